@@ -1,0 +1,276 @@
+"""The configuration as dataclasses: one per group, and `Config`, which the library receives.
+
+Hydra merges `conf/` into these types, so that a misspelt key or a value of the wrong type is an error before anything runs.
+Lengths are in m, angles in rad, times in s. Values live in `conf/`, not here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+
+from omegaconf import MISSING
+
+
+class ModelSource(Enum):
+    """Where the robot description comes from."""
+
+    builtin = "builtin"
+    menagerie = "menagerie"
+
+
+class Backend(Enum):
+    """Which physics engine steps the worlds of batch and throughput."""
+
+    auto = "auto"
+    native = "native"
+    mjwarp = "mjwarp"
+
+
+class GraphMode(Enum):
+    """Whether MJWarp's substeps are captured into a graph and replayed."""
+
+    auto = "auto"
+    require = "require"
+    off = "off"
+
+
+@dataclass(kw_only=True, slots=True)
+class LayoutCfg:
+    """Where a scene's objects stand for one robot, and the buffer sizes its contacts need."""
+
+    table_center: list[float] = MISSING
+    table_half: list[float] = MISSING
+    red_xy: list[float] = MISSING
+    blue_xy: list[float] = MISSING
+    nconmax: int = MISSING
+    njmax: int = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class RobotCfg:
+    """An arm: names of its parts and the commands of the task."""
+
+    name: str = MISSING
+    title: str = MISSING
+    menagerie_name: str = MISSING
+    menagerie_file: str = MISSING
+    arm_joints: list[str] = MISSING
+    gripper_joints: list[str] = MISSING
+    home: list[float] = MISSING
+    gripper_open: list[float] = MISSING
+    gripper_closed: list[float] = MISSING
+    ik_joints: list[str] = MISSING
+    locked: dict[str, float] = MISSING
+    arm_force_limit: float | None = None
+    aperture_sites: list[str] = MISSING
+    aperture_geoms: dict[str, list[str]] = field(default_factory=dict)
+    aperture_bodies: dict[str, str] = field(default_factory=dict)
+    replace_collision: bool = False
+    approach_height: float = MISSING
+    layouts: dict[str, LayoutCfg] = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class ModelCfg:
+    """Source of the robot description."""
+
+    source: ModelSource = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class SceneCfg:
+    """Table and cubes."""
+
+    name: str = MISSING
+    table_center: list[float] = MISSING
+    table_half: list[float] = MISSING
+    table_friction: list[float] = MISSING
+    red_xy: list[float] = MISSING
+    blue_xy: list[float] = MISSING
+    cube_half: float = MISSING
+    cube_mass: float = MISSING
+    cube_friction: list[float] = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class TimingCfg:
+    """Physics step and control interval."""
+
+    physics_dt: float = MISSING
+    substeps: int = MISSING
+
+    @property
+    def frame_dt(self) -> float:
+        """Time between two commands [s]."""
+        return self.physics_dt * self.substeps
+
+
+@dataclass(kw_only=True, slots=True)
+class SolverCfg:
+    """Constraint solver. ``null`` keeps the model file's own value."""
+
+    iterations: int | None = None
+    ls_iterations: int | None = None
+    impratio: float | None = None
+    tolerance: float | None = None
+
+
+@dataclass(kw_only=True, slots=True)
+class BatchCfg:
+    """MJWarp's buffer sizes. ``null`` takes the default of this robot and scene (nconmax, njmax) or of MJWarp."""
+
+    nconmax: int | None = None
+    naconmax: int | None = None
+    njmax: int | None = None
+    nccdmax: int | None = None
+    naccdmax: int | None = None
+
+
+@dataclass(kw_only=True, slots=True)
+class SimCfg:
+    """Backend and device."""
+
+    backend: Backend = MISSING
+    device: str = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class ResetCfg:
+    """How each world's start differs from the nominal one: uniform, plus or minus."""
+
+    cube_xy: float = MISSING
+    cube_yaw: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class TaskCfg:
+    """What has to be achieved, sampled at frame ends. The rules' thresholds are in `AcceptanceCfg`."""
+
+    name: str = MISSING
+    control_hz: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class PhaseCfg:
+    """One phase of the scripted grasp.
+
+    ``anchor`` is ``red``, ``blue`` (a cube's centre), ``on_blue`` (where the red cube's centre goes) or null (hold the last
+    command). The target lies ``h_scale`` approach heights plus ``offset`` above it.
+    """
+
+    anchor: str | None = None
+    h_scale: float = 0.0
+    offset: float = 0.0
+    gripper: str = MISSING
+    seconds: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class ControllerCfg:
+    """The scripted controller and its planner."""
+
+    name: str = MISSING
+    phases: dict[str, PhaseCfg] = MISSING
+    knots: int = MISSING
+    ik_tolerance: float = MISSING
+    ik_iterations: int = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class AcceptanceCfg:
+    """Thresholds of the episode acceptance."""
+
+    lift_phases: list[str] = MISSING
+    carry_phase: str = MISSING
+    airborne_height: float = MISSING
+    lift_frames: int = MISSING
+    carry_frames: int = MISSING
+    carry_distance: float = MISSING
+    window: int = MISSING
+    xy_err: float = MISSING
+    dz_min: float = MISSING
+    dz_max: float = MISSING
+    support_gap: float = MISSING
+    rest_speed: float = MISSING
+    rest_position: float = MISSING
+    rest_rotation_deg: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class ParityCfg:
+    """Tolerances of MJWarp against native MuJoCo: ``step1`` and ``step50`` map a field to its largest difference."""
+
+    states: dict[str, str] = MISSING
+    step1: dict[str, float] = MISSING
+    step50: dict[str, float] = MISSING
+    cube_position: float = MISSING
+    cube_rotation_deg: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class CapacityCfg:
+    """How many worlds size the buffers where worlds are slow (any CPU backend); on CUDA all nworld do."""
+
+    cpu_nworld: int = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class BatchGateCfg:
+    """The batch gate."""
+
+    failed_worlds: int = MISSING
+    distinct_fraction: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class ThroughputCfg:
+    """How throughput is measured."""
+
+    repetitions: int = MISSING
+    frames: int = MISSING
+    max_seconds: float = MISSING
+    from_phase: str = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class GateCfg:
+    """Thresholds of every gate."""
+
+    acceptance: AcceptanceCfg = field(default_factory=AcceptanceCfg)
+    parity: ParityCfg = field(default_factory=ParityCfg)
+    capacity: CapacityCfg = field(default_factory=CapacityCfg)
+    batch: BatchGateCfg = field(default_factory=BatchGateCfg)
+    throughput: ThroughputCfg = field(default_factory=ThroughputCfg)
+
+
+@dataclass(kw_only=True, slots=True)
+class JobCfg:
+    """What the command line runs."""
+
+    name: str = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class Config:
+    """Everything a run needs."""
+
+    robot: RobotCfg = field(default_factory=RobotCfg)
+    model: ModelCfg = field(default_factory=ModelCfg)
+    scene: SceneCfg = field(default_factory=SceneCfg)
+    timing: TimingCfg = field(default_factory=TimingCfg)
+    solver: SolverCfg = field(default_factory=SolverCfg)
+    batch: BatchCfg = field(default_factory=BatchCfg)
+    sim: SimCfg = field(default_factory=SimCfg)
+    reset: ResetCfg = field(default_factory=ResetCfg)
+    task: TaskCfg = field(default_factory=TaskCfg)
+    controller: ControllerCfg = field(default_factory=ControllerCfg)
+    gate: GateCfg = field(default_factory=GateCfg)
+    job: JobCfg = field(default_factory=JobCfg)
+    nworld: int = MISSING
+    seed: int = MISSING
+    gates: list[str] = MISSING
+    graph: GraphMode = MISSING
+    view: bool = MISSING
+    video: bool = MISSING

@@ -1,0 +1,118 @@
+"""Composes `conf/` into the dataclasses of `schema`. The library's only contact with Hydra."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import cast
+
+from hydra import compose, initialize_config_module
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
+
+from mjstack.config.schema import Config
+from mjstack.config.validate import validate
+from mjstack.errors import MjstackError, UnknownName, suggest
+
+CONFIG_MODULE = "mjstack.conf"
+CONFIG_NAME = "config"
+
+ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
+
+
+class CompositionError(MjstackError):
+    """The overrides do not fit the configuration files."""
+
+    exit_code = 2
+
+
+def load_config(overrides: Sequence[str] = ()) -> Config:
+    """Composes the configuration as the command line does.
+
+    Args:
+        overrides: Command-line overrides, such as ``["robot=rebot", "nworld=64"]``.
+
+    Returns:
+        The configuration, complete and validated.
+
+    Raises:
+        MjstackError: An override does not fit; the message says which and what would.
+    """
+    return to_config(compose_overrides(overrides))
+
+
+def compose_overrides(overrides: Sequence[str]) -> DictConfig:
+    """Composes without validating values; errors are one line each."""
+    if GlobalHydra.instance().is_initialized():
+        return _compose(overrides)
+    with initialize_config_module(config_module=CONFIG_MODULE, version_base="1.3"):
+        return _compose(overrides)
+
+
+def to_config(cfg: DictConfig) -> Config:
+    """Turns a composed configuration into dataclasses and checks their values."""
+    try:
+        config = cast(Config, OmegaConf.to_object(cfg))
+    except OmegaConfBaseException as error:
+        raise _translate(error, cfg) from error
+    validate(config)
+    return config
+
+
+def _compose(overrides: Sequence[str]) -> DictConfig:
+    try:
+        return compose(CONFIG_NAME, overrides=list(overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise _translate(error, None) from error
+
+
+def _translate(error: Exception, cfg: DictConfig | None) -> MjstackError:
+    """One line from Hydra's and OmegaConf's chained, multi-line errors."""
+    if isinstance(error, MissingConfigException) and error.options is not None and error.missing_cfg_file:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        return UnknownName(f"{group}={name}:", name, error.options)
+    cause = error.__cause__ if isinstance(error, ConfigCompositionException) and error.__cause__ else error
+    key = getattr(cause, "full_key", None)
+    text = str(cause).splitlines()[0] if str(cause) else type(cause).__name__
+    if isinstance(cause, ConfigKeyError | AttributeError) or "not in struct" in text or "not in 'Config'" in text:
+        return _unknown_key(error, str(key or getattr(cause, "key", "") or ""))
+    match = re.search(r"Could not override '([^']+)'\. No match in the defaults list", str(error))
+    if match:
+        groups = ["robot", "model", "scene", "timing", "solver", "batch", "sim", "reset", "task", "controller", "gate", "job"]
+        return UnknownName("configuration group", match.group(1), groups)
+    return CompositionError(f"{key}: {text}." if key else f"{text.rstrip('.')}.")
+
+
+def _unknown_key(error: Exception, key: str) -> MjstackError:
+    match = re.search(r"Could not override '([^']+)'", str(error))
+    key = match.group(1) if match else key
+    base = OmegaConf.to_container(compose(CONFIG_NAME), resolve=False) if GlobalHydra.instance().is_initialized() else {}
+    keys = _flat_keys(base)
+    leaf = key.rpartition(".")[2]
+    same_leaf = [k for k in keys if k.rpartition(".")[2] == leaf]
+    if same_leaf:
+        return CompositionError(f"configuration key '{key}' does not exist. Did you mean '{same_leaf[0]}'?")
+    siblings = [k for k in keys if k.rpartition(".")[0] == key.rpartition(".")[0]]
+    pool = siblings + [k for k in keys if "." not in k]
+    return CompositionError(f"configuration key '{key}' does not exist. {suggest(key, _nearest_first(leaf, pool))}")
+
+
+def _nearest_first(leaf: str, keys: Sequence[str]) -> list[str]:
+    import difflib
+
+    by_leaf = {k.rpartition(".")[2]: k for k in keys}
+    near = difflib.get_close_matches(leaf, by_leaf, n=1, cutoff=0.6)
+    return [by_leaf[near[0]]] if near else list(keys)
+
+
+def _flat_keys(node: object, prefix: str = "") -> list[str]:
+    if not isinstance(node, dict):
+        return []
+    out: list[str] = []
+    for name, value in node.items():
+        path = f"{prefix}{name}"
+        out += [path, *_flat_keys(value, f"{path}.")]
+    return out

@@ -1,0 +1,160 @@
+"""Checks values that types cannot: ranges, lengths, names, and how they fit together."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from mjstack.config.schema import Config
+from mjstack.errors import ConfigError, UnknownName
+
+GATES = ("baseline", "parity", "capacity", "batch", "throughput")
+ANCHORS = ("red", "blue", "on_blue")
+_DEVICE = re.compile(r"auto|cpu|cuda:\d+")
+
+
+def validate(cfg: Config) -> None:
+    """Raises a `ConfigError` or `UnknownName` for the first value that cannot be used."""
+    _positive_int("nworld", cfg.nworld)
+    if cfg.seed < 0:
+        raise ConfigError("seed", cfg.seed, "a non-negative integer")
+    if not cfg.gates:
+        raise ConfigError("gates", "[]", f"at least one of {', '.join(GATES)}")
+    for name in cfg.gates:
+        if name not in GATES:
+            raise UnknownName("gate", name, GATES)
+    if cfg.job.name != "gates":
+        raise UnknownName("job", cfg.job.name, ["gates"])
+    if not _DEVICE.fullmatch(cfg.sim.device):
+        raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N")
+    _timing(cfg)
+    _solver_and_batch(cfg)
+    _robot(cfg)
+    _scene(cfg)
+    _controller(cfg)
+    _gates(cfg)
+
+
+def _timing(cfg: Config) -> None:
+    _positive("timing.physics_dt", cfg.timing.physics_dt, "s")
+    _positive_int("timing.substeps", cfg.timing.substeps)
+    wanted = 1.0 / cfg.task.control_hz
+    if not math.isclose(cfg.timing.frame_dt, wanted, rel_tol=1e-9):
+        raise ConfigError(
+            "timing.physics_dt x timing.substeps",
+            f"{cfg.timing.frame_dt:g}",
+            f"{wanted:g} s, because task '{cfg.task.name}' is controlled at {cfg.task.control_hz:g} Hz",
+            "Change both together",
+        )
+
+
+def _solver_and_batch(cfg: Config) -> None:
+    for name in ("nconmax", "naconmax", "njmax", "nccdmax", "naccdmax"):
+        value = getattr(cfg.batch, name)
+        if value is not None:
+            _positive_int(f"batch.{name}", value)
+    for name in ("iterations", "ls_iterations"):
+        value = getattr(cfg.solver, name)
+        if value is not None:
+            _positive_int(f"solver.{name}", value)
+    for name in ("impratio", "tolerance"):
+        value = getattr(cfg.solver, name)
+        if value is not None:
+            _positive(f"solver.{name}", value)
+
+
+def _robot(cfg: Config) -> None:
+    robot = cfg.robot
+    n_arm, n_grip = len(robot.arm_joints), len(robot.gripper_joints)
+    _length("robot.home", robot.home, n_arm + n_grip)
+    _length("robot.gripper_open", robot.gripper_open, n_grip)
+    _length("robot.gripper_closed", robot.gripper_closed, n_grip)
+    _length("robot.aperture_sites", robot.aperture_sites, 2)
+    for key, names in (("robot.ik_joints", robot.ik_joints), ("robot.locked", list(robot.locked))):
+        for name in names:
+            if name not in robot.arm_joints:
+                raise UnknownName(f"{key}: arm joint", name, robot.arm_joints)
+    if set(robot.ik_joints) & set(robot.locked):
+        raise ConfigError("robot.locked", list(robot.locked), "joints that robot.ik_joints does not move")
+    if robot.arm_force_limit is not None:
+        _positive("robot.arm_force_limit", robot.arm_force_limit, "N m")
+    _positive("robot.approach_height", robot.approach_height, "m")
+    if cfg.scene.name not in robot.layouts:
+        raise UnknownName(f"robot.layouts of {robot.name}: scene", cfg.scene.name, robot.layouts)
+
+
+def _scene(cfg: Config) -> None:
+    scene = cfg.scene
+    for key, size in (("table_center", 3), ("table_half", 3), ("table_friction", 3), ("cube_friction", 3)):
+        _length(f"scene.{key}", getattr(scene, key), size)
+    for key in ("red_xy", "blue_xy"):
+        value = getattr(scene, key)
+        _length(f"scene.{key}", value, 2)
+        for axis in (0, 1):
+            reach = scene.table_half[axis] - scene.cube_half
+            if abs(value[axis] - scene.table_center[axis]) > reach:
+                low, high = scene.table_center[axis] - reach, scene.table_center[axis] + reach
+                raise ConfigError(
+                    f"scene.{key}", value, f"{'xy'[axis]} within [{low:.3f}, {high:.3f}] m, so that the cube is on the table"
+                )
+    _positive("scene.cube_half", scene.cube_half, "m")
+    _positive("scene.cube_mass", scene.cube_mass, "kg")
+    apart = math.dist(scene.red_xy, scene.blue_xy)
+    if apart < 2.0 * math.sqrt(2.0) * scene.cube_half:
+        raise ConfigError("scene.red_xy", scene.red_xy, f"a cube that does not touch the blue one at {scene.blue_xy}")
+    for name in ("cube_xy", "cube_yaw"):
+        value = getattr(cfg.reset, name)
+        if not (math.isfinite(value) and value >= 0.0):
+            raise ConfigError(f"reset.{name}", value, "a number that is not negative")
+
+
+def _controller(cfg: Config) -> None:
+    for name, phase in cfg.controller.phases.items():
+        key = f"controller.phases.{name}"
+        if phase.anchor is not None and phase.anchor not in ANCHORS:
+            raise UnknownName(f"{key}.anchor:", phase.anchor, ANCHORS)
+        if phase.gripper not in ("open", "closed"):
+            raise ConfigError(f"{key}.gripper", phase.gripper, "open or closed")
+        _positive(f"{key}.seconds", phase.seconds, "s")
+        frames = phase.seconds / cfg.timing.frame_dt
+        if abs(frames - round(frames)) > 1e-6:
+            raise ConfigError(f"{key}.seconds", phase.seconds, f"a multiple of the frame, {cfg.timing.frame_dt:g} s")
+    if next(iter(cfg.controller.phases.values())).anchor is None:
+        raise ConfigError("controller.phases", next(iter(cfg.controller.phases)), "a first phase with an anchor")
+    if cfg.controller.knots < 3:
+        raise ConfigError("controller.knots", cfg.controller.knots, "at least 3")
+    _positive("controller.ik_tolerance", cfg.controller.ik_tolerance, "m")
+    _positive_int("controller.ik_iterations", cfg.controller.ik_iterations)
+
+
+def _gates(cfg: Config) -> None:
+    gate, phases = cfg.gate, cfg.controller.phases
+    named = [("gate.acceptance.carry_phase", gate.acceptance.carry_phase)]
+    named += [("gate.acceptance.lift_phases", name) for name in gate.acceptance.lift_phases]
+    named += [("gate.parity.states", name) for name in gate.parity.states.values()]
+    named += [("gate.throughput.from_phase", gate.throughput.from_phase)]
+    for key, name in named:
+        if name not in phases:
+            raise UnknownName(f"{key}: phase", name, phases)
+    frames = sum(round(phase.seconds / cfg.timing.frame_dt) for phase in phases.values())
+    if not 2 <= gate.acceptance.window <= frames:
+        raise ConfigError("gate.acceptance.window", gate.acceptance.window, f"2 to {frames} frames (the episode)")
+    _positive_int("gate.capacity.cpu_nworld", gate.capacity.cpu_nworld)
+    _positive_int("gate.throughput.repetitions", gate.throughput.repetitions)
+    _positive_int("gate.throughput.frames", gate.throughput.frames)
+    _positive("gate.throughput.max_seconds", gate.throughput.max_seconds, "s")
+
+
+def _positive_int(key: str, value: int) -> None:
+    if value < 1:
+        raise ConfigError(key, value, "an integer of at least 1")
+
+
+def _positive(key: str, value: float, unit: str = "") -> None:
+    if not (math.isfinite(value) and value > 0.0):
+        raise ConfigError(key, value, f"a positive number{f' [{unit}]' if unit else ''}")
+
+
+def _length(key: str, value: list, size: int) -> None:
+    if len(value) != size:
+        raise ConfigError(key, value, f"{size} numbers or names")

@@ -1,0 +1,93 @@
+"""Errors built from facts: what is wrong with its value, what was expected, what to do.
+
+Every error that a user can cause derives from `MjstackError` and carries the exit status that the command line returns for it.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+
+
+class MjstackError(Exception):
+    """Base class. Its message is one line that a user can act on."""
+
+    exit_code = 1
+
+
+class ConfigError(MjstackError):
+    """A value in the configuration cannot be used. Raised before anything is written."""
+
+    exit_code = 2
+
+    def __init__(self, key: str, value: object, expected: str, fix: str = "") -> None:
+        """Builds the message.
+
+        Args:
+            key: Dotted configuration key, such as ``timing.substeps``.
+            value: The offending value.
+            expected: What would have been accepted.
+            fix: What to do about it, a sentence without its full stop.
+        """
+        message = f"{key}={value}: expected {expected}."
+        super().__init__(message + (f" {fix}." if fix else ""))
+        self.key = key
+
+
+class UnknownName(MjstackError):
+    """A name that does not exist, listed with the ones that do."""
+
+    exit_code = 2
+
+    def __init__(self, what: str, name: str, available: Iterable[str]) -> None:
+        super().__init__(f"{what} '{name}' does not exist. {suggest(name, available)}")
+
+
+class SourceError(MjstackError):
+    """A robot description that cannot be fetched, found or read."""
+
+    exit_code = 2
+
+
+class DeviceError(MjstackError):
+    """A compute device that was asked for and is not there."""
+
+    exit_code = 2
+
+
+class UnsupportedModel(MjstackError):
+    """MJWarp does not implement a feature of the model."""
+
+    def __init__(self, feature: str) -> None:
+        super().__init__(
+            f"MJWarp does not support this model: {feature}. Remove the feature from the model, or run sim=native."
+        )
+
+
+class Unreachable(MjstackError):
+    """The arm cannot bring its aperture centre to a target."""
+
+    def __init__(self, world: int, phase: str, target: Sequence[float], distance: float, tolerance: float) -> None:
+        where = ", ".join(f"{x:.3f}" for x in target)
+        super().__init__(
+            f"world {world}, phase {phase}: target ({where}) m is {1e3 * distance:.1f} mm out of reach of the aperture "
+            f"centre, expected at most {1e3 * tolerance:.1f} mm. Move the cube closer, or change controller.phases.{phase}."
+        )
+        self.world = world
+        self.phase = phase
+        self.distance = distance
+
+
+def suggest(name: str, available: Iterable[str]) -> str:
+    """Lists the available names, the nearest match first if there is one."""
+    names = sorted(available)
+    nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    hint = f"Did you mean '{nearest[0]}'? " if nearest else ""
+    return f"{hint}Available: {', '.join(names) or 'none'}."
+
+
+def name_worlds(worlds: Sequence[int], nworld: int, limit: int = 8) -> str:
+    """Says how many worlds and names the first ones: ``17 of 4096 worlds (first: 3, 41, 96)``."""
+    shown = ", ".join(str(w) for w in worlds[:limit])
+    label = "first: " if len(worlds) > limit else ""
+    return f"{len(worlds)} of {nworld} worlds ({label}{shown})"

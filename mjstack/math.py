@@ -1,0 +1,63 @@
+"""Batched rotations on torch tensors. Quaternions are (w, x, y, z), the last dimension is the vector's own."""
+
+from __future__ import annotations
+
+import torch
+
+
+def quat_mul(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Hamilton product ``a b``, shape ``(..., 4)``."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        dim=-1,
+    )
+
+
+def quat_from_yaw(yaw: torch.Tensor) -> torch.Tensor:
+    """Rotation about world z.
+
+    Args:
+        yaw: Angle [rad], shape ``(...)``.
+
+    Returns:
+        Unit quaternion, shape ``(..., 4)``.
+    """
+    half, zero = 0.5 * yaw, torch.zeros_like(yaw)
+    return torch.stack((torch.cos(half), zero, zero, torch.sin(half)), dim=-1)
+
+
+def quat_angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Angle [rad] of the rotation between two unit quaternions, in [0, pi], shape ``(...)``.
+
+    The sine comes from the vector part of ``conj(a) b``, so that small angles keep their precision in float32.
+    """
+    conj = torch.cat((a[..., :1], -a[..., 1:]), dim=-1)
+    rel = quat_mul(conj, b)
+    return 2.0 * torch.atan2(torch.linalg.vector_norm(rel[..., 1:], dim=-1), rel[..., 0].abs())
+
+
+def quat_z_row(quat: torch.Tensor) -> torch.Tensor:
+    """Third row of the rotation matrix: the world-z components of the body's axes, shape ``(..., 3)``."""
+    w, x, y, z = quat.unbind(-1)
+    return torch.stack((2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)), dim=-1)
+
+
+def lowest_corner(pos: torch.Tensor, quat: torch.Tensor, half: float) -> torch.Tensor:
+    """Height [m] of the lowest corner of a cube.
+
+    Args:
+        pos: Centre [m], shape ``(..., 3)``.
+        quat: Orientation, shape ``(..., 4)``.
+        half: Half the edge length [m].
+
+    Returns:
+        World z of the lowest corner, shape ``(...)``.
+    """
+    return pos[..., 2] - half * quat_z_row(quat).abs().sum(-1)
