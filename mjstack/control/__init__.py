@@ -1,1 +1,1 @@
-
+"""Controllers: what writes the commands."""

@@ -1,1 +1,6 @@
+"""Scenes: a robot, a table and cubes as one MjModel, and where each name lies in it."""
 
+from mjstack.scene.build import BLUE, RED, build_scene, table_top
+from mjstack.scene.index import SceneIndex
+
+__all__ = ["BLUE", "RED", "SceneIndex", "build_scene", "table_top"]

@@ -1,1 +1,16 @@
+"""Physics backends behind one protocol."""
 
+from mjstack.sim.build import make_simulation, resolve_backend, resolve_device
+from mjstack.sim.simulation import LOST_PHYSICS, Overflow, Simulation
+from mjstack.sim.sizes import BatchSizes, resolve_sizes
+
+__all__ = [
+    "LOST_PHYSICS",
+    "BatchSizes",
+    "Overflow",
+    "Simulation",
+    "make_simulation",
+    "resolve_backend",
+    "resolve_device",
+    "resolve_sizes",
+]

@@ -1,0 +1,185 @@
+"""The scripted grasp: phases, targets of the aperture centre, and the command tape of every world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from mjstack.config.schema import Config
+from mjstack.errors import Unreachable
+from mjstack.kinematics.mink_ik import ApertureIk
+from mjstack.scene import table_top
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """A phase as frames ``start`` to ``stop`` (exclusive) of the episode."""
+
+    name: str
+    start: int
+    stop: int
+
+
+def build_phases(cfg: Config) -> list[Phase]:
+    """The controller's phases laid out over the episode's frames."""
+    phases, start = [], 0
+    for name, phase in cfg.controller.phases.items():
+        stop = start + round(phase.seconds / cfg.timing.frame_dt)
+        phases.append(Phase(name, start, stop))
+        start = stop
+    return phases
+
+
+class CommandTape:
+    """Commands of every world for the whole episode, held as a few knots per phase.
+
+    The arm's motion between two targets is a polynomial in the smoothstep parameter through Chebyshev points, so that 600
+    frames need some 40 solutions of inverse kinematics a world, and memory does not grow with the episode.
+    """
+
+    def __init__(self, knots: np.ndarray, weights: np.ndarray, segments: np.ndarray, waypoint_error: np.ndarray) -> None:
+        """Wraps a plan.
+
+        Args:
+            knots: Commands, shape ``(nworld, n, nu)``.
+            weights: Weight of each knot of a frame's segment, shape ``(frames, k)``.
+            segments: First knot of each frame's segment, shape ``(frames,)``.
+            waypoint_error: Largest distance [m] from a target at any knot, shape ``(nworld,)``.
+        """
+        self.waypoint_error = waypoint_error
+        self.frames, self._k = weights.shape
+        self._segments = segments.tolist()
+        self._weights = torch.from_numpy(weights)
+        self._knots = torch.from_numpy(knots)
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> CommandTape:
+        """Moves the tape to a device; returns itself."""
+        self._weights = self._weights.to(device, dtype)
+        self._knots = self._knots.to(device, dtype)
+        return self
+
+    def command(self, frame: int) -> torch.Tensor:
+        """Commands of one frame, shape ``(nworld, nu)``."""
+        first = self._segments[frame]
+        return torch.einsum("k,nku->nu", self._weights[frame], self._knots[:, first : first + self._k])
+
+
+class ScriptedPlanner:
+    """Plans command tapes for cubes at given places, with mink."""
+
+    def __init__(self, cfg: Config) -> None:
+        """Plans the nominal layout, from which every other plan starts.
+
+        Raises:
+            Unreachable: A nominal target is out of reach.
+        """
+        self._cfg = cfg
+        self.phases = build_phases(cfg)
+        self.ik = ApertureIk(
+            cfg.robot, cfg.model, tolerance=cfg.controller.ik_tolerance, iterations=cfg.controller.ik_iterations
+        )
+        self._nodes = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, cfg.controller.knots))
+        self._weights, self._segments = self._frame_weights()
+        self._seed: np.ndarray | None = None
+        nominal = np.array([[*cfg.scene.red_xy, *cfg.scene.blue_xy]])
+        self._seed = self._plan_world(0, nominal[0])[0]
+
+    def plan(self, cubes_xy: np.ndarray, progress: Callable[[int], None] | None = None) -> CommandTape:
+        """Plans one tape per world; worlds whose cubes stand alike share the work.
+
+        Args:
+            cubes_xy: Red x, y and blue x, y at the start [m], shape ``(nworld, 4)``.
+            progress: Called with the number of worlds done.
+
+        Raises:
+            Unreachable: A target is out of reach; names the world, the phase and the distance.
+        """
+        nworld = cubes_xy.shape[0]
+        knots = np.full((nworld, len(self.phases) * len(self._nodes), len(self._cfg.robot.home)), np.nan)
+        error = np.full(nworld, np.nan)
+        done: dict[bytes, int] = {}
+        for world in range(nworld):
+            twin = done.setdefault(cubes_xy[world].tobytes(), world)
+            if twin == world:
+                knots[world], error[world] = self._plan_world(world, cubes_xy[world])
+            else:
+                knots[world], error[world] = knots[twin], error[twin]
+            if progress is not None:
+                progress(world + 1)
+        return CommandTape(knots, self._weights, self._segments, error)
+
+    def path_error(self, cubes_xy: np.ndarray) -> float:
+        """Largest distance [m] of the aperture centre from its straight path at any frame, for one layout ``(4,)``."""
+        tape = self.plan(cubes_xy[None])
+        worst = 0.0
+        for phase, (start, end, _, _) in zip(self.phases, self._targets(cubes_xy), strict=True):
+            for frame in range(phase.start, phase.stop):
+                s = _smoothstep((frame + 1 - phase.start) / (phase.stop - phase.start))
+                at = self.ik.aperture(tape.command(frame)[0].numpy())
+                worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start)))))
+        return worst
+
+    def _plan_world(self, world: int, xy: np.ndarray) -> tuple[np.ndarray, float]:
+        n = len(self._nodes)
+        knots = np.empty((len(self.phases) * n, len(self._cfg.robot.home)))
+        worst, command = 0.0, self.ik.home
+        for i, (phase, (start, end, grip0, grip1)) in enumerate(zip(self.phases, self._targets(xy), strict=True)):
+            still = bool((start == end).all() and (grip0 == grip1).all())
+            for j, s in enumerate(self._nodes):
+                k = i * n + j
+                repeated = (still and j > 0) or (j == 0 and i > 0)
+                if not repeated:
+                    guess = command if self._seed is None else self._seed[k]
+                    target = start + s * (end - start)
+                    command, distance = self.ik.solve(target, grip0 + s * (grip1 - grip0), guess)
+                    if distance > self.ik.tolerance:
+                        raise Unreachable(world, phase.name, target.tolist(), distance, self.ik.tolerance)
+                    worst = max(worst, distance)
+                knots[k] = command
+        return knots, worst
+
+    def _targets(self, xy: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """Start and end of the aperture centre and of the gripper command, per phase."""
+        robot, scene = self._cfg.robot, self._cfg.scene
+        half, top = scene.cube_half, table_top(scene)
+        anchors = {
+            "red": np.array([xy[0], xy[1], top + half]),
+            "blue": np.array([xy[2], xy[3], top + half]),
+            "on_blue": np.array([xy[2], xy[3], top + 3.0 * half]),
+        }
+        grips = {"open": np.array(robot.gripper_open), "closed": np.array(robot.gripper_closed)}
+        out: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+        for cfg in self._cfg.controller.phases.values():
+            grip = grips[cfg.gripper]
+            if cfg.anchor is None:
+                end = out[-1][1]
+            else:
+                end = anchors[cfg.anchor] + np.array([0.0, 0.0, cfg.h_scale * robot.approach_height + cfg.offset])
+            # The first phase's target stands from the first frame; only the gripper moves from home.
+            start = out[-1][1] if out else end
+            grip0 = out[-1][3] if out else np.array(robot.home[len(robot.arm_joints) :])
+            out.append((start, end, grip0, grip))
+        return out
+
+    def _frame_weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Barycentric Lagrange weights of the Chebyshev points, for every frame."""
+        n = len(self._nodes)
+        bary = (-1.0) ** np.arange(n)
+        bary[[0, -1]] *= 0.5
+        rows, segments = [], []
+        for i, phase in enumerate(self.phases):
+            for frame in range(phase.start, phase.stop):
+                s = _smoothstep((frame + 1 - phase.start) / (phase.stop - phase.start))
+                gap = s - self._nodes
+                hit = np.abs(gap) < 1e-12
+                row = hit.astype(float) if hit.any() else (bary / gap) / (bary / gap).sum()
+                rows.append(row)
+                segments.append(i * n)
+        return np.array(rows), np.array(segments)
+
+
+def _smoothstep(u: float) -> float:
+    return u * u * (3.0 - 2.0 * u)

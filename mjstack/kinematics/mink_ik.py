@@ -1,0 +1,115 @@
+"""Inverse kinematics with mink on a robot-only model: the reference that plans the scripted grasp."""
+
+from __future__ import annotations
+
+import mink
+import mujoco
+import numpy as np
+
+from mjstack.config.schema import ModelCfg, RobotCfg
+from mjstack.robots import robot_spec
+
+_POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the aperture centre by micrometres
+_MAX_STEP = 0.3  # [rad] per iteration, so that a far target is approached on one branch of solutions
+
+
+class ApertureTask(mink.Task):
+    """Drives the aperture centre, the midpoint of two sites, to a point.
+
+    The midpoint belongs to no single frame: on a jaw that swings it moves with the jaw's angle.
+    """
+
+    def __init__(self, sites: list[int], nv: int) -> None:
+        """Stores the two site indices; the target is set before each solve."""
+        super().__init__(cost=np.ones(3))
+        self.target = np.zeros(3)
+        self._sites = sites
+        self._jac = np.empty((2, 3, nv))
+
+    def compute_error(self, configuration: mink.Configuration) -> np.ndarray:
+        """Aperture centre minus target [m], shape ``(3,)``."""
+        return configuration.data.site_xpos[self._sites].mean(axis=0) - self.target
+
+    def compute_jacobian(self, configuration: mink.Configuration) -> np.ndarray:
+        """Mean of the two sites' translational Jacobians, shape ``(3, nv)``."""
+        for jac, site in zip(self._jac, self._sites, strict=True):
+            mujoco.mj_jacSite(configuration.model, configuration.data, jac, None, site)
+        return self._jac.mean(axis=0)
+
+
+class ApertureIk:
+    """Solves for the arm command that brings the aperture centre to a target at a given gripper command."""
+
+    def __init__(self, robot: RobotCfg, model: ModelCfg, *, tolerance: float, iterations: int) -> None:
+        """Compiles the robot without a scene.
+
+        Args:
+            robot: The robot's profile.
+            model: Where its description comes from.
+            tolerance: Distance that counts as reached [m].
+            iterations: Most mink steps per solve.
+        """
+        spec = robot_spec(robot, model)
+        spec.compiler.discardvisual = True
+        self.model = spec.compile()
+        self.tolerance = tolerance
+        self._iterations = iterations
+        names = [*robot.arm_joints, *robot.gripper_joints]
+        joints = [self.model.joint(name) for name in names]
+        self._qpos = np.array([joint.qposadr[0] for joint in joints])
+        self._n_arm = len(robot.arm_joints)
+        self.home = np.array(robot.home)
+        for name, value in robot.locked.items():
+            self.home[names.index(name)] = value
+        self._configuration = mink.Configuration(self.model)
+        moving = {int(self.model.joint(name).dofadr[0]) for name in robot.ik_joints}
+        frozen = [dof for dof in range(self.model.nv) if dof not in moving]
+        self._task = ApertureTask([self.model.site(s).id for s in robot.aperture_sites], self.model.nv)
+        self._posture = mink.PostureTask(self.model, cost=_POSTURE_COST)
+        self._limits = [mink.ConfigurationLimit(self.model, gain=1.0)]
+        self._constraints = [mink.DofFreezingTask(self.model, frozen)]
+        self._posture.set_target(self._to_qpos(self.home))
+
+    def solve(self, target: np.ndarray, gripper: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+        """Finds a command.
+
+        Args:
+            target: Where the aperture centre goes [m], shape ``(3,)``.
+            gripper: Gripper command, held fixed.
+            start: Command to start from, shape ``(nu,)``, arm joints first.
+
+        Returns:
+            The command, shape ``(nu,)``, and the distance [m] that is left.
+        """
+        command = start.copy()
+        command[self._n_arm :] = gripper
+        self._task.target[:] = target
+        configuration = self._configuration
+        configuration.update(self._to_qpos(command))
+        for _ in range(self._iterations):
+            step = mink.solve_ik(
+                configuration,
+                [self._task, self._posture],
+                dt=1.0,
+                solver="daqp",
+                damping=1e-9,
+                limits=self._limits,
+                constraints=self._constraints,
+            )
+            largest = float(np.abs(step).max())
+            configuration.integrate_inplace(step * min(1.0, _MAX_STEP / max(largest, 1e-12)), 1.0)
+            # Newton's method squares the error: a step this short leaves nothing that matters.
+            if largest < 1e-3:
+                break
+        distance = float(np.linalg.norm(self._task.compute_error(configuration)))
+        return configuration.q[self._qpos].copy(), distance
+
+    def aperture(self, command: np.ndarray) -> np.ndarray:
+        """Aperture centre [m] at a command, shape ``(3,)``."""
+        self._configuration.update(self._to_qpos(command))
+        return self._task.compute_error(self._configuration) + self._task.target
+
+    def _to_qpos(self, command: np.ndarray) -> np.ndarray:
+        qpos = self.model.qpos0.copy()
+        qpos[self._qpos] = command
+        return qpos

@@ -1,0 +1,1 @@
+"""Terms: plain functions on batched views."""

@@ -1,0 +1,58 @@
+"""Chooses a backend and a device: the only branch on the backend."""
+
+from __future__ import annotations
+
+import mujoco
+import torch
+
+from mjstack.config.schema import Backend, Config
+from mjstack.errors import ConfigError, DeviceError
+from mjstack.sim.native import NativeSimulation
+from mjstack.sim.simulation import Simulation
+from mjstack.sim.sizes import resolve_sizes
+
+
+def resolve_device(requested: str) -> str:
+    """``cpu`` or ``cuda:N`` for a requested device.
+
+    Raises:
+        DeviceError: The CUDA device is not there.
+    """
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if requested == "auto":
+        return "cuda:0" if count else "cpu"
+    if requested.startswith("cuda") and int(requested.partition(":")[2]) >= count:
+        found = f"cuda:0 to cuda:{count - 1}" if count > 1 else "cuda:0" if count else "no CUDA device"
+        raise DeviceError(f"sim.device={requested}: this machine has {found}. Use sim.device=auto or sim.device=cpu.")
+    return requested
+
+
+def resolve_backend(cfg: Config) -> tuple[Backend, str]:
+    """Backend (never auto) and device of the batch and throughput gates."""
+    device = resolve_device(cfg.sim.device)
+    backend = cfg.sim.backend
+    if backend is Backend.auto:
+        backend = Backend.mjwarp if device.startswith("cuda") else Backend.native
+    if backend is Backend.native and cfg.sim.device.startswith("cuda"):
+        raise ConfigError("sim.device", cfg.sim.device, "cpu or auto, because native MuJoCo runs on the CPU", "Use sim=mjwarp")
+    return backend, "cpu" if backend is Backend.native else device
+
+
+def make_simulation(
+    model: mujoco.MjModel, cfg: Config, nworld: int, *, backend: Backend | None = None, device: str | None = None
+) -> Simulation:
+    """Builds a simulation.
+
+    Args:
+        model: The compiled model, its timestep set.
+        cfg: The configuration; `sim`, `batch` and `graph` are used.
+        nworld: Number of worlds.
+        backend: Overrides the configured backend.
+        device: Overrides the configured device.
+    """
+    chosen, where = resolve_backend(cfg) if backend is None else (backend, device or resolve_device(cfg.sim.device))
+    if chosen is Backend.native:
+        return NativeSimulation(model, nworld)
+    from mjstack.sim.mjwarp import MjwarpSimulation  # loads Warp, which native runs do not need
+
+    return MjwarpSimulation(model, nworld, resolve_sizes(cfg), where, cfg.graph)

@@ -1,0 +1,239 @@
+"""MuJoCo Warp: thousands of worlds on CUDA, or on Warp's CPU device for checks."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import warnings
+
+import mujoco
+import mujoco_warp as mjw
+import torch
+import warp as wp
+
+from mjstack.config.schema import GraphMode
+from mjstack.errors import MjstackError, UnsupportedModel
+from mjstack.sim.sizes import BatchSizes
+
+log = logging.getLogger(__name__)
+
+
+@wp.kernel
+def _count_contacts(
+    nacon: wp.array(dtype=int),
+    worldid: wp.array(dtype=int),
+    count: wp.array(dtype=int),
+):
+    """Counts each world's entries of the packed contact list. The list may claim more than it holds after an overflow."""
+    i = wp.tid()
+    if i < wp.min(nacon[0], worldid.shape[0]):
+        wp.atomic_add(count, worldid[i], 1)
+
+
+@wp.kernel
+def _record_peaks(
+    nefc: wp.array(dtype=int),
+    nacon: wp.array(dtype=int),
+    ncollision: wp.array(dtype=int),
+    contacts: wp.array(dtype=int),
+    overflow: wp.array(dtype=int),
+    peak_nefc: wp.array(dtype=int),
+    peak_contacts: wp.array(dtype=int),
+    peak_pool: wp.array(dtype=int),
+    seen: wp.array(dtype=int),
+):
+    """Keeps the largest counters and every overflow bit seen so far."""
+    w = wp.tid()
+    peak_nefc[w] = wp.max(peak_nefc[w], nefc[w])
+    peak_contacts[w] = wp.max(peak_contacts[w], contacts[w])
+    seen[w] = seen[w] | overflow[w]
+    if w == 0:
+        peak_pool[0] = wp.max(peak_pool[0], nacon[0])
+        peak_pool[1] = wp.max(peak_pool[1], ncollision[0])
+
+
+class MjwarpSimulation:
+    """`Simulation` on MuJoCo Warp, float32.
+
+    Box against box uses the primitive collider, as native MuJoCo does: with MJWarp's convex one the kept contacts of a
+    resting stack can alternate, and it never comes to rest. The substeps of one `step(n)` are captured into a graph.
+    """
+
+    backend = "mjwarp"
+
+    def __init__(
+        self, model: mujoco.MjModel, nworld: int, sizes: BatchSizes, device: str, graph: GraphMode = GraphMode.auto
+    ) -> None:
+        """Uploads the model and allocates nworld worlds at qpos0.
+
+        Args:
+            model: The compiled model.
+            nworld: Number of worlds.
+            sizes: Buffer sizes.
+            device: ``"cpu"`` or ``"cuda:N"``.
+            graph: Whether `step` replays a captured graph.
+
+        Raises:
+            UnsupportedModel: MJWarp does not implement a feature of the model.
+        """
+        wp.config.quiet = True
+        wp.init()
+        self.model, self.nworld, self.sizes = model, nworld, sizes
+        self.device = torch.device(device)
+        self._device = wp.get_device(device)
+        self._graph_mode = graph
+        self._graphs: dict[int, object] = {}
+        name = self._device.name if self._device.is_cuda else "Warp's CPU device"
+        self.description = f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}"
+        with wp.ScopedDevice(self._device):
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("error")
+                    self._m = mjw.put_model(model)
+            except (NotImplementedError, ValueError, UserWarning) as error:
+                raise UnsupportedModel(str(error).splitlines()[0].rstrip(".")) from error
+            self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
+            self._m.opt.warn_overflow = 0
+            self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
+            self._contacts = wp.zeros(nworld, dtype=int)
+            self._peak_nefc = wp.zeros(nworld, dtype=int)
+            self._peak_contacts = wp.zeros(nworld, dtype=int)
+            self._peak_pool = wp.zeros(2, dtype=int)
+            self._seen = wp.zeros(nworld, dtype=int)
+            self._mask = wp.zeros(nworld, dtype=bool)
+        d = self._d
+        self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
+        self.xpos, self.xquat, self.site_xpos = wp.to_torch(d.xpos), wp.to_torch(d.xquat), wp.to_torch(d.site_xpos)
+        self.qfrc_actuator = wp.to_torch(d.qfrc_actuator)
+        self.constraint_count = wp.to_torch(d.nefc)
+        self.contact_count = wp.to_torch(self._contacts)
+        self.peak_constraints = wp.to_torch(self._peak_nefc)
+        self.peak_contacts = wp.to_torch(self._peak_contacts)
+        self.peak_pool = wp.to_torch(self._peak_pool)
+        self.overflow = wp.to_torch(self._seen)
+        self.step_count = torch.zeros(nworld, dtype=torch.int64, device=self.device)
+        self._torch_mask = wp.to_torch(self._mask)
+        self._warm_up()
+
+    def step(self, n: int = 1) -> None:
+        """Advances every world by n physics steps under the current ctrl."""
+        graph = self._graph(n)
+        with self._stream():
+            if graph is None:
+                self._substeps(n)
+            else:
+                wp.capture_launch(graph)
+        self.step_count += n
+
+    def forward(self) -> None:
+        """Computes everything that derives from the state, without advancing time."""
+        with self._stream():
+            mjw.forward(self._m, self._d)
+            self._count()
+
+    def reset(self, mask: torch.Tensor | None = None) -> None:
+        """Puts the masked worlds back to qpos0, at rest, and clears their counters and overflow bits."""
+        if mask is None:
+            self._torch_mask.fill_(True)
+            self.peak_pool.zero_()
+        else:
+            self._torch_mask.copy_(mask)
+        with self._stream():
+            mjw.reset_data(self._m, self._d, reset=self._mask)
+        keep = ~self._torch_mask
+        for buffer in (self.step_count, self.overflow, self.peak_contacts, self.peak_constraints, self.contact_count):
+            buffer *= keep
+
+    def option_values(self) -> dict[str, float | int | str]:
+        """The physics options as uploaded."""
+        opt = self._m.opt
+        primitive = bool(int(opt.disableflags) & int(mjw.DisableBit.NATIVECCD))
+        return {
+            "timestep": float(opt.timestep.numpy()[0]),
+            "iterations": int(opt.iterations),
+            "ls_iterations": int(opt.ls_iterations),
+            "impratio": float(opt.impratio_invsqrt.numpy()[0]) ** -2,
+            "tolerance": float(opt.tolerance.numpy()[0]),
+            "integrator": mujoco.mjtIntegrator(int(opt.integrator)).name,
+            "cone": mujoco.mjtCone(int(opt.cone)).name,
+            "solver": mujoco.mjtSolver(int(opt.solver)).name,
+            "box_box": "primitive" if primitive else "convex",
+        }
+
+    def synchronize(self) -> None:
+        """Waits for the device."""
+        wp.synchronize_device(self._device)
+
+    def close(self) -> None:
+        """Drops the graphs; buffers go with the object."""
+        self._graphs.clear()
+
+    def _stream(self) -> wp.ScopedStream | wp.ScopedDevice:
+        """Work goes to torch's current stream, so that reads and writes of the views are ordered with it."""
+        if not self._device.is_cuda:
+            return wp.ScopedDevice(self._device)
+        current = torch.cuda.current_stream(self.device)
+        if getattr(self, "_torch_stream", None) != current:
+            self._torch_stream = current
+            # One object is kept: a second one for the same stream would unregister it when freed.
+            self._warp_stream = wp.stream_from_torch(current)
+        return wp.ScopedStream(self._warp_stream, sync_enter=False, sync_exit=False)
+
+    def _substeps(self, n: int) -> None:
+        for _ in range(n):
+            mjw.step(self._m, self._d)
+            self._count()
+
+    def _count(self) -> None:
+        """Two launches: what each world uses now, and the most it has used."""
+        d = self._d
+        self._contacts.zero_()
+        wp.launch(_count_contacts, dim=d.contact.worldid.shape[0], inputs=[d.nacon, d.contact.worldid, self._contacts])
+        wp.launch(
+            _record_peaks,
+            dim=self.nworld,
+            inputs=[
+                d.nefc,
+                d.nacon,
+                d.ncollision,
+                self._contacts,
+                d.overflow,
+                self._peak_nefc,
+                self._peak_contacts,
+                self._peak_pool,
+                self._seen,
+            ],
+        )
+
+    def _warm_up(self) -> None:
+        """Compiles and loads every kernel, then leaves the worlds as new."""
+        with self._stream():
+            self._substeps(1)
+        self.synchronize()
+        self.reset()
+        self.synchronize()
+
+    def _graph(self, n: int) -> object | None:
+        if self._graph_mode is GraphMode.off or n == 0:
+            return None
+        if n not in self._graphs:
+            self._graphs[n] = self._capture(n)
+        return self._graphs[n]
+
+    def _capture(self, n: int) -> object | None:
+        """Captures n substeps. Python's collector waits, so that nothing is freed in the middle of a capture."""
+        self.synchronize()
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            with wp.ScopedDevice(self._device), wp.ScopedCapture() as capture:
+                self._substeps(n)
+        except Exception as error:
+            if self._graph_mode is GraphMode.require:
+                raise MjstackError(f"graph=require: {n} substeps cannot be captured: {error}. Use graph=auto.") from error
+            log.warning("substeps run uncaptured: %s", error)
+            return None
+        finally:
+            if collecting:
+                gc.enable()
+        return capture.graph
