@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mink
 import mujoco
 import numpy as np
@@ -10,6 +12,7 @@ from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.robots import robot_spec
 
 _POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the aperture centre by micrometres
+_CONVERGED = 0.1  # of the tolerance: Newton's method squares the error, one more step would be for nothing
 _MAX_STEP = 0.3  # [rad] per iteration, so that a far target is approached on one branch of solutions
 
 
@@ -86,6 +89,7 @@ class ApertureIk:
         self._task.target[:] = target
         configuration = self._configuration
         configuration.update(self._to_qpos(command))
+        distance = math.inf
         for _ in range(self._iterations):
             step = mink.solve_ik(
                 configuration,
@@ -98,10 +102,9 @@ class ApertureIk:
             )
             largest = float(np.abs(step).max())
             configuration.integrate_inplace(step * min(1.0, _MAX_STEP / max(largest, 1e-12)), 1.0)
-            # Newton's method squares the error: a step this short leaves nothing that matters.
-            if largest < 1e-3:
+            distance = float(np.linalg.norm(self._task.compute_error(configuration)))
+            if distance < _CONVERGED * self.tolerance:
                 break
-        distance = float(np.linalg.norm(self._task.compute_error(configuration)))
         return configuration.q[self._qpos].copy(), distance
 
     def aperture(self, command: np.ndarray) -> np.ndarray:

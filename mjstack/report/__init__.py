@@ -1,1 +1,1 @@
-
+"""Reports: records, text and pictures."""

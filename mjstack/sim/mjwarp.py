@@ -7,13 +7,15 @@ import logging
 import warnings
 
 import mujoco
-import mujoco_warp as mjw
 import torch
 import warp as wp
 
 from mjstack.config.schema import GraphMode
 from mjstack.errors import MjstackError, UnsupportedModel
 from mjstack.sim.sizes import BatchSizes
+
+wp.config.log_level = wp.LOG_WARNING  # before mujoco_warp, which starts Warp on import
+import mujoco_warp as mjw  # noqa: E402
 
 log = logging.getLogger(__name__)
 
@@ -76,8 +78,6 @@ class MjwarpSimulation:
         Raises:
             UnsupportedModel: MJWarp does not implement a feature of the model.
         """
-        wp.config.quiet = True
-        wp.init()
         self.model, self.nworld, self.sizes = model, nworld, sizes
         self.device = torch.device(device)
         self._device = wp.get_device(device)

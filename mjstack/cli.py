@@ -1,0 +1,172 @@
+"""The command line: composes, validates before anything is written, runs, and maps errors to exit codes.
+
+Hydra exits with 1 on its own configuration errors, ignores what the main function returns, and makes the run folder before
+calling it. So every job is composed and checked here first, and Hydra only runs what has passed.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import OverrideParseException
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from mjstack.config.schema import Config
+from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, to_config
+from mjstack.errors import MjstackError
+from mjstack.job import JobOutcome, check_machine, run_job
+from mjstack.report.record import Status
+
+INTERRUPTED = 130
+_FLAGS_WITHOUT_RUN = {"--help", "-h", "--hydra-help", "--info", "-i", "--version", "--shell-completion", "-sc"}
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of the console script; leaves with the exit status of the run."""
+    raise SystemExit(run(list(sys.argv[1:] if argv is None else argv)))
+
+
+def run(args: list[str]) -> int:
+    """Runs a command line and returns its exit status."""
+    errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+    if _FLAGS_WITHOUT_RUN & set(args) or any(a.startswith(("--info", "--hydra-help")) for a in args):
+        return _run_hydra(args, [])
+    sweep = bool({"-m", "--multirun"} & set(args))
+    dry = any(a in ("--cfg", "-c") or a.startswith("--cfg=") for a in args)
+    try:
+        overrides = _overrides(args)
+        for job in _expand(overrides) if sweep else [overrides]:
+            config = to_config(compose_overrides([o for o in job if not _is_hydra(o)]))
+            if not dry:
+                check_machine(config)
+        if not dry:
+            check_writable(_output_folder(overrides, sweep))
+    except MjstackError as error:
+        errors.print(f"mjstack: {error}")
+        return error.exit_code
+    outcomes: list[JobOutcome] = []
+    try:
+        status = _run_hydra(args, outcomes)
+    except KeyboardInterrupt:
+        status = INTERRUPTED
+    if sweep and outcomes:
+        _print_sweep(outcomes)
+    return max([status, *(outcome.exit_code for outcome in outcomes)])
+
+
+def _run_hydra(args: list[str], outcomes: list[JobOutcome]) -> int:
+    """Hands the command line to Hydra; each job adds its outcome."""
+
+    def job(cfg: DictConfig) -> None:
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        outcome = run_job(to_config(cfg), folder, overrides=list(HydraConfig.get().overrides.task))
+        outcomes.append(outcome)
+        if outcome.status is Status.interrupted:
+            raise KeyboardInterrupt
+
+    argv = sys.argv
+    sys.argv = [argv[0], *args]
+    try:
+        hydra.main(version_base="1.3", config_path=f"pkg://{CONFIG_MODULE}", config_name=CONFIG_NAME)(job)()
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 1
+    finally:
+        sys.argv = argv
+    return 0
+
+
+def _overrides(args: list[str]) -> list[str]:
+    """The key=value arguments; Hydra's own flags and their values are left out."""
+    takes_value = {"--cfg", "-c", "--package", "-p", "--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp"}
+    out, skip = [], False
+    for arg in args:
+        if skip:
+            skip = False
+        elif arg in takes_value:
+            skip = True
+        elif arg.startswith("-"):
+            continue
+        elif "=" not in arg and not arg.startswith("~"):
+            raise CompositionError(f"argument '{arg}' is not an override. Write key=value, such as nworld=64.")
+        else:
+            out.append(arg)
+    return out
+
+
+def _expand(overrides: list[str]) -> list[list[str]]:
+    """The jobs of a sweep, as Hydra's basic sweeper makes them."""
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+    except OverrideParseException as error:
+        raise CompositionError(str(error).splitlines()[0]) from error
+    return [list(job) for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
+
+
+def _is_hydra(override: str) -> bool:
+    return override.lstrip("+~").startswith(("hydra.", "hydra/"))
+
+
+def _output_folder(overrides: list[str], sweep: bool) -> Path:
+    """The folder Hydra would make for these arguments, without making it."""
+    from hydra import compose, initialize_config_module
+
+    with initialize_config_module(config_module=CONFIG_MODULE, version_base="1.3"):
+        # Hydra's own part is composed alone: the rest of the configuration has been checked by now.
+        try:
+            cfg = compose(CONFIG_NAME, overrides=[o for o in overrides if _is_hydra(o)], return_hydra_config=True)
+        except Exception as error:
+            raise CompositionError(str(error).splitlines()[0]) from error
+        return Path(cfg.hydra.sweep.dir if sweep else cfg.hydra.run.dir)
+
+
+def check_writable(folder: Path) -> None:
+    """Checks that a folder can be made and written, by a file that is gone at once."""
+    existing = folder.absolute()
+    while not existing.exists():
+        existing = existing.parent
+    try:
+        if not existing.is_dir():
+            raise NotADirectoryError(20, "Not a directory")
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise CompositionError(
+            f"outputs folder {folder}: {existing} cannot be written ({error.strerror}), expected a writable folder. "
+            "Run from another folder, or set hydra.run.dir."
+        ) from error
+
+
+def _print_sweep(outcomes: list[JobOutcome]) -> None:
+    """One row per job, also written beside the jobs as summary.md."""
+    names = list(dict.fromkeys(gate.name for outcome in outcomes for gate in outcome.gates))
+    table = Table(title=f"sweep of {len(outcomes)} jobs")
+    for column in ("job", "overrides", *names, "status"):
+        table.add_column(column)
+    lines = [f"| job | overrides | {' | '.join(names)} | status |", "| --- " * (len(names) + 3) + "|"]
+    for number, outcome in enumerate(outcomes):
+        by_name = {gate.name: gate for gate in outcome.gates}
+        cells = [
+            f"{by_name[name].status.value}: {by_name[name].reason}" if name in by_name else "not run" for name in names
+        ]
+        row = [str(number), " ".join(outcome.overrides), *cells, outcome.status.value]
+        table.add_row(*row)
+        lines.append(f"| {' | '.join(row)} |")
+    Console().print(table)
+    sweep_folder = os.path.commonpath([str(outcome.folder) for outcome in outcomes])
+    if len(outcomes) > 1:
+        (Path(sweep_folder) / "summary.md").write_text("\n".join(lines) + "\n")
+        Console(soft_wrap=True).print(f"summary: {sweep_folder}/summary.md")
+
+
+__all__ = ["Config", "check_writable", "main", "run"]

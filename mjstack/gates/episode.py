@@ -1,0 +1,131 @@
+"""One scripted episode over many worlds: the loop that every gate uses."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from mjstack.config.schema import Config, ResetCfg
+from mjstack.control.scripted import CommandTape, ScriptedPlanner
+from mjstack.mdp.reset import reset_cubes, reset_home
+from mjstack.scene import SceneIndex
+from mjstack.sim import Simulation
+from mjstack.tasks.stack import StackEvidence, Verdict
+
+FrameHook = Callable[[int, Simulation], None]
+Advance = Callable[[str, int, int], None]
+"""Reports progress: what is going on, how much is done, and of how much."""
+
+NOMINAL = ResetCfg(cube_xy=0.0, cube_yaw=0.0)
+
+
+@dataclass(slots=True)
+class State:
+    """State of every world at a frame end, on the host."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    ctrl: np.ndarray
+
+
+@dataclass(slots=True)
+class Episode:
+    """What an episode leaves behind.
+
+    Attributes:
+        verdict: The acceptance of every world.
+        tape: The commands that were played.
+        seconds: Wall time of the frames alone.
+        qpos: World 0 at every frame end, shape ``(frames, nq)``, if it was recorded.
+        states: Snapshots of all worlds after the frames that were asked for.
+    """
+
+    verdict: Verdict
+    tape: CommandTape
+    seconds: float
+    qpos: np.ndarray | None = None
+    states: dict[int, State] = field(default_factory=dict)
+
+
+def start_worlds(
+    sim: Simulation, index: SceneIndex, cfg: Config, reset: ResetCfg, planner: ScriptedPlanner, advance: Advance | None = None
+) -> CommandTape:
+    """Resets every world and plans its commands from where its cubes then stand."""
+    everyone = torch.ones(sim.nworld, dtype=torch.bool, device=sim.device)
+    sim.reset()
+    reset_home(sim, index, cfg.robot, everyone)
+    episode = torch.zeros(sim.nworld, dtype=torch.int64, device=sim.device)
+    reset_cubes(sim, index, reset, everyone, seed=cfg.seed, episode=episode)
+    sim.forward()
+    cubes = torch.cat([sim.qpos[:, a : a + 2] for a in index.cube_qpos], dim=1)
+    progress = None if advance is None else (lambda done: advance("planning", done, sim.nworld))
+    tape = planner.plan(cubes.double().cpu().numpy(), progress)
+    return tape.to(sim.device, sim.ctrl.dtype)
+
+
+def run_episode(
+    sim: Simulation,
+    index: SceneIndex,
+    cfg: Config,
+    planner: ScriptedPlanner,
+    reset: ResetCfg,
+    *,
+    record: bool = False,
+    snapshots: frozenset[int] = frozenset(),
+    on_frame: FrameHook | None = None,
+    advance: Advance | None = None,
+) -> Episode:
+    """Plays the scripted task once in every world and judges it.
+
+    Args:
+        sim: The worlds.
+        index: Addresses.
+        cfg: The configuration.
+        planner: Plans the commands.
+        reset: How worlds differ at the start.
+        record: Keep world 0's qpos at every frame end.
+        snapshots: Frames after which the state of all worlds is kept.
+        on_frame: Called after each frame, before the evidence is taken.
+        advance: Told about progress.
+    """
+    tape = start_worlds(sim, index, cfg, reset, planner, advance)
+    evidence = StackEvidence(cfg, index, planner.phases, sim.nworld, sim.device)
+    trajectory = np.full((tape.frames, sim.qpos.shape[1]), np.nan) if record else None
+    states: dict[int, State] = {}
+    actuators = torch.from_numpy(index.ctrl).to(sim.device)
+    sim.synchronize()
+    began = time.perf_counter()
+    for frame in range(tape.frames):
+        sim.ctrl[:, actuators] = tape.command(frame)
+        sim.step(cfg.timing.substeps)
+        if on_frame is not None:
+            on_frame(frame, sim)
+        evidence.update(sim)
+        if trajectory is not None:
+            trajectory[frame] = sim.qpos[0].cpu().numpy()
+        if frame in snapshots:
+            states[frame] = snapshot(sim)
+        if advance is not None:
+            if frame % 10 == 9:
+                sim.synchronize()  # so that the bar shows work done, not work queued
+            advance("frames", frame + 1, tape.frames)
+    sim.synchronize()
+    seconds = time.perf_counter() - began
+    return Episode(evidence.verdict(sim), tape, seconds, trajectory, states)
+
+
+def snapshot(sim: Simulation) -> State:
+    """Copies the state of every world to the host."""
+    return State(*(view.double().cpu().numpy().copy() for view in (sim.qpos, sim.qvel, sim.ctrl)))
+
+
+def restore(sim: Simulation, state: State) -> None:
+    """Puts every world into a kept state, counters cleared, warm starts zero, derived arrays current."""
+    sim.reset()
+    for view, values in ((sim.qpos, state.qpos), (sim.qvel, state.qvel), (sim.ctrl, state.ctrl)):
+        view.copy_(torch.from_numpy(values))
+    sim.forward()

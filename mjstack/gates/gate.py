@@ -1,0 +1,148 @@
+"""What a gate is given and what it shares with the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from mjstack.config.schema import Backend, Config
+from mjstack.control.scripted import ScriptedPlanner
+from mjstack.gates.episode import NOMINAL, Advance, Episode, FrameHook, State, run_episode
+from mjstack.report.record import GateResult, Status
+from mjstack.robots import robot_spec
+from mjstack.scene import SceneIndex, build_scene
+from mjstack.sim import Simulation, make_simulation, resolve_backend, resolve_device
+from mjstack.tasks.stack import Rule, Verdict, describe_rules
+
+Say = Callable[[str], None]
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+@dataclass(eq=False)
+class GateContext:
+    """Everything gates need, and what one leaves for the next.
+
+    Attributes:
+        cfg: The configuration.
+        folder: Where the run's files go, or None for none.
+        say: Prints a line.
+        advance: Told about progress.
+        on_frame: Called after each frame of the one-world episode that is shown (viewer).
+        results: Results so far, by gate.
+    """
+
+    cfg: Config
+    folder: Path | None = None
+    say: Say = _silent
+    advance: Advance | None = None
+    on_frame: FrameHook | None = None
+    results: dict[str, GateResult] = field(default_factory=dict)
+    carry_start: State | None = None
+    shown: Episode | None = None
+    shown_by: str = ""
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The scene for physics."""
+        return self._build(visuals=False)
+
+    @cached_property
+    def visual_model(self) -> mujoco.MjModel:
+        """The same scene with everything that only pictures need."""
+        return self._build(visuals=True)
+
+    @cached_property
+    def index(self) -> SceneIndex:
+        """Addresses in the model."""
+        return SceneIndex(self.model, self.cfg.robot)
+
+    @cached_property
+    def planner(self) -> ScriptedPlanner:
+        """The planner, its nominal plan made."""
+        return ScriptedPlanner(self.cfg)
+
+    @cached_property
+    def backend(self) -> tuple[Backend, str]:
+        """Backend and device of batch, capacity and throughput."""
+        return resolve_backend(self.cfg)
+
+    @cached_property
+    def nominal(self) -> tuple[Simulation, Episode]:
+        """One native world's episode from the nominal layout: the reference of baseline and parity."""
+        sim = make_simulation(self.model, self.cfg, 1, backend=Backend.native)
+        frames = frozenset(self.phase_end(name) for name in self.cfg.gate.parity.states.values())
+        hook = self.on_frame if "parity" not in self.cfg.gates else None
+        episode = self.run(sim, NOMINAL, record=True, snapshots=frames, on_frame=hook)
+        return sim, episode
+
+    def run(self, sim: Simulation, reset, **kwargs) -> Episode:  # noqa: ANN001, ANN003
+        """`run_episode` with this context's scene and planner."""
+        return run_episode(sim, self.index, self.cfg, self.planner, reset, advance=self.advance, **kwargs)
+
+    def batch_simulation(self, nworld: int) -> Simulation:
+        """Worlds on the backend of the batch."""
+        backend, device = self.backend
+        return make_simulation(self.model, self.cfg, nworld, backend=backend, device=device)
+
+    def parity_simulation(self) -> Simulation:
+        """One MJWarp world."""
+        return make_simulation(
+            self.model, self.cfg, 1, backend=Backend.mjwarp, device=resolve_device(self.cfg.sim.device)
+        )
+
+    def phase_end(self, name: str) -> int:
+        """Last frame of a phase."""
+        return next(phase.stop for phase in self.planner.phases if phase.name == name) - 1
+
+    def phase_start(self, name: str) -> int:
+        """First frame of a phase."""
+        return next(phase.start for phase in self.planner.phases if phase.name == name)
+
+    def _build(self, *, visuals: bool) -> mujoco.MjModel:
+        cfg = self.cfg
+        return build_scene(robot_spec(cfg.robot, cfg.model), cfg.scene, cfg.timing, cfg.solver, visuals=visuals)
+
+
+def judge_one(verdict: Verdict) -> tuple[Status, str, dict]:
+    """Status, reason and metrics of a one-world episode."""
+    bits = int(verdict.failed[0])
+    metrics = {
+        "xy_err_m": float(verdict.xy_err[0]),
+        "dz_m": float(verdict.dz[0]),
+        "rest_speed_m_per_s": float(verdict.rest_speed[0]),
+        "peak_speed_m_per_s": float(verdict.peak_speed[0]),
+        "rest_position_m": float(verdict.rest_position[0]),
+        "rest_rotation_deg": float(np.degrees(float(verdict.rest_rotation[0]))),
+    }
+    status = Status.failed if bits else Status.passed
+    return status, f"failed: {describe_rules(bits)}" if bits else "", metrics
+
+
+def acceptance_thresholds(cfg: Config) -> dict:
+    """The acceptance rules' numbers, with units, for a report."""
+    t = cfg.gate.acceptance
+    return {
+        "xy_err_max_m": t.xy_err,
+        "dz_min_m": t.dz_min,
+        "dz_max_m": t.dz_max,
+        "lift_frames": t.lift_frames,
+        "carry_distance_m": t.carry_distance,
+        "support_gap_m": t.support_gap,
+        "rest_speed_m_per_s": t.rest_speed,
+        "rest_position_m": t.rest_position,
+        "rest_rotation_deg": t.rest_rotation_deg,
+        "window_frames": t.window,
+    }
+
+
+def failing_rules(failed: np.ndarray) -> dict[Rule, list[int]]:
+    """Which worlds broke which rule."""
+    return {rule: np.flatnonzero(failed & int(rule)).tolist() for rule in Rule if (failed & int(rule)).any()}

@@ -1,0 +1,118 @@
+"""Gate *parity*: MJWarp against native MuJoCo, one world."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from mjstack.gates.episode import NOMINAL, State, restore
+from mjstack.gates.gate import GateContext, acceptance_thresholds, judge_one
+from mjstack.math import quat_angle
+from mjstack.report.record import GateResult, Status, Value
+from mjstack.sim import Simulation
+
+FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
+
+
+def run_parity(context: GateContext) -> list[GateResult]:
+    """Compares steps from equal states, the whole task, and the options each backend holds."""
+    cfg = context.cfg
+    native, reference = context.nominal
+    mjwarp = context.parity_simulation()
+    problems: list[str] = []
+    details: list[str] = []
+    metrics: dict[str, Value] = {"backend": mjwarp.description}
+    thresholds: dict[str, Value] = dict(acceptance_thresholds(cfg))
+
+    for name, phase in cfg.gate.parity.states.items():
+        state = reference.states[context.phase_end(phase)]
+        for steps, limits in ((1, cfg.gate.parity.step1), (50, cfg.gate.parity.step50)):
+            found = compare_steps(native, mjwarp, state, steps)
+            for field, limit in limits.items():
+                metrics[f"{name}.step{steps}.{field}"] = found[field]
+                thresholds[f"step{steps}.{field}"] = limit
+                if not found[field] <= limit:
+                    problems.append(f"{name}, {steps} steps: {field} differs by {found[field]:.2g}, limit {limit:.2g}")
+
+    for option, (asked, uploaded, equal) in compare_options(native, mjwarp).items():
+        metrics[f"option.{option}"] = f"{asked} / {uploaded}"
+        details.append(f"option {option}: native {asked}, uploaded {uploaded}")
+        if not equal:
+            problems.append(f"option {option}: native {asked}, uploaded {uploaded}")
+
+    episode = context.run(mjwarp, NOMINAL, record=True, on_frame=context.on_frame)
+    status, reason, judged = judge_one(episode.verdict)
+    if status is Status.failed:
+        problems.append(reason)
+    if int(mjwarp.overflow[0]):
+        problems.append(f"buffer overflow, bits {int(mjwarp.overflow[0]):#x}: raise batch.njmax or batch.nconmax")
+    metrics.update(judged)
+    metrics["peak_contacts"] = int(mjwarp.peak_contacts[0])
+    metrics["peak_constraint_rows"] = int(mjwarp.peak_constraints[0])
+    metrics["episode_s"] = episode.seconds
+    assert episode.qpos is not None
+    assert reference.qpos is not None
+    for cube, address in zip(("red", "blue"), context.index.cube_qpos, strict=True):
+        ours, theirs = episode.qpos[-1, address : address + 7], reference.qpos[-1, address : address + 7]
+        distance = float(np.linalg.norm(ours[:3] - theirs[:3]))
+        angle = math.degrees(float(quat_angle(torch.from_numpy(ours[3:]), torch.from_numpy(theirs[3:]))))
+        metrics[f"final.{cube}.position_m"], metrics[f"final.{cube}.rotation_deg"] = distance, angle
+        if not (distance <= cfg.gate.parity.cube_position and angle <= cfg.gate.parity.cube_rotation_deg):
+            problems.append(f"{cube} cube ends {1e3 * distance:.2f} mm and {angle:.2f} deg from native's")
+    thresholds["final.position_m"] = cfg.gate.parity.cube_position
+    thresholds["final.rotation_deg"] = cfg.gate.parity.cube_rotation_deg
+    context.say(f"stack check: xy_err={judged['xy_err_m']:.4f} dz={judged['dz_m']:.4f} ({mjwarp.description})")
+    context.shown, context.shown_by = episode, "parity"
+    mjwarp.close()
+    summary = "; ".join(problems) or (
+        f"xy_err {1e3 * judged['xy_err_m']:.1f} mm, dz {1e3 * judged['dz_m']:.1f} mm; red "
+        f"{1e3 * float(metrics['final.red.position_m'] or 0):.2f} mm from native's"
+    )
+    return [
+        GateResult(
+            name="parity",
+            status=Status.failed if problems else Status.passed,
+            reason=summary,
+            thresholds=thresholds,
+            metrics=metrics,
+            details=details,
+        )
+    ]
+
+
+def compare_steps(native: Simulation, mjwarp: Simulation, state: State, steps: int) -> dict[str, float]:
+    """Largest absolute difference of every field after some steps from one state, derived fields brought up to date."""
+    for sim in (native, mjwarp):
+        restore(sim, state)
+        sim.step(steps)
+        sim.forward()
+        sim.synchronize()
+    out = {}
+    for field in FIELDS:
+        a, b = getattr(native, field).double(), getattr(mjwarp, field).double().cpu()
+        if field == "xquat":  # q and -q are one rotation
+            b = torch.where((a * b).sum(-1, keepdim=True) < 0.0, -b, b)
+        out[field] = float((a - b).abs().amax())
+    return out
+
+
+def compare_options(native: Simulation, mjwarp: Simulation) -> dict[str, tuple[str, str, bool]]:
+    """Native's and the uploaded options side by side; numbers agree to float32."""
+    ours = mjwarp.option_values()
+    out = {}
+    for name, value in native.option_values().items():
+        uploaded = ours[name]
+        if isinstance(value, str) or isinstance(uploaded, str):
+            equal = value == uploaded
+        elif name == "tolerance":  # MJWarp clamps it to what float32 can resolve
+            equal = math.isclose(max(value, 1e-6), uploaded, rel_tol=1e-5)
+        else:
+            equal = math.isclose(value, uploaded, rel_tol=1e-5)
+        out[name] = (_short(value), _short(uploaded), equal)
+    return out
+
+
+def _short(value: float | int | str) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,66 @@
+"""Runs the chosen gates in their order and keeps the report current."""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Callable
+
+from mjstack.errors import MjstackError
+from mjstack.gates.baseline import run_baseline
+from mjstack.gates.batch import run_batch
+from mjstack.gates.capacity import run_capacity
+from mjstack.gates.gate import GateContext
+from mjstack.gates.parity import run_parity
+from mjstack.gates.throughput import run_throughput
+from mjstack.report.record import GateResult, Status
+
+log = logging.getLogger(__name__)
+
+GATES: dict[str, Callable[[GateContext], list[GateResult]]] = {
+    "baseline": run_baseline,
+    "parity": run_parity,
+    "capacity": run_capacity,
+    "batch": run_batch,
+    "throughput": run_throughput,
+}
+
+
+def run_gates(
+    context: GateContext,
+    on_start: Callable[[str], None] = lambda _: None,
+    on_result: Callable[[GateResult], None] = lambda _: None,
+) -> list[GateResult]:
+    """Runs the gates that the configuration names, each once, in the order of `GATES`.
+
+    Args:
+        context: What they need. Its ``results`` fill up.
+        on_start: Told before a gate starts.
+        on_result: Told after each result, before the next gate starts.
+
+    Returns:
+        All results. A gate that raises has failed, with the error as its reason; the others still run.
+    """
+    out: list[GateResult] = []
+    for name, run in GATES.items():
+        if name not in context.cfg.gates:
+            continue
+        on_start(name)
+        began = time.perf_counter()
+        try:
+            results = run(context)
+        except MjstackError as error:
+            results = [GateResult(name=name, status=Status.failed, reason=str(error))]
+        except Exception as error:
+            log.error("gate %s broke:\n%s", name, traceback.format_exc())
+            reason = f"internal error, {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+            results = [GateResult(name=name, status=Status.failed, reason=f"{reason} (run.log has the traceback)")]
+        seconds = time.perf_counter() - began
+        for result in results:
+            result.seconds = seconds if result.status is not Status.skipped else 0.0
+            context.results[result.name] = result
+            log.info("gate %s: %s %s", result.name, result.status.value, result.reason)
+            out.append(result)
+            on_result(result)
+    return out

@@ -1,0 +1,259 @@
+"""One job: a configuration and a folder in, gates run, a report left behind."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from omegaconf import OmegaConf
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from mjstack.config.schema import Config
+from mjstack.errors import ConfigError, MjstackError
+from mjstack.gates.gate import GateContext
+from mjstack.gates.runner import run_gates
+from mjstack.report.markdown import headline
+from mjstack.report.picture import require_video, save_pictures, save_video
+from mjstack.report.provenance import collect_provenance
+from mjstack.report.record import GateResult, Report, Status
+from mjstack.sim import Simulation, resolve_backend
+
+log = logging.getLogger(__name__)
+
+_COLOR = {Status.passed: "green", Status.failed: "red", Status.skipped: "yellow", Status.interrupted: "red"}
+
+
+@dataclass(kw_only=True, slots=True)
+class JobOutcome:
+    """How a job ended."""
+
+    status: Status
+    folder: Path
+    overrides: list[str]
+    gates: list[GateResult] = field(default_factory=list)
+
+    @property
+    def exit_code(self) -> int:
+        """0 pass, 1 a gate failed, 130 interrupted."""
+        return {Status.passed: 0, Status.interrupted: 130}.get(self.status, 1)
+
+
+def check_machine(cfg: Config) -> None:
+    """Raises for what this machine cannot do, before anything is written."""
+    from mjstack.robots import robot_spec
+
+    resolve_backend(cfg)
+    robot_spec(cfg.robot, cfg.model)
+    if (cfg.view or cfg.video) and not {"baseline", "parity"} & set(cfg.gates):
+        key = "view" if cfg.view else "video"
+        raise ConfigError(key, "true", "gates with baseline or parity, whose world is shown", "Add one of them to gates")
+    if cfg.view and sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ConfigError("view", "true", "a display, and DISPLAY is not set", "Use video=true instead")
+    if cfg.video:
+        try:
+            require_video()
+        except MjstackError as error:
+            error.exit_code = 2
+            raise
+
+
+def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
+    """Runs the gates of one configuration and writes its report after each.
+
+    Args:
+        cfg: The configuration.
+        folder: Where report.json, report.md, pictures and logs go.
+        overrides: What was asked for on the command line.
+
+    Returns:
+        How it ended. Ctrl-C is an outcome, not an exception: the finished gates are in the report.
+    """
+    console = Console(highlight=False)
+    context = GateContext(cfg=cfg, folder=folder)
+    report: Report | None = None
+    outcome = JobOutcome(status=Status.interrupted, folder=folder, overrides=overrides)
+    try:
+        console.print(
+            f"[bold]{cfg.robot.title}[/], task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)} -> {folder}",
+            soft_wrap=True,
+        )
+        report = Report(provenance=_provenance(cfg, context))
+        report.write(folder)
+        with _ProgressBar(console) as bar:
+            context.say, context.advance = bar.say, bar.advance
+            context.on_frame = _viewer(context) if cfg.view else None
+            run_gates(context, bar.start, lambda result: _record(report, result, folder, bar))
+        report.conclude()
+        outcome.status = report.status
+        _draw(context, report, folder, console)
+        report.write(folder)
+    except KeyboardInterrupt:
+        outcome.status = Status.interrupted
+        if report is not None:
+            report.status = Status.interrupted
+            report.write(folder)
+        console.print("interrupted; the finished gates are in the report")
+    except OSError as error:
+        outcome.status = Status.failed
+        Console(stderr=True).print(f"mjstack: {folder} cannot be written: {error.strerror}. Free space, or set hydra.run.dir.")
+    except MjstackError as error:
+        outcome.status = Status.failed
+        log.error("%s", error)
+        Console(stderr=True, soft_wrap=True).print(f"mjstack: {error}")
+    if report is not None:
+        outcome.gates = report.gates
+        _print_summary(console, report, folder)
+    return outcome
+
+
+def _record(report: Report, result: GateResult, folder: Path, bar: _ProgressBar) -> None:
+    report.gates.append(result)
+    report.write(folder)
+    bar.finish(result)
+
+
+def _provenance(cfg: Config, context: GateContext) -> dict:
+    backend, device = context.backend
+    driver = "no CUDA device"
+    name = f"native MuJoCo on {os.cpu_count()} cores" if backend.value == "native" else "Warp's CPU device"
+    if device.startswith("cuda"):
+        import torch
+        import warp as wp
+
+        name = torch.cuda.get_device_name(device)
+        driver = ".".join(str(part) for part in wp.context.runtime.driver_version or ("unknown",))
+    spec_text = _model_text(context.model)
+    config = OmegaConf.to_yaml(OmegaConf.structured(cfg))
+    return collect_provenance(config_yaml=config, model_xml=spec_text, device=f"{device}: {name}", driver=driver)
+
+
+def _model_text(model: mujoco.MjModel) -> str:
+    """The compiled model's numbers as text: what the physics sees, whatever file it came from."""
+    size = mujoco.mj_sizeModel(model)
+    buffer = np.empty(size, np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes().hex()
+
+
+def _draw(context: GateContext, report: Report, folder: Path, console: Console) -> None:
+    """Pictures and video of the one-world episode, if there was one. Their failure fails no gate."""
+    episode, cfg = context.shown, context.cfg
+    if episode is None or episode.qpos is None:
+        return
+    cubes = np.stack([episode.qpos[:, a : a + 3] for a in context.index.cube_qpos], axis=1)
+    title = f"{cfg.robot.title}, {cfg.task.name}: {context.shown_by} world"
+    try:
+        report.pictures = save_pictures(
+            folder, context.visual_model, episode.qpos[-1], cubes, cfg.scene.cube_half, title
+        )
+        if cfg.video:
+            save_video(folder / "episode.mp4", context.visual_model, episode.qpos, cfg.timing.frame_dt)
+            console.print(f"video: {folder}/episode.mp4", soft_wrap=True)
+    except MjstackError as error:
+        log.warning("%s", error)
+        console.print(f"no picture: {error}", soft_wrap=True)
+
+
+def _viewer(context: GateContext):  # noqa: ANN202
+    """Shows a one-world episode in MuJoCo's viewer, in real time; closing the window lets the run go on."""
+    import mujoco.viewer
+
+    model = context.visual_model
+    data = mujoco.MjData(model)
+    handle = mujoco.viewer.launch_passive(model, data)
+
+    def show(frame: int, sim: Simulation) -> None:
+        if not handle.is_running():
+            return
+        began = time.perf_counter()
+        data.qpos[:] = sim.qpos[0].cpu().numpy()
+        mujoco.mj_forward(model, data)
+        handle.sync()
+        time.sleep(max(0.0, context.cfg.timing.frame_dt - (time.perf_counter() - began)))
+
+    return show
+
+
+def _print_summary(console: Console, report: Report, folder: Path) -> None:
+    table = Table()
+    table.add_column("gate")
+    table.add_column("status")
+    table.add_column("s", justify="right")
+    table.add_column("what it says", overflow="fold")
+    for gate in report.gates:
+        color = _COLOR[gate.status]
+        table.add_row(gate.name, f"[{color}]{gate.status.value}[/]", f"{gate.seconds:.1f}", headline(gate))
+    console.print(table)
+    console.print(f"report: {folder}/report.md", soft_wrap=True)
+    for gate in report.gates:
+        if gate.status is Status.skipped:
+            console.print(f"skipped: {gate.name}: {gate.reason}", soft_wrap=True)
+    console.print(f"status: [{_COLOR[report.status]}]{report.status.value}[/]")
+
+
+class _ProgressBar:
+    """A bar per gate with rate and time left on a terminal; a line now and then elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[unit]}"),
+            TextColumn("{task.fields[rate]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._gate, self._unit = "", ""
+        self._task: TaskID | None = None
+        self._began = self._spoke = time.monotonic()
+
+    def __enter__(self) -> _ProgressBar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def say(self, line: str) -> None:
+        self._progress.console.print(line, soft_wrap=True)
+
+    def start(self, gate: str) -> None:
+        self._gate = gate
+        self._drop()
+        self._task = self._progress.add_task(gate, total=1, unit="", rate="starting (MJWarp compiles at its first use)")
+        self._spoke = time.monotonic()
+
+    def advance(self, unit: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        if unit != self._unit or done <= 1 or self._task is None:
+            self._drop()
+            self._unit, self._began = unit, now
+            self._task = self._progress.add_task(f"{self._gate}: {unit}", total=total, unit="", rate="")
+        rate = f"{done / (now - self._began):.1f}/s" if now > self._began and done > 1 else ""
+        self._progress.update(self._task, completed=done, rate=rate)
+        if self._progress.disable and now - self._spoke > 15.0:
+            self._spoke = now
+            left = (total - done) * (now - self._began) / max(done, 1)
+            self.say(f"{self._gate}: {unit} {done}/{total}, {rate}, {left:.0f} s left")
+
+    def finish(self, result: GateResult) -> None:
+        self._drop()
+        color = _COLOR[result.status]
+        self.say(f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s): {headline(result)}")
+
+    def _drop(self) -> None:
+        if self._task is not None:
+            self._progress.remove_task(self._task)
+            self._task = None

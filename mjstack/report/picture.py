@@ -1,0 +1,160 @@
+"""Pictures of a run: the final scene, the cubes' way there, and a video."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from pathlib import Path
+
+# Without a screen MuJoCo has to be told how to draw before it is first imported.
+if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+    os.environ.setdefault("MUJOCO_GL", "egl")
+
+import matplotlib
+import mujoco
+import numpy as np
+
+from mjstack.errors import MjstackError
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
+log = logging.getLogger(__name__)
+
+CUBE_COLORS = {"red": "#cc2a24", "blue": "#2457c7"}
+
+
+class SceneCamera:
+    """Draws a model offscreen."""
+
+    def __init__(self, model: mujoco.MjModel, width: int = 960, height: int = 720) -> None:
+        """Opens a renderer.
+
+        Raises:
+            MjstackError: This machine cannot draw offscreen.
+        """
+        self._model, self._data = model, mujoco.MjData(model)
+        try:
+            self._renderer = mujoco.Renderer(model, height, width)
+        except Exception as error:  # OpenGL loaders fail in their own ways
+            gl = os.environ.get("MUJOCO_GL", "not set")
+            raise MjstackError(
+                f"offscreen rendering fails (MUJOCO_GL={gl}: {type(error).__name__}). Set MUJOCO_GL=egl or osmesa."
+            ) from error
+        table = model.geom("table").id
+        self._camera = mujoco.MjvCamera()
+        self._camera.lookat = [0.62 * model.geom_pos[table][0], 0.0, model.geom_pos[table][2] + 0.08]
+        self._camera.distance = 0.75 + 1.1 * float(model.geom_pos[table][0])
+        self._camera.azimuth, self._camera.elevation = 140.0, -24.0
+
+    def draw(self, qpos: np.ndarray) -> np.ndarray:
+        """An image of one state, shape ``(height, width, 3)``, uint8."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_forward(self._model, self._data)
+        self._renderer.update_scene(self._data, self._camera)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        self._renderer.close()
+
+
+def save_pictures(
+    folder: Path, model: mujoco.MjModel, qpos: np.ndarray, cubes: np.ndarray, half: float, title: str
+) -> list[str]:
+    """Writes scene.png and trajectories.png.
+
+    Args:
+        folder: Where.
+        model: The scene with visuals.
+        qpos: Final state, shape ``(nq,)``.
+        cubes: Positions of red and blue over the episode [m], shape ``(frames, 2, 3)``.
+        half: Half a cube's edge [m].
+        title: What is shown.
+
+    Returns:
+        File names.
+    """
+    try:
+        camera = SceneCamera(model)
+        image = camera.draw(qpos)
+        camera.close()
+        plt.imsave(folder / "scene.png", image)
+    except MjstackError as error:
+        log.warning("%s The final scene is plotted instead.", error)
+        _plot_scene(folder / "scene.png", model, qpos, cubes[-1], half, title)
+    _plot_trajectories(folder / "trajectories.png", cubes, title)
+    return ["scene.png", "trajectories.png"]
+
+
+def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, frame_dt: float) -> None:
+    """Writes an mp4 of an episode in real time.
+
+    Args:
+        path: The file.
+        model: The scene with visuals.
+        qpos: States at frame ends, shape ``(frames, nq)``.
+        frame_dt: Time between them [s].
+
+    Raises:
+        MjstackError: This machine cannot draw offscreen, or lacks the extra ``video``.
+    """
+    writer_of = require_video()
+    skip = max(1, round(1.0 / (25.0 * frame_dt)))
+    camera = SceneCamera(model, 960, 720)
+    writer = writer_of(str(path), (960, 720), fps=1.0 / (frame_dt * skip), macro_block_size=16)
+    writer.send(None)
+    for state in qpos[::skip]:
+        writer.send(np.ascontiguousarray(camera.draw(state)))
+    writer.close()
+    camera.close()
+
+
+def require_video():  # noqa: ANN201
+    """The mp4 writer, or one line that says what to install."""
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise MjstackError("video=true needs the extra 'video'. Run: pip install 'mjstack[video]'.") from error
+    return imageio_ffmpeg.write_frames
+
+
+def _plot_trajectories(path: Path, cubes: np.ndarray, title: str) -> None:
+    figure, (top, side) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    for cube, (name, color) in enumerate(CUBE_COLORS.items()):
+        xyz = cubes[:, cube]
+        top.plot(xyz[:, 1], xyz[:, 0], color=color, label=name)
+        top.plot(xyz[-1, 1], xyz[-1, 0], "s", color=color, ms=8)
+        side.plot(1e3 * xyz[:, 2], color=color, label=name)
+    top.set(xlabel="y [m]", ylabel="x [m]", title="from above", aspect="equal")
+    side.set(xlabel="frame", ylabel="height of the centre [mm]", title="over the episode")
+    for axes in (top, side):
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _plot_scene(
+    path: Path, model: mujoco.MjModel, qpos: np.ndarray, cubes: np.ndarray, half: float, title: str
+) -> None:
+    """A drawing in lines for machines without OpenGL: arm joints, table and cubes."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    figure = plt.figure(figsize=(7, 5.5), layout="constrained")
+    axes = figure.add_subplot(projection="3d")
+    anchors = data.xanchor[[j for j in range(model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]]
+    axes.plot(*np.vstack([[0, 0, 0], anchors]).T, "-o", color="0.3")
+    table = model.geom("table").id
+    center, size = model.geom_pos[table], model.geom_size[table]
+    low, extent = center - size, 2.0 * size
+    axes.bar3d(*low, *extent, color="#b8a894", alpha=0.4)
+    for pos, color in zip(cubes, CUBE_COLORS.values(), strict=True):
+        axes.bar3d(*(pos - half), *([2.0 * half] * 3), color=color)
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
+    axes.set_aspect("equal")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

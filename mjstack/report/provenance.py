@@ -1,0 +1,64 @@
+"""Where a result comes from: versions, hardware, commit, and hashes of configuration and model."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import subprocess
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+
+from mjstack.report.record import Value
+
+PACKAGES = ("mjstack", "mujoco", "mujoco-warp", "warp-lang", "torch", "mink", "hydra-core", "numpy")
+
+
+def collect_provenance(*, config_yaml: str, model_xml: str, device: str, driver: str) -> dict[str, Value | dict[str, Value]]:
+    """Collects what is needed to judge and to repeat a run.
+
+    Args:
+        config_yaml: The whole configuration as text.
+        model_xml: The compiled scene as MJCF.
+        device: What the batch runs on, in words.
+        driver: CUDA driver version, or a word why there is none.
+    """
+    versions: dict[str, Value] = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return {
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
+        "versions": versions,
+        "device": device,
+        "driver": driver,
+        "cpu": _cpu_name(),
+        "cpu_count": os.cpu_count(),
+        "git_commit": _git_commit(),
+        "config_sha256": hashlib.sha256(config_yaml.encode()).hexdigest(),
+        "model_sha256": hashlib.sha256(model_xml.encode()).hexdigest(),
+    }
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _git_commit() -> str:
+    """The checkout's commit, marked where files differ from it; an installed wheel has none."""
+    git = ["git", "-C", str(Path(__file__).resolve().parents[2])]
+    try:
+        commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True)
+        dirty = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return "no checkout"
+    return commit.stdout.strip() + (" with changes" if dirty.stdout.strip() else "")
