@@ -86,7 +86,18 @@ def _run_hydra(args: list[str], outcomes: list[JobOutcome]) -> int:
 
 def _overrides(args: list[str]) -> list[str]:
     """The key=value arguments; Hydra's own flags and their values are left out."""
-    takes_value = {"--cfg", "-c", "--package", "-p", "--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp"}
+    takes_value = {
+        "--cfg",
+        "-c",
+        "--package",
+        "-p",
+        "--config-dir",
+        "-cd",
+        "--config-name",
+        "-cn",
+        "--config-path",
+        "-cp",
+    }
     out, skip = [], False
     for arg in args:
         if skip:
@@ -156,9 +167,7 @@ def _print_sweep(outcomes: list[JobOutcome]) -> None:
     lines = [f"| job | overrides | {' | '.join(names)} | status |", "| --- " * (len(names) + 3) + "|"]
     for number, outcome in enumerate(outcomes):
         by_name = {gate.name: gate for gate in outcome.gates}
-        cells = [
-            f"{by_name[name].status.value}: {by_name[name].reason}" if name in by_name else "not run" for name in names
-        ]
+        cells = [f"{by_name[name].status.value}: {by_name[name].reason}" if name in by_name else "not run" for name in names]
         row = [str(number), " ".join(outcome.overrides), *cells, outcome.status.value]
         table.add_row(*row)
         lines.append(f"| {' | '.join(row)} |")

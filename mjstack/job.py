@@ -18,13 +18,14 @@ from rich.table import Table
 
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError, MjstackError
+from mjstack.gates.episode import FrameHook
 from mjstack.gates.gate import GateContext
 from mjstack.gates.runner import run_gates
 from mjstack.report.markdown import headline
 from mjstack.report.picture import require_video, save_pictures, save_video
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Report, Status
-from mjstack.sim import Simulation, resolve_backend
+from mjstack.sim import Simulation, cuda_driver, cuda_name, resolve_backend
 
 log = logging.getLogger(__name__)
 
@@ -125,11 +126,7 @@ def _provenance(cfg: Config, context: GateContext) -> dict:
     driver = "no CUDA device"
     name = f"native MuJoCo on {os.cpu_count()} cores" if backend.value == "native" else "Warp's CPU device"
     if device.startswith("cuda"):
-        import torch
-        import warp as wp
-
-        name = torch.cuda.get_device_name(device)
-        driver = ".".join(str(part) for part in wp.context.runtime.driver_version or ("unknown",))
+        name, driver = cuda_name(device), cuda_driver()
     spec_text = _model_text(context.model)
     config = OmegaConf.to_yaml(OmegaConf.structured(cfg))
     return collect_provenance(config_yaml=config, model_xml=spec_text, device=f"{device}: {name}", driver=driver)
@@ -151,9 +148,7 @@ def _draw(context: GateContext, report: Report, folder: Path, console: Console) 
     cubes = np.stack([episode.qpos[:, a : a + 3] for a in context.index.cube_qpos], axis=1)
     title = f"{cfg.robot.title}, {cfg.task.name}: {context.shown_by} world"
     try:
-        report.pictures = save_pictures(
-            folder, context.visual_model, episode.qpos[-1], cubes, cfg.scene.cube_half, title
-        )
+        report.pictures = save_pictures(folder, context.visual_model, episode.qpos[-1], cubes, cfg.scene.cube_half, title)
         if cfg.video:
             save_video(folder / "episode.mp4", context.visual_model, episode.qpos, cfg.timing.frame_dt)
             console.print(f"video: {folder}/episode.mp4", soft_wrap=True)
@@ -162,7 +157,7 @@ def _draw(context: GateContext, report: Report, folder: Path, console: Console) 
         console.print(f"no picture: {error}", soft_wrap=True)
 
 
-def _viewer(context: GateContext):  # noqa: ANN202
+def _viewer(context: GateContext) -> FrameHook:
     """Shows a one-world episode in MuJoCo's viewer, in real time; closing the window lets the run go on."""
     import mujoco.viewer
 

@@ -81,7 +81,20 @@ def _translate(error: Exception, cfg: DictConfig | None) -> MjstackError:
         return _unknown_key(error, str(key or getattr(cause, "key", "") or ""))
     match = re.search(r"Could not override '([^']+)'\. No match in the defaults list", str(error))
     if match:
-        groups = ["robot", "model", "scene", "timing", "solver", "batch", "sim", "reset", "task", "controller", "gate", "job"]
+        groups = [
+            "robot",
+            "model",
+            "scene",
+            "timing",
+            "solver",
+            "batch",
+            "sim",
+            "reset",
+            "task",
+            "controller",
+            "gate",
+            "job",
+        ]
         return UnknownName("configuration group", match.group(1), groups)
     return CompositionError(f"{key}: {text}." if key else f"{text.rstrip('.')}.")
 

@@ -95,7 +95,9 @@ def _scene(cfg: Config) -> None:
             if abs(value[axis] - scene.table_center[axis]) > reach:
                 low, high = scene.table_center[axis] - reach, scene.table_center[axis] + reach
                 raise ConfigError(
-                    f"scene.{key}", value, f"{'xy'[axis]} within [{low:.3f}, {high:.3f}] m, so that the cube is on the table"
+                    f"scene.{key}",
+                    value,
+                    f"{'xy'[axis]} within [{low:.3f}, {high:.3f}] m, so that the cube is on the table",
                 )
     _positive("scene.cube_half", scene.cube_half, "m")
     _positive("scene.cube_mass", scene.cube_mass, "kg")

@@ -49,9 +49,10 @@ def run_batch(context: GateContext) -> list[GateResult]:
         for rule, worlds in broken.items():
             details.append(f"{RULE_TEXT[rule]}: {name_worlds(worlds, cfg.nworld, _NAMED_IN_DETAIL)}")
             metrics[f"failed.{rule.name}"] = len(worlds)
-        problems.append(f"{name_worlds(bad, cfg.nworld)} failed: " + "; ".join(
-            f"{RULE_TEXT[rule]} in {len(worlds)}" for rule, worlds in broken.items()
-        ))
+        problems.append(
+            f"{name_worlds(bad, cfg.nworld)} failed: "
+            + "; ".join(f"{RULE_TEXT[rule]} in {len(worlds)}" for rule, worlds in broken.items())
+        )
     if cfg.nworld > 1 and distinct < cfg.gate.batch.distinct_fraction * cfg.nworld:
         problems.append(
             f"only {distinct} distinct final states of {cfg.nworld} worlds: identical worlds prove nothing, use reset=jitter"

@@ -52,7 +52,12 @@ class Episode:
 
 
 def start_worlds(
-    sim: Simulation, index: SceneIndex, cfg: Config, reset: ResetCfg, planner: ScriptedPlanner, advance: Advance | None = None
+    sim: Simulation,
+    index: SceneIndex,
+    cfg: Config,
+    reset: ResetCfg,
+    planner: ScriptedPlanner,
+    advance: Advance | None = None,
 ) -> CommandTape:
     """Resets every world and plans its commands from where its cubes then stand."""
     everyone = torch.ones(sim.nworld, dtype=torch.bool, device=sim.device)

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from mjstack.config.schema import Backend, Config
+from mjstack.config.schema import Backend, Config, ResetCfg
 from mjstack.control.scripted import ScriptedPlanner
 from mjstack.gates.episode import NOMINAL, Advance, Episode, FrameHook, State, run_episode
 from mjstack.report.record import GateResult, Status
@@ -83,7 +84,7 @@ class GateContext:
         episode = self.run(sim, NOMINAL, record=True, snapshots=frames, on_frame=hook)
         return sim, episode
 
-    def run(self, sim: Simulation, reset, **kwargs) -> Episode:  # noqa: ANN001, ANN003
+    def run(self, sim: Simulation, reset: ResetCfg, **kwargs: Any) -> Episode:
         """`run_episode` with this context's scene and planner."""
         return run_episode(sim, self.index, self.cfg, self.planner, reset, advance=self.advance, **kwargs)
 
@@ -94,9 +95,7 @@ class GateContext:
 
     def parity_simulation(self) -> Simulation:
         """One MJWarp world."""
-        return make_simulation(
-            self.model, self.cfg, 1, backend=Backend.mjwarp, device=resolve_device(self.cfg.sim.device)
-        )
+        return make_simulation(self.model, self.cfg, 1, backend=Backend.mjwarp, device=resolve_device(self.cfg.sim.device))
 
     def phase_end(self, name: str) -> int:
         """Last frame of a phase."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import statistics
 import time
+from collections.abc import Callable
 
 import torch
 
@@ -31,7 +32,10 @@ def run_throughput(context: GateContext) -> list[GateResult]:
     reason = "no CUDA device was used: " + (
         "this machine has none" if not torch.cuda.is_available() else f"sim={backend.value} sim.device={device}"
     )
-    return [_measure(context, "throughput", backend, device), GateResult(name=CUDA, status=Status.skipped, reason=reason)]
+    return [
+        _measure(context, "throughput", backend, device),
+        GateResult(name=CUDA, status=Status.skipped, reason=reason),
+    ]
 
 
 def _measure(context: GateContext, name: str, backend: Backend, device: str) -> GateResult:
@@ -109,7 +113,7 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
     )
 
 
-def _play_up_to(context: GateContext, sim: Simulation, first: int, play) -> State:  # noqa: ANN001
+def _play_up_to(context: GateContext, sim: Simulation, first: int, play: Callable[[int, int], float]) -> State:
     for frame in range(first):
         play(frame, 1)
         if context.advance is not None:

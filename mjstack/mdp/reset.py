@@ -45,9 +45,9 @@ def reset_cubes(
         world0: Number of the first world, where this simulation holds a part of a larger batch.
     """
     world = torch.arange(world0, world0 + sim.nworld, device=sim.device)
-    draw = uniform(
-        seed=seed, world=world, episode=episode, step=torch.zeros_like(world), stream=CUBE_STREAM, size=6
-    ).to(sim.qpos.dtype)
+    draw = uniform(seed=seed, world=world, episode=episode, step=torch.zeros_like(world), stream=CUBE_STREAM, size=6).to(
+        sim.qpos.dtype
+    )
     for cube, address in enumerate(index.cube_qpos):
         dx, dy, yaw = draw[:, 3 * cube : 3 * cube + 3].unbind(1)
         pose = sim.qpos[:, address : address + 7].clone()

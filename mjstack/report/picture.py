@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
+from collections.abc import Callable
 from pathlib import Path
-
-# Without a screen MuJoCo has to be told how to draw before it is first imported.
-if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-    os.environ.setdefault("MUJOCO_GL", "egl")
+from typing import Any
 
 import matplotlib
 import mujoco
@@ -18,7 +15,7 @@ import numpy as np
 from mjstack.errors import MjstackError
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 log = logging.getLogger(__name__)
 
@@ -111,7 +108,7 @@ def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, frame_dt: fl
     camera.close()
 
 
-def require_video():  # noqa: ANN201
+def require_video() -> Callable[..., Any]:
     """The mp4 writer, or one line that says what to install."""
     try:
         import imageio_ffmpeg
@@ -137,9 +134,7 @@ def _plot_trajectories(path: Path, cubes: np.ndarray, title: str) -> None:
     plt.close(figure)
 
 
-def _plot_scene(
-    path: Path, model: mujoco.MjModel, qpos: np.ndarray, cubes: np.ndarray, half: float, title: str
-) -> None:
+def _plot_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray, cubes: np.ndarray, half: float, title: str) -> None:
     """A drawing in lines for machines without OpenGL: arm joints, table and cubes."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos

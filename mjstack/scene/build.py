@@ -37,9 +37,7 @@ def build_scene(
     if solver.tolerance is not None:
         option.tolerance = solver.tolerance
     world = spec.worldbody
-    world.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], rgba=[0.32, 0.36, 0.42, 1], condim=3
-    )
+    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], rgba=[0.32, 0.36, 0.42, 1], condim=3)
     world.add_geom(
         name="table",
         type=mujoco.mjtGeom.mjGEOM_BOX,

@@ -1,6 +1,6 @@
 """Physics backends behind one protocol."""
 
-from mjstack.sim.build import make_simulation, resolve_backend, resolve_device
+from mjstack.sim.build import cuda_driver, cuda_name, make_simulation, resolve_backend, resolve_device
 from mjstack.sim.simulation import LOST_PHYSICS, Overflow, Simulation
 from mjstack.sim.sizes import BatchSizes, resolve_sizes
 
@@ -9,6 +9,8 @@ __all__ = [
     "BatchSizes",
     "Overflow",
     "Simulation",
+    "cuda_driver",
+    "cuda_name",
     "make_simulation",
     "resolve_backend",
     "resolve_device",

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+from pathlib import Path
+
 import mujoco
 import torch
 
@@ -56,3 +60,24 @@ def make_simulation(
     from mjstack.sim.mjwarp import MjwarpSimulation  # loads Warp, which native runs do not need
 
     return MjwarpSimulation(model, nworld, resolve_sizes(cfg), where, cfg.graph)
+
+
+def cuda_name(device: str) -> str:
+    """The GPU's name."""
+    return torch.cuda.get_device_name(device)
+
+
+def cuda_driver() -> str:
+    """Version of the NVIDIA driver, from the kernel module or NVML; ``unknown`` where neither tells."""
+    try:
+        text = Path("/proc/driver/nvidia/version").read_text()
+    except OSError:
+        text = ""
+    match = re.search(r"Kernel Module[^\d]*([\d.]+)", text)
+    if match:
+        return match.group(1)
+    try:
+        query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+        return subprocess.run(query, capture_output=True, text=True, timeout=10, check=True).stdout.splitlines()[0].strip()
+    except (OSError, subprocess.SubprocessError, IndexError):
+        return "unknown"

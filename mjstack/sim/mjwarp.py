@@ -12,46 +12,13 @@ import warp as wp
 
 from mjstack.config.schema import GraphMode
 from mjstack.errors import MjstackError, UnsupportedModel
+from mjstack.sim.counters import count_contacts, record_peaks
 from mjstack.sim.sizes import BatchSizes
 
-wp.config.log_level = wp.LOG_WARNING  # before mujoco_warp, which starts Warp on import
+wp.config.log_level = wp.LOG_ERROR  # before mujoco_warp, which starts Warp on import
 import mujoco_warp as mjw  # noqa: E402
 
 log = logging.getLogger(__name__)
-
-
-@wp.kernel
-def _count_contacts(
-    nacon: wp.array(dtype=int),
-    worldid: wp.array(dtype=int),
-    count: wp.array(dtype=int),
-):
-    """Counts each world's entries of the packed contact list. The list may claim more than it holds after an overflow."""
-    i = wp.tid()
-    if i < wp.min(nacon[0], worldid.shape[0]):
-        wp.atomic_add(count, worldid[i], 1)
-
-
-@wp.kernel
-def _record_peaks(
-    nefc: wp.array(dtype=int),
-    nacon: wp.array(dtype=int),
-    ncollision: wp.array(dtype=int),
-    contacts: wp.array(dtype=int),
-    overflow: wp.array(dtype=int),
-    peak_nefc: wp.array(dtype=int),
-    peak_contacts: wp.array(dtype=int),
-    peak_pool: wp.array(dtype=int),
-    seen: wp.array(dtype=int),
-):
-    """Keeps the largest counters and every overflow bit seen so far."""
-    w = wp.tid()
-    peak_nefc[w] = wp.max(peak_nefc[w], nefc[w])
-    peak_contacts[w] = wp.max(peak_contacts[w], contacts[w])
-    seen[w] = seen[w] | overflow[w]
-    if w == 0:
-        peak_pool[0] = wp.max(peak_pool[0], nacon[0])
-        peak_pool[1] = wp.max(peak_pool[1], ncollision[0])
 
 
 class MjwarpSimulation:
@@ -188,9 +155,9 @@ class MjwarpSimulation:
         """Two launches: what each world uses now, and the most it has used."""
         d = self._d
         self._contacts.zero_()
-        wp.launch(_count_contacts, dim=d.contact.worldid.shape[0], inputs=[d.nacon, d.contact.worldid, self._contacts])
+        wp.launch(count_contacts, dim=d.contact.worldid.shape[0], inputs=[d.nacon, d.contact.worldid, self._contacts])
         wp.launch(
-            _record_peaks,
+            record_peaks,
             dim=self.nworld,
             inputs=[
                 d.nefc,

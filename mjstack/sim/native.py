@@ -67,9 +67,9 @@ class NativeSimulation:
         self.qfrc_actuator = torch.from_numpy(self._derived["qfrc_actuator"])
         # Columns: contacts, rows, peak contacts, peak rows, overflow bits.
         self._counts = np.zeros((nworld, 5), dtype=np.int32)
-        self.contact_count, self.constraint_count, self.peak_contacts, self.peak_constraints, self.overflow = (
-            torch.from_numpy(self._counts).unbind(1)
-        )
+        self.contact_count, self.constraint_count, self.peak_contacts, self.peak_constraints, self.overflow = torch.from_numpy(
+            self._counts
+        ).unbind(1)
         self.step_count = torch.zeros(nworld, dtype=torch.int64)
         self.reset()
 
