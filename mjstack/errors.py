@@ -67,6 +67,8 @@ class UnsupportedModel(MjstackError):
 class Unreachable(MjstackError):
     """The arm cannot bring its aperture centre to a target."""
 
+    exit_code = 2
+
     def __init__(self, world: int, phase: str, target: Sequence[float], distance: float, tolerance: float) -> None:
         where = ", ".join(f"{x:.3f}" for x in target)
         super().__init__(

@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from mjstack.config.schema import Config
+from mjstack.control.scripted import ScriptedPlanner
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.gates.episode import FrameHook
 from mjstack.gates.gate import GateContext
@@ -49,10 +50,8 @@ class JobOutcome:
 
 def check_machine(cfg: Config) -> None:
     """Raises for what this machine cannot do, before anything is written."""
-    from mjstack.robots import robot_spec
-
     resolve_backend(cfg)
-    robot_spec(cfg.robot, cfg.model)
+    ScriptedPlanner(cfg)  # reads the robot, and reaches every nominal target
     if (cfg.view or cfg.video) and not {"baseline", "parity"} & set(cfg.gates):
         key = "view" if cfg.view else "video"
         raise ConfigError(key, "true", "gates with baseline or parity, whose world is shown", "Add one of them to gates")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -56,10 +57,10 @@ class CommandTape:
         self._knots = torch.from_numpy(knots)
 
     def to(self, device: torch.device, dtype: torch.dtype) -> CommandTape:
-        """Moves the tape to a device; returns itself."""
-        self._weights = self._weights.to(device, dtype)
-        self._knots = self._knots.to(device, dtype)
-        return self
+        """The same tape on a device."""
+        moved = copy.copy(self)
+        moved._weights, moved._knots = self._weights.to(device, dtype), self._knots.to(device, dtype)
+        return moved
 
     def command(self, frame: int) -> torch.Tensor:
         """Commands of one frame, shape ``(nworld, nu)``."""
@@ -84,6 +85,7 @@ class ScriptedPlanner:
         self._nodes = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, cfg.controller.knots))
         self._weights, self._segments = self._frame_weights()
         self._seed: np.ndarray | None = None
+        self._last: tuple[np.ndarray, CommandTape] | None = None
         nominal = np.array([[*cfg.scene.red_xy, *cfg.scene.blue_xy]])
         self._seed = self._plan_world(0, nominal[0])[0]
 
@@ -97,6 +99,8 @@ class ScriptedPlanner:
         Raises:
             Unreachable: A target is out of reach; names the world, the phase and the distance.
         """
+        if self._last is not None and np.array_equal(self._last[0], cubes_xy):
+            return self._last[1]  # the gates of one run play the same batch
         nworld = cubes_xy.shape[0]
         knots = np.full((nworld, len(self.phases) * len(self._nodes), len(self._cfg.robot.home)), np.nan)
         error = np.full(nworld, np.nan)
@@ -109,7 +113,10 @@ class ScriptedPlanner:
                 knots[world], error[world] = knots[twin], error[twin]
             if progress is not None:
                 progress(world + 1)
-        return CommandTape(knots, self._weights, self._segments, error)
+        tape = CommandTape(knots, self._weights, self._segments, error)
+        if nworld > 1:
+            self._last = (cubes_xy.copy(), tape)
+        return tape
 
     def path_error(self, cubes_xy: np.ndarray) -> float:
         """Largest distance [m] of the aperture centre from its straight path at any frame, for one layout ``(4,)``."""

@@ -11,7 +11,7 @@ from mjstack.gates.episode import NOMINAL, State, restore
 from mjstack.gates.gate import GateContext, acceptance_thresholds, judge_one
 from mjstack.math import quat_angle
 from mjstack.report.record import GateResult, Status, Value
-from mjstack.sim import Simulation
+from mjstack.sim import Overflow, Simulation
 
 FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 
@@ -47,10 +47,12 @@ def run_parity(context: GateContext) -> list[GateResult]:
     if status is Status.failed:
         problems.append(reason)
     if int(mjwarp.overflow[0]):
-        problems.append(f"buffer overflow, bits {int(mjwarp.overflow[0]):#x}: raise batch.njmax or batch.nconmax")
+        problems.append(f"{Overflow(int(mjwarp.overflow[0]))!s} overflow: raise batch.njmax or batch.nconmax")
     metrics.update(judged)
     metrics["peak_contacts"] = int(mjwarp.peak_contacts[0])
     metrics["peak_constraint_rows"] = int(mjwarp.peak_constraints[0])
+    limits = getattr(mjwarp, "solver_limits", None)
+    metrics["solver_limit_hit"] = bool(limits is not None and int(limits[0]))
     metrics["episode_s"] = episode.seconds
     assert episode.qpos is not None
     assert reference.qpos is not None

@@ -7,12 +7,19 @@ import os
 import sys
 
 
+_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
+
+
 def choose_gl() -> None:
-    """Sets ``MUJOCO_GL`` on a Linux machine without a screen, unless the user has set it."""
-    if not sys.platform.startswith("linux") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+    """Sets ``MUJOCO_GL`` on Linux: the user's choice if its library is there, else what this machine has.
+
+    A choice whose library is missing would break the import of mujoco itself; then pictures are plotted instead.
+    """
+    if not sys.platform.startswith("linux"):
         return
-    for library, name in (("EGL", "egl"), ("OSMesa", "osmesa")):
-        if ctypes.util.find_library(library):
-            os.environ.setdefault("MUJOCO_GL", name)
-            return
-    os.environ.setdefault("MUJOCO_GL", "disable")
+    asked = os.environ.get("MUJOCO_GL", "").lower()
+    found = [name for name, library in _LIBRARIES.items() if ctypes.util.find_library(library)]
+    if asked in _LIBRARIES and asked not in found:
+        os.environ["MUJOCO_GL"] = "disable"
+    elif not asked and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        os.environ["MUJOCO_GL"] = found[0] if found else "disable"

@@ -29,7 +29,7 @@ def collect_provenance(*, config_yaml: str, model_xml: str, device: str, driver:
         try:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
+            versions[name] = "from a checkout" if name == "mjstack" else "not installed"
     return {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
         "versions": versions,

@@ -73,7 +73,7 @@ def cuda_driver() -> str:
         text = Path("/proc/driver/nvidia/version").read_text()
     except OSError:
         text = ""
-    match = re.search(r"Kernel Module[^\d]*([\d.]+)", text)
+    match = re.search(r"\b(\d{3}\.\d+(?:\.\d+)?)\b", text)
     if match:
         return match.group(1)
     try:

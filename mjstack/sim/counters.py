@@ -26,13 +26,16 @@ def record_peaks(
     peak_nefc: wp.array[int],
     peak_contacts: wp.array[int],
     peak_pool: wp.array[int],
-    seen: wp.array[int],
+    lost_bits: int,
+    lost: wp.array[int],
+    limits: wp.array[int],
 ) -> None:
-    """Keeps the largest counters and every overflow bit seen so far."""
+    """Keeps the largest counters, and every overflow bit seen so far: lost physics apart from solver limits."""
     w = wp.tid()
     peak_nefc[w] = wp.max(peak_nefc[w], nefc[w])
     peak_contacts[w] = wp.max(peak_contacts[w], contacts[w])
-    seen[w] = seen[w] | overflow[w]
+    lost[w] = lost[w] | (overflow[w] & lost_bits)
+    limits[w] = limits[w] | (overflow[w] & ~lost_bits)
     if w == 0:
         peak_pool[0] = wp.max(peak_pool[0], nacon[0])
         peak_pool[1] = wp.max(peak_pool[1], ncollision[0])

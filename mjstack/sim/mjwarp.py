@@ -13,6 +13,7 @@ import warp as wp
 from mjstack.config.schema import GraphMode
 from mjstack.errors import MjstackError, UnsupportedModel
 from mjstack.sim.counters import count_contacts, record_peaks
+from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.sim.sizes import BatchSizes
 
 wp.config.log_level = wp.LOG_ERROR  # before mujoco_warp, which starts Warp on import
@@ -26,6 +27,10 @@ class MjwarpSimulation:
 
     Box against box uses the primitive collider, as native MuJoCo does: with MJWarp's convex one the kept contacts of a
     resting stack can alternate, and it never comes to rest. The substeps of one `step(n)` are captured into a graph.
+
+    Attributes:
+        peak_pool: Most contacts, and most broad-phase pairs, of all worlds at once since the last full reset, shape ``(2,)``.
+        solver_limits: MJWarp's bits for worlds whose solver stopped at an iteration limit, shape ``(nworld,)``, int32.
     """
 
     backend = "mjwarp"
@@ -50,6 +55,7 @@ class MjwarpSimulation:
         self._device = wp.get_device(device)
         self._graph_mode = graph
         self._graphs: dict[int, object] = {}
+        self._stream_handle: int | None = None
         name = self._device.name if self._device.is_cuda else "Warp's CPU device"
         self.description = f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}"
         with wp.ScopedDevice(self._device):
@@ -66,7 +72,8 @@ class MjwarpSimulation:
             self._peak_nefc = wp.zeros(nworld, dtype=int)
             self._peak_contacts = wp.zeros(nworld, dtype=int)
             self._peak_pool = wp.zeros(2, dtype=int)
-            self._seen = wp.zeros(nworld, dtype=int)
+            self._lost = wp.zeros(nworld, dtype=int)
+            self._limits = wp.zeros(nworld, dtype=int)
             self._mask = wp.zeros(nworld, dtype=bool)
         d = self._d
         self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
@@ -77,7 +84,8 @@ class MjwarpSimulation:
         self.peak_constraints = wp.to_torch(self._peak_nefc)
         self.peak_contacts = wp.to_torch(self._peak_contacts)
         self.peak_pool = wp.to_torch(self._peak_pool)
-        self.overflow = wp.to_torch(self._seen)
+        self.overflow = wp.to_torch(self._lost)
+        self.solver_limits = wp.to_torch(self._limits)
         self.step_count = torch.zeros(nworld, dtype=torch.int64, device=self.device)
         self._torch_mask = wp.to_torch(self._mask)
         self._warm_up()
@@ -108,7 +116,8 @@ class MjwarpSimulation:
         with self._stream():
             mjw.reset_data(self._m, self._d, reset=self._mask)
         keep = ~self._torch_mask
-        for buffer in (self.step_count, self.overflow, self.peak_contacts, self.peak_constraints, self.contact_count):
+        counters = (self.overflow, self.solver_limits, self.peak_contacts, self.peak_constraints, self.contact_count)
+        for buffer in (self.step_count, *counters):
             buffer *= keep
 
     def option_values(self) -> dict[str, float | int | str]:
@@ -140,9 +149,9 @@ class MjwarpSimulation:
         if not self._device.is_cuda:
             return wp.ScopedDevice(self._device)
         current = torch.cuda.current_stream(self.device)
-        if getattr(self, "_torch_stream", None) != current:
-            self._torch_stream = current
+        if current.cuda_stream != self._stream_handle:
             # One object is kept: a second one for the same stream would unregister it when freed.
+            self._stream_handle = current.cuda_stream
             self._warp_stream = wp.stream_from_torch(current)
         return wp.ScopedStream(self._warp_stream, sync_enter=False, sync_exit=False)
 
@@ -168,7 +177,9 @@ class MjwarpSimulation:
                 self._peak_nefc,
                 self._peak_contacts,
                 self._peak_pool,
-                self._seen,
+                LOST_PHYSICS,
+                self._lost,
+                self._limits,
             ],
         )
 
