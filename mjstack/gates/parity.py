@@ -51,8 +51,8 @@ def run_parity(context: GateContext) -> list[GateResult]:
     metrics.update(judged)
     metrics["peak_contacts"] = int(mjwarp.peak_contacts[0])
     metrics["peak_constraint_rows"] = int(mjwarp.peak_constraints[0])
-    limits = getattr(mjwarp, "solver_limits", None)
-    metrics["solver_limit_hit"] = bool(limits is not None and int(limits[0]))
+    bits = getattr(mjwarp, "solver_limits", None)
+    metrics["solver_limit_hit"] = bool(bits is not None and int(bits[0]))
     metrics["episode_s"] = episode.seconds
     assert episode.qpos is not None
     assert reference.qpos is not None

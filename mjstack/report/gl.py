@@ -6,7 +6,6 @@ import ctypes.util
 import os
 import sys
 
-
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 
 
