@@ -42,7 +42,7 @@ class SceneCamera:
         table = model.geom("table").id
         self._camera = mujoco.MjvCamera()
         self._camera.lookat = [0.62 * model.geom_pos[table][0], 0.0, model.geom_pos[table][2] + 0.08]
-        self._camera.distance = 0.75 + 1.1 * float(model.geom_pos[table][0])
+        self._camera.distance = 0.55 + 1.0 * float(model.geom_pos[table][0])
         self._camera.azimuth, self._camera.elevation = 140.0, -24.0
 
     def draw(self, qpos: np.ndarray) -> np.ndarray:
@@ -81,7 +81,7 @@ def save_pictures(
     except MjstackError as error:
         log.warning("%s The final scene is plotted instead.", error)
         _plot_scene(folder / "scene.png", model, qpos, cubes[-1], half, title)
-    _plot_trajectories(folder / "trajectories.png", cubes, title)
+    _plot_trajectories(folder / "trajectories.png", cubes, half, title)
     return ["scene.png", "trajectories.png"]
 
 
@@ -99,8 +99,8 @@ def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, frame_dt: fl
     """
     writer_of = require_video()
     skip = max(1, round(1.0 / (25.0 * frame_dt)))
-    camera = SceneCamera(model, 960, 720)
-    writer = writer_of(str(path), (960, 720), fps=1.0 / (frame_dt * skip), macro_block_size=16)
+    camera = SceneCamera(model, 640, 480)
+    writer = writer_of(str(path), (640, 480), fps=1.0 / (frame_dt * skip), macro_block_size=16)
     writer.send(None)
     for state in qpos[::skip]:
         writer.send(np.ascontiguousarray(camera.draw(state)))
@@ -117,20 +117,26 @@ def require_video() -> Callable[..., Any]:
     return imageio_ffmpeg.write_frames
 
 
-def _plot_trajectories(path: Path, cubes: np.ndarray, title: str) -> None:
-    figure, (top, side) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+def _plot_trajectories(path: Path, cubes: np.ndarray, half: float, title: str) -> None:
+    figure, (side, above, height) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
     for cube, (name, color) in enumerate(CUBE_COLORS.items()):
-        xyz = cubes[:, cube]
-        top.plot(xyz[:, 1], xyz[:, 0], color=color, label=name)
-        top.plot(xyz[-1, 1], xyz[-1, 0], "s", color=color, ms=8)
-        side.plot(1e3 * xyz[:, 2], color=color, label=name)
-    top.set(xlabel="y [m]", ylabel="x [m]", title="from above", aspect="equal")
-    side.set(xlabel="frame", ylabel="height of the centre [mm]", title="over the episode")
-    for axes in (top, side):
+        mm = 1e3 * cubes[:, cube]
+        for axes, row in ((side, 2), (above, 0)):
+            axes.plot(mm[:, 1], mm[:, row], color=color, label=name)
+            for at, fill in ((mm[0], False), (mm[-1], True)):
+                corner = (at[1] - 1e3 * half, at[row] - 1e3 * half)
+                square = plt.Rectangle(corner, 2e3 * half, 2e3 * half, color=color, fill=fill, alpha=0.5 if fill else 1.0)
+                axes.add_patch(square)
+        height.plot(mm[:, 2], color=color, label=name)
+    side.set(xlabel="y [mm]", ylabel="z [mm]", title="from the front (outline: start, filled: end)", aspect="equal")
+    above.set(xlabel="y [mm]", ylabel="x [mm]", title="from above", aspect="equal")
+    height.set(xlabel="frame", ylabel="z [mm]", title="height of the centre")
+    for axes in (side, above, height):
         axes.grid(alpha=0.3)
-        axes.legend(frameon=False)
+        axes.margins(0.1)
+    height.legend(frameon=False)
     figure.suptitle(title)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=100)
     plt.close(figure)
 
 
