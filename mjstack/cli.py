@@ -18,6 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from omegaconf import DictConfig
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from mjstack.config.schema import Config
@@ -120,7 +121,7 @@ def _expand(overrides: list[str]) -> list[list[str]]:
     try:
         parsed = OverridesParser.create().parse_overrides(overrides)
     except OverrideParseException as error:
-        raise CompositionError(str(error).splitlines()[0]) from error
+        raise CompositionError(f"override cannot be read: {str(error).splitlines()[0]}.") from error
     return [list(job) for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
 
 
@@ -169,7 +170,7 @@ def _print_sweep(outcomes: list[JobOutcome]) -> None:
         by_name = {gate.name: gate for gate in outcome.gates}
         cells = [f"{by_name[name].status.value}: {by_name[name].reason}" if name in by_name else "not run" for name in names]
         row = [str(number), " ".join(outcome.overrides), *cells, outcome.status.value]
-        table.add_row(*row)
+        table.add_row(*(escape(cell) for cell in row))
         lines.append(f"| {' | '.join(row)} |")
     Console().print(table)
     sweep_folder = os.path.commonpath([str(outcome.folder) for outcome in outcomes])

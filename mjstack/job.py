@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from omegaconf import OmegaConf
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -184,7 +185,7 @@ def _print_summary(console: Console, report: Report, folder: Path) -> None:
     table.add_column("what it says", overflow="fold")
     for gate in report.gates:
         color = _COLOR[gate.status]
-        table.add_row(gate.name, f"[{color}]{gate.status.value}[/]", f"{gate.seconds:.1f}", headline(gate))
+        table.add_row(gate.name, f"[{color}]{gate.status.value}[/]", f"{gate.seconds:.1f}", escape(headline(gate)))
     console.print(table)
     console.print(f"report: {folder}/report.md", soft_wrap=True)
     for gate in report.gates:
@@ -245,7 +246,7 @@ class _ProgressBar:
     def finish(self, result: GateResult) -> None:
         self._drop()
         color = _COLOR[result.status]
-        self.say(f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s): {headline(result)}")
+        self.say(f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s): {escape(headline(result))}")
 
     def _drop(self) -> None:
         if self._task is not None:

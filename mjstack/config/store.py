@@ -9,7 +9,7 @@ from typing import cast
 from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
@@ -19,6 +19,7 @@ from mjstack.errors import MjstackError, UnknownName, suggest
 
 CONFIG_MODULE = "mjstack.conf"
 CONFIG_NAME = "config"
+_KINDS = {"Integer": "an integer", "Float": "a number", "Boolean": "true or false"}
 
 ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
 
@@ -79,6 +80,11 @@ def _translate(error: Exception, cfg: DictConfig | None) -> MjstackError:
     text = str(cause).splitlines()[0] if str(cause) else type(cause).__name__
     if isinstance(cause, ConfigKeyError | AttributeError) or "not in struct" in text or "not in 'Config'" in text:
         return _unknown_key(error, str(key or getattr(cause, "key", "") or ""))
+    converted = re.search(r"Value '(.*)' of type '\w+' could not be converted to (\w+)", text)
+    if converted and key:
+        return CompositionError(f"{key}={converted.group(1)}: expected {_KINDS.get(converted.group(2), converted.group(2))}.")
+    if "Ambiguous value for argument" in text:
+        return CompositionError(f"{text.rstrip('.')}: several values are a sweep. Add -m, or give one value.")
     match = re.search(r"Could not override '([^']+)'\. No match in the defaults list", str(error))
     if match:
         groups = [
@@ -96,6 +102,8 @@ def _translate(error: Exception, cfg: DictConfig | None) -> MjstackError:
             "job",
         ]
         return UnknownName("configuration group", match.group(1), groups)
+    if isinstance(error, OverrideParseException):
+        return CompositionError(f"override '{error.override}' cannot be read: {text.rstrip('.')}.")
     return CompositionError(f"{key}: {text}." if key else f"{text.rstrip('.')}.")
 
 
