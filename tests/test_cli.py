@@ -1,0 +1,180 @@
+"""The command line: exit statuses, what it writes, and that it writes nothing for bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from mjstack.cli import run
+
+SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
+PROVENANCE = {"versions", "device", "driver", "cpu_count", "git_commit", "config_sha256", "model_sha256"}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def everything(folder: Path) -> list[Path]:
+    return list(folder.rglob("*"))
+
+
+def the_report(folder: Path) -> dict:
+    (path,) = folder.rglob("report.json")
+    return json.loads(path.read_text())
+
+
+BAD = [
+    ["robot=so100"],
+    ["nworld=0"],
+    ["nworld=many"],
+    ["batch.njmax=-1"],
+    ["timing.substeps=0"],
+    ["gates=[parityy]"],
+    ["sim.nworlds=3"],
+    ["sim=mjwarp", "sim.device=cuda:77"],
+    ["scene.red_xy=[0.9,0.0]"],
+    ["gate.throughput.from_phase=lift"],
+    ["nworld"],
+    ["nworld=[1,"],
+    ["hydra.run.dir=afile/below"],
+    ["hydra.nothing=1"],
+    ["-m", "robot=so101,so100", "gates=[baseline]"],
+    ["-m", "nworld=1,0"],
+    ["video=true", "gates=[batch]"],
+]
+
+
+@pytest.mark.parametrize("args", BAD, ids=[" ".join(args) for args in BAD])
+def test_bad_input_exits_2_in_one_line_and_writes_nothing(
+    args: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if "hydra.run.dir=afile/below" in args:
+        (folder / "afile").write_text("")
+    before = everything(folder)
+    assert run(args) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith("mjstack: ")
+    assert len(err.strip().splitlines()) == 1
+    assert "Traceback" not in out + err
+    assert everything(folder) == before
+
+
+@pytest.mark.parametrize("args", [["robot=so100"], ["nworld=many"]], ids=" ".join)
+def test_bad_input_in_a_process_of_its_own(args: list[str], folder: Path) -> None:
+    done = subprocess.run([sys.executable, SCRIPT, *args], cwd=folder, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("mjstack: ")
+    assert done.stdout == ""
+    assert everything(folder) == []
+
+
+def test_baseline_leaves_a_whole_report(folder: Path) -> None:
+    assert run(["gates=[baseline]"]) == 0
+    report = the_report(folder)
+    assert report["schema"] == 1
+    assert report["status"] == "pass"
+    assert set(report["provenance"]) >= PROVENANCE
+    assert len(report["provenance"]["model_sha256"]) == 64
+    (gate,) = report["gates"]
+    assert set(gate) >= {"name", "status", "reason", "seconds", "thresholds", "metrics"}
+    assert (gate["name"], gate["status"]) == ("baseline", "pass")
+    assert 0 <= gate["metrics"]["xy_err_m"] <= gate["thresholds"]["xy_err_max_m"]
+    assert 0.035 <= gate["metrics"]["dz_m"] <= 0.055
+    assert all(isinstance(v, float | int | str | bool | None) for v in gate["metrics"].values())
+    (job,) = {path.parent for path in folder.rglob("report.json")}
+    assert job.relative_to(folder).parts[0] == "outputs"
+    for name in ("report.md", "run.log", "scene.png", "trajectories.png", ".hydra/config.yaml", ".hydra/overrides.yaml"):
+        assert (job / name).stat().st_size > 0, name
+    assert [path.name for path in folder.iterdir()] == ["outputs"]
+
+
+def test_failed_gate_exits_1(folder: Path) -> None:
+    assert run(["gates=[baseline]", "gate.acceptance.xy_err=1e-6"]) == 1
+    report = the_report(folder)
+    assert report["status"] == "fail"
+    assert report["gates"][0]["status"] == "fail"
+    assert "not stacked" in report["gates"][0]["reason"]
+
+
+def test_sweep_reports_each_job_and_a_summary(folder: Path) -> None:
+    assert run(["-m", "robot=so101,rebot", "gates=[baseline]"]) == 0
+    reports = sorted(folder.rglob("report.json"))
+    assert [path.parent.name for path in reports] == ["0", "1"]
+    assert all(json.loads(path.read_text())["status"] == "pass" for path in reports)
+    (summary,) = folder.rglob("summary.md")
+    rows = summary.read_text().splitlines()
+    assert len(rows) == 4
+    assert "robot=so101" in rows[2]
+    assert "robot=rebot" in rows[3]
+
+
+def test_sweep_exits_with_its_worst_job(folder: Path) -> None:
+    assert run(["-m", "gate.acceptance.xy_err=0.015,1e-6", "gates=[baseline]"]) == 1
+    statuses = [json.loads(path.read_text())["status"] for path in sorted(folder.rglob("report.json"))]
+    assert statuses == ["pass", "fail"]
+
+
+def test_cfg_prints_and_writes_nothing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--cfg", "job", "robot=rebot"]) == 0
+    assert "name: rebot" in capsys.readouterr().out
+    assert everything(folder) == []
+
+
+@pytest.fixture
+def in_the_batch(folder: Path) -> Iterator[Callable[[], subprocess.Popen]]:
+    """A process that has passed baseline and is in a long native batch."""
+    processes = []
+
+    def begin() -> subprocess.Popen:
+        args = ["gates=[baseline,batch]", "nworld=400", "sim=native", "hydra.run.dir=out"]
+        process = subprocess.Popen(
+            [sys.executable, SCRIPT, *args], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        processes.append(process)
+        path, until = folder / "out" / "report.json", time.monotonic() + 60
+        while time.monotonic() < until and process.poll() is None:
+            if path.exists() and json.loads(path.read_text())["gates"]:
+                time.sleep(1.0)
+                assert process.poll() is None
+                return process
+            time.sleep(0.1)
+        pytest.fail("baseline did not finish")
+
+    yield begin
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def test_ctrl_c_leaves_the_finished_gates(folder: Path, in_the_batch: Callable[[], subprocess.Popen]) -> None:
+    process = in_the_batch()
+    os.kill(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    report = json.loads((folder / "out" / "report.json").read_text())
+    assert report["status"] == "interrupted"
+    assert [(gate["name"], gate["status"]) for gate in report["gates"]] == [("baseline", "pass")]
+
+
+def test_kill_leaves_a_readable_report(folder: Path, in_the_batch: Callable[[], subprocess.Popen]) -> None:
+    process = in_the_batch()
+    process.kill()
+    process.wait(timeout=30)
+    report = json.loads((folder / "out" / "report.json").read_text())
+    assert report["status"] == "interrupted"
+    assert [gate["name"] for gate in report["gates"]] == ["baseline"]
+    assert "interrupted" in (folder / "out" / "report.md").read_text()

@@ -1,0 +1,206 @@
+"""Every configuration file composes, holds the task's figures, and every bad value is refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mjstack.conf
+import pytest
+
+from mjstack.config import load_config
+from mjstack.config.schema import Backend, Config, ModelSource
+from mjstack.errors import MjstackError
+from mjstack.job import check_machine
+
+CONF = Path(next(iter(mjstack.conf.__path__)))
+GATE_FILES = sorted(path.stem for path in (CONF / "gate").glob("*.yaml"))
+
+
+def choices() -> list[str]:
+    """``group=choice`` for every file in the configuration groups."""
+    out = []
+    for path in sorted(CONF.rglob("*.yaml")):
+        group = path.parent.relative_to(CONF).as_posix()
+        if group == ".":
+            continue
+        if group.startswith("hydra"):
+            continue
+        if group == "gate":  # a list of all its files
+            continue
+        out.append(f"{'+' if group == 'experiment' else ''}{group}={path.stem}".lstrip("+"))
+    return out
+
+
+@pytest.mark.parametrize("override", choices())
+def test_every_file_composes(override: str) -> None:
+    assert isinstance(load_config([override]), Config)
+
+
+def test_walk_found_the_groups() -> None:
+    found = set(choices())
+    assert {"robot=so101", "robot=rebot", "timing=fine", "sim=mjwarp", "experiment=fine", "model=menagerie"} <= found
+    assert GATE_FILES == ["acceptance", "batch", "capacity", "parity", "throughput"]
+
+
+def test_every_group_has_an_init_so_that_it_ships() -> None:
+    for path in CONF.rglob("*.yaml"):
+        assert (path.parent / "__init__.py").is_file(), path.parent
+
+
+def test_defaults(so101_cfg: Config) -> None:
+    cfg = so101_cfg
+    assert cfg.robot.name == "so101"
+    assert cfg.model.source is ModelSource.builtin
+    assert cfg.sim.backend is Backend.auto
+    assert cfg.nworld == 256
+    assert cfg.seed == 0
+    assert cfg.gates == ["baseline", "parity", "capacity", "batch", "throughput"]
+    assert (cfg.timing.physics_dt, cfg.timing.substeps) == (0.002, 10)
+    assert cfg.timing.frame_dt == pytest.approx(0.02)
+    solver = cfg.solver
+    assert (solver.iterations, solver.ls_iterations, solver.impratio, solver.tolerance) == (100, 50, 100.0, 1e-6)
+    assert (cfg.reset.cube_xy, cfg.reset.cube_yaw) == (0.002, 0.05)
+
+
+def test_overrides_arrive() -> None:
+    cfg = load_config(["timing=fine", "nworld=7", "gates=[capacity]", "gate.acceptance.xy_err=0.01", "batch.njmax=90"])
+    assert (cfg.timing.physics_dt, cfg.timing.substeps) == (0.001, 20)
+    assert cfg.timing.frame_dt == pytest.approx(0.02)
+    assert cfg.nworld == 7
+    assert cfg.gates == ["capacity"]
+    assert cfg.gate.acceptance.xy_err == 0.01
+    assert cfg.batch.njmax == 90
+
+
+def test_experiment_is_what_it_changes() -> None:
+    assert load_config(["experiment=fine"]).timing.substeps == 20
+    assert load_config(["experiment=asset_solver"]).solver.iterations is None
+
+
+FIGURES = {
+    "so101": {
+        "home": [0, 0, 0.473, 1.177, 1.584, 0.7],
+        "gripper_open": [0.7],
+        "gripper_closed": [0.30],
+        "locked": {"wrist_roll": 1.584},
+        "ik_joints": ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex"],
+        "arm_force_limit": 30.0,
+        "approach_height": 0.09,
+        "table": ([0.35, -0.04, 0.012], [0.16, 0.26, 0.012]),
+        "cubes": ([0.33, -0.13], [0.33, 0.06]),
+        "sizes": (128, 300),
+    },
+    "rebot": {
+        "home": [0, -0.7, -1.1, 0, 0, 0, 0.04, 0.04],
+        "gripper_open": [0.04, 0.04],
+        "gripper_closed": [0.018, 0.018],
+        "locked": {"joint6": 0.0},
+        "ik_joints": ["joint1", "joint2", "joint3", "joint4", "joint5"],
+        "arm_force_limit": None,
+        "approach_height": 0.12,
+        "table": ([0.48, 0, 0.200], [0.16, 0.30, 0.012]),
+        "cubes": ([0.48, -0.14], [0.48, 0.14]),
+        "sizes": (256, 500),
+    },
+}
+
+
+def test_task_figures_of_each_robot(robot: str) -> None:
+    cfg, want = load_config([f"robot={robot}"]), FIGURES[robot]
+    for key in ("home", "gripper_open", "gripper_closed", "locked", "ik_joints", "arm_force_limit", "approach_height"):
+        assert getattr(cfg.robot, key) == want[key], key
+    assert (cfg.scene.table_center, cfg.scene.table_half) == want["table"]
+    assert (cfg.scene.red_xy, cfg.scene.blue_xy) == want["cubes"]
+    layout = cfg.robot.layouts["stack"]
+    assert (layout.nconmax, layout.njmax) == want["sizes"]
+    assert (cfg.scene.cube_half, cfg.scene.cube_mass) == (0.022, 0.08)
+    assert cfg.scene.cube_friction == [1.2, 0.005, 0.0005]
+    assert cfg.scene.table_friction == [1.0, 0.005, 0.0005]
+
+
+def test_acceptance_figures(so101_cfg: Config) -> None:
+    t = so101_cfg.gate.acceptance
+    assert (t.xy_err, t.dz_min, t.dz_max) == (0.015, 0.035, 0.055)
+    assert (t.airborne_height, t.lift_frames, t.carry_frames, t.carry_distance) == (0.010, 10, 10, 0.05)
+    assert (t.window, t.support_gap) == (50, 0.005)
+    assert (t.rest_speed, t.rest_position, t.rest_rotation_deg) == (0.05, 0.005, 3.0)
+    assert (t.lift_phases, t.carry_phase) == (["lift_red", "above_blue"], "above_blue")
+    seconds = [phase.seconds for phase in so101_cfg.controller.phases.values()]
+    assert seconds == [1.2, 1.4, 1.6, 1.4, 1.6, 1.4, 1.0, 1.0, 1.4]
+    assert so101_cfg.controller.ik_tolerance == 0.0005
+
+
+BAD = [
+    (["robot=so100"], "Did you mean 'so101'?"),
+    (["robots=so101"], "Did you mean 'robot'?"),
+    (["timing=coarse"], "Available: default, fine"),
+    (["nworld=0"], "nworld=0"),
+    (["nworld=-3"], "nworld=-3"),
+    (["nworld=many"], "nworld"),
+    (["nworld=2.5"], "nworld"),
+    (["seed=-1"], "seed=-1"),
+    (["batch.njmax=-1"], "batch.njmax=-1"),
+    (["batch.nconmax=0"], "batch.nconmax=0"),
+    (["timing.substeps=0"], "timing.substeps=0"),
+    (["timing.substeps=11"], "0.02 s"),
+    (["timing.physics_dt=nan"], "timing.physics_dt"),
+    (["gates=[parityy]"], "Did you mean 'parity'?"),
+    (["gates=[]"], "gates"),
+    (["sim.nworlds=3"], "nworld'?"),
+    (["nworlds=3"], "nworld'?"),
+    (["sim.device=gpu"], "auto, cpu or cuda:N"),
+    (["graph=sometimes"], "graph"),
+    (["view=perhaps"], "view"),
+    (["scene.red_xy=[0.9,0.0]"], "on the table"),
+    (["scene.red_xy=[0.33]"], "2 numbers"),
+    (["scene.red_xy=[0.33,0.06]"], "touch"),
+    (["scene.cube_mass=0"], "scene.cube_mass"),
+    (["reset.cube_xy=-0.1"], "reset.cube_xy"),
+    (["solver.tolerance=0"], "solver.tolerance"),
+    (["gate.acceptance.carry_phase=above_blu"], "Did you mean 'above_blue'?"),
+    (["gate.acceptance.lift_phases=[lift]"], "lift_red"),
+    (["gate.parity.states.stacked=don"], "Did you mean 'done'?"),
+    (["gate.throughput.from_phase=lift"], "Did you mean 'lift_red'?"),
+    (["gate.acceptance.window=1"], "gate.acceptance.window=1"),
+    (["gate.throughput.repetitions=0"], "gate.throughput.repetitions=0"),
+    (["controller.phases.release.seconds=0.013"], "multiple of the frame"),
+    (["controller.phases.release.gripper=ajar"], "open or closed"),
+    (["controller.phases.release.anchor=green"], "anchor"),
+    (["controller.knots=2"], "controller.knots=2"),
+    (["robot.home=[0,0]"], "robot.home"),
+    (["robot.ik_joints=[elbow]"], "elbow_flex"),
+    (["nworld=3", "nworld="], "nworld"),
+    (["nworld=[1,"], ""),
+]
+
+
+@pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
+def test_bad_input_is_one_line(overrides: list[str], says: str) -> None:
+    with pytest.raises(MjstackError) as caught:
+        load_config(overrides)
+    assert caught.value.exit_code == 2
+    message = str(caught.value)
+    assert message.strip()
+    assert "\n" not in message
+    assert says in message
+
+
+def test_missing_cuda_device_is_refused_before_the_run() -> None:
+    with pytest.raises(MjstackError, match="cuda:77") as caught:
+        check_machine(load_config(["sim=mjwarp", "sim.device=cuda:77"]))
+    assert caught.value.exit_code == 2
+    assert "\n" not in str(caught.value)
+
+
+def test_native_on_cuda_is_refused() -> None:
+    with pytest.raises(MjstackError) as caught:
+        check_machine(load_config(["sim=native", "sim.device=cuda:0"]))
+    assert caught.value.exit_code == 2
+
+
+def test_missing_menagerie_folder_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
+    with pytest.raises(MjstackError, match="MENAGERIE_ROOT") as caught:
+        check_machine(load_config(["model=menagerie"]))
+    assert caught.value.exit_code == 2
+    assert "\n" not in str(caught.value)

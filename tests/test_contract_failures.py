@@ -1,0 +1,194 @@
+"""Failures injected into real simulations: each is caught, in its own world and by its own rule, and no other world is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from mjstack.gates import gate as gate_module
+from mjstack.gates.batch import run_batch
+from mjstack.gates.capacity import run_capacity
+from mjstack.gates.episode import run_episode, start_worlds
+from mjstack.gates.gate import GateContext
+from mjstack.gates.throughput import run_throughput
+from mjstack.report.record import Status
+from mjstack.sim import Overflow, Simulation
+from mjstack.tasks.stack import Rule, StackEvidence
+
+AFTER_RELEASE = 480
+
+
+def teleport(context: GateContext, world: int) -> Callable[[int, Simulation], None]:
+    """Moves red beside the stack, once, when it has been released."""
+
+    def hook(frame: int, sim: Simulation) -> None:
+        if frame == AFTER_RELEASE:
+            sim.qpos[world, context.index.cube_qpos[0]] += 0.08
+
+    return hook
+
+
+def rules(bits: torch.Tensor) -> list[set[str]]:
+    return [{rule.name for rule in Rule if int(b) & rule} for b in bits]
+
+
+def test_native(robot: str, stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]) -> None:
+    context = stage(robot)
+    sim = make_sim("native", 6, robot=robot)
+    push = teleport(context, 1)
+    kept = {}
+
+    def hook(frame: int, sim: Simulation) -> None:
+        push(frame, sim)
+        if frame == 0:  # world 2 stalls: its steps are counted, and it stays where it is
+            kept.update(qpos=sim.qpos[2].clone(), qvel=sim.qvel[2].clone())
+        sim.qpos[2], sim.qvel[2] = kept["qpos"], kept["qvel"]
+        if frame == 597:  # late: native MuJoCo takes some hundred times longer over a world that is not finite
+            sim.qvel[3, context.index.cube_qvel[1]] = math.nan
+            sim.step_count[5] -= 1
+
+    episode = run_episode(sim, context.index, context.cfg, context.planner, context.cfg.reset, on_frame=hook)
+    found = rules(episode.verdict.failed)
+    assert found[0] == found[4] == set()
+    assert found[1] == {"STACKED"}
+    assert found[2] == {"LIFT", "CARRY", "STACKED"}
+    assert {"FINITE", "STACKED", "SUPPORTED", "REST_SPEED"} <= found[3]
+    assert "STEPS" not in found[3]
+    assert found[5] == {"STEPS"}
+
+
+def test_mjwarp(stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]) -> None:
+    context = stage("so101")
+    sim = make_sim("mjwarp", 3)
+    push = teleport(context, 1)
+
+    def hook(frame: int, sim: Simulation) -> None:
+        push(frame, sim)
+        if frame == 300:
+            sim.qvel[2, context.index.cube_qvel[1]] = math.nan
+
+    episode = run_episode(sim, context.index, context.cfg, context.planner, context.cfg.reset, on_frame=hook)
+    found = rules(episode.verdict.failed)
+    assert found[0] == set()
+    assert found[1] == {"STACKED"}
+    assert {"FINITE", "STACKED"} <= found[2]
+
+
+def test_nan_leaves_the_other_worlds_bit_identical(
+    backend: str, stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]
+) -> None:
+    context = stage("so101")
+    final = []
+    for poison in (False, True):
+        sim = make_sim(backend, 3)
+        start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+        for frame in range(6):
+            if poison and frame == 2:
+                sim.qvel[1, context.index.cube_qvel[0]] = math.nan
+            sim.step(10)
+        final.append((sim.qpos.clone(), sim.qvel.clone()))
+        assert bool(torch.isfinite(sim.qpos[1]).all()) is not poison
+    for clean, dirty in zip(*final, strict=True):
+        assert torch.equal(clean[[0, 2]], dirty[[0, 2]])
+
+
+def crowd(context: GateContext, sim: Simulation, world: int) -> None:
+    """Puts both cubes of one world into each other, the table and the gripper: far more contacts than elsewhere."""
+    aperture = sim.site_xpos[world, context.index.aperture_sites].mean(0)
+    top = context.cfg.scene.table_center[2] + context.cfg.scene.table_half[2]
+    red, blue = context.index.cube_qpos
+    sim.qpos[world, red : red + 3] = aperture.to(sim.qpos.dtype)
+    sim.qpos[world, blue : blue + 2] = aperture[:2].to(sim.qpos.dtype) + 0.01
+    sim.qpos[world, blue + 2] = top + 0.015
+
+
+def test_overflow_in_exactly_the_crowded_world(
+    stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]
+) -> None:
+    context = stage("so101")
+    # Any world needs up to 144 rows in the first frames, the crowded one 192.
+    sim = make_sim("mjwarp", 3, "batch.njmax=160")
+    start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+    sim.forward()
+    assert int(sim.overflow.abs().sum()) == 0
+    crowd(context, sim, 1)
+    evidence = StackEvidence(context.cfg, context.index, context.planner.phases, 3, sim.device)
+    for _ in range(3):
+        sim.step(10)
+        evidence.update(sim)
+    bits = sim.overflow.tolist()
+    assert bits[1] & Overflow.NEFC
+    assert bits[0] == bits[2] == 0
+    found = rules(evidence.verdict(sim).failed)
+    assert ["OVERFLOW" in broken for broken in found] == [False, True, False]
+    sim.reset(torch.tensor([False, True, False]))
+    sim.step(1)
+    assert sim.overflow.tolist() == [0, 0, 0]
+
+
+def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., GateContext]) -> None:
+    context = new_context("sim=native", "nworld=2", "batch.njmax=100")
+    (result,) = run_capacity(context)
+    assert result.status is Status.failed
+    assert "njmax overflow in 2 of 2 worlds (0, 1)" in result.reason
+    assert "njmax=100" in result.reason
+    wanted = int(result.reason.split("batch.njmax=")[1].split()[0].rstrip(".;"))
+    assert wanted == result.metrics["recommended.njmax"]
+    assert wanted > int(result.metrics["peak_constraint_rows_per_world"]) > 100
+
+
+def test_capacity_gate_passes_with_what_it_recommends(new_context: Callable[..., GateContext]) -> None:
+    (result,) = run_capacity(new_context("sim=native", "nworld=2", "batch.njmax=184", "batch.nconmax=40"))
+    assert result.status is Status.passed, result.reason
+    assert int(result.metrics["recommended.njmax"]) <= 184
+    assert int(result.metrics["recommended.nconmax"]) <= 40
+
+
+def test_capacity_gate_sizes_the_contact_pool(new_context: Callable[..., GateContext]) -> None:
+    (result,) = run_capacity(new_context("sim=native", "nworld=2", "batch.nconmax=8"))
+    assert result.status is Status.failed
+    assert "contact pool overflow in 2 of 2 worlds (0, 1)" in result.reason
+    assert "batch.nconmax=" in result.reason
+
+
+def test_batch_gate_names_world_and_rule_and_voids_throughput(
+    new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = new_context(
+        "sim=native", "nworld=4", "gate.throughput.frames=2", "gate.throughput.repetitions=1", "gates=[batch,throughput]"
+    )
+
+    def broken_episode(*args: object, **kwargs: object) -> object:
+        return run_episode(*args, **kwargs, on_frame=teleport(context, 2))
+
+    monkeypatch.setattr(gate_module, "run_episode", broken_episode)
+    (batch,) = run_batch(context)
+    assert batch.status is Status.failed
+    assert "1 of 4 worlds (2) failed" in batch.reason
+    assert "not stacked" in batch.reason
+    assert batch.details == ["not stacked: 1 of 4 worlds (2)"]
+    assert batch.metrics["accepted"] == 3
+    assert batch.metrics["success_rate"] == pytest.approx(0.75)
+    assert batch.metrics["failed.STACKED"] == 1
+
+    context.results["batch"] = batch
+    throughput, _ = run_throughput(context)
+    assert throughput.status is Status.failed
+    assert "no figure" in throughput.reason
+    assert not [name for name in throughput.metrics if "per_s" in name or "ms_per" in name]
+
+    batch.status = Status.passed
+    throughput, cuda = run_throughput(context)
+    assert throughput.status is Status.passed
+    assert throughput.metrics["world_steps_per_s.median"] > 0
+    assert cuda.name == "throughput_cuda"
+
+
+def test_batch_gate_refuses_identical_worlds(new_context: Callable[..., GateContext]) -> None:
+    (batch,) = run_batch(new_context("sim=native", "nworld=2", "reset=nominal"))
+    assert batch.status is Status.failed
+    assert batch.metrics["distinct_final_states"] == 1
+    assert "reset=jitter" in batch.reason

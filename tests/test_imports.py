@@ -1,0 +1,101 @@
+"""Who may import whom: packages in layers, and one home for each third-party package."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import mjstack
+
+ROOT = Path(mjstack.__file__).parent
+# A module may import from its own layer and from earlier ones.
+LAYERS = [
+    {"errors", "math", "rng"},
+    {"config"},
+    {"robots"},
+    {"scene"},
+    {"sim"},
+    {"kinematics"},
+    {"control"},
+    {"tasks", "mdp"},
+    {"gates"},
+    {"job"},
+    {"cli"},
+]
+LEAVES = {"report": {"errors", "report"}}  # anything may import it, and it imports only these
+HOMES = {
+    "mujoco_warp": ("sim/",),
+    "warp": ("sim/",),
+    "mink": ("kinematics/mink_ik.py",),
+    "mujoco_menagerie": ("robots/source.py",),
+    "hydra": ("config/", "cli.py"),
+    "omegaconf": ("config/", "cli.py", "job.py"),
+    "matplotlib": ("report/picture.py",),
+    "imageio_ffmpeg": ("report/picture.py",),
+    "rich": ("job.py", "cli.py"),
+}
+
+
+def imports(path: Path) -> set[str]:
+    """Every module that a file imports, lazily or not."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            base = node.module or ""
+            found |= {f"{base}.{alias.name}" for alias in node.names} if base == "mjstack" else {base}
+    return found
+
+
+FILES = {str(path.relative_to(ROOT)): imports(path) for path in sorted(ROOT.rglob("*.py"))}
+
+
+def package(file: str) -> str:
+    return file.removesuffix(".py").split("/")[0]
+
+
+def test_the_tree_is_all_in_a_layer() -> None:
+    known = set().union(*LAYERS, LEAVES) | {"__init__"}
+    assert {package(file) for file in FILES} <= known
+
+
+def test_layers_import_downwards_only() -> None:
+    level = {name: i for i, layer in enumerate(LAYERS) for name in layer}
+    wrong = []
+    for file, names in FILES.items():
+        here = package(file)
+        for name in names:
+            parts = name.split(".")
+            if parts[0] != "mjstack" or len(parts) < 2 or here == "__init__":
+                continue
+            there = parts[1]
+            allowed = LEAVES[here] if here in LEAVES else LEAVES.keys() | {n for n in level if level[n] <= level[here]}
+            if there not in allowed:
+                wrong.append(f"{file} imports {name}")
+    assert not wrong
+
+
+def test_third_party_packages_have_one_home() -> None:
+    wrong = [
+        f"{file} imports {name}"
+        for file, names in FILES.items()
+        for name in names
+        for top in [name.split(".")[0]]
+        if top in HOMES and not file.startswith(HOMES[top])
+    ]
+    assert not wrong
+
+
+def test_homes_are_lived_in() -> None:
+    used = {name.split(".")[0] for names in FILES.values() for name in names}
+    assert set(HOMES) <= used
+
+
+def test_native_runs_do_not_load_warp() -> None:
+    """`sim.build` imports the Warp backend inside a function, and only there."""
+    module_level = ast.parse((ROOT / "sim" / "build.py").read_text()).body
+    top = {node.module for node in module_level if isinstance(node, ast.ImportFrom)}
+    assert "mjstack.sim.mjwarp" not in top
+    assert "mjstack.sim.mjwarp" in FILES["sim/build.py"]

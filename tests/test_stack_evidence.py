@@ -1,0 +1,391 @@
+"""The batched evidence on the device against the plain checker, world by world."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from stack_checker import BLUE, RED, Outcome, check_world
+
+from mjstack.tasks.stack import Rule, StackEvidence, Verdict, describe_rules
+
+HAIR = 2e-6  # [m], [m/s], [rad]: a good deal more than float32 rounds at these sizes
+NUMBERS = ("xy_err", "dz", "rest_speed", "peak_speed", "rest_position", "rest_rotation")
+
+
+@dataclass
+class World:
+    """A recording to be altered."""
+
+    pose: np.ndarray
+    velocity: np.ndarray
+    step_count: int
+    rec: SimpleNamespace
+    overflow: int = 0
+    arm: float = 0.0
+
+    def frames(self, name: str) -> slice:
+        phase = next(p for p in self.rec.phases if p.name == name)
+        return slice(phase.start, phase.stop)
+
+    @property
+    def window(self) -> slice:
+        return slice(-self.rec.cfg.gate.acceptance.window, None)
+
+
+def feed(worlds: list[World], rec: SimpleNamespace, dtype: torch.dtype = torch.float64) -> Verdict:
+    """Plays recordings through the evidence; the state also has one coordinate of an arm."""
+    index = SimpleNamespace(cube_qpos=[1, 8], cube_qvel=[1, 7])
+    n = len(worlds)
+    evidence = StackEvidence(rec.cfg, index, rec.phases, n, torch.device("cpu"))
+    arm = np.array([[w.arm] for w in worlds])
+    pose = np.stack([w.pose.reshape(len(w.pose), 14) for w in worlds])
+    velocity = np.stack([w.velocity.reshape(len(w.velocity), 12) for w in worlds])
+    sim = SimpleNamespace(
+        nworld=n,
+        device=torch.device("cpu"),
+        step_count=torch.tensor([w.step_count for w in worlds]),
+        overflow=torch.tensor([w.overflow for w in worlds], dtype=torch.int32),
+    )
+    for frame in range(pose.shape[1]):
+        sim.qpos = torch.tensor(np.hstack([arm, pose[:, frame]]), dtype=dtype)
+        sim.qvel = torch.tensor(np.hstack([arm, velocity[:, frame]]), dtype=dtype)
+        evidence.update(sim)
+    return evidence.verdict(sim)
+
+
+def names_of(bits: int) -> set[str]:
+    return {rule.name for rule in Rule if bits & rule}
+
+
+def reference(w: World) -> Outcome:
+    return check_world(
+        w.pose,
+        w.velocity,
+        w.rec.cfg,
+        w.rec.phases,
+        step_count=w.step_count,
+        overflow=w.overflow != 0,
+        finite_elsewhere=math.isfinite(w.arm),
+    )
+
+
+def assert_same(verdict: Verdict, k: int, expected: Outcome) -> None:
+    assert names_of(int(verdict.failed[k])) == expected.failed
+    for name in NUMBERS:
+        assert float(getattr(verdict, name)[k]) == pytest.approx(getattr(expected, name), abs=1e-6, rel=1e-4, nan_ok=True), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_recorded_episodes(robot: str, recorded: Callable[[str], SimpleNamespace], dtype: torch.dtype) -> None:
+    rec = recorded(robot)
+    worlds = [World(rec.pose[k], rec.velocity[k], int(rec.step_count[k]), rec) for k in range(len(rec.pose))]
+    verdict = feed(worlds, rec, dtype)
+    for k, world in enumerate(worlds):
+        expected = reference(world)
+        assert expected.failed == set()
+        assert_same(verdict, k, expected)
+        assert_same(rec.verdict, k, expected)
+
+
+# Alterations of an accepted recording whose last frames have been made ideal, each with the rules it has to break.
+
+Case = tuple[Callable[[World], None], set[str]]
+CASES: dict[str, Case] = {}
+
+
+def case(*rules: str) -> Callable[[Callable[[World], None]], Callable[[World], None]]:
+    def register(alter: Callable[[World], None]) -> Callable[[World], None]:
+        CASES[alter.__name__] = (alter, set(rules))
+        return alter
+
+    return register
+
+
+@case()
+def untouched(w: World) -> None:
+    pass
+
+
+@case("STACKED")
+def red_teleported_after_release(w: World) -> None:
+    w.pose[w.frames("retreat").start :, RED, 0] += 0.06
+
+
+@case("STACKED")
+def fallen_off_in_the_last_frame_only(w: World) -> None:
+    w.pose[-1, RED, :2] = w.pose[-1, BLUE, :2] + [0.0153, 0.0]
+    w.pose[-2, RED, :2] = w.pose[-2, BLUE, :2] + [0.0147, 0.0]
+    w.pose[w.window, RED, 0] = np.where(np.arange(50) == 49, w.pose[-1, RED, 0], w.pose[-2, RED, 0])
+
+
+@case("STACKED")
+def stacked_late_by_one_frame(w: World) -> None:
+    first = len(w.pose) - w.rec.cfg.gate.acceptance.window
+    w.pose[w.window, RED, 0] += 0.0149
+    w.pose[first, RED, 0] += 0.0002
+
+
+@case()
+def not_stacked_just_before_the_window(w: World) -> None:
+    w.pose[: len(w.pose) - 50][-1, RED, 0] += 0.05
+
+
+@case("SUPPORTED", "STACKED")
+def blue_sunk_into_the_table(w: World) -> None:
+    w.pose[w.window, BLUE, 2] -= 0.012
+
+
+@case("SUPPORTED")
+def both_off_the_table_edge(w: World) -> None:
+    reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.cube_half
+    w.pose[w.window, :, 1] = w.rec.cfg.scene.table_center[1] + reach + HAIR
+
+
+@case()
+def both_at_the_table_edge(w: World) -> None:
+    reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.cube_half
+    w.pose[w.window, :, 1] = w.rec.cfg.scene.table_center[1] + reach - HAIR
+
+
+@case("SUPPORTED")
+def both_off_the_far_edge(w: World) -> None:
+    reach = w.rec.cfg.scene.table_half[0] - w.rec.cfg.scene.cube_half
+    w.pose[w.window, :, 0] = w.rec.cfg.scene.table_center[0] - reach - HAIR
+
+
+@case("SUPPORTED")
+def blue_tilted_off_its_support(w: World) -> None:
+    w.pose[w.window, BLUE, 3:] = [math.cos(0.2), math.sin(0.2), 0.0, 0.0]
+
+
+@case("REST_POSITION")
+def slow_drift(w: World) -> None:
+    w.pose[w.window, :, 1] += np.linspace(0.0, 0.0052, 50)[:, None]
+
+
+@case("REST_POSITION")
+def drift_there_and_back(w: World) -> None:
+    w.pose[w.window, :, 1] += (0.0026 * np.sin(np.linspace(0.0, 2.0 * np.pi, 50)))[:, None]
+
+
+@case("REST_ROTATION")
+def slow_turn_of_blue(w: World) -> None:
+    half = 0.5 * np.radians(np.linspace(0.0, 3.1, 50))
+    w.pose[w.window, BLUE, 3:] = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
+
+
+@case("REST_ROTATION")
+def turn_between_the_middle_and_the_ends(w: World) -> None:
+    half = 0.5 * np.radians(1.6 * np.sin(np.linspace(0.0, 2.0 * np.pi, 50)))
+    w.pose[w.window, RED, 3:] = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
+
+
+@case()
+def quaternion_of_either_sign(w: World) -> None:
+    w.pose[::2, :, 3:] *= -1.0
+
+
+@case("REST_SPEED")
+def jitter_in_place(w: World) -> None:
+    w.velocity[w.window, RED, 0] = 0.06 * (-1.0) ** np.arange(50)
+
+
+@case("REST_SPEED")
+def spin_in_place(w: World) -> None:
+    w.velocity[w.window, BLUE, 5] = 0.0502 / (math.sqrt(3.0) * 0.022)
+
+
+@case()
+def one_fast_frame(w: World) -> None:
+    w.velocity[-20, RED, 0] = 0.3
+
+
+@case("LIFT", "CARRY")
+def never_lifted(w: World) -> None:
+    w.pose[w.frames("lift_red").start : w.frames("above_blue").stop, RED, 2] = w.pose[0, RED, 2]
+
+
+@case("LIFT", "CARRY")
+def airborne_runs_of_nine_frames(w: World) -> None:
+    frames = range(w.frames("lift_red").start, w.frames("above_blue").stop)
+    for k, frame in enumerate(frames):
+        if k % 10 == 0:
+            w.pose[frame, RED, 2] = w.pose[0, RED, 2]
+
+
+@case("CARRY")
+def dragged_in_above_blue(w: World) -> None:
+    w.pose[w.frames("above_blue"), RED, 2] = w.pose[0, RED, 2]
+
+
+@case("CARRY")
+def carried_in_hops_of_nine_frames(w: World) -> None:
+    for k, frame in enumerate(range(w.frames("above_blue").start, w.frames("above_blue").stop)):
+        if k % 10 == 0:
+            w.pose[frame, RED, 2] = w.pose[0, RED, 2]
+
+
+@case("CARRY")
+def moved_between_two_flights_only(w: World) -> None:
+    part = w.frames("above_blue")
+    middle = (part.start + part.stop) // 2
+    w.pose[part.start : middle, RED, :2] = w.pose[0, RED, :2]
+    w.pose[middle, RED, 2] = w.pose[0, RED, 2]
+    w.pose[middle : part.stop, RED, :2] = w.pose[-1, RED, :2]
+
+
+@case("FINITE")
+def not_a_number_in_one_frame(w: World) -> None:
+    w.velocity[100, RED, 3] = math.nan
+
+
+@case("FINITE", "LIFT", "CARRY", "STACKED", "REST_SPEED", "REST_POSITION", "REST_ROTATION")
+def red_not_a_number_from_the_grasp(w: World) -> None:
+    w.pose[w.frames("grasp_red").start :, RED] = math.nan
+    w.velocity[w.frames("grasp_red").start :, RED] = math.nan
+
+
+@case("FINITE", "REST_SPEED")
+def infinite_velocity_at_the_end(w: World) -> None:
+    w.velocity[-1, BLUE, 0] = math.inf
+
+
+@case("FINITE")
+def arm_not_a_number(w: World) -> None:
+    w.arm = math.nan
+
+
+@case("STEPS")
+def one_step_short(w: World) -> None:
+    w.step_count -= 1
+
+
+@case("STEPS")
+def one_step_long(w: World) -> None:
+    w.step_count += 1
+
+
+@case("OVERFLOW")
+def rows_lost(w: World) -> None:
+    w.overflow = 1
+
+
+def hair(name: str, broken: str, amount: Callable[[World, float], None]) -> None:
+    """Registers both sides of a threshold."""
+    CASES[f"{name}_inside"] = (lambda w: amount(w, -HAIR), set())
+    CASES[f"{name}_outside"] = (lambda w: amount(w, HAIR), {broken})
+
+
+def _xy(w: World, by: float) -> None:
+    w.pose[w.window, RED, 0] = w.pose[w.window, BLUE, 0] + w.rec.cfg.gate.acceptance.xy_err + by
+
+
+def _dz_min(w: World, by: float) -> None:
+    w.pose[w.window, RED, 2] = w.pose[w.window, BLUE, 2] + w.rec.cfg.gate.acceptance.dz_min - by
+
+
+def _dz_max(w: World, by: float) -> None:
+    w.pose[w.window, RED, 2] = w.pose[w.window, BLUE, 2] + w.rec.cfg.gate.acceptance.dz_max + by
+
+
+def _gap_above(w: World, by: float) -> None:
+    w.pose[w.window, :, 2] += w.rec.cfg.gate.acceptance.support_gap + by
+
+
+def _gap_below(w: World, by: float) -> None:
+    w.pose[w.window, :, 2] -= w.rec.cfg.gate.acceptance.support_gap + by
+
+
+def _speed(w: World, by: float) -> None:
+    w.velocity[w.window, RED, 1] = w.rec.cfg.gate.acceptance.rest_speed + by
+
+
+def _position(w: World, by: float) -> None:
+    w.pose[-30, :, 1] += w.rec.cfg.gate.acceptance.rest_position + by
+
+
+def _rotation(w: World, by: float) -> None:
+    half = 0.5 * (math.radians(w.rec.cfg.gate.acceptance.rest_rotation_deg) + by)
+    w.pose[-30, RED, 3:] = [math.cos(half), 0.0, 0.0, math.sin(half)]
+
+
+def _height(w: World, by: float) -> None:
+    top = w.rec.cfg.scene.table_center[2] + w.rec.cfg.scene.table_half[2]
+    flight = slice(w.frames("lift_red").start, w.frames("above_blue").stop)
+    w.pose[flight, RED, 3:] = [1.0, 0.0, 0.0, 0.0]
+    w.pose[flight, RED, 2] = top + 0.022 + w.rec.cfg.gate.acceptance.airborne_height - by
+
+
+def _carry_distance(w: World, by: float) -> None:
+    w.pose[w.frames("above_blue"), RED, :2] = w.pose[0, RED, :2]
+    w.pose[w.frames("above_blue").stop - 1, RED, 0] += w.rec.cfg.gate.acceptance.carry_distance - by
+
+
+hair("xy_err", "STACKED", _xy)
+hair("dz_min", "STACKED", _dz_min)
+hair("dz_max", "STACKED", _dz_max)
+hair("gap_above", "SUPPORTED", _gap_above)
+hair("gap_below", "SUPPORTED", _gap_below)
+hair("rest_speed", "REST_SPEED", _speed)
+hair("rest_position", "REST_POSITION", _position)
+hair("rest_rotation", "REST_ROTATION", _rotation)
+hair("carry_distance", "CARRY", _carry_distance)
+CASES["airborne_height_inside"] = (lambda w: _height(w, -HAIR), set())
+CASES["airborne_height_outside"] = (lambda w: _height(w, HAIR), {"LIFT", "CARRY"})
+
+
+@pytest.fixture(scope="module")
+def altered(recorded: Callable[[str], SimpleNamespace]) -> dict[str, tuple[Verdict, int, World]]:
+    """Every case as one world of one batch."""
+    rec = recorded("so101")
+    worlds = []
+    for alter, _ in CASES.values():
+        world = World(rec.pose[0].copy(), rec.velocity[0].copy(), int(rec.step_count[0]), rec)
+        _make_ideal(world)
+        alter(world)
+        worlds.append(world)
+    verdict = feed(worlds, rec)
+    return {name: (verdict, k, worlds[k]) for k, name in enumerate(CASES)}
+
+
+def _make_ideal(w: World) -> None:
+    """The last frames at rest, one cube exactly on the other."""
+    top = w.rec.cfg.scene.table_center[2] + w.rec.cfg.scene.table_half[2]
+    xy = w.pose[-1, BLUE, :2].copy()
+    w.pose[w.window, :, 3:] = [1.0, 0.0, 0.0, 0.0]
+    w.pose[w.window, RED, :3], w.pose[w.window, BLUE, :3] = [*xy, top + 0.066], [*xy, top + 0.022]
+    w.velocity[w.window] = 0.0
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_altered_recording(name: str, altered: dict[str, tuple[Verdict, int, World]]) -> None:
+    verdict, k, world = altered[name]
+    assert names_of(int(verdict.failed[k])) == CASES[name][1]
+    assert_same(verdict, k, reference(world))
+
+
+def test_episode_cut_short_fails_whatever_came_before(recorded: Callable[[str], SimpleNamespace]) -> None:
+    rec = recorded("so101")
+    world = World(rec.pose[0][:-1], rec.velocity[0][:-1], int(rec.step_count[0]), rec)
+    failed = names_of(int(feed([world], rec).failed[0]))
+    assert {"STEPS", "STACKED", "SUPPORTED"} <= failed
+
+
+def test_iteration_limits_are_no_overflow(recorded: Callable[[str], SimpleNamespace]) -> None:
+    """MJWarp's bits 9 and 10 say that the solver stopped early, not that physics was dropped."""
+    rec = recorded("so101")
+    world = World(rec.pose[0], rec.velocity[0], int(rec.step_count[0]), rec, overflow=(1 << 9) | (1 << 10))
+    assert int(feed([world], rec).failed[0]) == 0
+
+
+def test_every_rule_has_words_and_a_case() -> None:
+    assert {rule.name for rule in Rule} == set().union(*(rules for _, rules in CASES.values()))
+    for rule in Rule:
+        assert describe_rules(int(rule))
+    assert describe_rules(int(Rule.LIFT | Rule.STACKED)).count(",") == 1
