@@ -4,25 +4,31 @@ ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
+READY_DEV := $(VENV)/.installed-dev
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
 .PHONY: run test setup clean
 
 run: $(READY)
-	$(BIN)/python scripts/run.py robot=so101 nworld=64 $(ARGS)
+	$(BIN)/python scripts/run.py robot=so101 nworld=32 $(ARGS)
 
-test: $(READY)
+test: $(READY_DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest
 
-setup: $(READY)
+setup: $(READY_DEV)
 
 # Installed again only when what is to be installed changes.
 $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(PIP) torch
+	$(PIP) --editable '.[video]'
+	touch $@
+
+$(READY_DEV): $(READY)
+	$(PIP) --editable '.[dev]'
 	touch $@
 
 clean:

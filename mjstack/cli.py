@@ -25,6 +25,7 @@ from mjstack.config.schema import Config
 from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, to_config
 from mjstack.errors import MjstackError
 from mjstack.job import JobOutcome, check_machine, run_job
+from mjstack.report.markdown import escape_cell
 from mjstack.report.record import Status
 
 INTERRUPTED = 130
@@ -171,7 +172,7 @@ def _print_sweep(outcomes: list[JobOutcome]) -> None:
         cells = [f"{by_name[name].status.value}: {by_name[name].reason}" if name in by_name else "not run" for name in names]
         row = [str(number), " ".join(outcome.overrides), *cells, outcome.status.value]
         table.add_row(*(escape(cell) for cell in row))
-        lines.append(f"| {' | '.join(row)} |")
+        lines.append(f"| {' | '.join(escape_cell(cell) for cell in row)} |")
     Console().print(table)
     sweep_folder = os.path.commonpath([str(outcome.folder) for outcome in outcomes])
     if len(outcomes) > 1:

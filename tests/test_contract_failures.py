@@ -46,7 +46,7 @@ def test_native(robot: str, stage: Callable[[str], GateContext], make_sim: Calla
         if frame == 0:  # world 2 stalls: its steps are counted, and it stays where it is
             kept.update(qpos=sim.qpos[2].clone(), qvel=sim.qvel[2].clone())
         sim.qpos[2], sim.qvel[2] = kept["qpos"], kept["qvel"]
-        if frame == 597:  # late: native MuJoCo takes some hundred times longer over a world that is not finite
+        if frame == 300:
             sim.qvel[3, context.index.cube_qvel[1]] = math.nan
             sim.step_count[5] -= 1
 

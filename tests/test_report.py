@@ -100,7 +100,6 @@ def test_markdown_has_every_gate_and_skip(tmp_path: Path) -> None:
     assert text.rstrip().endswith("- throughput_cuda: no CUDA device")
 
 
-@pytest.mark.xfail(strict=True, reason="report/markdown.py puts reasons into table cells unescaped")
 def test_table_cells_survive_a_bar_in_a_reason(tmp_path: Path) -> None:
     bad = GateResult(name="baseline", status=Status.failed, reason="a | b")
     Report(provenance={}, gates=[bad]).write(tmp_path)

@@ -235,8 +235,10 @@ def test_mesh_free_and_standalone(robot: str, tmp_path: Path) -> None:
 def test_plausible_mass(robot: str) -> None:
     model = built_in(robot)
     low, high = MASS_BOUNDS[robot]
-    assert np.isfinite(model.body_mass).all() and np.isfinite(model.body_inertia).all()
-    assert (model.body_mass[1:] > 0.005).all() and (model.body_inertia[1:] > 0).all()
+    assert np.isfinite(model.body_mass).all()
+    assert np.isfinite(model.body_inertia).all()
+    assert (model.body_mass[1:] > 0.005).all()
+    assert (model.body_inertia[1:] > 0).all()
     assert low < model.body_mass.sum() < high
 
 

@@ -9,7 +9,7 @@ def to_markdown(report: Report) -> str:
     """Summary table, pictures, then every gate with thresholds and metrics."""
     lines = [f"# mjstack run: {report.status.value}", ""]
     lines += ["| gate | status | seconds | what it says |", "| --- | --- | ---: | --- |"]
-    lines += [f"| {g.name} | {g.status.value} | {g.seconds:.1f} | {g.reason} |" for g in report.gates]
+    lines += [f"| {g.name} | {g.status.value} | {g.seconds:.1f} | {escape_cell(g.reason)} |" for g in report.gates]
     for picture in report.pictures:
         lines += ["", f"![{picture}]({picture})"]
     for gate in report.gates:
@@ -35,6 +35,11 @@ def format_value(value: Value) -> str:
     return "" if value is None else str(value)
 
 
+def escape_cell(text: str) -> str:
+    """Text as a cell of a Markdown table."""
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
 def headline(gate: GateResult) -> str:
     """One line about a gate, for the terminal."""
     return gate.reason or "ok"
@@ -43,5 +48,5 @@ def headline(gate: GateResult) -> str:
 def _table(title: str, values: dict[str, Value]) -> list[str]:
     if not values:
         return []
-    rows = [f"| {name} | {format_value(value)} |" for name, value in values.items()]
+    rows = [f"| {name} | {escape_cell(format_value(value))} |" for name, value in values.items()]
     return [f"| {title} | value |", "| --- | ---: |", *rows, ""]

@@ -23,7 +23,8 @@ class NativeSimulation:
     """`Simulation` on native MuJoCo, float64 on the CPU.
 
     A world's whole state, warm start included, is one row that goes into a thread's MjData before its substeps and comes
-    back after them. MuJoCo's automatic reset of a diverged world is switched off, because it would hide the divergence.
+    back after them. MuJoCo's automatic reset of a diverged world is switched off, because it would hide the divergence; a
+    world whose state is not finite is not stepped any more, and its derived arrays are NaN.
     """
 
     backend = "native"
@@ -52,6 +53,8 @@ class NativeSimulation:
         self.qpos = torch.from_numpy(self._state[:, q : q + m.nq])
         self.qvel = torch.from_numpy(self._state[:, v : v + m.nv])
         self.ctrl = torch.from_numpy(self._state[:, self._state.shape[1] - m.nu :])
+        self._physics = slice(q, v + m.nv)
+        self._finite = np.ones(nworld, dtype=bool)
         self._initial = self._state[0].copy()
         mujoco.mj_getState(m, self._datas[0], self._initial, _SPEC)
 
@@ -113,6 +116,8 @@ class NativeSimulation:
             self._pool.shutdown(cancel_futures=True)
 
     def _run(self, n: int) -> None:
+        # A diverged world stays as it is: MuJoCo would spend every solver iteration on its NaN, and gain nothing.
+        self._finite = np.isfinite(self._state[:, self._physics]).all(axis=1)
         if self._pool is None:
             self._run_worlds(self._datas[0], range(self.nworld), n)
             return
@@ -132,6 +137,10 @@ class NativeSimulation:
         site_xpos, qfrc_actuator = self._derived["site_xpos"], self._derived["qfrc_actuator"]
         warning = data.warning.number
         for w in worlds:
+            if not self._finite[w]:
+                for derived in (xpos, xquat, site_xpos, qfrc_actuator):
+                    derived[w] = np.nan
+                continue
             mujoco.mj_setState(m, data, state[w], _SPEC)
             data.maxuse_con = data.maxuse_efc = 0
             warning[:] = 0

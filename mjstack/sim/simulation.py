@@ -53,7 +53,8 @@ class Simulation(Protocol):
         contact_count: Contacts found by the last step or forward, shape ``(nworld,)``, int32.
         constraint_count: Constraint rows likewise, shape ``(nworld,)``, int32.
         step_count: Physics steps since the world's last reset, shape ``(nworld,)``, int64.
-        overflow: Bits of `Overflow`, sticky until the world is reset, shape ``(nworld,)``, int32.
+        overflow: Bits of `Overflow` raised by `step`, sticky until the world is reset, shape ``(nworld,)``, int32. `forward`
+            alone raises none on MJWarp.
         peak_contacts: Largest contact_count over all substeps since the world's last reset, shape ``(nworld,)``, int32.
         peak_constraints: Largest constraint_count likewise, shape ``(nworld,)``, int32.
     """
