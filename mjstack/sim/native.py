@@ -54,7 +54,7 @@ class NativeSimulation:
         self.qvel = torch.from_numpy(self._state[:, v : v + m.nv])
         self.ctrl = torch.from_numpy(self._state[:, self._state.shape[1] - m.nu :])
         self._physics = slice(q, v + m.nv)
-        self._finite = np.ones(nworld, dtype=bool)
+        self._finite: np.ndarray = np.ones(nworld, dtype=bool)
         self._initial = self._state[0].copy()
         mujoco.mj_getState(m, self._datas[0], self._initial, _SPEC)
 
@@ -117,7 +117,7 @@ class NativeSimulation:
 
     def _run(self, n: int) -> None:
         # A diverged world stays as it is: MuJoCo would spend every solver iteration on its NaN, and gain nothing.
-        self._finite = np.isfinite(self._state[:, self._physics]).all(axis=1)
+        self._finite[:] = np.isfinite(self._state[:, self._physics]).all(axis=1)
         if self._pool is None:
             self._run_worlds(self._datas[0], range(self.nworld), n)
             return
