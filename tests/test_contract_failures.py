@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from comparison import assert_same_run
 
 from mjstack.gates import gate as gate_module
 from mjstack.gates.batch import run_batch
@@ -77,7 +78,7 @@ def test_mjwarp(stage: Callable[[str], GateContext], make_sim: Callable[..., Sim
     assert {"FINITE", "STACKED"} <= found[2]
 
 
-def test_nan_leaves_the_other_worlds_bit_identical(
+def test_nan_leaves_the_other_worlds_alone(
     backend: str, stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]
 ) -> None:
     context = stage("so101")
@@ -92,7 +93,7 @@ def test_nan_leaves_the_other_worlds_bit_identical(
         final.append((sim.qpos.clone(), sim.qvel.clone()))
         assert bool(torch.isfinite(torch.cat((sim.qpos[1], sim.qvel[1]))).all()) is not poison
     for clean, dirty in zip(*final, strict=True):
-        assert torch.equal(clean[[0, 2]], dirty[[0, 2]])
+        assert_same_run(clean[[0, 2]], dirty[[0, 2]], backend)
 
 
 def crowd(context: GateContext, sim: Simulation, world: int) -> None:
