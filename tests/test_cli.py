@@ -141,7 +141,13 @@ def in_the_batch(folder: Path) -> Iterator[Callable[[], subprocess.Popen]]:
     def begin() -> subprocess.Popen:
         args = ["gates=[baseline,batch]", "nworld=400", "sim=native", "hydra.run.dir=out"]
         process = subprocess.Popen(
-            [sys.executable, SCRIPT, *args], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            [sys.executable, SCRIPT, *args],
+            cwd=folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            # A runner in the background may have been started with Ctrl-C ignored, and Python would take that over.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         processes.append(process)
         path, until = folder / "out" / "report.json", time.monotonic() + 60
