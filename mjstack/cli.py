@@ -15,20 +15,21 @@ from pathlib import Path
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import OverrideParseException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from mjstack.config.schema import Config
-from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, to_config
+from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, own_hydra, to_config
 from mjstack.errors import MjstackError
 from mjstack.job import JobOutcome, check_machine, run_job
 from mjstack.report.markdown import escape_cell
 from mjstack.report.record import Status
 
 INTERRUPTED = 130
+_OTHER_CONFIG = {"--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp"}
 _FLAGS_WITHOUT_RUN = {"--help", "-h", "--hydra-help", "--info", "-i", "--version", "--shell-completion", "-sc"}
 
 
@@ -55,6 +56,8 @@ def run(args: list[str]) -> int:
     except MjstackError as error:
         errors.print(f"mjstack: {error}")
         return error.exit_code
+    except KeyboardInterrupt:
+        return INTERRUPTED
     outcomes: list[JobOutcome] = []
     try:
         status = _run_hydra(args, outcomes)
@@ -88,22 +91,13 @@ def _run_hydra(args: list[str], outcomes: list[JobOutcome]) -> int:
 
 def _overrides(args: list[str]) -> list[str]:
     """The key=value arguments; Hydra's own flags and their values are left out."""
-    takes_value = {
-        "--cfg",
-        "-c",
-        "--package",
-        "-p",
-        "--config-dir",
-        "-cd",
-        "--config-name",
-        "-cn",
-        "--config-path",
-        "-cp",
-    }
+    takes_value = {"--cfg", "-c", "--package", "-p"}
     out, skip = [], False
     for arg in args:
         if skip:
             skip = False
+        elif arg.partition("=")[0] in _OTHER_CONFIG:
+            raise CompositionError(f"argument '{arg}': mjstack runs its own configuration. Change it with key=value overrides.")
         elif arg in takes_value:
             skip = True
         elif arg.startswith("-"):
@@ -123,7 +117,12 @@ def _expand(overrides: list[str]) -> list[list[str]]:
         parsed = OverridesParser.create().parse_overrides(overrides)
     except OverrideParseException as error:
         raise CompositionError(f"override cannot be read: {str(error).splitlines()[0]}.") from error
-    return [list(job) for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
+    try:
+        return [list(job) for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
+    except HydraException as error:
+        raise CompositionError(
+            f"this sweep cannot be expanded: {str(error).splitlines()[0]}. List its values, such as robot=so101,rebot."
+        ) from error
 
 
 def _is_hydra(override: str) -> bool:
@@ -132,23 +131,23 @@ def _is_hydra(override: str) -> bool:
 
 def _output_folder(overrides: list[str], sweep: bool) -> Path:
     """The folder Hydra would make for these arguments, without making it."""
-    from hydra import compose, initialize_config_module
+    from hydra import compose
 
-    with initialize_config_module(config_module=CONFIG_MODULE, version_base="1.3"):
+    with own_hydra():
         # Hydra's own part is composed alone: the rest of the configuration has been checked by now.
         try:
             cfg = compose(CONFIG_NAME, overrides=[o for o in overrides if _is_hydra(o)], return_hydra_config=True)
+            return Path(cfg.hydra.sweep.dir if sweep else cfg.hydra.run.dir)
         except Exception as error:
-            raise CompositionError(str(error).splitlines()[0]) from error
-        return Path(cfg.hydra.sweep.dir if sweep else cfg.hydra.run.dir)
+            raise CompositionError(f"hydra's own settings cannot be used: {str(error).splitlines()[0]}.") from error
 
 
 def check_writable(folder: Path) -> None:
     """Checks that a folder can be made and written, by a file that is gone at once."""
     existing = folder.absolute()
-    while not existing.exists():
-        existing = existing.parent
     try:
+        while not existing.exists():
+            existing = existing.parent
         if not existing.is_dir():
             raise NotADirectoryError(20, "Not a directory")
         with tempfile.TemporaryFile(dir=existing):

@@ -83,7 +83,8 @@ def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
     outcome = JobOutcome(status=Status.interrupted, folder=folder, overrides=overrides)
     try:
         console.print(
-            f"[bold]{cfg.robot.title}[/], task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)} -> {folder}",
+            f"[bold]{cfg.robot.title}[/], task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)} -> "
+            f"{escape(str(folder))}",
             soft_wrap=True,
         )
         report = Report(provenance=_provenance(cfg, context))
@@ -94,6 +95,7 @@ def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
             run_gates(context, bar.start, lambda result: _record(report, result, folder, bar))
         report.conclude()
         outcome.status = report.status
+        report.write(folder)
         _draw(context, report, folder, console)
         report.write(folder)
     except KeyboardInterrupt:
@@ -108,7 +110,7 @@ def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
     except MjstackError as error:
         outcome.status = Status.failed
         log.error("%s", error)
-        Console(stderr=True, soft_wrap=True).print(f"mjstack: {error}")
+        Console(stderr=True, soft_wrap=True).print(f"mjstack: {escape(str(error))}")
     if report is not None:
         outcome.gates = report.gates
         _print_summary(console, report, folder)
@@ -152,9 +154,9 @@ def _draw(context: GateContext, report: Report, folder: Path, console: Console) 
         if cfg.video:
             save_video(folder / "episode.mp4", context.visual_model, episode.qpos, cfg.timing.frame_dt)
             console.print(f"video: {folder}/episode.mp4", soft_wrap=True)
-    except MjstackError as error:
-        log.warning("%s", error)
-        console.print(f"no picture: {error}", soft_wrap=True)
+    except Exception as error:  # drawing must not take back what the gates found
+        log.exception("drawing failed")
+        console.print(f"no picture: {escape(str(error) or type(error).__name__)}", soft_wrap=True)
 
 
 def _viewer(context: GateContext) -> FrameHook:
@@ -187,10 +189,10 @@ def _print_summary(console: Console, report: Report, folder: Path) -> None:
         color = _COLOR[gate.status]
         table.add_row(gate.name, f"[{color}]{gate.status.value}[/]", f"{gate.seconds:.1f}", escape(headline(gate)))
     console.print(table)
-    console.print(f"report: {folder}/report.md", soft_wrap=True)
+    console.print(f"report: {escape(str(folder))}/report.md", soft_wrap=True)
     for gate in report.gates:
         if gate.status is Status.skipped:
-            console.print(f"skipped: {gate.name}: {gate.reason}", soft_wrap=True)
+            console.print(f"skipped: {gate.name}: {escape(gate.reason)}", soft_wrap=True)
     console.print(f"status: [{_COLOR[report.status]}]{report.status.value}[/]")
 
 

@@ -52,6 +52,21 @@ BAD = [
     ["-m", "robot=so101,so100", "gates=[baseline]"],
     ["-m", "nworld=1,0"],
     ["video=true", "gates=[batch]"],
+    ["+bogus=1"],
+    ["++sim.nworlds=3"],
+    ["gates=baseline"],
+    ["task.control_hz=0"],
+    ["hydra.run.dir=${foo}"],
+    ["robot.gripper_open=[9.0]"],
+    ["robot.aperture_sites=[x,y]"],
+    ["robot.locked.wrist_roll=nan"],
+    ["scene.red_xy=[nan,0]"],
+    ["scene.red_xy=[0.48,-0.2]"],
+    ["scene.table_half=[-1,1,1]"],
+    ["reset.cube_xy=0.5"],
+    ["gate.parity.step1.qpos=nan"],
+    ["-cn", "foo"],
+    ["-m", "robot=glob(*)"],
 ]
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import cast
 
 from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.singleton import Singleton
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
@@ -47,18 +49,28 @@ def load_config(overrides: Sequence[str] = ()) -> Config:
 
 def compose_overrides(overrides: Sequence[str]) -> DictConfig:
     """Composes without validating values; errors are one line each."""
-    if GlobalHydra.instance().is_initialized():
+    with own_hydra():
         return _compose(overrides)
-    with initialize_config_module(config_module=CONFIG_MODULE, version_base="1.3"):
-        return _compose(overrides)
+
+
+@contextmanager
+def own_hydra() -> Iterator[None]:
+    """Composes from mjstack's files, also inside somebody else's Hydra application, whose state comes back afterwards."""
+    outer = Singleton.get_state()
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_module(config_module=CONFIG_MODULE, version_base="1.3"):
+            yield
+    finally:
+        Singleton.set_state(outer)
 
 
 def to_config(cfg: DictConfig) -> Config:
     """Turns a composed configuration into dataclasses and checks their values."""
     try:
         config = cast(Config, OmegaConf.to_object(cfg))
-    except OmegaConfBaseException as error:
-        raise _translate(error, cfg) from error
+    except (OmegaConfBaseException, AttributeError, TypeError) as error:
+        raise _translate(error) from error
     validate(config)
     return config
 
@@ -67,10 +79,10 @@ def _compose(overrides: Sequence[str]) -> DictConfig:
     try:
         return compose(CONFIG_NAME, overrides=list(overrides))
     except (HydraException, OmegaConfBaseException) as error:
-        raise _translate(error, None) from error
+        raise _translate(error) from error
 
 
-def _translate(error: Exception, cfg: DictConfig | None) -> MjstackError:
+def _translate(error: Exception) -> MjstackError:
     """One line from Hydra's and OmegaConf's chained, multi-line errors."""
     if isinstance(error, MissingConfigException) and error.options is not None and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
@@ -83,6 +95,8 @@ def _translate(error: Exception, cfg: DictConfig | None) -> MjstackError:
     converted = re.search(r"Value '(.*)' of type '\w+' could not be converted to (\w+)", text)
     if converted and key:
         return CompositionError(f"{key}={converted.group(1)}: expected {_KINDS.get(converted.group(2), converted.group(2))}.")
+    if key and "not a ListConfig" in text:
+        return CompositionError(f"{key}: expected a list, such as {key}=[...].")
     if "Ambiguous value for argument" in text:
         return CompositionError(f"{text.rstrip('.')}: several values are a sweep. Add -m, or give one value.")
     match = re.search(r"Could not override '([^']+)'\. No match in the defaults list", str(error))
@@ -108,16 +122,17 @@ def _translate(error: Exception, cfg: DictConfig | None) -> MjstackError:
 
 
 def _unknown_key(error: Exception, key: str) -> MjstackError:
-    match = re.search(r"Could not override '([^']+)'", str(error))
+    match = re.search(r"Could not override '([^']+)'", str(error)) or re.search(r"(?:attribute|argument) '(\w+)'", str(error))
     key = match.group(1) if match else key
-    base = OmegaConf.to_container(compose(CONFIG_NAME), resolve=False) if GlobalHydra.instance().is_initialized() else {}
+    with own_hydra():
+        base = OmegaConf.to_container(compose(CONFIG_NAME), resolve=False)
     keys = _flat_keys(base)
     leaf = key.rpartition(".")[2]
     same_leaf = [k for k in keys if k.rpartition(".")[2] == leaf]
     if same_leaf:
         return CompositionError(f"configuration key '{key}' does not exist. Did you mean '{same_leaf[0]}'?")
     siblings = [k for k in keys if k.rpartition(".")[0] == key.rpartition(".")[0]]
-    pool = siblings + [k for k in keys if "." not in k]
+    pool = sorted({*siblings, *(k for k in keys if "." not in k)})
     return CompositionError(f"configuration key '{key}' does not exist. {suggest(key, _nearest_first(leaf, pool))}")
 
 

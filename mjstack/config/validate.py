@@ -10,6 +10,7 @@ from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput")
 ANCHORS = ("red", "blue", "on_blue")
+PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
 
 
@@ -38,6 +39,7 @@ def validate(cfg: Config) -> None:
 def _timing(cfg: Config) -> None:
     _positive("timing.physics_dt", cfg.timing.physics_dt, "s")
     _positive_int("timing.substeps", cfg.timing.substeps)
+    _positive("task.control_hz", cfg.task.control_hz, "Hz")
     wanted = 1.0 / cfg.task.control_hz
     if not math.isclose(cfg.timing.frame_dt, wanted, rel_tol=1e-9):
         raise ConfigError(
@@ -76,6 +78,7 @@ def _robot(cfg: Config) -> None:
                 raise UnknownName(f"{key}: arm joint", name, robot.arm_joints)
     if set(robot.ik_joints) & set(robot.locked):
         raise ConfigError("robot.locked", list(robot.locked), "joints that robot.ik_joints does not move")
+    _length("robot.locked", list(robot.locked.values()), len(robot.locked))
     if robot.arm_force_limit is not None:
         _positive("robot.arm_force_limit", robot.arm_force_limit, "N m")
     _positive("robot.approach_height", robot.approach_height, "m")
@@ -87,27 +90,30 @@ def _scene(cfg: Config) -> None:
     scene = cfg.scene
     for key, size in (("table_center", 3), ("table_half", 3), ("table_friction", 3), ("cube_friction", 3)):
         _length(f"scene.{key}", getattr(scene, key), size)
+    _positive("scene.cube_half", scene.cube_half, "m")
+    _positive("scene.cube_mass", scene.cube_mass, "kg")
+    for key in ("table_half", "table_friction", "cube_friction"):
+        for number in getattr(scene, key):
+            _positive(f"scene.{key}", number)
+    for name in ("cube_xy", "cube_yaw"):
+        value = getattr(cfg.reset, name)
+        if not (math.isfinite(value) and value >= 0.0):
+            raise ConfigError(f"reset.{name}", value, "a number that is not negative")
     for key in ("red_xy", "blue_xy"):
         value = getattr(scene, key)
         _length(f"scene.{key}", value, 2)
         for axis in (0, 1):
             reach = scene.table_half[axis] - scene.cube_half
-            if abs(value[axis] - scene.table_center[axis]) > reach:
+            if not abs(value[axis] - scene.table_center[axis]) + cfg.reset.cube_xy <= reach:
                 low, high = scene.table_center[axis] - reach, scene.table_center[axis] + reach
                 raise ConfigError(
                     f"scene.{key}",
                     value,
-                    f"{'xy'[axis]} within [{low:.3f}, {high:.3f}] m, so that the cube is on the table",
+                    f"{'xy'[axis]} within [{low:.3f}, {high:.3f}] m less reset.cube_xy, so that the cube is on the table",
                 )
-    _positive("scene.cube_half", scene.cube_half, "m")
-    _positive("scene.cube_mass", scene.cube_mass, "kg")
     apart = math.dist(scene.red_xy, scene.blue_xy)
-    if apart < 2.0 * math.sqrt(2.0) * scene.cube_half:
+    if not apart >= 2.0 * math.sqrt(2.0) * (scene.cube_half + cfg.reset.cube_xy):
         raise ConfigError("scene.red_xy", scene.red_xy, f"a cube that does not touch the blue one at {scene.blue_xy}")
-    for name in ("cube_xy", "cube_yaw"):
-        value = getattr(cfg.reset, name)
-        if not (math.isfinite(value) and value >= 0.0):
-            raise ConfigError(f"reset.{name}", value, "a number that is not negative")
 
 
 def _controller(cfg: Config) -> None:
@@ -118,6 +124,9 @@ def _controller(cfg: Config) -> None:
         if phase.gripper not in ("open", "closed"):
             raise ConfigError(f"{key}.gripper", phase.gripper, "open or closed")
         _positive(f"{key}.seconds", phase.seconds, "s")
+        for part in ("h_scale", "offset"):
+            if not math.isfinite(getattr(phase, part)):
+                raise ConfigError(f"{key}.{part}", getattr(phase, part), "a finite number")
         frames = phase.seconds / cfg.timing.frame_dt
         if abs(frames - round(frames)) > 1e-6:
             raise ConfigError(f"{key}.seconds", phase.seconds, f"a multiple of the frame, {cfg.timing.frame_dt:g} s")
@@ -141,6 +150,20 @@ def _gates(cfg: Config) -> None:
     frames = sum(round(phase.seconds / cfg.timing.frame_dt) for phase in phases.values())
     if not 2 <= gate.acceptance.window <= frames:
         raise ConfigError("gate.acceptance.window", gate.acceptance.window, f"2 to {frames} frames (the episode)")
+    for name in ("lift_frames", "carry_frames"):
+        _positive_int(f"gate.acceptance.{name}", getattr(gate.acceptance, name))
+    for name in ("carry_distance", "xy_err", "support_gap", "rest_speed", "rest_position", "rest_rotation_deg"):
+        _positive(f"gate.acceptance.{name}", getattr(gate.acceptance, name))
+    if gate.batch.failed_worlds < 0:
+        raise ConfigError("gate.batch.failed_worlds", gate.batch.failed_worlds, "an integer of at least 0")
+    for name in ("step1", "step50"):
+        limits = getattr(gate.parity, name)
+        for field in limits:
+            if field not in PARITY_FIELDS:
+                raise UnknownName(f"gate.parity.{name}: field", field, PARITY_FIELDS)
+        for field in PARITY_FIELDS:
+            if not (field in limits and math.isfinite(limits[field]) and limits[field] >= 0.0):
+                raise ConfigError(f"gate.parity.{name}.{field}", limits.get(field), "a number that is not negative")
     _positive_int("gate.capacity.cpu_nworld", gate.capacity.cpu_nworld)
     _positive_int("gate.throughput.repetitions", gate.throughput.repetitions)
     _positive_int("gate.throughput.frames", gate.throughput.frames)
@@ -160,3 +183,5 @@ def _positive(key: str, value: float, unit: str = "") -> None:
 def _length(key: str, value: list, size: int) -> None:
     if len(value) != size:
         raise ConfigError(key, value, f"{size} numbers or names")
+    if any(isinstance(item, float) and not math.isfinite(item) for item in value):
+        raise ConfigError(key, value, "finite numbers")

@@ -142,7 +142,7 @@ class ScriptedPlanner:
                     guess = command if self._seed is None else self._seed[k]
                     target = start + s * (end - start)
                     command, distance = self.ik.solve(target, grip0 + s * (grip1 - grip0), guess)
-                    if distance > self.ik.tolerance:
+                    if not distance <= self.ik.tolerance:
                         raise Unreachable(world, phase.name, target.tolist(), distance, self.ik.tolerance)
                     worst = max(worst, distance)
                 knots[k] = command

@@ -9,7 +9,7 @@ import numpy as np
 from mjstack.errors import name_worlds
 from mjstack.gates.gate import GateContext
 from mjstack.report.record import GateResult, Status, Value
-from mjstack.sim import LOST_PHYSICS, Overflow, resolve_sizes
+from mjstack.sim import LOST_PHYSICS, Overflow, describe_overflow, resolve_sizes
 
 _MARGIN = 1.25  # of the recommended sizes over the peaks
 
@@ -37,17 +37,24 @@ def run_capacity(context: GateContext) -> list[GateResult]:
             f"Raise it: batch.njmax={_recommend(int(rows.max()))}"
         )
     need = max(used, pairs or 0) / nworld
+    pool_fix = (
+        f"batch.nconmax={_recommend(math.ceil(need))}"
+        if sizes.naconmax is None
+        else f"batch.naconmax={_recommend(math.ceil(need * cfg.nworld))}"
+    )
     lost = overflow & int(Overflow.NARROWPHASE | Overflow.BROADPHASE)
     if need > share or lost.any():
         worlds = np.flatnonzero((contacts > share) | (lost != 0)).tolist()
         problems.append(
             f"contact pool overflow in {name_worlds(worlds, nworld)}; {share:g} per world, {need:.0f} needed. "
-            f"Raise it: batch.nconmax={_recommend(math.ceil(need))}"
+            f"Raise it: {pool_fix}"
         )
     rest = overflow & ~int(Overflow.NEFC | Overflow.NJMAX_NNZ | Overflow.NARROWPHASE | Overflow.BROADPHASE)
     if rest.any():
-        bits = Overflow(int(np.bitwise_or.reduce(rest)))
-        problems.append(f"{bits!s} overflow in {name_worlds(np.flatnonzero(rest).tolist(), nworld)}. Raise batch.nccdmax")
+        names = describe_overflow(int(np.bitwise_or.reduce(rest)))
+        key = "batch.nccdmax" if sizes.naccdmax is None else "batch.naccdmax"
+        fix = f"Raise {key}" if "CCD" in names else "Simplify the model, or run sim=native"
+        problems.append(f"{names} overflow in {name_worlds(np.flatnonzero(rest).tolist(), nworld)}. {fix}")
     metrics: dict[str, Value] = {
         "backend": sim.description,
         "worlds": nworld,

@@ -7,13 +7,13 @@ import math
 import numpy as np
 import torch
 
+from mjstack.config.schema import Config
+from mjstack.config.validate import PARITY_FIELDS
 from mjstack.gates.episode import NOMINAL, State, restore
 from mjstack.gates.gate import GateContext, acceptance_thresholds, judge_one
 from mjstack.math import quat_angle
 from mjstack.report.record import GateResult, Status, Value
-from mjstack.sim import Overflow, Simulation
-
-FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
+from mjstack.sim import Simulation, describe_overflow
 
 
 def run_parity(context: GateContext) -> list[GateResult]:
@@ -36,18 +36,19 @@ def run_parity(context: GateContext) -> list[GateResult]:
                 if not found[field] <= limit:
                     problems.append(f"{name}, {steps} steps: {field} differs by {found[field]:.2g}, limit {limit:.2g}")
 
-    for option, (asked, uploaded, equal) in compare_options(native, mjwarp).items():
-        metrics[f"option.{option}"] = f"{asked} / {uploaded}"
-        details.append(f"option {option}: native {asked}, uploaded {uploaded}")
+    for option, (asked, held, uploaded, equal) in compare_options(cfg, native, mjwarp).items():
+        metrics[f"option.{option}"] = f"{asked} / {held} / {uploaded}"
+        line = f"option {option}: requested {asked}, native {held}, uploaded {uploaded}"
+        details.append(line)
         if not equal:
-            problems.append(f"option {option}: native {asked}, uploaded {uploaded}")
+            problems.append(line)
 
     episode = context.run(mjwarp, NOMINAL, record=True, on_frame=context.on_frame)
     status, reason, judged = judge_one(episode.verdict)
     if status is Status.failed:
         problems.append(reason)
     if int(mjwarp.overflow[0]):
-        problems.append(f"{Overflow(int(mjwarp.overflow[0]))!s} overflow: raise batch.njmax or batch.nconmax")
+        problems.append(f"{describe_overflow(int(mjwarp.overflow[0]))} overflow: raise batch.njmax or batch.nconmax")
     metrics.update(judged)
     metrics["peak_contacts"] = int(mjwarp.peak_contacts[0])
     metrics["peak_constraint_rows"] = int(mjwarp.peak_constraints[0])
@@ -92,7 +93,7 @@ def compare_steps(native: Simulation, mjwarp: Simulation, state: State, steps: i
         sim.forward()
         sim.synchronize()
     out = {}
-    for field in FIELDS:
+    for field in PARITY_FIELDS:
         a, b = getattr(native, field).double(), getattr(mjwarp, field).double().cpu()
         if field == "xquat":  # q and -q are one rotation
             b = torch.where((a * b).sum(-1, keepdim=True) < 0.0, -b, b)
@@ -100,20 +101,37 @@ def compare_steps(native: Simulation, mjwarp: Simulation, state: State, steps: i
     return out
 
 
-def compare_options(native: Simulation, mjwarp: Simulation) -> dict[str, tuple[str, str, bool]]:
-    """Native's and the uploaded options side by side; numbers agree to float32."""
-    ours = mjwarp.option_values()
+def compare_options(cfg: Config, native: Simulation, mjwarp: Simulation) -> dict[str, tuple[str, str, str, bool]]:
+    """Requested, native's and the uploaded options side by side, and whether they agree; numbers to float32.
+
+    What the configuration leaves to the robot's file is requested as ``the file's``.
+    """
+    solver = cfg.solver
+    requested: dict[str, float | int | str | None] = {
+        "timestep": cfg.timing.physics_dt,
+        "integrator": "mjINT_IMPLICITFAST",
+        "cone": "mjCONE_ELLIPTIC",
+        "box_box": "primitive",
+        "iterations": solver.iterations,
+        "ls_iterations": solver.ls_iterations,
+        "impratio": solver.impratio,
+        "tolerance": solver.tolerance,
+    }
+    uploaded = mjwarp.option_values()
     out = {}
-    for name, value in native.option_values().items():
-        uploaded = ours[name]
-        if isinstance(value, str) or isinstance(uploaded, str):
-            equal = value == uploaded
-        elif name == "tolerance":  # MJWarp clamps it to what float32 can resolve
-            equal = math.isclose(max(value, 1e-6), uploaded, rel_tol=1e-5)
-        else:
-            equal = math.isclose(value, uploaded, rel_tol=1e-5)
-        out[name] = (_short(value), _short(uploaded), equal)
+    for name, held in native.option_values().items():
+        asked = requested.get(name)
+        equal = _agree(name, held, uploaded[name]) and (asked is None or _agree(name, asked, held))
+        out[name] = ("the file's" if asked is None else _short(asked), _short(held), _short(uploaded[name]), equal)
     return out
+
+
+def _agree(name: str, asked: float | int | str, got: float | int | str) -> bool:
+    if isinstance(asked, str) or isinstance(got, str):
+        return asked == got
+    if name == "tolerance":  # MJWarp clamps it to what float32 can resolve
+        asked, got = max(asked, 1e-6), max(got, 1e-6)
+    return math.isclose(asked, got, rel_tol=1e-5)
 
 
 def _short(value: float | int | str) -> str:

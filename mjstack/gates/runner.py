@@ -58,7 +58,8 @@ def run_gates(
             results = [GateResult(name=name, status=Status.failed, reason=f"{reason} (run.log has the traceback)")]
         seconds = time.perf_counter() - began
         for result in results:
-            result.seconds = seconds if result.status is not Status.skipped else 0.0
+            if result.status is not Status.skipped and not result.seconds:
+                result.seconds = seconds
             context.results[result.name] = result
             log.info("gate %s: %s %s", result.name, result.status.value, result.reason)
             out.append(result)

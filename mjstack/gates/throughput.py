@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import statistics
 import time
@@ -10,10 +11,13 @@ from collections.abc import Callable
 import torch
 
 from mjstack.config.schema import Backend
+from mjstack.errors import MjstackError
 from mjstack.gates.episode import State, restore, snapshot, start_worlds
 from mjstack.gates.gate import GateContext
 from mjstack.report.record import GateResult, Status, Value
 from mjstack.sim import LOST_PHYSICS, Simulation, make_simulation, resolve_sizes
+
+log = logging.getLogger(__name__)
 
 CUDA = "throughput_cuda"
 
@@ -25,17 +29,30 @@ def run_throughput(context: GateContext) -> list[GateResult]:
     """
     backend, device = context.backend
     if device.startswith("cuda"):
-        return [
-            _measure(context, "throughput", Backend.native, "cpu"),
-            _measure(context, CUDA, Backend.mjwarp, device),
-        ]
+        native = _guarded(context, "throughput", Backend.native, "cpu")
+        return [native, _guarded(context, CUDA, Backend.mjwarp, device)]
     reason = "no CUDA device was used: " + (
         "this machine has none" if not torch.cuda.is_available() else f"sim={backend.value} sim.device={device}"
     )
     return [
-        _measure(context, "throughput", backend, device),
+        _guarded(context, "throughput", backend, device),
         GateResult(name=CUDA, status=Status.skipped, reason=reason),
     ]
+
+
+def _guarded(context: GateContext, name: str, backend: Backend, device: str) -> GateResult:
+    """One measurement; if it breaks, out of memory say, the other one is kept."""
+    began = time.perf_counter()
+    try:
+        result = _measure(context, name, backend, device)
+    except MjstackError as error:
+        result = GateResult(name=name, status=Status.failed, reason=str(error))
+    except Exception as error:
+        log.exception("%s broke", name)
+        reason = f"{type(error).__name__}: {(str(error) or 'no message').splitlines()[0]} (run.log has the traceback)"
+        result = GateResult(name=name, status=Status.failed, reason=reason)
+    result.seconds = time.perf_counter() - began
+    return result
 
 
 def _measure(context: GateContext, name: str, backend: Backend, device: str) -> GateResult:
@@ -65,13 +82,17 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
     warm_seconds = play(first, 1)
     frame_seconds = play(first + 1, 1)
     frames = max(1, min(t.frames, int(t.max_seconds / frame_seconds), tape.frames - first))
-    times = []
+    times: list[float] = []
+    bad = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
     for repetition in range(t.repetitions):
         restore(sim, state)
         times.append(play(first, frames))
+        bad |= (sim.overflow & LOST_PHYSICS) != 0
+        bad |= ~(torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1))
+        bad |= sim.step_count != frames * cfg.timing.substeps
         if context.advance is not None:
             context.advance("repetitions", repetition + 1, t.repetitions)
-    lost = int((sim.overflow & LOST_PHYSICS).ne(0).sum())
+    lost = int(bad.sum())
     steps = frames * cfg.timing.substeps
     ms = [1e3 * seconds / steps for seconds in times]
     rate = [cfg.nworld * steps / seconds for seconds in times]
@@ -99,7 +120,7 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
     status = Status.passed
     reason = f"{statistics.median(rate):,.0f} world-steps/s, {statistics.median(ms):.3g} ms per step of {cfg.nworld} worlds"
     if lost or (batch is not None and batch.status is Status.failed):
-        why = f"buffers overflowed in {lost} worlds" if lost else "the batch gate failed"
+        why = f"{lost} worlds overflowed, diverged or were not stepped" if lost else "the batch gate failed"
         metrics = {key: value for key, value in metrics.items() if "_per_" not in key or key == "frames_per_repetition"}
         status, reason = Status.failed, f"no figure: {why}, and a figure counts only where the task was verified"
     elif batch is None:

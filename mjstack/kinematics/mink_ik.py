@@ -9,7 +9,9 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import ModelCfg, RobotCfg
+from mjstack.errors import ConfigError
 from mjstack.robots import robot_spec
+from mjstack.scene.index import find
 
 _POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the aperture centre by micrometres
 _CONVERGED = 0.1  # of the tolerance: Newton's method squares the error, one more step would be for nothing
@@ -58,8 +60,17 @@ class ApertureIk:
         self.tolerance = tolerance
         self._iterations = iterations
         names = [*robot.arm_joints, *robot.gripper_joints]
-        joints = [self.model.joint(name) for name in names]
-        self._qpos = np.array([joint.qposadr[0] for joint in joints])
+        joints = [find(self.model, "joint", name) for name in names]
+        for key, values in (
+            ("home", robot.home),
+            ("gripper_open", robot.gripper_open),
+            ("gripper_closed", robot.gripper_closed),
+        ):
+            for name, value in zip(names[-len(values) :], values, strict=True):
+                low, high = self.model.joint(name).range
+                if not low <= value <= high:
+                    raise ConfigError(f"robot.{key} of {name}", value, f"a command within [{low:.4g}, {high:.4g}]")
+        self._qpos = self.model.jnt_qposadr[joints]
         self._n_arm = len(robot.arm_joints)
         self.home = np.array(robot.home)
         for name, value in robot.locked.items():
@@ -67,7 +78,7 @@ class ApertureIk:
         self._configuration = mink.Configuration(self.model)
         moving = {int(self.model.joint(name).dofadr[0]) for name in robot.ik_joints}
         frozen = [dof for dof in range(self.model.nv) if dof not in moving]
-        self._task = ApertureTask([self.model.site(s).id for s in robot.aperture_sites], self.model.nv)
+        self._task = ApertureTask([find(self.model, "site", s) for s in robot.aperture_sites], self.model.nv)
         self._posture = mink.PostureTask(self.model, cost=_POSTURE_COST)
         self._limits = [mink.ConfigurationLimit(self.model, gain=1.0)]
         self._constraints = [mink.DofFreezingTask(self.model, frozen)]
@@ -91,15 +102,18 @@ class ApertureIk:
         configuration.update(self._to_qpos(command))
         distance = math.inf
         for _ in range(self._iterations):
-            step = mink.solve_ik(
-                configuration,
-                [self._task, self._posture],
-                dt=1.0,
-                solver="daqp",
-                damping=1e-9,
-                limits=self._limits,
-                constraints=self._constraints,
-            )
+            try:
+                step = mink.solve_ik(
+                    configuration,
+                    [self._task, self._posture],
+                    dt=1.0,
+                    solver="daqp",
+                    damping=1e-9,
+                    limits=self._limits,
+                    constraints=self._constraints,
+                )
+            except mink.NoSolutionFound:
+                return command, math.inf
             largest = float(np.abs(step).max())
             configuration.integrate_inplace(step * min(1.0, _MAX_STEP / max(largest, 1e-12)), 1.0)
             distance = float(np.linalg.norm(self._task.compute_error(configuration)))

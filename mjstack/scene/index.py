@@ -23,15 +23,16 @@ class SceneIndex:
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
         joints = [*robot.arm_joints, *robot.gripper_joints]
-        self.robot_qpos = np.array([model.jnt_qposadr[_find(model, "joint", n)] for n in joints])
-        self.ctrl = np.array([_find(model, "actuator", n) for n in joints])
-        self.aperture_sites = [_find(model, "site", n) for n in robot.aperture_sites]
-        cubes = [_find(model, "joint", n) for n in (RED, BLUE)]
+        self.robot_qpos = np.array([model.jnt_qposadr[find(model, "joint", n)] for n in joints])
+        self.ctrl = np.array([find(model, "actuator", n) for n in joints])
+        self.aperture_sites = [find(model, "site", n) for n in robot.aperture_sites]
+        cubes = [find(model, "joint", n) for n in (RED, BLUE)]
         self.cube_qpos = [int(model.jnt_qposadr[j]) for j in cubes]
         self.cube_qvel = [int(model.jnt_dofadr[j]) for j in cubes]
 
 
-def _find(model: mujoco.MjModel, kind: str, name: str) -> int:
+def find(model: mujoco.MjModel, kind: str, name: str) -> int:
+    """Index of a named joint, actuator or site; an unknown name is an error that lists the known ones."""
     index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
     if index < 0:
         count = {"joint": model.njnt, "actuator": model.nu, "site": model.nsite}[kind]

@@ -29,12 +29,15 @@ def record_peaks(
     lost_bits: int,
     lost: wp.array[int],
     limits: wp.array[int],
+    advance: int,
+    steps: wp.array[wp.int64],
 ) -> None:
     """Keeps the largest counters, and every overflow bit seen so far: lost physics apart from solver limits."""
     w = wp.tid()
     peak_nefc[w] = wp.max(peak_nefc[w], nefc[w])
     peak_contacts[w] = wp.max(peak_contacts[w], contacts[w])
     lost[w] = lost[w] | (overflow[w] & lost_bits)
+    steps[w] = steps[w] + wp.int64(advance)
     limits[w] = limits[w] | (overflow[w] & ~lost_bits)
     if w == 0:
         peak_pool[0] = wp.max(peak_pool[0], nacon[0])

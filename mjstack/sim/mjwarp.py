@@ -21,6 +21,9 @@ import mujoco_warp as mjw  # noqa: E402
 
 log = logging.getLogger(__name__)
 
+# One object per torch stream, for ever: a second one for the same stream would unregister it when freed.
+_STREAMS: dict[tuple[str, int], wp.Stream] = {}
+
 
 class MjwarpSimulation:
     """`Simulation` on MuJoCo Warp, float32.
@@ -55,16 +58,15 @@ class MjwarpSimulation:
         self._device = wp.get_device(device)
         self._graph_mode = graph
         self._graphs: dict[int, object] = {}
-        self._stream_handle: int | None = None
         name = self._device.name if self._device.is_cuda else "Warp's CPU device"
         self.description = f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}"
         with wp.ScopedDevice(self._device):
             try:
                 with warnings.catch_warnings():
-                    warnings.simplefilter("error")
+                    warnings.filterwarnings("error", category=UserWarning)
                     self._m = mjw.put_model(model)
             except (NotImplementedError, ValueError, UserWarning) as error:
-                raise UnsupportedModel(str(error).splitlines()[0].rstrip(".")) from error
+                raise UnsupportedModel((str(error) or repr(error)).splitlines()[0].rstrip(".")) from error
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
@@ -74,6 +76,7 @@ class MjwarpSimulation:
             self._peak_pool = wp.zeros(2, dtype=int)
             self._lost = wp.zeros(nworld, dtype=int)
             self._limits = wp.zeros(nworld, dtype=int)
+            self._steps = wp.zeros(nworld, dtype=wp.int64)
             self._mask = wp.zeros(nworld, dtype=bool)
         d = self._d
         self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
@@ -86,7 +89,7 @@ class MjwarpSimulation:
         self.peak_pool = wp.to_torch(self._peak_pool)
         self.overflow = wp.to_torch(self._lost)
         self.solver_limits = wp.to_torch(self._limits)
-        self.step_count = torch.zeros(nworld, dtype=torch.int64, device=self.device)
+        self.step_count = wp.to_torch(self._steps)
         self._torch_mask = wp.to_torch(self._mask)
         self._warm_up()
 
@@ -98,13 +101,12 @@ class MjwarpSimulation:
                 self._substeps(n)
             else:
                 wp.capture_launch(graph)
-        self.step_count += n
 
     def forward(self) -> None:
         """Computes everything that derives from the state, without advancing time."""
         with self._stream():
             mjw.forward(self._m, self._d)
-            self._count()
+            self._count(steps=0)
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Puts the masked worlds back to qpos0, at rest, and clears their counters and overflow bits."""
@@ -149,19 +151,18 @@ class MjwarpSimulation:
         if not self._device.is_cuda:
             return wp.ScopedDevice(self._device)
         current = torch.cuda.current_stream(self.device)
-        if current.cuda_stream != self._stream_handle:
-            # One object is kept: a second one for the same stream would unregister it when freed.
-            self._stream_handle = current.cuda_stream
-            self._warp_stream = wp.stream_from_torch(current)
-        return wp.ScopedStream(self._warp_stream, sync_enter=False, sync_exit=False)
+        key = (str(self._device), current.cuda_stream)
+        if key not in _STREAMS:
+            _STREAMS[key] = wp.stream_from_torch(current)
+        return wp.ScopedStream(_STREAMS[key], sync_enter=False, sync_exit=False)
 
     def _substeps(self, n: int) -> None:
         for _ in range(n):
             mjw.step(self._m, self._d)
-            self._count()
+            self._count(steps=1)
 
-    def _count(self) -> None:
-        """Two launches: what each world uses now, and the most it has used."""
+    def _count(self, *, steps: int) -> None:
+        """Two launches: steps made, what each world uses now, and the most it has used."""
         d = self._d
         self._contacts.zero_()
         wp.launch(count_contacts, dim=d.contact.worldid.shape[0], inputs=[d.nacon, d.contact.worldid, self._contacts])
@@ -180,6 +181,8 @@ class MjwarpSimulation:
                 LOST_PHYSICS,
                 self._lost,
                 self._limits,
+                steps,
+                self._steps,
             ],
         )
 

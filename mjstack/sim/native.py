@@ -19,6 +19,11 @@ _CONTACT_FULL = int(mujoco.mjtWarning.mjWARN_CONTACTFULL)
 _CONSTRAINT_FULL = int(mujoco.mjtWarning.mjWARN_CNSTRFULL)
 
 
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class NativeSimulation:
     """`Simulation` on native MuJoCo, float64 on the CPU.
 
@@ -41,7 +46,7 @@ class NativeSimulation:
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.nworld = nworld
         self.device = torch.device("cpu")
-        self._nthread = max(1, min(nthread or os.cpu_count() or 1, nworld))
+        self._nthread = max(1, min(nthread or available_cores(), nworld))
         self.description = f"MuJoCo {mujoco.__version__} on {self._nthread} threads, {platform.machine()} CPU"
         self._datas = [mujoco.MjData(self.model) for _ in range(self._nthread)]
         self._pool = ThreadPoolExecutor(self._nthread) if self._nthread > 1 else None
@@ -73,13 +78,13 @@ class NativeSimulation:
         self.contact_count, self.constraint_count, self.peak_contacts, self.peak_constraints, self.overflow = torch.from_numpy(
             self._counts
         ).unbind(1)
-        self.step_count = torch.zeros(nworld, dtype=torch.int64)
+        self._steps = np.zeros(nworld, dtype=np.int64)
+        self.step_count = torch.from_numpy(self._steps)
         self.reset()
 
     def step(self, n: int = 1) -> None:
         """Advances every world by n physics steps under the current ctrl."""
         self._run(n)
-        self.step_count += n
 
     def forward(self) -> None:
         """Computes everything that derives from the state, without advancing time; warm starts stay as they are."""
@@ -90,7 +95,7 @@ class NativeSimulation:
         rows = np.ones(self.nworld, dtype=bool) if mask is None else mask.numpy()
         self._state[rows] = self._initial
         self._counts[rows] = 0
-        self.step_count[torch.from_numpy(rows)] = 0
+        self._steps[rows] = 0
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options of the model."""
@@ -132,7 +137,7 @@ class NativeSimulation:
 
     def _run_worlds(self, data: mujoco.MjData, worlds: range, n: int) -> None:
         """Steps some worlds on one thread. mj_step releases the interpreter lock; the rest is a few microseconds."""
-        m, state, counts = self.model, self._state, self._counts
+        m, state, counts, steps = self.model, self._state, self._counts, self._steps
         xpos, xquat = self._derived["xpos"], self._derived["xquat"]
         site_xpos, qfrc_actuator = self._derived["site_xpos"], self._derived["qfrc_actuator"]
         warning = data.warning.number
@@ -147,6 +152,7 @@ class NativeSimulation:
             if n:
                 mujoco.mj_step(m, data, n)
                 mujoco.mj_getState(m, data, state[w], _SPEC)
+                steps[w] += n
             else:
                 mujoco.mj_forward(m, data)
             xpos[w] = data.xpos

@@ -27,6 +27,11 @@ class Overflow(IntFlag):
     TACTILE = 1 << 11
 
 
+def describe_overflow(bits: int) -> str:
+    """The names of the bits, such as ``NEFC, CCD``."""
+    return ", ".join(flag.name or "" for flag in Overflow if bits & flag)
+
+
 LOST_PHYSICS = int(sum(Overflow))
 
 
