@@ -21,7 +21,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from mjstack.config.schema import Config
 from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, own_hydra, to_config
 from mjstack.errors import MjstackError
 from mjstack.job import JobOutcome, check_machine, run_job
@@ -177,6 +176,3 @@ def _print_sweep(outcomes: list[JobOutcome]) -> None:
     if len(outcomes) > 1:
         (Path(sweep_folder) / "summary.md").write_text("\n".join(lines) + "\n")
         Console(soft_wrap=True).print(f"summary: {sweep_folder}/summary.md")
-
-
-__all__ = ["Config", "check_writable", "main", "run"]

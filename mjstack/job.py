@@ -129,9 +129,9 @@ def _provenance(cfg: Config, context: GateContext) -> dict:
     name = f"native MuJoCo on {os.cpu_count()} cores" if backend.value == "native" else "Warp's CPU device"
     if device.startswith("cuda"):
         name, driver = cuda_name(device), cuda_driver()
-    spec_text = _model_text(context.model)
+    model_text = _model_text(context.model)
     config = OmegaConf.to_yaml(OmegaConf.structured(cfg))
-    return collect_provenance(config_yaml=config, model_xml=spec_text, device=f"{device}: {name}", driver=driver)
+    return collect_provenance(config_yaml=config, model_text=model_text, device=f"{device}: {name}", driver=driver)
 
 
 def _model_text(model: mujoco.MjModel) -> str:

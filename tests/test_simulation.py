@@ -246,7 +246,7 @@ def test_unsupported_model_says_so_in_one_line() -> None:
 
 
 def test_random_stacks_come_to_rest_on_mjwarp() -> None:
-    """With MJWarp's convex box-box collider, the kept contacts of a resting stack can alternate for ever."""
+    """A few stacks on the CPU device. Only the hundreds of tests/test_resting_stacks.py tell the two box colliders apart."""
     cfg, n = load_config([]), 16
     model = build_scene(mujoco.MjSpec(), cfg.scene, cfg.timing, cfg.solver)
     sim = make_simulation(model, cfg, n, backend=Backend.mjwarp, device="cpu")

@@ -15,12 +15,12 @@ from mjstack.report.record import Value
 PACKAGES = ("mjstack", "mujoco", "mujoco-warp", "warp-lang", "torch", "mink", "hydra-core", "numpy")
 
 
-def collect_provenance(*, config_yaml: str, model_xml: str, device: str, driver: str) -> dict[str, Value | dict[str, Value]]:
+def collect_provenance(*, config_yaml: str, model_text: str, device: str, driver: str) -> dict[str, Value | dict[str, Value]]:
     """Collects what is needed to judge and to repeat a run.
 
     Args:
         config_yaml: The whole configuration as text.
-        model_xml: The compiled scene as MJCF.
+        model_text: The compiled model as text, whatever file it came from.
         device: What the batch runs on, in words.
         driver: CUDA driver version, or a word why there is none.
     """
@@ -39,7 +39,7 @@ def collect_provenance(*, config_yaml: str, model_xml: str, device: str, driver:
         "cpu_count": os.cpu_count(),
         "git_commit": _git_commit(),
         "config_sha256": hashlib.sha256(config_yaml.encode()).hexdigest(),
-        "model_sha256": hashlib.sha256(model_xml.encode()).hexdigest(),
+        "model_sha256": hashlib.sha256(model_text.encode()).hexdigest(),
     }
 
 
