@@ -13,6 +13,8 @@ if (_CHECKOUT / "conf" / "config.yaml").is_file():
 choose_gl()
 
 from mjstack.config import Config, load_config  # noqa: E402
+from mjstack.envs import Env, make_env  # noqa: E402
+from mjstack.errors import MjstackError  # noqa: E402
 
-__all__ = ["Config", "load_config"]
+__all__ = ["Config", "Env", "MjstackError", "load_config", "make_env"]
 __version__ = "0.1.0"

@@ -64,6 +64,36 @@ class UnsupportedModel(MjstackError):
         )
 
 
+class TermError(MjstackError):
+    """A term of a manager that cannot be found, built or used."""
+
+    exit_code = 2
+
+    def __init__(self, label: str, problem: str) -> None:
+        """Builds the message from the term's dotted configuration key and what is wrong with it."""
+        super().__init__(f"{label}: {problem.rstrip('.')}.")
+        self.label = label
+
+
+class ParameterError(MjstackError):
+    """A value that a term cannot use. The manager turns it into a `ConfigError` that has the term's key."""
+
+    exit_code = 2
+
+    def __init__(self, name: str, value: object, expected: str, fix: str = "") -> None:
+        """Keeps the parameter's name, its value, what would have been accepted, and what to do about it."""
+        super().__init__(f"{name}={value}: expected {expected}." + (f" {fix}." if fix else ""))
+        self.facts = (name, value, expected, fix)
+
+
+class FaultError(MjstackError):
+    """Something went wrong while worlds were stepped."""
+
+    def __init__(self, what: str, fix: str) -> None:
+        """Builds the message from what went wrong and what to do, each a sentence without its full stop."""
+        super().__init__(f"{what}. {fix}.")
+
+
 class Unreachable(MjstackError):
     """The arm cannot bring its aperture centre to a target."""
 
@@ -78,6 +108,37 @@ class Unreachable(MjstackError):
         self.world = world
         self.phase = phase
         self.distance = distance
+
+
+class RebindError(MjstackError):
+    """A view of a simulation was assigned to instead of written into."""
+
+    def __init__(self, view: str) -> None:
+        """Builds the message.
+
+        Args:
+            view: The view as the user writes it, such as ``sim.qpos``.
+        """
+        super().__init__(f"{view} is a view of the simulation's memory and cannot be rebound: write {view}[:] = ... instead.")
+        self.view = view
+
+
+class ArgumentError(MjstackError):
+    """An argument of a function cannot be used."""
+
+    exit_code = 2
+
+    def __init__(self, name: str, found: object, expected: str, fix: str = "") -> None:
+        """Builds the message.
+
+        Args:
+            name: The argument.
+            found: What was given.
+            expected: What would have been accepted.
+            fix: What to do about it, a sentence without its full stop.
+        """
+        super().__init__(f"{name}: found {found}, expected {expected}." + (f" {fix}." if fix else ""))
+        self.name = name
 
 
 def suggest(name: str, available: Iterable[str]) -> str:

@@ -17,8 +17,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import Backend, Config
 from mjstack.control.scripted import ScriptedPlanner
+from mjstack.envs import build_env
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.gates.episode import FrameHook
 from mjstack.gates.gate import GateContext
@@ -52,7 +53,12 @@ class JobOutcome:
 def check_machine(cfg: Config) -> None:
     """Raises for what this machine cannot do, before anything is written."""
     resolve_backend(cfg)
+    if cfg.task.name != "stack":
+        raise ConfigError(
+            "task", cfg.task.name, "task=stack, whose scripted episode the gates verify", "Train it: mjstack.make_env"
+        )
     ScriptedPlanner(cfg)  # reads the robot, and reaches every nominal target
+    build_env(cfg, nworld=1, backend=Backend.native, device="cpu").close()  # builds and checks every term
     if (cfg.view or cfg.video) and not {"baseline", "parity"} & set(cfg.gates):
         key = "view" if cfg.view else "video"
         raise ConfigError(key, "true", "gates with baseline or parity, whose world is shown", "Add one of them to gates")

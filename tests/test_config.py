@@ -59,7 +59,7 @@ def test_defaults(so101_cfg: Config) -> None:
     assert cfg.timing.frame_dt == pytest.approx(0.02)
     solver = cfg.solver
     assert (solver.iterations, solver.ls_iterations, solver.impratio, solver.tolerance) == (100, 50, 100.0, 1e-6)
-    assert (cfg.reset.cube_xy, cfg.reset.cube_yaw) == (0.002, 0.05)
+    assert cfg.reset["cubes"].params == {"xy": 0.002, "yaw": 0.05}
 
 
 def test_overrides_arrive() -> None:
@@ -155,7 +155,8 @@ BAD = [
     (["scene.red_xy=[0.33]"], "2 numbers"),
     (["scene.red_xy=[0.33,0.06]"], "touch"),
     (["scene.cube_mass=0"], "scene.cube_mass"),
-    (["reset.cube_xy=-0.1"], "reset.cube_xy"),
+    (["task.episode_frames=0"], "task.episode_frames=0"),
+    (["reward.lift.wait=1"], "wait"),
     (["solver.tolerance=0"], "solver.tolerance"),
     (["gate.acceptance.carry_phase=above_blu"], "Did you mean 'above_blue'?"),
     (["gate.acceptance.lift_phases=[lift]"], "lift_red"),

@@ -17,22 +17,25 @@ LAYERS = [
     {"sim"},
     {"kinematics"},
     {"control"},
-    {"tasks", "mdp"},
-    {"gates"},
+    {"managers"},
+    {"mdp"},
+    {"tasks"},
+    {"envs"},
+    {"adapters", "gates"},
     {"job"},
     {"cli"},
 ]
 LEAVES = {"report": {"errors", "report"}}  # anything may import it, and it imports only these
 HOMES = {
     "mujoco_warp": ("sim/",),
-    "warp": ("sim/",),
+    "warp": ("sim/", "kinematics/"),
     "mink": ("kinematics/mink_ik.py",),
     "mujoco_menagerie": ("robots/source.py",),
     "hydra": ("config/", "cli.py"),
     "omegaconf": ("config/", "cli.py", "job.py"),
     "matplotlib": ("report/picture.py",),
     "imageio_ffmpeg": ("report/picture.py",),
-    "rich": ("job.py", "cli.py"),
+    "rich": ("job.py", "cli.py", "managers/base.py"),
 }
 
 

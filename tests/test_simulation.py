@@ -12,7 +12,7 @@ from comparison import assert_same_run
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend
-from mjstack.errors import UnsupportedModel
+from mjstack.errors import ArgumentError, RebindError, UnsupportedModel
 from mjstack.gates.episode import start_worlds
 from mjstack.gates.gate import GateContext
 from mjstack.math import quat_angle
@@ -20,10 +20,47 @@ from mjstack.scene import build_scene, table_top
 from mjstack.sim import Simulation, make_simulation
 
 N = 3
-VIEWS = ("qpos", "qvel", "ctrl", "xpos", "xquat", "site_xpos", "qfrc_actuator")
+STATE = ("qpos", "qvel", "act", "ctrl")
+POSES = ("xpos", "xquat", "site_xpos", "geom_xpos")
+VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata")
 COUNTS = ("contact_count", "constraint_count", "peak_contacts", "peak_constraints", "overflow")
 Make = Callable[..., Simulation]
 Stage = Callable[[str], GateContext]
+
+
+# An arm with an activation and sensors, and a ball: what the robots' scenes lack.
+SENSING = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body name="arm" pos="0 0 0.5">
+      <joint name="elbow" type="hinge" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02"/>
+      <site name="tip" pos="0.2 0 0"/>
+    </body>
+    <body name="ball" pos="0.5 0 0.5"><freejoint/><geom size="0.03"/></body>
+  </worldbody>
+  <actuator><position joint="elbow" kp="20" timeconst="0.02"/></actuator>
+  <sensor><jointpos joint="elbow"/><jointvel joint="elbow"/><framepos objtype="site" objname="tip"/></sensor>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def sensing() -> Callable[[str], Simulation]:
+    """Simulations of that model by backend, reset."""
+    made: dict[str, Simulation] = {}
+
+    def get(backend: str) -> Simulation:
+        if backend not in made:
+            kind = Backend.native if backend == "native" else Backend.mjwarp
+            device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
+            model = mujoco.MjModel.from_xml_string(SENSING)
+            made[backend] = make_simulation(model, load_config([]), N, backend=kind, device=device)
+        made[backend].reset()
+        return made[backend]
+
+    return get
 
 
 def start(sim: Simulation, context: GateContext) -> None:
@@ -37,11 +74,14 @@ def test_shapes_types_and_device(backend: str, make_sim: Make, stage: Stage) -> 
     shapes = {
         "qpos": (N, m.nq),
         "qvel": (N, m.nv),
+        "act": (N, m.na),
         "ctrl": (N, m.nu),
         "xpos": (N, m.nbody, 3),
         "xquat": (N, m.nbody, 4),
         "site_xpos": (N, m.nsite, 3),
+        "geom_xpos": (N, m.ngeom, 3),
         "qfrc_actuator": (N, m.nv),
+        "sensordata": (N, m.nsensordata),
     }
     for name, shape in shapes.items():
         view = getattr(sim, name)
@@ -64,11 +104,53 @@ def test_views_keep_their_address(backend: str, make_sim: Make) -> None:
 
     before = addresses()
     sim.step(10)
+    sim.step(10, kinematics=True)
     sim.forward()
+    sim.kinematics()
     sim.reset(torch.tensor([True, False, True], device=sim.device))
     sim.reset()
     sim.step(3)
+    sim.qpos += 0.0
     assert addresses() == before
+
+
+@pytest.mark.parametrize("name", [*VIEWS, *COUNTS, "step_count", "fields"])
+def test_views_cannot_be_rebound(backend: str, make_sim: Make, name: str) -> None:
+    sim = make_sim(backend, N)
+    view = getattr(sim, name)
+    with pytest.raises(RebindError) as caught:
+        setattr(sim, name, torch.zeros(N))
+    setattr(sim, name, view)
+    assert getattr(sim, name) is view
+    written = "sim.fields[name]" if name == "fields" else f"sim.{name}"
+    assert str(caught.value) == (
+        f"{written} is a view of the simulation's memory and cannot be rebound: write {written}[:] = ... instead."
+    )
+
+
+@pytest.mark.parametrize(
+    ("mask", "found"),
+    [
+        (torch.zeros(N), r"a torch.float32 tensor of shape \(3,\) on "),
+        (torch.zeros(N + 1, dtype=torch.bool), r"a torch.bool tensor of shape \(4,\) on "),
+        (torch.zeros(N, 1, dtype=torch.bool), r"a torch.bool tensor of shape \(3, 1\) on "),
+        (torch.zeros(N, dtype=torch.bool, device="meta"), r"a torch.bool tensor of shape \(3,\) on meta"),
+        ([True] * N, "a list"),
+    ],
+)
+def test_a_wrong_mask_is_refused(backend: str, make_sim: Make, mask: object, found: str) -> None:
+    sim = make_sim(backend, N)
+    sim.step(1)
+    if isinstance(mask, torch.Tensor) and mask.device.type == "cpu":
+        mask = mask.to(sim.device)
+    for call in (sim.reset, sim.kinematics):
+        with pytest.raises(
+            ArgumentError, match=rf"^mask: found {found}.*, expected a torch.bool tensor of shape \(3,\) on "
+        ) as caught:
+            call(mask)
+        assert "\n" not in str(caught.value)
+        assert caught.value.exit_code == 2
+    assert sim.step_count.tolist() == [1] * N
 
 
 def test_step_counts(backend: str, make_sim: Make) -> None:
@@ -148,21 +230,107 @@ def test_world_k_of_n_is_world_k_of_one(backend: str, make_sim: Make, stage: Sta
 
 
 def test_forward_writes_every_derived_number(backend: str, make_sim: Make, stage: Stage) -> None:
-    sim = make_sim(backend, N)
+    sim, m = make_sim(backend, N), stage("so101").model
     start(sim, stage("so101"))
     sim.forward()
-    derived = ("xpos", "xquat", "site_xpos", "qfrc_actuator")
+    derived = (*POSES, "qfrc_actuator")
     expected = {name: getattr(sim, name).clone() for name in derived}
     state = [sim.qpos.clone(), sim.qvel.clone()]
     for name in derived:
         getattr(sim, name).fill_(float("nan"))
-    # The world body never moves: MJWarp writes its pose once, with the data, and not again.
+    # What never moves MJWarp places once, with the data: the world body and the geoms of bodies without a joint above them.
+    static = torch.from_numpy(m.body_weldid[m.geom_bodyid] == 0).to(sim.device)
     sim.xpos[:, 0], sim.xquat[:, 0] = expected["xpos"][:, 0], expected["xquat"][:, 0]
+    sim.geom_xpos[:, static] = expected["geom_xpos"][:, static]
     sim.forward()
     for name in derived:
         assert torch.equal(getattr(sim, name), expected[name]), name
     assert torch.equal(sim.qpos, state[0])
     assert torch.equal(sim.qvel, state[1])
+
+
+def test_activations_and_sensors(backend: str, sensing: Callable[[str], Simulation]) -> None:
+    sim = sensing(backend)
+    m = sim.model
+    assert (sim.act.shape, sim.sensordata.shape) == ((N, 1), (N, 5))
+    sim.ctrl[:, 0] = torch.tensor([0.2, 0.4, 0.6], device=sim.device)
+    sim.step(20)
+    expected = []
+    for k in range(N):
+        data = mujoco.MjData(m)
+        data.ctrl[0] = float(sim.ctrl[k, 0])
+        mujoco.mj_step(m, data, 20)
+        assert float(sim.act[k, 0]) == pytest.approx(data.act[0], rel=1e-4)
+        np.testing.assert_allclose(sim.sensordata[k].double().cpu(), data.sensordata, atol=1e-4)
+        mujoco.mj_forward(m, data)
+        expected.append(data.sensordata.copy())
+    sim.sensordata.fill_(float("nan"))
+    sim.forward()
+    np.testing.assert_allclose(sim.sensordata.double().cpu(), expected, atol=1e-4)
+    # Masked worlds become zero, even where they were NaN; the others stay.
+    before = {name: getattr(sim, name).clone() for name in ("act", "sensordata")}
+    mask = torch.tensor([False, True, False], device=sim.device)
+    for name in before:
+        getattr(sim, name)[1] = float("nan")
+    sim.reset(mask)
+    for name, value in before.items():
+        assert not getattr(sim, name)[1].any(), name
+        assert torch.equal(getattr(sim, name)[~mask], value[~mask]), name
+        assert value[~mask].any(), name
+
+
+def test_kinematics_belongs_to_the_last_state(backend: str, make_sim: Make, stage: Stage) -> None:
+    sim = make_sim(backend, N)
+    start(sim, stage("so101"))
+    sim.step(10)
+    stale = {name: getattr(sim, name).clone() for name in POSES}
+    sim.kinematics()
+    posed = {name: getattr(sim, name).clone() for name in POSES}
+    sim.forward()
+    for name in POSES:
+        assert torch.equal(getattr(sim, name), posed[name]), name
+        assert not torch.equal(stale[name], posed[name]), name
+    sim.step(10, kinematics=True)
+    posed = {name: getattr(sim, name).clone() for name in POSES}
+    sim.forward()
+    for name in POSES:
+        assert torch.equal(getattr(sim, name), posed[name]), name
+    sim.step(0)
+    sim.qpos[:, 0] += 0.5
+    sim.step(0, kinematics=True)
+    assert not torch.equal(sim.site_xpos, posed["site_xpos"])
+    assert sim.step_count.tolist() == [20] * N
+
+
+def test_kinematics_changes_no_physics(backend: str, make_sim: Make, stage: Stage) -> None:
+    if backend == "mjwarp-cuda":
+        pytest.skip("CUDA repeats no run bit for bit")
+    finals = []
+    for kinematics in (False, True):
+        sim = make_sim(backend, N)
+        start(sim, stage("so101"))
+        for _ in range(5):
+            sim.step(4, kinematics=kinematics)
+            sim.step(1, kinematics=kinematics)
+            if kinematics:
+                sim.kinematics()
+        finals.append([getattr(sim, name).clone() for name in (*STATE, "qfrc_actuator", *COUNTS, "step_count")])
+    for a, b in zip(*finals, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_native_kinematics_visits_masked_worlds_only(make_sim: Make, stage: Stage) -> None:
+    sim = make_sim("native", N)
+    start(sim, stage("so101"))
+    sim.forward()
+    before = {name: getattr(sim, name).clone() for name in POSES}
+    sim.qpos[:, 0] += 0.1
+    sim.qvel[2, 0] = float("nan")
+    sim.kinematics(torch.tensor([True, False, True]))
+    for name in POSES:
+        assert not torch.equal(getattr(sim, name)[0], before[name][0]), name
+        assert torch.equal(getattr(sim, name)[1], before[name][1]), name
+        assert torch.isnan(getattr(sim, name)[2]).all(), name
 
 
 def test_forward_agrees_with_mujoco(backend: str, make_sim: Make, stage: Stage) -> None:
@@ -174,7 +342,7 @@ def test_forward_agrees_with_mujoco(backend: str, make_sim: Make, stage: Stage) 
     for k in range(N):
         data.qpos, data.qvel, data.ctrl = (v[k].double().cpu().numpy() for v in (sim.qpos, sim.qvel, sim.ctrl))
         mujoco.mj_forward(context.model, data)
-        for name, tolerance in (("xpos", 1e-5), ("xquat", 1e-5), ("site_xpos", 1e-5), ("qfrc_actuator", 5e-3)):
+        for name, tolerance in (*((name, 1e-5) for name in POSES), ("qfrc_actuator", 5e-3)):
             np.testing.assert_allclose(getattr(sim, name)[k].double().cpu(), getattr(data, name), atol=tolerance, err_msg=name)
         assert int(sim.contact_count[k]) == data.ncon
 
@@ -213,7 +381,8 @@ def test_native_does_not_reset_a_diverged_world(make_sim: Make, stage: Stage) ->
     sim.qvel[1, 0] = float("nan")
     sim.step(10)
     assert not torch.isfinite(sim.qvel[1]).all()
-    assert torch.isnan(sim.xpos[1]).all()
+    for name in (*POSES, "qfrc_actuator"):
+        assert torch.isnan(getattr(sim, name)[1]).all(), name
     assert torch.isfinite(sim.qpos[[0, 2]]).all()
     assert not mujoco.mjtDisableBit.mjDSBL_AUTORESET & stage("so101").model.opt.disableflags
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any
 
 from omegaconf import MISSING
 
@@ -37,7 +38,10 @@ class GraphMode(Enum):
 
 @dataclass(kw_only=True, slots=True)
 class LayoutCfg:
-    """Where a scene's objects stand for one robot, and the buffer sizes its contacts need."""
+    """Where a scene's objects stand for one robot, and the buffer sizes its contacts need.
+
+    ``nconmax`` and ``njmax`` are for the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions.
+    """
 
     table_center: list[float] = MISSING
     table_half: list[float] = MISSING
@@ -45,6 +49,8 @@ class LayoutCfg:
     blue_xy: list[float] = MISSING
     nconmax: int = MISSING
     njmax: int = MISSING
+    env_nconmax: int = MISSING
+    env_njmax: int = MISSING
 
 
 @dataclass(kw_only=True, slots=True)
@@ -66,6 +72,7 @@ class RobotCfg:
     aperture_sites: list[str] = MISSING
     aperture_geoms: dict[str, list[str]] = field(default_factory=dict)
     aperture_bodies: dict[str, str] = field(default_factory=dict)
+    jaw_bodies: list[str] = MISSING
     replace_collision: bool = False
     approach_height: float = MISSING
     layouts: dict[str, LayoutCfg] = MISSING
@@ -136,11 +143,52 @@ class SimCfg:
 
 
 @dataclass(kw_only=True, slots=True)
-class ResetCfg:
-    """How each world's start differs from the nominal one: uniform, plus or minus."""
+class TermCfg:
+    """A function or class by its dotted name, and the values of its keyword parameters."""
 
-    cube_xy: float = MISSING
-    cube_yaw: float = MISSING
+    func: str = MISSING
+    params: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(kw_only=True, slots=True)
+class ActionTermCfg(TermCfg):
+    """A part of the action vector; ``func`` names a subclass of ``ActionTerm``."""
+
+
+@dataclass(kw_only=True, slots=True)
+class ObservationTermCfg(TermCfg):
+    """A part of an observation group.
+
+    ``noise`` is the half-width of uniform noise in the term's own unit, added first; then values are clipped to ``clip``
+    (low, high) and multiplied by ``scale``. ``history`` frames are kept, oldest first.
+    """
+
+    scale: float = 1.0
+    clip: list[float] | None = None
+    noise: float = 0.0
+    history: int = 1
+
+
+@dataclass(kw_only=True, slots=True)
+class ObservationGroupCfg:
+    """Terms that are concatenated into one tensor; ``noise: false`` switches the noise of all of them off."""
+
+    noise: bool = True
+    terms: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(kw_only=True, slots=True)
+class RewardTermCfg(TermCfg):
+    """A reward per second of simulated time: each frame adds weight x value x frame_dt."""
+
+    weight: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class TerminationTermCfg(TermCfg):
+    """Ends an episode; with ``time_out`` it is truncated, otherwise terminated."""
+
+    time_out: bool = False
 
 
 @dataclass(kw_only=True, slots=True)
@@ -149,6 +197,9 @@ class TaskCfg:
 
     name: str = MISSING
     control_hz: float = MISSING
+    episode_frames: int = MISSING
+    goal_height: float = MISSING
+    success: TermCfg | None = None
 
 
 @dataclass(kw_only=True, slots=True)
@@ -168,9 +219,10 @@ class PhaseCfg:
 
 @dataclass(kw_only=True, slots=True)
 class ControllerCfg:
-    """The scripted controller and its planner."""
+    """The scripted controller and its planner. Its commands go through the action terms of ``action``."""
 
     name: str = MISSING
+    action: dict[str, Any] = MISSING
     phases: dict[str, PhaseCfg] = MISSING
     knots: int = MISSING
     ik_tolerance: float = MISSING
@@ -262,7 +314,13 @@ class Config:
     solver: SolverCfg = field(default_factory=SolverCfg)
     batch: BatchCfg = field(default_factory=BatchCfg)
     sim: SimCfg = field(default_factory=SimCfg)
-    reset: ResetCfg = field(default_factory=ResetCfg)
+    # Terms by name. OmegaConf would not let a command line add a term to a typed dict, so the store types them:
+    # ActionTermCfg, ObservationGroupCfg, TermCfg, TerminationTermCfg and RewardTermCfg.
+    action: dict[str, Any] = field(default_factory=dict)
+    observation: dict[str, Any] = field(default_factory=dict)
+    reset: dict[str, Any] = field(default_factory=dict)
+    termination: dict[str, Any] = field(default_factory=dict)
+    reward: dict[str, Any] = field(default_factory=dict)
     task: TaskCfg = field(default_factory=TaskCfg)
     controller: ControllerCfg = field(default_factory=ControllerCfg)
     gate: GateCfg = field(default_factory=GateCfg)

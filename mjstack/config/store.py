@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
 from mjstack.config.schema import Config
+from mjstack.config.terms import type_terms
 from mjstack.config.validate import validate
 from mjstack.errors import MjstackError, UnknownName, suggest
 
@@ -71,6 +72,7 @@ def to_config(cfg: DictConfig) -> Config:
         config = cast(Config, OmegaConf.to_object(cfg))
     except (OmegaConfBaseException, AttributeError, TypeError) as error:
         raise _translate(error) from error
+    type_terms(config)
     validate(config)
     return config
 
@@ -109,7 +111,11 @@ def _translate(error: Exception) -> MjstackError:
             "solver",
             "batch",
             "sim",
+            "action",
+            "observation",
             "reset",
+            "termination",
+            "reward",
             "task",
             "controller",
             "gate",

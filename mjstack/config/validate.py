@@ -40,6 +40,7 @@ def _timing(cfg: Config) -> None:
     _positive("timing.physics_dt", cfg.timing.physics_dt, "s")
     _positive_int("timing.substeps", cfg.timing.substeps)
     _positive("task.control_hz", cfg.task.control_hz, "Hz")
+    _positive_int("task.episode_frames", cfg.task.episode_frames)
     wanted = 1.0 / cfg.task.control_hz
     if not math.isclose(cfg.timing.frame_dt, wanted, rel_tol=1e-9):
         raise ConfigError(
@@ -95,24 +96,20 @@ def _scene(cfg: Config) -> None:
     for key in ("table_half", "table_friction", "cube_friction"):
         for number in getattr(scene, key):
             _positive(f"scene.{key}", number)
-    for name in ("cube_xy", "cube_yaw"):
-        value = getattr(cfg.reset, name)
-        if not (math.isfinite(value) and value >= 0.0):
-            raise ConfigError(f"reset.{name}", value, "a number that is not negative")
     for key in ("red_xy", "blue_xy"):
         value = getattr(scene, key)
         _length(f"scene.{key}", value, 2)
         for axis in (0, 1):
             reach = scene.table_half[axis] - scene.cube_half
-            if not abs(value[axis] - scene.table_center[axis]) + cfg.reset.cube_xy <= reach:
+            if not abs(value[axis] - scene.table_center[axis]) <= reach:
                 low, high = scene.table_center[axis] - reach, scene.table_center[axis] + reach
                 raise ConfigError(
                     f"scene.{key}",
                     value,
-                    f"{'xy'[axis]} within [{low:.3f}, {high:.3f}] m less reset.cube_xy, so that the cube is on the table",
+                    f"{'xy'[axis]} within [{low:.3f}, {high:.3f}] m, so that the cube is on the table",
                 )
     apart = math.dist(scene.red_xy, scene.blue_xy)
-    if not apart >= 2.0 * math.sqrt(2.0) * (scene.cube_half + cfg.reset.cube_xy):
+    if not apart >= 2.0 * math.sqrt(2.0) * scene.cube_half:
         raise ConfigError("scene.red_xy", scene.red_xy, f"a cube that does not touch the blue one at {scene.blue_xy}")
 
 

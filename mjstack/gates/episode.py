@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from mjstack.config.schema import Config, ResetCfg
+from mjstack.config.schema import Config, TermCfg
 from mjstack.control.scripted import CommandTape, ScriptedPlanner
-from mjstack.mdp.reset import reset_cubes, reset_home
+from mjstack.envs import Env, scripted_config
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
 from mjstack.tasks.stack import StackEvidence, Verdict
@@ -20,7 +20,8 @@ FrameHook = Callable[[int, Simulation], None]
 Advance = Callable[[str, int, int], None]
 """Reports progress: what is going on, how much is done, and of how much."""
 
-NOMINAL = ResetCfg(cube_xy=0.0, cube_yaw=0.0)
+Reset = dict[str, TermCfg]
+NOMINAL: Reset = {"home": TermCfg(func="mjstack.mdp.reset.home")}
 
 
 @dataclass(slots=True)
@@ -55,21 +56,22 @@ def start_worlds(
     sim: Simulation,
     index: SceneIndex,
     cfg: Config,
-    reset: ResetCfg,
+    reset: Reset,
     planner: ScriptedPlanner,
     advance: Advance | None = None,
-) -> CommandTape:
-    """Resets every world and plans its commands from where its cubes then stand."""
-    everyone = torch.ones(sim.nworld, dtype=torch.bool, device=sim.device)
-    sim.reset()
-    reset_home(sim, index, cfg.robot, everyone)
-    episode = torch.zeros(sim.nworld, dtype=torch.int64, device=sim.device)
-    reset_cubes(sim, index, reset, everyone, seed=cfg.seed, episode=episode)
+) -> tuple[Env, CommandTape]:
+    """Resets every world and plans its commands from where its cubes then stand.
+
+    Returns:
+        The environment that the commands go through, and the commands, which are its actions.
+    """
+    env = Env(sim, index, scripted_config(cfg, reset=reset), check_faults=False)  # the acceptance names lost worlds
+    env.reset(seed=cfg.seed)
     sim.forward()
     cubes = torch.cat([sim.qpos[:, a : a + 2] for a in index.cube_qpos], dim=1)
     progress = None if advance is None else (lambda done: advance("planning", done, sim.nworld))
     tape = planner.plan(cubes.double().cpu().numpy(), progress)
-    return tape.to(sim.device, sim.ctrl.dtype)
+    return env, tape.to(sim.device, sim.ctrl.dtype)
 
 
 def run_episode(
@@ -77,7 +79,7 @@ def run_episode(
     index: SceneIndex,
     cfg: Config,
     planner: ScriptedPlanner,
-    reset: ResetCfg,
+    reset: Reset,
     *,
     record: bool = False,
     snapshots: frozenset[int] = frozenset(),
@@ -97,16 +99,14 @@ def run_episode(
         on_frame: Called after each frame, before the evidence is taken.
         advance: Told about progress.
     """
-    tape = start_worlds(sim, index, cfg, reset, planner, advance)
+    env, tape = start_worlds(sim, index, cfg, reset, planner, advance)
     evidence = StackEvidence(cfg, index, planner.phases, sim.nworld, sim.device)
     trajectory = np.full((tape.frames, sim.qpos.shape[1]), np.nan) if record else None
     states: dict[int, State] = {}
-    actuators = torch.from_numpy(index.ctrl).to(sim.device)
     sim.synchronize()
     began = time.perf_counter()
     for frame in range(tape.frames):
-        sim.ctrl[:, actuators] = tape.command(frame)
-        sim.step(cfg.timing.substeps)
+        env.step(tape.command(frame))
         if on_frame is not None:
             on_frame(frame, sim)
         evidence.update(sim)

@@ -11,12 +11,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjstack.config.schema import Backend, Config, ResetCfg
+from mjstack.config.schema import Backend, Config
 from mjstack.control.scripted import ScriptedPlanner
-from mjstack.gates.episode import NOMINAL, Advance, Episode, FrameHook, State, run_episode
+from mjstack.gates.episode import NOMINAL, Advance, Episode, FrameHook, Reset, State, run_episode
+from mjstack.managers.reset import required_fields
 from mjstack.report.record import GateResult, Status
-from mjstack.robots import robot_spec
-from mjstack.scene import SceneIndex, build_scene
+from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import Simulation, make_simulation, resolve_backend, resolve_device
 from mjstack.tasks.stack import Rule, Verdict, describe_rules
 
@@ -53,12 +53,12 @@ class GateContext:
     @cached_property
     def model(self) -> mujoco.MjModel:
         """The scene for physics."""
-        return self._build(visuals=False)
+        return build_model(self.cfg)
 
     @cached_property
     def visual_model(self) -> mujoco.MjModel:
         """The same scene with everything that only pictures need."""
-        return self._build(visuals=True)
+        return build_model(self.cfg, visuals=True)
 
     @cached_property
     def index(self) -> SceneIndex:
@@ -84,14 +84,18 @@ class GateContext:
         episode = self.run(sim, NOMINAL, record=True, snapshots=frames, on_frame=hook)
         return sim, episode
 
-    def run(self, sim: Simulation, reset: ResetCfg, **kwargs: Any) -> Episode:
+    def run(self, sim: Simulation, reset: Reset, **kwargs: Any) -> Episode:
         """`run_episode` with this context's scene and planner."""
         return run_episode(sim, self.index, self.cfg, self.planner, reset, advance=self.advance, **kwargs)
 
     def batch_simulation(self, nworld: int) -> Simulation:
         """Worlds on the backend of the batch."""
-        backend, device = self.backend
-        return make_simulation(self.model, self.cfg, nworld, backend=backend, device=device)
+        return self.simulation(nworld, *self.backend)
+
+    def simulation(self, nworld: int, backend: Backend, device: str) -> Simulation:
+        """Worlds that can start as the configuration says."""
+        fields = required_fields(self.cfg.reset)
+        return make_simulation(self.model, self.cfg, nworld, backend=backend, device=device, fields=fields)
 
     def parity_simulation(self) -> Simulation:
         """One MJWarp world."""
@@ -104,10 +108,6 @@ class GateContext:
     def phase_start(self, name: str) -> int:
         """First frame of a phase."""
         return next(phase.start for phase in self.planner.phases if phase.name == name)
-
-    def _build(self, *, visuals: bool) -> mujoco.MjModel:
-        cfg = self.cfg
-        return build_scene(robot_spec(cfg.robot, cfg.model), cfg.scene, cfg.timing, cfg.solver, visuals=visuals)
 
 
 def judge_one(verdict: Verdict) -> tuple[Status, str, dict]:

@@ -15,7 +15,7 @@ from mjstack.errors import MjstackError
 from mjstack.gates.episode import State, restore, snapshot, start_worlds
 from mjstack.gates.gate import GateContext
 from mjstack.report.record import GateResult, Status, Value
-from mjstack.sim import LOST_PHYSICS, Simulation, make_simulation, resolve_sizes
+from mjstack.sim import LOST_PHYSICS, Simulation, resolve_sizes
 
 log = logging.getLogger(__name__)
 
@@ -58,18 +58,18 @@ def _guarded(context: GateContext, name: str, backend: Backend, device: str) -> 
 def _measure(context: GateContext, name: str, backend: Backend, device: str) -> GateResult:
     cfg, t = context.cfg, context.cfg.gate.throughput
     began = time.perf_counter()
-    sim = make_simulation(context.model, cfg, cfg.nworld, backend=backend, device=device)
+    sim = context.simulation(cfg.nworld, backend, device)
     build_seconds = time.perf_counter() - began
-    tape = start_worlds(sim, context.index, cfg, cfg.reset, context.planner, context.advance)
+    env, tape = start_worlds(sim, context.index, cfg, cfg.reset, context.planner, context.advance)
     first = context.phase_start(t.from_phase)
-    actuators = torch.from_numpy(context.index.ctrl).to(sim.device)
 
     def play(start: int, frames: int) -> float:
         """Seconds that some frames take, the device idle at both ends."""
         sim.synchronize()
         began = time.perf_counter()
         for frame in range(start, start + frames):
-            sim.ctrl[:, actuators] = tape.command(frame)
+            env.action_manager.process(tape.command(frame))
+            env.action_manager.write_commands()
             sim.step(cfg.timing.substeps)
         sim.synchronize()
         return time.perf_counter() - began

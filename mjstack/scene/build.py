@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 
-from mjstack.config.schema import SceneCfg, SolverCfg, TimingCfg
+from mjstack.config.schema import Config, SceneCfg, SolverCfg, TimingCfg
+from mjstack.robots import robot_spec
 
 RED, BLUE = "red_cube", "blue_cube"
+_NETFORCE = 3  # the contact sensor's reduction to one force and torque, in the world frame
+
+
+def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
+    """The configured robot in the configured scene, compiled.
+
+    Args:
+        cfg: The configuration.
+        visuals: Keep geoms that only pictures need. The physics is the same without them, and steps faster.
+    """
+    spec = robot_spec(cfg.robot, cfg.model)
+    return build_scene(spec, cfg.scene, cfg.timing, cfg.solver, jaw_bodies=cfg.robot.jaw_bodies, visuals=visuals)
 
 
 def build_scene(
-    spec: mujoco.MjSpec, scene: SceneCfg, timing: TimingCfg, solver: SolverCfg, *, visuals: bool = False
+    spec: mujoco.MjSpec,
+    scene: SceneCfg,
+    timing: TimingCfg,
+    solver: SolverCfg,
+    *,
+    jaw_bodies: Sequence[str] = (),
+    visuals: bool = False,
 ) -> mujoco.MjModel:
     """Adds the scene to a robot and compiles it.
 
@@ -19,7 +40,8 @@ def build_scene(
         scene: Table and cubes.
         timing: Physics timestep.
         solver: Solver settings; ``None`` keeps the robot file's own.
-        visuals: Keep geoms that only pictures need. The physics is the same without them, and steps faster.
+        jaw_bodies: Bodies whose contact force on each cube a sensor measures.
+        visuals: Keep geoms that only pictures need.
 
     Returns:
         The compiled model; its ``qpos0`` has the cubes at their nominal places.
@@ -60,6 +82,9 @@ def build_scene(
             condim=3,
             rgba=rgba,
         )
+    for cube in (RED, BLUE):
+        for jaw in jaw_bodies:
+            _add_jaw_sensor(spec, jaw, cube)
     if visuals:
         world.add_light(pos=[0.2, -0.6, 1.6], dir=[0.1, 0.4, -1.0], diffuse=[0.6, 0.6, 0.6])
         spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
@@ -68,6 +93,24 @@ def build_scene(
     else:
         spec.compiler.discardvisual = True
     return spec.compile()
+
+
+def jaw_sensor(jaw: str, cube: str) -> str:
+    """Name of the sensor of the force between a jaw and a cube."""
+    return f"{jaw}/{cube}"
+
+
+def _add_jaw_sensor(spec: mujoco.MjSpec, jaw: str, cube: str) -> None:
+    """Measures the net contact force [N] between two bodies: 3 numbers, world frame."""
+    spec.add_sensor(
+        name=jaw_sensor(jaw, cube),
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        objname=jaw,
+        reftype=mujoco.mjtObj.mjOBJ_BODY,
+        refname=cube,
+        intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NETFORCE, 1],
+    )
 
 
 def table_top(scene: SceneCfg) -> float:

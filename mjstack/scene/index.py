@@ -2,12 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
+import torch
 
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import UnknownName
-from mjstack.scene.build import BLUE, RED
+from mjstack.scene.build import BLUE, RED, jaw_sensor
+
+CUBES = (RED, BLUE)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotTensors:
+    """The robot's columns and limits as tensors, arm joints first, then the gripper's.
+
+    Attributes:
+        qpos: Columns of qpos, shape ``(n,)``, int64.
+        qvel: Columns of qvel, shape ``(n,)``, int64.
+        ctrl: Columns of ctrl, shape ``(n,)``, int64.
+        range: Joint limits [rad, m], shape ``(n, 2)``.
+        ctrl_range: Limits of the commands, shape ``(n, 2)``.
+        home: Home command, shape ``(n,)``.
+        gripper_open: Command of the open gripper, shape ``(n_gripper,)``.
+        gripper_closed: Likewise closed.
+    """
+
+    qpos: torch.Tensor
+    qvel: torch.Tensor
+    ctrl: torch.Tensor
+    range: torch.Tensor
+    ctrl_range: torch.Tensor
+    home: torch.Tensor
+    gripper_open: torch.Tensor
+    gripper_closed: torch.Tensor
 
 
 class SceneIndex:
@@ -17,24 +47,70 @@ class SceneIndex:
         cube_qpos: First qpos address of the red and of the blue cube (7 numbers each: position, quaternion).
         cube_qvel: First qvel address of the red and of the blue cube (6 numbers each).
         robot_qpos: qpos addresses of the arm's and then the gripper's joints.
+        robot_qvel: qvel addresses in the same order.
+        robot_range: Joint limits in the same order [rad, m], shape ``(n, 2)``.
         ctrl: Actuator indices in the same order.
+        ctrl_range: Limits of the commands in the same order, shape ``(n, 2)``.
+        n_arm: How many of them are the arm's.
         aperture_sites: The two site indices whose midpoint is the aperture centre.
+        objects: First qpos and qvel address of every object that moves freely, by name.
+        bodies: Body index of those objects.
+        geoms: Geom indices of those objects.
+        jaw_force: First sensordata address of each jaw's force on an object (3 numbers), by the object's name.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
-        joints = [*robot.arm_joints, *robot.gripper_joints]
-        self.robot_qpos = np.array([model.jnt_qposadr[find(model, "joint", n)] for n in joints])
-        self.ctrl = np.array([find(model, "actuator", n) for n in joints])
+        names = [*robot.arm_joints, *robot.gripper_joints]
+        joints = [find(model, "joint", n) for n in names]
+        self._robot = robot
+        self._tensors: dict[tuple[torch.device, torch.dtype], RobotTensors] = {}
+        self.robot_qpos = np.array([model.jnt_qposadr[j] for j in joints])
+        self.robot_qvel = np.array([model.jnt_dofadr[j] for j in joints])
+        self.robot_range = model.jnt_range[joints].copy()
+        self.ctrl = np.array([find(model, "actuator", n) for n in names])
+        self.ctrl_range = model.actuator_ctrlrange[self.ctrl].copy()
+        self.n_arm = len(robot.arm_joints)
         self.aperture_sites = [find(model, "site", n) for n in robot.aperture_sites]
-        cubes = [find(model, "joint", n) for n in (RED, BLUE)]
+        cubes = [find(model, "joint", n) for n in CUBES]
         self.cube_qpos = [int(model.jnt_qposadr[j]) for j in cubes]
         self.cube_qvel = [int(model.jnt_dofadr[j]) for j in cubes]
+        self.objects = {n: (q, v) for n, q, v in zip(CUBES, self.cube_qpos, self.cube_qvel, strict=True)}
+        self.bodies = {n: int(model.jnt_bodyid[j]) for n, j in zip(CUBES, cubes, strict=True)}
+        self.geoms = {n: np.flatnonzero(model.geom_bodyid == body).tolist() for n, body in self.bodies.items()}
+        self.jaw_force: dict[str, list[int]] = {}
+        for cube in CUBES:
+            sensors = [find(model, "sensor", jaw_sensor(jaw, cube)) for jaw in robot.jaw_bodies]
+            self.jaw_force[cube] = [int(model.sensor_adr[s]) for s in sensors]
+
+    def on(self, device: torch.device, dtype: torch.dtype) -> RobotTensors:
+        """The robot's part on a device. Made once: a captured step may not copy from the host."""
+        key = (device, dtype)
+        if key not in self._tensors:
+            columns = [
+                torch.as_tensor(a, dtype=torch.int64, device=device) for a in (self.robot_qpos, self.robot_qvel, self.ctrl)
+            ]
+            values = (
+                self.robot_range,
+                self.ctrl_range,
+                self._robot.home,
+                self._robot.gripper_open,
+                self._robot.gripper_closed,
+            )
+            numbers = [torch.as_tensor(np.asarray(v, dtype=float), dtype=dtype, device=device) for v in values]
+            self._tensors[key] = RobotTensors(*columns, *numbers)
+        return self._tensors[key]
+
+    def object_address(self, name: str) -> tuple[int, int]:
+        """First qpos and qvel address of an object; an unknown name is an error that lists the known ones."""
+        if name not in self.objects:
+            raise UnknownName("object", name, self.objects)
+        return self.objects[name]
 
 
 def find(model: mujoco.MjModel, kind: str, name: str) -> int:
-    """Index of a named joint, actuator or site; an unknown name is an error that lists the known ones."""
+    """Index of a named joint, actuator, site or sensor; an unknown name is an error that lists the known ones."""
     index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
     if index < 0:
-        count = {"joint": model.njnt, "actuator": model.nu, "site": model.nsite}[kind]
+        count = {"joint": model.njnt, "actuator": model.nu, "site": model.nsite, "sensor": model.nsensor}[kind]
         raise UnknownName(kind, name, [getattr(model, kind)(i).name for i in range(count)])
     return index

@@ -3,10 +3,12 @@
 from mjstack.sim.build import cuda_driver, cuda_name, make_simulation, resolve_backend, resolve_device
 from mjstack.sim.simulation import LOST_PHYSICS, Overflow, Simulation, describe_overflow
 from mjstack.sim.sizes import BatchSizes, resolve_sizes
+from mjstack.sim.views import Fields
 
 __all__ = [
     "LOST_PHYSICS",
     "BatchSizes",
+    "Fields",
     "Overflow",
     "Simulation",
     "cuda_driver",

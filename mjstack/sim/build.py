@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -13,7 +14,7 @@ from mjstack.config.schema import Backend, Config
 from mjstack.errors import ConfigError, DeviceError
 from mjstack.sim.native import NativeSimulation
 from mjstack.sim.simulation import Simulation
-from mjstack.sim.sizes import resolve_sizes
+from mjstack.sim.sizes import BatchSizes, resolve_sizes
 
 
 def resolve_device(requested: str) -> str:
@@ -43,7 +44,14 @@ def resolve_backend(cfg: Config) -> tuple[Backend, str]:
 
 
 def make_simulation(
-    model: mujoco.MjModel, cfg: Config, nworld: int, *, backend: Backend | None = None, device: str | None = None
+    model: mujoco.MjModel,
+    cfg: Config,
+    nworld: int,
+    *,
+    backend: Backend | None = None,
+    device: str | None = None,
+    fields: Sequence[str] = (),
+    sizes: BatchSizes | None = None,
 ) -> Simulation:
     """Builds a simulation.
 
@@ -53,13 +61,19 @@ def make_simulation(
         nworld: Number of worlds.
         backend: Overrides the configured backend.
         device: Overrides the configured device.
+        fields: Model fields that may differ from world to world, by MuJoCo's names.
+        sizes: Overrides the configured buffer sizes; only MJWarp has any.
+
+    Raises:
+        UnknownName: A field does not exist, or cannot differ.
+        UnsupportedModel: MJWarp does not implement a feature of the model.
     """
     chosen, where = resolve_backend(cfg) if backend is None else (backend, device or resolve_device(cfg.sim.device))
     if chosen is Backend.native:
-        return NativeSimulation(model, nworld)
+        return NativeSimulation(model, nworld, fields=fields)
     from mjstack.sim.mjwarp import MjwarpSimulation  # loads Warp, which native runs do not need
 
-    return MjwarpSimulation(model, nworld, resolve_sizes(cfg), where, cfg.graph)
+    return MjwarpSimulation(model, nworld, sizes or resolve_sizes(cfg), where, cfg.graph, fields=fields)
 
 
 def cuda_name(device: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import warnings
+from collections.abc import Sequence
 
 import mujoco
 import torch
@@ -13,19 +14,20 @@ import warp as wp
 from mjstack.config.schema import GraphMode
 from mjstack.errors import MjstackError, UnsupportedModel
 from mjstack.sim.counters import count_contacts, record_peaks
+from mjstack.sim.fields import PLACING_FIELDS, check_fields
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.sim.sizes import BatchSizes
+from mjstack.sim.static_geoms import place_static_geoms
+from mjstack.sim.streams import torch_stream_scope
+from mjstack.sim.views import Fields, FixedViews, check_mask
 
 wp.config.log_level = wp.LOG_ERROR  # before mujoco_warp, which starts Warp on import
 import mujoco_warp as mjw  # noqa: E402
 
 log = logging.getLogger(__name__)
 
-# One object per torch stream, for ever: a second one for the same stream would unregister it when freed.
-_STREAMS: dict[tuple[str, int], wp.Stream] = {}
 
-
-class MjwarpSimulation:
+class MjwarpSimulation(FixedViews):
     """`Simulation` on MuJoCo Warp, float32.
 
     Box against box uses the primitive collider, as native MuJoCo does: with MJWarp's convex one the kept contacts of a
@@ -39,7 +41,14 @@ class MjwarpSimulation:
     backend = "mjwarp"
 
     def __init__(
-        self, model: mujoco.MjModel, nworld: int, sizes: BatchSizes, device: str, graph: GraphMode = GraphMode.auto
+        self,
+        model: mujoco.MjModel,
+        nworld: int,
+        sizes: BatchSizes,
+        device: str,
+        graph: GraphMode = GraphMode.auto,
+        *,
+        fields: Sequence[str] = (),
     ) -> None:
         """Uploads the model and allocates nworld worlds at qpos0.
 
@@ -49,22 +58,26 @@ class MjwarpSimulation:
             sizes: Buffer sizes.
             device: ``"cpu"`` or ``"cuda:N"``.
             graph: Whether `step` replays a captured graph.
+            fields: Model fields that may differ from world to world.
 
         Raises:
+            UnknownName: A field does not exist, or cannot differ.
             UnsupportedModel: MJWarp does not implement a feature of the model.
         """
         self.model, self.nworld, self.sizes = model, nworld, sizes
         self.device = torch.device(device)
         self._device = wp.get_device(device)
         self._graph_mode = graph
-        self._graphs: dict[int, object] = {}
+        self._graphs: dict[tuple[int, bool], object] = {}
+        names = check_fields(fields)
+        self._placing = not PLACING_FIELDS.isdisjoint(names)
         name = self._device.name if self._device.is_cuda else "Warp's CPU device"
         self.description = f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}"
         with wp.ScopedDevice(self._device):
             try:
                 with warnings.catch_warnings():
                     warnings.filterwarnings("error", category=UserWarning)
-                    self._m = mjw.put_model(model)
+                    self._m = mjw.put_model(model, batch_sizes=dict.fromkeys(names, nworld))
             except (NotImplementedError, ValueError, UserWarning) as error:
                 raise UnsupportedModel((str(error) or repr(error)).splitlines()[0].rstrip(".")) from error
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
@@ -79,9 +92,14 @@ class MjwarpSimulation:
             self._steps = wp.zeros(nworld, dtype=wp.int64)
             self._mask = wp.zeros(nworld, dtype=bool)
         d = self._d
-        self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
-        self.xpos, self.xquat, self.site_xpos = wp.to_torch(d.xpos), wp.to_torch(d.xquat), wp.to_torch(d.site_xpos)
-        self.qfrc_actuator = wp.to_torch(d.qfrc_actuator)
+        self.qpos, self.qvel, self.act, self.ctrl = map(wp.to_torch, (d.qpos, d.qvel, d.act, d.ctrl))
+        self.xpos, self.xquat = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
+        self.site_xpos, self.geom_xpos = wp.to_torch(d.site_xpos), wp.to_torch(d.geom_xpos)
+        self.qfrc_actuator, self.sensordata = wp.to_torch(d.qfrc_actuator), wp.to_torch(d.sensordata)
+        # `view` never copies: a field that MJWarp holds as vectors or matrices keeps its memory under MuJoCo's shape.
+        self.fields = Fields(
+            {name: wp.to_torch(getattr(self._m, name)).view(nworld, *getattr(model, name).shape) for name in names}
+        )
         self.constraint_count = wp.to_torch(d.nefc)
         self.contact_count = wp.to_torch(self._contacts)
         self.peak_constraints = wp.to_torch(self._peak_nefc)
@@ -93,20 +111,28 @@ class MjwarpSimulation:
         self._torch_mask = wp.to_torch(self._mask)
         self._warm_up()
 
-    def step(self, n: int = 1) -> None:
-        """Advances every world by n physics steps under the current ctrl."""
-        graph = self._graph(n)
-        with self._stream():
+    def step(self, n: int = 1, *, kinematics: bool = False) -> None:
+        """Advances every world by n physics steps under the current ctrl; the poses follow with kinematics."""
+        graph = self._graph(n, kinematics)
+        with torch_stream_scope(self._device):
             if graph is None:
-                self._substeps(n)
+                self._substeps(n, kinematics)
             else:
                 wp.capture_launch(graph)
 
     def forward(self) -> None:
         """Computes everything that derives from the state, without advancing time."""
-        with self._stream():
+        with torch_stream_scope(self._device):
+            self._place()
             mjw.forward(self._m, self._d)
             self._count(steps=0)
+
+    def kinematics(self, mask: torch.Tensor | None = None) -> None:
+        """Brings the poses of all worlds up to the current qpos: a mask would save nothing."""
+        if mask is not None:
+            check_mask(mask, self.nworld, self.device)
+        with torch_stream_scope(self._device):
+            self._pose()
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Puts the masked worlds back to qpos0, at rest, and clears their counters and overflow bits."""
@@ -114,8 +140,9 @@ class MjwarpSimulation:
             self._torch_mask.fill_(True)
             self.peak_pool.zero_()
         else:
+            check_mask(mask, self.nworld, self.device)
             self._torch_mask.copy_(mask)
-        with self._stream():
+        with torch_stream_scope(self._device):
             mjw.reset_data(self._m, self._d, reset=self._mask)
         keep = ~self._torch_mask
         counters = (self.overflow, self.solver_limits, self.peak_contacts, self.peak_constraints, self.contact_count)
@@ -146,20 +173,32 @@ class MjwarpSimulation:
         """Drops the graphs; buffers go with the object."""
         self._graphs.clear()
 
-    def _stream(self) -> wp.ScopedStream | wp.ScopedDevice:
-        """Work goes to torch's current stream, so that reads and writes of the views are ordered with it."""
-        if not self._device.is_cuda:
-            return wp.ScopedDevice(self._device)
-        current = torch.cuda.current_stream(self.device)
-        key = (str(self._device), current.cuda_stream)
-        if key not in _STREAMS:
-            _STREAMS[key] = wp.stream_from_torch(current)
-        return wp.ScopedStream(_STREAMS[key], sync_enter=False, sync_exit=False)
-
-    def _substeps(self, n: int) -> None:
+    def _substeps(self, n: int, kinematics: bool) -> None:
+        self._place()
         for _ in range(n):
             mjw.step(self._m, self._d)
             self._count(steps=1)
+        if kinematics:
+            self._pose()
+
+    def _pose(self) -> None:
+        """Poses of the current qpos, and nothing that a later step would start from: its forward computes them anew."""
+        mjw.kinematics(self._m, self._d)
+        self._place(posed=True)
+
+    def _place(self, *, posed: bool = False) -> None:
+        """Puts the geoms that never move where the fields say: MJWarp does it once, when it makes the data."""
+        if not self._placing:
+            return
+        m, d = self._m, self._d
+        if not posed:
+            mjw.kinematics(m, d)
+        wp.launch(
+            place_static_geoms,
+            dim=(self.nworld, m.ngeom),
+            inputs=[m.body_rootid, m.body_weldid, m.body_mocapid, m.geom_bodyid, m.geom_pos, m.geom_quat, d.xpos, d.xquat],
+            outputs=[d.geom_xpos, d.geom_xmat],
+        )
 
     def _count(self, *, steps: int) -> None:
         """Two launches: steps made, what each world uses now, and the most it has used."""
@@ -188,27 +227,28 @@ class MjwarpSimulation:
 
     def _warm_up(self) -> None:
         """Compiles and loads every kernel, then leaves the worlds as new."""
-        with self._stream():
-            self._substeps(1)
+        with torch_stream_scope(self._device):
+            self._substeps(1, kinematics=True)
         self.synchronize()
         self.reset()
         self.synchronize()
 
-    def _graph(self, n: int) -> object | None:
+    def _graph(self, n: int, kinematics: bool) -> object | None:
         if self._graph_mode is GraphMode.off or n == 0:
             return None
-        if n not in self._graphs:
-            self._graphs[n] = self._capture(n)
-        return self._graphs[n]
+        key = (n, kinematics)
+        if key not in self._graphs:
+            self._graphs[key] = self._capture(n, kinematics)
+        return self._graphs[key]
 
-    def _capture(self, n: int) -> object | None:
+    def _capture(self, n: int, kinematics: bool) -> object | None:
         """Captures n substeps. Python's collector waits, so that nothing is freed in the middle of a capture."""
         self.synchronize()
         collecting = gc.isenabled()
         gc.disable()
         try:
             with wp.ScopedDevice(self._device), wp.ScopedCapture() as capture:
-                self._substeps(n)
+                self._substeps(n, kinematics)
         except Exception as error:
             if self._graph_mode is GraphMode.require:
                 raise MjstackError(f"graph=require: {n} substeps cannot be captured: {error}. Use graph=auto.") from error

@@ -5,18 +5,29 @@ from __future__ import annotations
 import copy
 import os
 import platform
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from functools import partial
 
 import mujoco
 import numpy as np
 import torch
 
+from mjstack.sim.fields import check_fields
+from mjstack.sim.simple_bodies import SimpleBodies
 from mjstack.sim.simulation import Overflow
+from mjstack.sim.views import Fields, FixedViews, check_mask
 
 _S = mujoco.mjtState
 _SPEC = int(_S.mjSTATE_TIME | _S.mjSTATE_QPOS | _S.mjSTATE_QVEL | _S.mjSTATE_ACT | _S.mjSTATE_WARMSTART | _S.mjSTATE_CTRL)
 _CONTACT_FULL = int(mujoco.mjtWarning.mjWARN_CONTACTFULL)
 _CONSTRAINT_FULL = int(mujoco.mjtWarning.mjWARN_CNSTRFULL)
+_SAMEFRAME = {
+    "body_sameframe": {"body_ipos", "body_iquat"},
+    "geom_sameframe": {"geom_pos", "geom_quat"},
+    "site_sameframe": {"site_pos", "site_quat"},
+}
 
 
 def available_cores() -> int:
@@ -24,55 +35,68 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class NativeSimulation:
+@dataclass(frozen=True, slots=True)
+class _Worker:
+    """What one thread works with. Each pair is an array of all worlds and the one of the thread's model or data beside it."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    fields: list[tuple[np.ndarray, np.ndarray]]
+    poses: list[tuple[np.ndarray, np.ndarray]]
+    others: list[tuple[np.ndarray, np.ndarray]]
+
+
+class NativeSimulation(FixedViews):
     """`Simulation` on native MuJoCo, float64 on the CPU.
 
     A world's whole state, warm start included, is one row that goes into a thread's MjData before its substeps and comes
-    back after them. MuJoCo's automatic reset of a diverged world is switched off, because it would hide the divergence; a
-    world whose state is not finite is not stepped any more, and its derived arrays are NaN.
+    back after them; so do its model fields into the thread's MjModel, if there are any. MuJoCo's automatic reset of a
+    diverged world is switched off, because it would hide the divergence; a world whose state is not finite is not stepped
+    any more, and its derived arrays are NaN.
     """
 
     backend = "native"
 
-    def __init__(self, model: mujoco.MjModel, nworld: int, *, nthread: int | None = None) -> None:
+    def __init__(self, model: mujoco.MjModel, nworld: int, *, fields: Sequence[str] = (), nthread: int | None = None) -> None:
         """Allocates nworld worlds at qpos0.
 
         Args:
             model: The compiled model.
             nworld: Number of worlds.
+            fields: Model fields that may differ from world to world.
             nthread: Threads; all cores by default.
+
+        Raises:
+            UnknownName: A field does not exist, or cannot differ.
         """
         self.model = copy.copy(model)
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.nworld = nworld
         self.device = torch.device("cpu")
-        self._nthread = max(1, min(nthread or available_cores(), nworld))
-        self.description = f"MuJoCo {mujoco.__version__} on {self._nthread} threads, {platform.machine()} CPU"
-        self._datas = [mujoco.MjData(self.model) for _ in range(self._nthread)]
-        self._pool = ThreadPoolExecutor(self._nthread) if self._nthread > 1 else None
+        nthread = max(1, min(nthread or available_cores(), nworld))
+        self.description = f"MuJoCo {mujoco.__version__} on {nthread} threads, {platform.machine()} CPU"
+        self._pool = ThreadPoolExecutor(nthread) if nthread > 1 else None
 
         m = self.model
         self._state = np.zeros((nworld, mujoco.mj_stateSize(m, _SPEC)))
-        # mj_getState's order: time, qpos, qvel, act, (history), warm start, ctrl.
-        q, v = 1, 1 + m.nq
-        self.qpos = torch.from_numpy(self._state[:, q : q + m.nq])
-        self.qvel = torch.from_numpy(self._state[:, v : v + m.nv])
-        self.ctrl = torch.from_numpy(self._state[:, self._state.shape[1] - m.nu :])
-        self._physics = slice(q, v + m.nv)
-        self._finite: np.ndarray = np.ones(nworld, dtype=bool)
+        # mj_getState's order: time, qpos, qvel, act, warm start, ctrl.
+        q, v, a, u = 1, 1 + m.nq, 1 + m.nq + m.nv, self._state.shape[1] - m.nu
+        self._qpos = self._state[:, q:v]
+        self._physics = self._state[:, q : a + m.na]
+        self.qpos, self.qvel = torch.from_numpy(self._qpos), torch.from_numpy(self._state[:, v:a])
+        self.act, self.ctrl = torch.from_numpy(self._state[:, a : a + m.na]), torch.from_numpy(self._state[:, u:])
         self._initial = self._state[0].copy()
-        mujoco.mj_getState(m, self._datas[0], self._initial, _SPEC)
+        mujoco.mj_getState(m, mujoco.MjData(m), self._initial, _SPEC)
 
-        self._derived = {
+        self._poses = {
             "xpos": np.zeros((nworld, m.nbody, 3)),
             "xquat": np.zeros((nworld, m.nbody, 4)),
             "site_xpos": np.zeros((nworld, m.nsite, 3)),
-            "qfrc_actuator": np.zeros((nworld, m.nv)),
+            "geom_xpos": np.zeros((nworld, m.ngeom, 3)),
         }
-        self.xpos = torch.from_numpy(self._derived["xpos"])
-        self.xquat = torch.from_numpy(self._derived["xquat"])
-        self.site_xpos = torch.from_numpy(self._derived["site_xpos"])
-        self.qfrc_actuator = torch.from_numpy(self._derived["qfrc_actuator"])
+        self._others = {"qfrc_actuator": np.zeros((nworld, m.nv)), "sensordata": np.zeros((nworld, m.nsensordata))}
+        self.xpos, self.xquat, self.site_xpos, self.geom_xpos = map(torch.from_numpy, self._poses.values())
+        self.qfrc_actuator, self.sensordata = map(torch.from_numpy, self._others.values())
         # Columns: contacts, rows, peak contacts, peak rows, overflow bits.
         self._counts = np.zeros((nworld, 5), dtype=np.int32)
         self.contact_count, self.constraint_count, self.peak_contacts, self.peak_constraints, self.overflow = torch.from_numpy(
@@ -80,20 +104,41 @@ class NativeSimulation:
         ).unbind(1)
         self._steps = np.zeros(nworld, dtype=np.int64)
         self.step_count = torch.from_numpy(self._steps)
+        self._fields = {
+            name: np.repeat(np.asarray(getattr(m, name), dtype=float)[None], nworld, axis=0) for name in check_fields(fields)
+        }
+        self.fields = Fields({name: torch.from_numpy(values) for name, values in self._fields.items()})
+        derive = not SimpleBodies.FIELDS.isdisjoint(self._fields) and m.dof_simplenum.any()
+        self._simple = SimpleBodies(m, self._fields, nworld) if derive else None
+        self._workers = [self._worker() for _ in range(nthread)]
         self.reset()
 
-    def step(self, n: int = 1) -> None:
-        """Advances every world by n physics steps under the current ctrl."""
-        self._run(n)
+    def step(self, n: int = 1, *, kinematics: bool = False) -> None:
+        """Advances every world by n physics steps under the current ctrl; the poses follow with kinematics."""
+        if n == 0:
+            if kinematics:
+                self.kinematics()
+            return
+        self._visit(partial(self._step, n=n, kinematics=kinematics), self._finite_worlds(self._poses, self._others))
+        if kinematics:
+            self._finite_worlds(self._poses)
 
     def forward(self) -> None:
         """Computes everything that derives from the state, without advancing time; warm starts stay as they are."""
-        self._run(0)
+        self._visit(partial(self._step, n=0, kinematics=False), self._finite_worlds(self._poses, self._others))
+
+    def kinematics(self, mask: torch.Tensor | None = None) -> None:
+        """Brings the poses of the masked worlds up to the current qpos; the other worlds are not visited."""
+        rows = self._rows(mask)
+        self._visit(self._pose, self._finite_worlds(self._poses, rows=rows))
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Puts the masked worlds back to qpos0, at rest."""
-        rows = np.ones(self.nworld, dtype=bool) if mask is None else mask.numpy()
+        rows = self._rows(mask)
         self._state[rows] = self._initial
+        if "qpos0" in self._fields:
+            self._qpos[rows] = self._fields["qpos0"][rows]
+        self._others["sensordata"][rows] = 0
         self._counts[rows] = 0
         self._steps[rows] = 0
 
@@ -120,33 +165,75 @@ class NativeSimulation:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
-    def _run(self, n: int) -> None:
-        # A diverged world stays as it is: MuJoCo would spend every solver iteration on its NaN, and gain nothing.
-        self._finite[:] = np.isfinite(self._state[:, self._physics]).all(axis=1)
-        if self._pool is None:
-            self._run_worlds(self._datas[0], range(self.nworld), n)
+    def _worker(self) -> _Worker:
+        """A thread's data, and its own model if worlds differ in it."""
+        model = copy.copy(self.model) if self._fields else self.model
+        # MuJoCo skips an offset that was zero when it compiled: these flags make it read the field.
+        for kind, names in _SAMEFRAME.items():
+            if names & self._fields.keys():
+                getattr(model, kind)[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+        data = mujoco.MjData(model)
+
+        def pairs(source: object, arrays: dict[str, np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+            return [(array, getattr(source, name)) for name, array in arrays.items() if array.size]
+
+        fields = pairs(model, self._fields)
+        if self._simple is not None:
+            fields.append((self._simple.dof_M0, model.dof_M0))
+        return _Worker(model, data, fields, pairs(data, self._poses), pairs(data, self._others))
+
+    def _rows(self, mask: torch.Tensor | None) -> np.ndarray:
+        """The mask as numpy sees it; every world for None."""
+        if mask is None:
+            return np.ones(self.nworld, dtype=bool)
+        check_mask(mask, self.nworld, self.device)
+        return mask.numpy()
+
+    def _finite_worlds(self, *derived: dict[str, np.ndarray], rows: np.ndarray | None = None) -> list[int]:
+        """The worlds among rows that can be computed; the others' derived arrays become NaN.
+
+        A diverged world stays as it is: MuJoCo would spend every solver iteration on its NaN, and gain nothing.
+        """
+        finite = np.isfinite(self._physics).all(axis=1)
+        chosen = np.ones_like(finite) if rows is None else rows
+        diverged = chosen & ~finite
+        if diverged.any():
+            for arrays in derived:
+                for array in arrays.values():
+                    array[diverged] = np.nan
+        return np.flatnonzero(chosen & finite).tolist()
+
+    def _visit(self, work: Callable[[_Worker, Iterable[int]], None], worlds: list[int]) -> None:
+        """Shares worlds out among the threads."""
+        if self._simple is not None:
+            self._simple.update()
+        if self._pool is None or len(worlds) < 2:
+            work(self._workers[0], worlds)
             return
-        # Interleaved rows balance the load: neighbouring worlds tend to cost alike.
-        jobs = [
-            self._pool.submit(self._run_worlds, data, range(i, self.nworld, self._nthread), n)
-            for i, data in enumerate(self._datas)
-        ]
+        # All threads draw from one iterator, so that none waits for another one's share. Which of them gets a world does not
+        # matter to it: the whole state is loaded. Taking the next item is atomic under the interpreter lock.
+        queue = iter(worlds)
+        jobs = [self._pool.submit(work, worker, queue) for worker in self._workers]
         wait(jobs)
         for job in jobs:
             job.result()
 
-    def _run_worlds(self, data: mujoco.MjData, worlds: range, n: int) -> None:
-        """Steps some worlds on one thread. mj_step releases the interpreter lock; the rest is a few microseconds."""
-        m, state, counts, steps = self.model, self._state, self._counts, self._steps
-        xpos, xquat = self._derived["xpos"], self._derived["xquat"]
-        site_xpos, qfrc_actuator = self._derived["site_xpos"], self._derived["qfrc_actuator"]
+    def _load(self, worker: _Worker, w: int) -> None:
+        """Makes a thread's model and data those of world w."""
+        for values, field in worker.fields:
+            field[:] = values[w]
+        mujoco.mj_setState(worker.model, worker.data, self._state[w], _SPEC)
+
+    def _step(self, worker: _Worker, worlds: Iterable[int], *, n: int, kinematics: bool) -> None:
+        """Steps some worlds on one thread, n=0 meaning forward.
+
+        MuJoCo's functions release the interpreter lock; the rest is a few microseconds a world.
+        """
+        m, data, state, counts, steps = worker.model, worker.data, self._state, self._counts, self._steps
+        derived = worker.others if kinematics else worker.poses + worker.others
         warning = data.warning.number
         for w in worlds:
-            if not self._finite[w]:
-                for derived in (xpos, xquat, site_xpos, qfrc_actuator):
-                    derived[w] = np.nan
-                continue
-            mujoco.mj_setState(m, data, state[w], _SPEC)
+            self._load(worker, w)
             data.maxuse_con = data.maxuse_efc = 0
             warning[:] = 0
             if n:
@@ -155,10 +242,8 @@ class NativeSimulation:
                 steps[w] += n
             else:
                 mujoco.mj_forward(m, data)
-            xpos[w] = data.xpos
-            xquat[w] = data.xquat
-            site_xpos[w] = data.site_xpos
-            qfrc_actuator[w] = data.qfrc_actuator
+            for view, array in derived:
+                view[w] = array
             row = counts[w]
             row[0], row[1] = data.ncon, data.nefc
             row[2] = max(row[2], data.maxuse_con, data.ncon)
@@ -167,3 +252,17 @@ class NativeSimulation:
                 row[4] |= int(Overflow.NARROWPHASE)
             if warning[_CONSTRAINT_FULL]:
                 row[4] |= int(Overflow.NEFC)
+            if kinematics:
+                self._write_poses(worker, w)
+
+    def _pose(self, worker: _Worker, worlds: Iterable[int]) -> None:
+        """Brings the poses of some worlds up to date on one thread."""
+        for w in worlds:
+            self._load(worker, w)
+            self._write_poses(worker, w)
+
+    def _write_poses(self, worker: _Worker, w: int) -> None:
+        """The poses of the state that the thread's data holds. The next world loads its whole state, so nothing leaks."""
+        mujoco.mj_kinematics(worker.model, worker.data)
+        for view, array in worker.poses:
+            view[w] = array

@@ -8,6 +8,8 @@ from typing import Protocol
 import mujoco
 import torch
 
+from mjstack.sim.views import Fields
+
 
 class Overflow(IntFlag):
     """What a world lost because a buffer was too small. The values are MJWarp's ``OverflowType``.
@@ -38,23 +40,40 @@ LOST_PHYSICS = int(sum(Overflow))
 class Simulation(Protocol):
     """``nworld`` copies of one model, stepped together.
 
-    Views are allocated once and keep their address. Write into them (``sim.ctrl[:] = ...``); a masked world is selected by a
-    bool tensor. After `step`, ``xpos``, ``xquat``, ``site_xpos`` and the counts belong to the state before the last
-    integration, on both backends; `forward` brings them up to date.
+    Views are allocated once and keep their address for life: write into them (``sim.ctrl[:] = ...``), never rebind them
+    (``sim.ctrl = ...`` raises). A mask selects worlds: a bool tensor of shape ``(nworld,)`` on ``device``.
+
+    When the views are up to date, on every backend:
+
+    - ``qpos``, ``qvel`` and ``act`` are the state, always current.
+    - After `step`, the poses (``xpos``, ``xquat``, ``site_xpos``, ``geom_xpos``) belong to the state before the last
+      integration, unless ``kinematics=True``. So do ``sensordata``, ``contact_count``, ``constraint_count`` and
+      ``qfrc_actuator``, always.
+    - `kinematics` brings the poses to the current state, `forward` everything.
+    - `reset` leaves poses, ``qfrc_actuator`` and the contact buffers as they were, until `kinematics` or `forward`.
 
     Attributes:
-        model: The compiled model.
+        model: The compiled model; per-world fields are not written into it.
         nworld: Number of worlds.
         backend: ``"native"`` or ``"mjwarp"``.
         device: Where the views live.
         description: Backend and hardware, for reports.
         qpos: Positions [m, rad, quaternions wxyz], shape ``(nworld, nq)``.
         qvel: Velocities [m/s, rad/s], shape ``(nworld, nv)``.
+        act: Activations of actuators that have a state, shape ``(nworld, na)``.
         ctrl: Actuator commands, shape ``(nworld, nu)``.
         xpos: Body positions [m], shape ``(nworld, nbody, 3)``.
         xquat: Body orientations wxyz, shape ``(nworld, nbody, 4)``.
         site_xpos: Site positions [m], shape ``(nworld, nsite, 3)``.
+        geom_xpos: Geom positions [m], shape ``(nworld, ngeom, 3)``.
         qfrc_actuator: Actuator forces in joint space [N, N m], shape ``(nworld, nv)``.
+        sensordata: Sensor outputs, in the model's order, shape ``(nworld, nsensordata)``.
+        fields: Per-world model fields that were asked for, by MuJoCo's name. Each is a tensor of MuJoCo's shape of that field
+            with ``nworld`` in front, and has the model's values to begin with. What is written acts from the next step on.
+            Fields that MuJoCo derives at compile time do not follow: with a new ``body_mass`` write ``body_invweight0`` and
+            its like too. Two limits are MuJoCo's: ``body_gravcomp`` acts only if the model has some, and ``body_ipos`` and
+            ``body_iquat`` must stay as they are where ``body_simple`` is set (a free cube), because such a body's mass matrix
+            is diagonal by construction. `reset` leaves fields alone, and starts a world from its ``qpos0`` if that is one.
         contact_count: Contacts found by the last step or forward, shape ``(nworld,)``, int32.
         constraint_count: Constraint rows likewise, shape ``(nworld,)``, int32.
         step_count: Physics steps since the world's last reset, shape ``(nworld,)``, int64.
@@ -71,11 +90,15 @@ class Simulation(Protocol):
     description: str
     qpos: torch.Tensor
     qvel: torch.Tensor
+    act: torch.Tensor
     ctrl: torch.Tensor
     xpos: torch.Tensor
     xquat: torch.Tensor
     site_xpos: torch.Tensor
+    geom_xpos: torch.Tensor
     qfrc_actuator: torch.Tensor
+    sensordata: torch.Tensor
+    fields: Fields
     contact_count: torch.Tensor
     constraint_count: torch.Tensor
     step_count: torch.Tensor
@@ -83,16 +106,32 @@ class Simulation(Protocol):
     peak_contacts: torch.Tensor
     peak_constraints: torch.Tensor
 
-    def step(self, n: int = 1) -> None:
-        """Advances every world by n physics steps under the current ctrl."""
+    def step(self, n: int = 1, *, kinematics: bool = False) -> None:
+        """Advances every world by n physics steps under the current ctrl.
+
+        Args:
+            n: Number of steps.
+            kinematics: Whether the poses are brought up to the state after the last of them. The physics is the same.
+        """
 
     def forward(self) -> None:
-        """Computes everything that derives from qpos, qvel and ctrl, without advancing time."""
+        """Computes everything that derives from qpos, qvel, act and ctrl, without advancing time."""
+
+    def kinematics(self, mask: torch.Tensor | None = None) -> None:
+        """Brings the poses up to the current qpos, without advancing time.
+
+        Args:
+            mask: Worlds that need it (None: all). Others may be brought up to date too.
+        """
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Puts the worlds of a ``(nworld,)`` bool mask (None: all) back to the model's qpos0, at rest, counters cleared.
+        """Puts worlds back to the model's qpos0, at rest: act, ctrl, sensordata, counters and overflow bits become zero.
 
-        Derived arrays are stale until `forward`.
+        Args:
+            mask: Worlds to reset (None: all).
+
+        Raises:
+            ArgumentError: The mask is not a bool tensor of shape ``(nworld,)`` on the simulation's device.
         """
 
     def option_values(self) -> dict[str, float | int | str]:

@@ -38,9 +38,19 @@ class BatchSizes:
 def resolve_sizes(cfg: Config) -> BatchSizes:
     """The configured sizes, with the defaults of this robot and scene where they are null."""
     layout = cfg.robot.layouts[cfg.scene.name]
+    return _sizes(cfg, layout.nconmax, layout.njmax)
+
+
+def resolve_env_sizes(cfg: Config) -> BatchSizes:
+    """Likewise with room for random actions, the worst case for contacts."""
+    layout = cfg.robot.layouts[cfg.scene.name]
+    return _sizes(cfg, layout.env_nconmax, layout.env_njmax)
+
+
+def _sizes(cfg: Config, nconmax: int, njmax: int) -> BatchSizes:
     return BatchSizes(
-        nconmax=cfg.batch.nconmax if cfg.batch.nconmax is not None else layout.nconmax,
-        njmax=cfg.batch.njmax if cfg.batch.njmax is not None else layout.njmax,
+        nconmax=cfg.batch.nconmax if cfg.batch.nconmax is not None else nconmax,
+        njmax=cfg.batch.njmax if cfg.batch.njmax is not None else njmax,
         naconmax=cfg.batch.naconmax,
         nccdmax=cfg.batch.nccdmax,
         naccdmax=cfg.batch.naccdmax,

@@ -10,8 +10,11 @@ import torch
 
 from mjstack.config.schema import Config
 from mjstack.control.scripted import Phase
+from mjstack.errors import ParameterError
+from mjstack.managers.base import EnvView
 from mjstack.math import lowest_corner, quat_angle
-from mjstack.scene import SceneIndex, table_top
+from mjstack.mdp.geometry import gripper_opening
+from mjstack.scene import BLUE, RED, SceneIndex, table_top
 from mjstack.sim.simulation import LOST_PHYSICS, Simulation
 
 
@@ -175,3 +178,78 @@ def describe_rules(bits: int) -> str:
 
 def _frames_of(phases: list[Phase], names: list[str]) -> set[int]:
     return {frame for phase in phases if phase.name in names for frame in range(phase.start, phase.stop)}
+
+
+class StackSuccess:
+    """Achieved while red has stood at rest on blue through the whole window, and the gripper is open.
+
+    Rules 4 and 5 of the acceptance, over a ring of the last frames. For the largest distance between any two frames of
+    the window, each frame keeps its largest distance to the later ones: a new frame updates all of them at once, and the
+    one that leaves takes its own along. Distances stay squared, and angles stay cosines, until they are judged.
+    """
+
+    def __init__(self, env: EnvView, *, open_fraction: float) -> None:
+        """Allocates the ring.
+
+        Args:
+            env: The environment. The thresholds are those of ``gate.acceptance``.
+            open_fraction: How far the gripper must be open, from 0 (closed) to 1 (open), as measured.
+
+        Raises:
+            ParameterError: The fraction is out of range.
+        """
+        if not 0.0 <= open_fraction <= 1.0:
+            raise ParameterError("open_fraction", open_fraction, "a number from 0 to 1")
+        self._t, self._scene, self._open = env.cfg.gate.acceptance, env.cfg.scene, open_fraction
+        self._addresses = [env.index.objects[name] for name in (RED, BLUE)]
+        n, window, device = env.nworld, self._t.window, env.device
+        self._slot = torch.zeros(1, dtype=torch.int64, device=device)  # where the oldest frame is, in every world
+        self._pose = torch.zeros((n, window, 2, 7), device=device)
+        self._energy = torch.zeros((n, window, 2), device=device)  # squared speed
+        self._far = torch.zeros((n, window, 2), device=device)  # per frame and cube: squared distance to later frames
+        self._turned = torch.zeros((n, window, 2), device=device)  # likewise: 1 - |cosine of half the angle|
+        self._held = torch.zeros(n, dtype=torch.int32, device=device)  # frames in a row that were stacked and supported
+        self._center = torch.tensor(self._scene.table_center[:2], dtype=torch.float32, device=device)
+        self._room = torch.tensor(self._scene.table_half[:2], dtype=torch.float32, device=device) - self._scene.cube_half
+
+    def __call__(self, env: EnvView) -> torch.Tensor:
+        """Takes in a frame; shape ``(nworld,)``, bool."""
+        t, half = self._t, self._scene.cube_half
+        pose = torch.stack([env.sim.qpos[:, q : q + 7] for q, _ in self._addresses], dim=1).float()
+        velocity = torch.stack([env.sim.qvel[:, v : v + 6] for _, v in self._addresses], dim=1).float()
+        pos, quat = pose[..., :3], pose[..., 3:]
+        speed = torch.linalg.vector_norm(velocity[..., :3], dim=-1)
+        speed = speed + math.sqrt(3.0) * half * torch.linalg.vector_norm(velocity[..., 3:], dim=-1)
+
+        # The new frame takes the oldest one's place, and is compared with all others, itself included.
+        self._pose.index_copy_(1, self._slot, pose[:, None])
+        self._energy.index_copy_(1, self._slot, speed.square()[:, None])
+        for ring in (self._far, self._turned):
+            ring.index_fill_(1, self._slot, 0.0)
+        far = (self._pose[..., :3] - pos[:, None]).square().sum(-1)
+        turned = 1.0 - (self._pose[..., 3:] * quat[:, None]).sum(-1).abs()
+        torch.maximum(self._far, far, out=self._far)
+        torch.maximum(self._turned, turned, out=self._turned)
+        self._slot.add_(1).remainder_(t.window)
+
+        dz = pos[:, 0, 2] - pos[:, 1, 2]
+        stacked = torch.linalg.vector_norm(pos[:, 0, :2] - pos[:, 1, :2], dim=1) <= t.xy_err
+        stacked &= (dz >= t.dz_min) & (dz <= t.dz_max)
+        low = lowest_corner(pos[:, 1], quat[:, 1], half) - table_top(self._scene)
+        stacked &= (low.abs() <= t.support_gap) & ((pos[:, 1, :2] - self._center).abs() <= self._room).all(1)
+        self._held.add_(1).mul_(stacked)
+
+        rest = (self._energy.mean(1) <= t.rest_speed**2).all(1)
+        rest &= self._far.amax((1, 2)) <= t.rest_position**2
+        rest &= self._turned.amax((1, 2)) <= 1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg))
+        return (self._held >= t.window) & rest & (gripper_opening(env) >= self._open).all(1)
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Forgets the masked worlds.
+
+        What was in their ring is still there until it is overwritten, which the count of held frames waits for. NaN would
+        outlive that in no slot, but a maximum keeps it, so it is cleared.
+        """
+        self._held.masked_fill_(mask, 0)
+        for ring in (self._pose, self._energy, self._far, self._turned):
+            ring.masked_fill_(mask.view(-1, *[1] * (ring.dim() - 1)), 0.0)

@@ -1,0 +1,60 @@
+"""Turns the terms of a composed configuration into dataclasses."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any, cast
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from mjstack.config.schema import (
+    ActionTermCfg,
+    Config,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    TermCfg,
+    TerminationTermCfg,
+)
+from mjstack.errors import ConfigError, TermError, UnknownName
+
+
+def type_terms(cfg: Config) -> None:
+    """Gives every term its type, in place. A term that is null is left out.
+
+    Raises:
+        MjstackError: A term has an unknown key, lacks one, or a value has the wrong type.
+    """
+    cfg.action = _terms("action", cfg.action, ActionTermCfg)
+    cfg.controller.action = _terms("controller.action", cfg.controller.action, ActionTermCfg)
+    cfg.reset = _terms("reset", cfg.reset, TermCfg)
+    cfg.termination = _terms("termination", cfg.termination, TerminationTermCfg)
+    cfg.reward = _terms("reward", cfg.reward, RewardTermCfg)
+    cfg.observation = _terms("observation", cfg.observation, ObservationGroupCfg)
+    for name, group in cfg.observation.items():
+        group.terms = _terms(f"observation.{name}.terms", group.terms, ObservationTermCfg)
+
+
+def _terms(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
+    return {name: _typed(f"{key}.{name}", node, kind) for name, node in nodes.items() if node is not None}
+
+
+def _typed(key: str, node: Any, kind: type) -> Any:
+    names = [field.name for field in fields(kind)]
+    if not isinstance(node, dict):
+        raise ConfigError(key, node, f"a term: {', '.join(names)}")
+    for name in node:
+        if name not in names:
+            raise UnknownName(f"{key}: key", str(name), names)
+    for name, value in node.items():
+        try:
+            OmegaConf.merge(OmegaConf.structured(kind), {name: value})
+        except OmegaConfBaseException as error:
+            wanted = next(field.type for field in fields(kind) if field.name == name)
+            raise ConfigError(f"{key}.{name}", value, str(wanted)) from error
+    merged = OmegaConf.merge(OmegaConf.structured(kind), node)
+    missing = sorted(OmegaConf.missing_keys(merged))
+    if missing:
+        raise TermError(key, f"'{missing[0]}' is missing: set {key}.{missing[0]}")
+    return cast(Any, OmegaConf.to_object(merged))

@@ -1,0 +1,89 @@
+"""Builds environments from a configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import mujoco
+
+from mjstack.config import load_config
+from mjstack.config.schema import Backend, Config
+from mjstack.envs.env import Env
+from mjstack.errors import ArgumentError
+from mjstack.managers.reset import required_fields
+from mjstack.scene import SceneIndex, build_model
+from mjstack.sim import make_simulation
+from mjstack.sim.sizes import BatchSizes, resolve_env_sizes
+
+
+def make_env(
+    overrides: Sequence[str] = (), *, nworld: int | None = None, seed: int | None = None, device: str | None = None
+) -> Env:
+    """Builds an environment as the command line would configure it.
+
+    Args:
+        overrides: Such as ``["task=reach", "robot=rebot", "action=ee_delta"]``.
+        nworld: Number of worlds.
+        seed: Seed of every random number.
+        device: ``auto``, ``cpu`` or ``cuda:N``.
+
+    Returns:
+        The environment, on MJWarp where there is CUDA, else on native MuJoCo (``sim=...`` chooses). Call ``reset`` first.
+
+    Raises:
+        MjstackError: An override or a term cannot be used; the message says which and what to do.
+    """
+    if isinstance(overrides, str):
+        raise ArgumentError("overrides", f"the string '{overrides}'", f"a list of strings, such as ['{overrides}']")
+    given = {"nworld": nworld, "seed": seed, "sim.device": device}
+    return build_env(load_config([*overrides, *(f"{k}={v}" for k, v in given.items() if v is not None)]))
+
+
+def build_env(
+    cfg: Config,
+    *,
+    nworld: int | None = None,
+    model: mujoco.MjModel | None = None,
+    backend: Backend | None = None,
+    device: str | None = None,
+    sizes: BatchSizes | None = None,
+) -> Env:
+    """Builds the environment that every gate, script and adapter uses.
+
+    Args:
+        cfg: The configuration.
+        nworld: Number of worlds, if not the configured one.
+        model: The scene, if it has been compiled before.
+        backend: Overrides the configured backend.
+        device: Overrides the configured device.
+        sizes: Overrides MJWarp's buffer sizes, which by default have room for random actions.
+    """
+    model = build_model(cfg) if model is None else model
+    sim = make_simulation(
+        model,
+        cfg,
+        cfg.nworld if nworld is None else nworld,
+        backend=backend,
+        device=device,
+        fields=required_fields(cfg.reset),
+        sizes=resolve_env_sizes(cfg) if sizes is None else sizes,
+    )
+    return Env(sim, SceneIndex(model, cfg.robot), cfg)
+
+
+def scripted_config(cfg: Config, **changes: object) -> Config:
+    """The configuration of an environment that the scripted controller drives through one whole episode.
+
+    The controller's action terms take the place of the configured ones. Nothing ends an episode early or rewards it: the
+    acceptance judges it as a whole.
+    """
+    return replace(
+        cfg,
+        action=cfg.controller.action,
+        observation={},
+        termination={},
+        reward={},
+        task=replace(cfg.task, success=None),
+        **changes,  # type: ignore[arg-type]
+    )

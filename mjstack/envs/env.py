@@ -1,0 +1,361 @@
+"""The environment: one step order over any simulation."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+from typing import Any
+
+import torch
+
+from mjstack.config.schema import Config
+from mjstack.envs.statistics import EpisodeStatistics
+from mjstack.errors import ArgumentError, FaultError, name_worlds
+from mjstack.managers.action import ActionManager
+from mjstack.managers.base import Term, first_value
+from mjstack.managers.observation import ObservationManager
+from mjstack.managers.reset import ResetManager
+from mjstack.managers.reward import RewardManager
+from mjstack.managers.termination import TerminationManager
+from mjstack.scene import SceneIndex
+from mjstack.sim import LOST_PHYSICS, Overflow, Simulation, describe_overflow
+
+FAULT_WINDOW = 200  # steps between two looks at the faults on CUDA; on the CPU looking costs nothing
+
+
+class Fault(IntFlag):
+    """What went wrong in a world, latched on the device until the host looks."""
+
+    ACTION = 1 << 0
+    STATE = 1 << 1
+    REWARD = 1 << 2
+    OBSERVATION = 1 << 3
+
+
+class Env:
+    """Many worlds of one task, stepped by actions.
+
+    One step, in this order:
+
+    1. the action manager takes the action and writes ``sim.ctrl``;
+    2. the simulation makes ``substeps`` physics steps and brings body, site and geom poses up to date;
+    3. success, terminations and rewards look at the new state;
+    4. observations are computed: for the worlds that end here, this is the terminal observation;
+    5. finished episodes go into the statistics;
+    6. the worlds that ended are reset, and observed again.
+
+    What derives from contacts (``sensordata``, ``contact_count``) is that of the last physics step before, and zero in a
+    world that has just been reset.
+
+    Attributes:
+        sim: The worlds.
+        index: Where names lie in their views.
+        cfg: The configuration.
+        nworld: Number of worlds.
+        device: Where tensors live.
+        seed: Seed of every random number; `reset` may set it.
+        world: Number of each world, shape ``(nworld,)``, int64.
+        episode: Episode of each world, shape ``(nworld,)``, int64.
+        frame: Frames since each world's last reset, shape ``(nworld,)``, int64.
+        success: Whether the task is achieved, shape ``(nworld,)``, bool.
+        action_manager: Actions; ``action_dim`` is the policy's output.
+        observation_manager: Observation groups; ``group_dims`` are the policy's inputs.
+        reset_manager: How episodes start.
+        termination_manager: How they end.
+        reward_manager: What they are worth.
+    """
+
+    def __init__(self, sim: Simulation, index: SceneIndex, cfg: Config, *, check_faults: bool = True) -> None:
+        """Builds the managers on a simulation, and checks every term once.
+
+        Args:
+            sim: The worlds, with the model fields that the reset terms write (`managers.required_fields`).
+            index: Addresses in the simulation's model.
+            cfg: The configuration: action, observation, reset, termination, reward and task.success are used.
+            check_faults: Raise when physics was lost. Gates, which judge such worlds themselves, do without.
+
+        Raises:
+            MjstackError: A term cannot be found, built or used; the message names it.
+        """
+        self.sim, self.index, self.cfg = sim, index, cfg
+        self.nworld, self.device, self.seed = sim.nworld, sim.device, cfg.seed
+        self.world = torch.arange(sim.nworld, device=sim.device)
+        self.episode = torch.full_like(self.world, -1)
+        self.frame = torch.zeros_like(self.world)
+        self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
+        self._everyone = torch.ones_like(self.success)
+        self._faults = torch.zeros(sim.nworld, dtype=torch.int32, device=sim.device)
+        self._overflow = torch.zeros_like(self._faults)
+        self._steps = 0
+        self._check_faults = check_faults
+        self._started = False
+        self._substeps = cfg.timing.substeps
+
+        # Terms are checked on worlds that have started, because a term may read anything.
+        self.reset_manager = ResetManager(self, cfg.reset)
+        self.episode.zero_()
+        self._write_start(self._everyone)
+        self.action_manager = ActionManager(self, cfg.action)
+        self._success = None if cfg.task.success is None else Term("task.success", cfg.task.success, self)
+        if self._success is not None:
+            first_value(self._success, self, dims=(1,), boolean=True)
+        self.termination_manager = TerminationManager(self, cfg.termination)
+        self.reward_manager = RewardManager(self, cfg.reward)
+        self.observation_manager = ObservationManager(self, cfg.observation)
+        self.statistics = EpisodeStatistics(self.reward_manager.names, self.termination_manager.names, sim.device)
+        self._forget(self._everyone)
+        self.episode.fill_(-1)
+
+    @property
+    def action(self) -> torch.Tensor:
+        """The policy's last action, shape ``(nworld, action_dim)``."""
+        return self.action_manager.action
+
+    @property
+    def previous_action(self) -> torch.Tensor:
+        """The one before."""
+        return self.action_manager.previous_action
+
+    @property
+    def max_episode_frames(self) -> int:
+        """Frames after which the task times out."""
+        return self.cfg.task.episode_frames
+
+    def reset(
+        self, *, seed: int | None = None, mask: torch.Tensor | None = None
+    ) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Starts new episodes.
+
+        Args:
+            seed: Starts every world's episode 0 under this seed. Without it, each reset world goes on to its next episode.
+            mask: Which worlds, shape ``(nworld,)``, bool; all if None.
+
+        Returns:
+            Observations by group, each ``(nworld, dim)``, float32; and an empty dict.
+
+        Raises:
+            ArgumentError: The seed or the mask cannot be used.
+            FaultError: The start does not fit the batch sizes.
+        """
+        mask = self._everyone if mask is None else self._check_mask(mask)
+        if seed is not None:
+            if mask is not self._everyone:
+                raise ArgumentError(
+                    "seed", str(seed), "no mask beside it, because a seed starts every world anew", "Leave one out"
+                )
+            if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 1 << 32:
+                raise ArgumentError("seed", repr(seed), "an integer from 0 to 4294967295")
+            self.seed = seed
+            self.episode.fill_(-1)
+        self.episode += mask
+        self.frame.masked_fill_(mask, 0)
+        self._write_start(mask)
+        if mask is self._everyone:
+            self._require_capacity()
+            for latch in (self._faults, self._overflow):
+                latch.zero_()
+            self._started = True
+        self._forget(mask)
+        return _copies(self.observation_manager.refresh(mask)), {}
+
+    def step(
+        self, action: torch.Tensor
+    ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advances every world by one control interval; see the class for the order.
+
+        Args:
+            action: Shape ``(nworld, action_dim)``, float32.
+
+        Returns:
+            ``obs``: by group, ``(nworld, dim)``, float32; of worlds that ended, the first of the new episode.
+            ``reward``: ``(nworld,)``, float32.
+            ``terminated``: ended by what happened, ``(nworld,)``, bool.
+            ``truncated``: ended by the clock alone, ``(nworld,)``, bool.
+            ``extras``: ``final_obs`` (as ``obs``, before the reset: valid where an episode ended) and ``success`` (at the
+            end of this frame, before the reset).
+
+        All of them are the caller's to keep.
+
+        Raises:
+            ArgumentError: The action has a wrong shape, dtype or device, or is not finite.
+            FaultError: Physics was lost, or a term gave a number that is not finite; on CUDA within 200 steps.
+        """
+        if not self._started:
+            raise ArgumentError("env", "step() before reset()", "reset() first", "Call env.reset()")
+        self.action_manager.process(action)
+        self._advance()
+        self._steps += 1
+        if self._check_faults and (not self._everyone.is_cuda or self._steps % FAULT_WINDOW == 0):
+            self.raise_faults()
+        obs, final = self._observe_and_reset()
+        t = self.termination_manager
+        extras = {"final_obs": final, "success": self._achieved}
+        return obs, self.reward_manager.reward.clone(), t.terminated.clone(), t.truncated.clone(), extras
+
+    def read_statistics(self) -> dict[str, float]:
+        """Means over the episodes that ended since the last call; see `EpisodeStatistics.read`. Waits for the device."""
+        self.raise_faults()
+        return self.statistics.read()
+
+    def raise_faults(self) -> None:
+        """Looks at what went wrong on the device. Waits for it.
+
+        Raises:
+            FaultError: Something did; names the worlds and what to do.
+        """
+        if not bool((self._overflow | self._faults).any()):
+            return
+        overflow, faults = torch.stack((self._overflow, self._faults)).tolist()
+        lost = [w for w, bits in enumerate(overflow) if bits]
+        if lost:
+            bits = 0
+            for w in lost:
+                bits |= overflow[w]
+            raise FaultError(
+                f"{describe_overflow(bits)} overflow in {name_worlds(lost, self.nworld)}", self._capacity_hint(bits)
+            )
+        for fault, what, fix in _FAULTS:
+            worlds = [w for w, value in enumerate(faults) if value & fault]
+            if worlds:
+                raise FaultError(f"{what} in {name_worlds(worlds, self.nworld)}{self._culprits(fault, worlds[0])}", fix)
+
+    def close(self) -> None:
+        """Gives the simulation's threads and buffers back."""
+        self.sim.close()
+
+    def __str__(self) -> str:
+        head = f"{self.cfg.task.name} with {self.cfg.robot.title}: {self.nworld} worlds, {self.sim.description}"
+        managers = (
+            self.action_manager,
+            self.observation_manager,
+            self.reset_manager,
+            self.termination_manager,
+            self.reward_manager,
+        )
+        return "\n".join((head, *(str(manager) for manager in managers)))
+
+    def _advance(self) -> None:
+        """Physics, then what looks at the new state."""
+        self.action_manager.write_commands()
+        self.sim.step(self._substeps, kinematics=True)
+        self.frame += 1
+        broken = ~(torch.isfinite(self.sim.qpos).all(1) & torch.isfinite(self.sim.qvel).all(1))
+        if self._success is not None:
+            self.success.copy_(self._success(self))
+        self.success &= ~broken
+        self.termination_manager.compute()
+        reward = self.reward_manager.compute(void=broken)
+        self.observation_manager.compute()
+        if self._check_faults:
+            self._latch(broken, reward)
+
+    def _latch(self, broken: torch.Tensor, reward: torch.Tensor) -> None:
+        """Keeps what went wrong, before a reset can erase it."""
+        lost = self.sim.overflow & LOST_PHYSICS
+        # A world's own overflow may end its episode; that of the shared pool voids the whole batch.
+        self._overflow |= lost & _POOL if self._ends_on("overflow") else lost
+        self._mark(Fault.ACTION, self.action_manager.not_finite)
+        self.action_manager.not_finite.zero_()
+        self._mark(Fault.REWARD, ~torch.isfinite(reward))
+        for group in self.observation_manager.groups.values():
+            self._mark(Fault.OBSERVATION, ~(torch.isfinite(group).all(1) | broken))
+        if not self._ends_on("non_finite"):
+            self._mark(Fault.STATE, broken)
+
+    def _mark(self, fault: Fault, worlds: torch.Tensor) -> None:
+        self._faults |= int(fault) * worlds.to(torch.int32)
+
+    def _ends_on(self, term: str) -> bool:
+        """Whether one of mjstack's own terminations is in use, under whatever name."""
+        return any(cfg.func == f"mjstack.mdp.termination.{term}" for cfg in self.cfg.termination.values())
+
+    def _observe_and_reset(self) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+        """The statistics, the terminal observation, the reset of the worlds that ended, and the observation to go on with."""
+        managers = self.termination_manager, self.reward_manager
+        done = managers[0].terminated | managers[0].truncated
+        self._achieved = self.success.clone()
+        final = _copies(self.observation_manager.groups)
+        if not managers[0].names or (not done.is_cuda and not bool(done.any())):
+            return _copies(final), final  # nothing to reset; on CUDA looking would stop the device
+        self.statistics.update(done, self.frame, self.success, managers[1].episode_sums, managers[0].values)
+        self.episode += done
+        self.frame.masked_fill_(done, 0)
+        self._write_start(done)
+        self._forget(done)
+        return _copies(self.observation_manager.refresh(done)), final
+
+    def _write_start(self, mask: torch.Tensor) -> None:
+        """Start states of the masked worlds; a function of seed, world and episode alone."""
+        self.reset_manager.reset(mask)
+        self.sim.kinematics(mask)
+
+    def _forget(self, mask: torch.Tensor) -> None:
+        """Whatever is kept from frame to frame starts anew."""
+        self.action_manager.reset(mask)
+        self.termination_manager.reset(mask)
+        self.reward_manager.reset(mask)
+        self.success.masked_fill_(mask, False)
+        if self._success is not None:
+            self._success.reset(mask)
+
+    def _check_mask(self, mask: torch.Tensor) -> torch.Tensor:
+        expected = f"a bool tensor of shape ({self.nworld},) on {self.device}"
+        if not isinstance(mask, torch.Tensor):
+            raise ArgumentError("mask", type(mask).__name__, expected)
+        if tuple(mask.shape) != (self.nworld,) or mask.dtype is not torch.bool or mask.device != self.device:
+            raise ArgumentError("mask", f"{mask.dtype} of shape {tuple(mask.shape)} on {mask.device}", expected)
+        if not self._started:
+            raise ArgumentError("mask", "a part of the worlds", "none at the first reset", "Call env.reset()")
+        return mask
+
+    def _require_capacity(self) -> None:
+        """Counts the contacts of a full start, which MJWarp's pool must hold before the first step."""
+        sizes, pool = getattr(self.sim, "sizes", None), getattr(self.sim, "peak_pool", None)
+        if sizes is None or pool is None:
+            return
+        self.sim.forward()
+        used = max(pool.tolist())
+        room = sizes.contact_pool(self.nworld)
+        if used > room:
+            key, value = ("naconmax", sizes.naconmax) if sizes.naconmax is not None else ("nconmax", sizes.nconmax)
+            per_world = -(-used // self.nworld)
+            need = used if sizes.naconmax is not None else per_world
+            raise FaultError(
+                f"batch.{key}={value}: the start of {self.nworld} worlds needs {used} contacts and collision pairs "
+                f"({per_world} per world), and there is room for {room}",
+                f"Raise it to more than batch.{key}={need}, or choose a reset with fewer contacts",
+            )
+        self._write_start(self._everyone)  # as if nobody had looked
+
+    def _capacity_hint(self, bits: int) -> str:
+        sizes = getattr(self.sim, "sizes", None)
+        by_key = {"njmax": Overflow.NEFC | Overflow.NJMAX_NNZ, "nconmax": _POOL, "nccdmax": Overflow.CCD}
+        keys = [key for key, flags in by_key.items() if bits & flags]
+        if not keys:
+            return "Simplify the model, or use sim=native"
+        held = ", ".join(f"{key}={getattr(sizes, key, None)}" for key in keys)
+        peak = f"; up to {int(self.sim.peak_constraints.max())} rows were needed" if "njmax" in keys else ""
+        return f"Raise {' and '.join(f'batch.{key}' for key in keys)} ({held}{peak})"
+
+    def _culprits(self, fault: Fault, world: int) -> str:
+        """Names the terms behind a number that is not finite, as far as their last values tell."""
+        if fault is Fault.REWARD:
+            bad = ~torch.isfinite(self.reward_manager.values[world])
+            names = [n for n, is_bad in zip(self.reward_manager.names, bad.tolist(), strict=True) if is_bad]
+            return f", from reward.{', reward.'.join(names)}" if names else ""
+        if fault is Fault.OBSERVATION:
+            terms = self.observation_manager.not_finite_terms(world)
+            return f", from {', '.join(terms)}" if terms else ""
+        return ""
+
+
+_POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
+_FAULTS = (
+    (Fault.ACTION, "actions were not finite", "Check what the policy returns"),
+    (Fault.STATE, "the state is not finite", "Lower the gains or the timestep, or add the termination non_finite"),
+    (Fault.REWARD, "the reward is not finite", "Correct the term"),
+    (Fault.OBSERVATION, "an observation is not finite", "Correct the term"),
+)
+
+
+def _copies(groups: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {name: group.clone() for name, group in groups.items()}

@@ -1,0 +1,21 @@
+"""Managers: actions, observations, resets, terminations and rewards as named terms over all worlds at once."""
+
+from mjstack.managers.action import ActionManager, ActionTerm
+from mjstack.managers.base import EnvView, random_uniform, uses_fields
+from mjstack.managers.observation import ObservationManager
+from mjstack.managers.reset import ResetManager, required_fields
+from mjstack.managers.reward import RewardManager
+from mjstack.managers.termination import TerminationManager
+
+__all__ = [
+    "ActionManager",
+    "ActionTerm",
+    "EnvView",
+    "ObservationManager",
+    "ResetManager",
+    "RewardManager",
+    "TerminationManager",
+    "random_uniform",
+    "required_fields",
+    "uses_fields",
+]

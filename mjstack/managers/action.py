@@ -1,0 +1,123 @@
+"""The action manager: slices of the policy's action, each turned into actuator commands by a term."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+
+import torch
+
+from mjstack.config.schema import ActionTermCfg
+from mjstack.errors import ArgumentError, TermError
+from mjstack.managers.base import EnvView, build_instance, check_params, render_table, resolve_func, show_params
+
+
+class ActionTerm(ABC):
+    """Turns a slice of the action into commands. A subclass takes the environment and keyword parameters.
+
+    Attributes:
+        dim: Width of the slice.
+        low: Smallest meaningful action, shape ``(dim,)``.
+        high: Largest, shape ``(dim,)``.
+        unit: Unit of the action, for tables.
+    """
+
+    dim: int
+    low: torch.Tensor
+    high: torch.Tensor
+    unit: str = "-1 to 1"
+
+    @abstractmethod
+    def write_commands(self, action: torch.Tensor) -> None:
+        """Writes ``sim.ctrl`` for an action of shape ``(nworld, dim)``."""
+
+
+class ActionManager:
+    """Takes the policy's action, keeps the last two, and writes the commands.
+
+    Attributes:
+        action_dim: Width of the whole action.
+        action: The last action, shape ``(nworld, action_dim)``, in the type of the simulation's floats.
+        previous_action: The one before. Both are zero after a reset.
+        low: Smallest meaningful action, shape ``(action_dim,)``.
+        high: Largest, shape ``(action_dim,)``.
+        not_finite: Worlds whose action was not finite since this was last cleared, shape ``(nworld,)``, bool.
+    """
+
+    def __init__(self, env: EnvView, cfg: Mapping[str, ActionTermCfg]) -> None:
+        """Builds the terms.
+
+        Raises:
+            TermError: A term cannot be found, built, or is no `ActionTerm`.
+        """
+        self._env = env
+        self.terms: dict[str, ActionTerm] = {}
+        self._slices: list[tuple[ActionTerm, slice]] = []
+        self._rows: list[tuple[object, ...]] = []
+        start = 0
+        for name, term_cfg in cfg.items():
+            label = f"action.{name}"
+            cls = resolve_func(label, term_cfg.func)
+            if not (isinstance(cls, type) and issubclass(cls, ActionTerm)):
+                raise TermError(label, f"func={term_cfg.func}: expected a subclass of mjstack.managers.ActionTerm")
+            check_params(label, cls, dict(term_cfg.params), 1)
+            term = build_instance(label, cls, env, dict(term_cfg.params))
+            self.terms[name] = term
+            self._slices.append((term, slice(start, start + term.dim)))
+            self._rows.append((name, term.dim, term.unit, show_params(dict(term_cfg.params))))
+            start += term.dim
+        self.action_dim = start
+        zeros = torch.zeros((env.nworld, start), dtype=env.sim.qpos.dtype, device=env.device)
+        self.action, self.previous_action = zeros, zeros.clone()
+        bounds = [(term.low, term.high) for term, _ in self._slices]
+        self.low = torch.cat([low for low, _ in bounds]) if bounds else zeros[0]
+        self.high = torch.cat([high for _, high in bounds]) if bounds else zeros[0]
+        self.not_finite = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
+
+    def process(self, action: torch.Tensor) -> None:
+        """Takes in an action.
+
+        A value that is not finite is an error at once on the CPU. On CUDA, where looking would stop the device, it counts
+        as 0 and its world is marked in ``not_finite``.
+
+        Args:
+            action: Shape ``(nworld, action_dim)``, float32 or float64.
+
+        Raises:
+            ArgumentError: Wrong shape, dtype or device, or values that are not finite.
+        """
+        self.check(action)
+        bad = ~torch.isfinite(action)
+        if not action.is_cuda and bool(bad.any()):
+            world = int(bad.any(1).nonzero()[0, 0])
+            raise ArgumentError(
+                "action", f"{action[world].tolist()} in world {world}", "finite numbers", "Check what the policy returns"
+            )
+        self.not_finite |= bad.any(1)
+        self.previous_action.copy_(self.action)
+        self.action.copy_(action.masked_fill(bad, 0.0))
+
+    def check(self, action: torch.Tensor) -> None:
+        """Raises an `ArgumentError` for an action of wrong type, shape, dtype or device."""
+        expected = f"a float32 tensor of shape ({self._env.nworld}, {self.action_dim}) on {self._env.device}"
+        if not isinstance(action, torch.Tensor):
+            raise ArgumentError("action", type(action).__name__, expected)
+        if tuple(action.shape) != (self._env.nworld, self.action_dim):
+            raise ArgumentError("action", f"shape {tuple(action.shape)}", expected)
+        if action.dtype not in (torch.float32, torch.float64):
+            raise ArgumentError("action", f"dtype {action.dtype}", expected)
+        if action.device != self._env.device:
+            raise ArgumentError("action", f"device {action.device}", expected)
+
+    def write_commands(self) -> None:
+        """Writes ``sim.ctrl`` in all worlds, term by term."""
+        for term, part in self._slices:
+            term.write_commands(self.action[:, part])
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Forgets the actions of the masked worlds."""
+        self.action.masked_fill_(mask[:, None], 0.0)
+        self.previous_action.masked_fill_(mask[:, None], 0.0)
+
+    def __str__(self) -> str:
+        return render_table(f"action: {self.action_dim} numbers", ("term", "dim", "range", "parameters"), self._rows)

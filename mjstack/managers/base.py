@@ -1,0 +1,252 @@
+"""What managers share: the view of an environment that terms receive, and how terms are found, checked and shown."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import io
+import zlib
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from mjstack.config.schema import Config, TermCfg
+from mjstack.errors import ConfigError, MjstackError, ParameterError, TermError, suggest
+from mjstack.rng import uniform
+from mjstack.scene import SceneIndex
+from mjstack.sim import Simulation
+
+
+class EnvView(Protocol):
+    """What a term may read of an environment. Any object with these attributes can have managers.
+
+    Attributes:
+        sim: The worlds. Terms read its views; reset terms and actions write into them.
+        index: Where names lie in those views.
+        cfg: The configuration.
+        nworld: Number of worlds.
+        device: Where tensors live.
+        seed: Seed of every random number.
+        world: Number of each world, shape ``(nworld,)``, int64.
+        episode: Episode of each world, shape ``(nworld,)``, int64.
+        frame: Frames since each world's last reset, shape ``(nworld,)``, int64.
+        action: The policy's last action, shape ``(nworld, action_dim)``.
+        previous_action: The one before.
+        success: Whether the task is achieved, shape ``(nworld,)``, bool.
+    """
+
+    sim: Simulation
+    index: SceneIndex
+    cfg: Config
+    nworld: int
+    device: torch.device
+    seed: int
+    world: torch.Tensor
+    episode: torch.Tensor
+    frame: torch.Tensor
+
+    @property
+    def action(self) -> torch.Tensor:
+        """The policy's last action."""
+
+    @property
+    def previous_action(self) -> torch.Tensor:
+        """The one before."""
+
+    @property
+    def success(self) -> torch.Tensor:
+        """Whether the task is achieved."""
+
+
+def uses_fields(*names: str) -> Callable[[Any], Any]:
+    """Marks a reset term that writes per-world model fields, so that the simulation is built with them."""
+
+    def mark(term: Any) -> Any:
+        term.model_fields = names
+        return term
+
+    return mark
+
+
+def random_uniform(
+    env: EnvView, name: str, size: int, low: float = -1.0, high: float = 1.0, step: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Random numbers of every world's current episode, the same whatever nworld is and whichever worlds reset.
+
+    Args:
+        env: The environment.
+        name: Whose numbers they are; two consumers with different names never share a draw.
+        size: Numbers per world.
+        low: Smallest value.
+        high: Upper bound.
+        step: Step within the episode, shape ``(nworld,)``; 0 if None, which is right for resets.
+
+    Returns:
+        Shape ``(nworld, size)``, in the type of the simulation's floats.
+    """
+    step = torch.zeros_like(env.world) if step is None else step
+    draw = uniform(
+        seed=env.seed, world=env.world, episode=env.episode, step=step, stream=zlib.crc32(name.encode()), size=size
+    ).to(env.sim.qpos.dtype)
+    return low + 0.5 * (high - low) * (draw + 1.0)
+
+
+def resolve_func(label: str, path: str) -> Callable[..., Any]:
+    """Finds a function or class by its dotted name.
+
+    Raises:
+        TermError: There is no such module, or nothing callable of that name in it.
+    """
+    module_name, _, attribute = path.rpartition(".")
+    if not module_name:
+        raise TermError(label, f"func={path}: expected a dotted name, such as mjstack.mdp.reward.reach")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise TermError(label, f"func={path}: module '{module_name}' cannot be imported ({error})") from error
+    func = getattr(module, attribute, None)
+    if not callable(func):
+        names = [
+            name for name, value in vars(module).items() if callable(value) and getattr(value, "__module__", "") == module_name
+        ]
+        raise TermError(label, f"func={path}: '{attribute}' does not exist. {suggest(attribute, names)}"[:-1])
+    return func
+
+
+def check_params(label: str, func: Callable[..., Any], params: dict[str, Any], leading: int) -> None:
+    """Holds the parameters against a signature whose first ``leading`` arguments the manager gives.
+
+    Raises:
+        TermError: A parameter is unknown or missing.
+    """
+    accepted = list(inspect.signature(func).parameters.values())[leading:]
+    if any(p.kind is p.VAR_KEYWORD for p in accepted):
+        return
+    names = [p.name for p in accepted]
+    for name in params:
+        if name not in names:
+            raise TermError(label, f"parameter '{name}' does not exist. {suggest(name, names)}"[:-1])
+    missing = [p.name for p in accepted if p.default is p.empty and p.name not in params]
+    if missing:
+        raise TermError(label, f"parameter '{missing[0]}' is missing: set {label}.params.{missing[0]}")
+
+
+def build_instance(label: str, cls: Callable[..., Any], env: EnvView, params: dict[str, Any]) -> Any:
+    """Builds a term that is a class.
+
+    Raises:
+        ConfigError: One of its parameters has a value that it cannot use.
+        TermError: It raised an error of its own.
+    """
+    try:
+        return cls(env, **params)
+    except ParameterError as error:
+        name, value, expected, fix = error.facts
+        raise ConfigError(f"{label}.params.{name}", value, expected, fix) from error
+    except MjstackError as error:
+        raise TermError(label, str(error)) from error
+    except Exception as error:
+        reason = str(error).splitlines()[0] if str(error) else "no message"
+        raise TermError(label, f"raised {type(error).__name__}: {reason}") from error
+
+
+class Term:
+    """A term ready to be called: a function with its parameters, or an instance of a class built with them."""
+
+    def __init__(self, label: str, cfg: TermCfg, env: EnvView, *, masked: bool = False) -> None:
+        """Finds the function or class and checks its parameters.
+
+        Args:
+            label: Dotted configuration key, for errors.
+            cfg: Dotted name and parameters.
+            env: What the term is built on.
+            masked: The term takes a mask after the environment, as reset terms do.
+
+        Raises:
+            TermError: The name or a parameter is wrong.
+        """
+        self.label = label
+        func = resolve_func(label, cfg.func)
+        self.params = dict(cfg.params)
+        is_class = inspect.isclass(func)
+        check_params(label, func, self.params, 1 if is_class or not masked else 2)
+        self.model_fields: Sequence[str] = getattr(func, "model_fields", ())
+        self._reset: Callable[[torch.Tensor], None] | None = None
+        if is_class:
+            self._call = build_instance(label, func, env, self.params)
+            self.params_of_call: dict[str, Any] = {}
+            self._reset = getattr(self._call, "reset", None)
+        else:
+            self._call, self.params_of_call = func, self.params
+
+    def __call__(self, *args: Any) -> Any:
+        """Calls the term with the environment, and a mask if it takes one."""
+        return self._call(*args, **self.params_of_call)
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Lets a term with a memory forget the masked worlds."""
+        if self._reset is not None:
+            self._reset(mask)
+
+
+def check_value(label: str, value: Any, env: EnvView, *, dims: tuple[int, ...], boolean: bool = False) -> torch.Tensor:
+    """Holds a term's first value against what its manager needs.
+
+    Args:
+        label: Dotted configuration key.
+        value: What the term returned.
+        env: Whose worlds they are.
+        dims: Allowed numbers of dimensions.
+        boolean: Whether truth values are expected, not numbers.
+
+    Raises:
+        TermError: Not a tensor, or wrong shape, dtype or device.
+    """
+    shape = f"({env.nworld},)" if dims == (1,) else f"({env.nworld},) or ({env.nworld}, d)"
+    kind = "bool" if boolean else "floating point"
+    expected = f"expected a {kind} tensor of shape {shape} on {env.device}"
+    if not isinstance(value, torch.Tensor):
+        raise TermError(label, f"returned {type(value).__name__}, {expected}")
+    if value.dim() not in dims or value.shape[0] != env.nworld:
+        raise TermError(label, f"returned shape {tuple(value.shape)}, {expected}")
+    if value.dtype is not torch.bool if boolean else not value.dtype.is_floating_point:
+        raise TermError(label, f"returned {value.dtype}, {expected}")
+    if value.device != env.device:
+        raise TermError(label, f"returned a tensor on {value.device}, {expected}")
+    return value
+
+
+def first_value(term: Term, env: EnvView, *, dims: tuple[int, ...], boolean: bool = False) -> torch.Tensor:
+    """Calls a value term for the first time and checks what it returns.
+
+    Raises:
+        TermError: It raised something of its own, or returned what its manager cannot use.
+    """
+    try:
+        value = term(env)
+    except MjstackError as error:
+        raise TermError(term.label, str(error)) from error
+    except Exception as error:
+        reason = str(error).splitlines()[0] if str(error) else "no message"
+        raise TermError(term.label, f"raised {type(error).__name__}: {reason}") from error
+    return check_value(term.label, value, env, dims=dims, boolean=boolean)
+
+
+def render_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A manager's terms as text."""
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column)
+    for row in rows:
+        table.add_row(*(str(cell) for cell in row))
+    out = io.StringIO()
+    Console(file=out, width=120, color_system=None, markup=False).print(table)
+    return out.getvalue().rstrip()
+
+
+def show_params(params: dict[str, Any]) -> str:
+    """Parameters as ``name=value`` pairs."""
+    return ", ".join(f"{name}={value}" for name, value in params.items())

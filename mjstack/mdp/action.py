@@ -1,0 +1,135 @@
+"""Action terms: classes that turn a slice of the action into actuator commands."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from mjstack.errors import ParameterError, UnknownName
+from mjstack.managers.action import ActionTerm
+from mjstack.managers.base import EnvView
+from mjstack.mdp.geometry import robot
+
+MODES = ("relative", "absolute", "delta")
+PARTS = ("arm", "gripper", "all")
+
+
+class JointPosition(ActionTerm):
+    """Position commands of some joints, kept within the actuators' ranges.
+
+    ``relative``: home plus ``scale`` times the action. ``absolute``: the action itself [rad, m]. ``delta``: the last
+    command plus ``scale`` times the action.
+    """
+
+    def __init__(self, env: EnvView, *, joints: str | list[str], mode: str = "relative", scale: float = 1.0) -> None:
+        """Chooses joints.
+
+        Args:
+            env: The environment.
+            joints: ``arm``, ``gripper``, ``all``, or names of joints.
+            mode: One of `MODES`.
+            scale: Command for an action of 1 [rad, m]; not used by ``absolute``.
+
+        Raises:
+            MjstackError: A joint or mode does not exist, or the scale is not finite.
+        """
+        if mode not in MODES:
+            raise UnknownName("action mode", mode, MODES)
+        _check_scale(scale)
+        names = [*env.cfg.robot.arm_joints, *env.cfg.robot.gripper_joints]
+        n, n_arm = len(names), env.index.n_arm
+        if isinstance(joints, str):
+            if joints not in PARTS:
+                raise UnknownName("action joints", joints, PARTS)
+            chosen = list(range(n)) if joints == "all" else list(range(n_arm)) if joints == "arm" else list(range(n_arm, n))
+        else:
+            for name in joints:
+                if name not in names:
+                    raise UnknownName("action joint", name, names)
+            chosen = [names.index(name) for name in joints]
+        tensors = robot(env)
+        self._ctrl = env.sim.ctrl
+        self._mode, self._scale = mode, scale
+        self._columns, self._home = tensors.ctrl[chosen], tensors.home[chosen]
+        self._low, self._high = tensors.ctrl_range[chosen].unbind(1)
+        self.dim = len(chosen)
+        self.low, self.high = (self._low, self._high) if mode == "absolute" else _unit_bounds(self.dim, self._home)
+        self.unit = "rad, m" if mode == "absolute" else "-1 to 1"
+
+    def write_commands(self, action: torch.Tensor) -> None:
+        """Writes the commands of its joints."""
+        if self._mode == "absolute":
+            command = action
+        elif self._mode == "relative":
+            command = self._home + self._scale * action
+        else:
+            command = self._ctrl.index_select(1, self._columns) + self._scale * action
+        self._ctrl[:, self._columns] = torch.clamp(command, self._low, self._high)
+
+
+class Gripper(ActionTerm):
+    """One number for all fingers: -1 is closed, 1 is open, as the robot's profile has them."""
+
+    def __init__(self, env: EnvView) -> None:
+        """Reads the profile."""
+        tensors = robot(env)
+        self._ctrl, self._columns = env.sim.ctrl, tensors.ctrl[env.index.n_arm :]
+        self._closed, self._opening = tensors.gripper_closed, tensors.gripper_open - tensors.gripper_closed
+        self.dim = 1
+        self.low, self.high = _unit_bounds(1, tensors.home)
+
+    def write_commands(self, action: torch.Tensor) -> None:
+        """Writes the fingers' commands."""
+        self._ctrl[:, self._columns] = self._closed + 0.5 * (action.clamp(-1.0, 1.0) + 1.0) * self._opening
+
+
+class EndEffectorDelta(ActionTerm):
+    """Moves the commanded aperture centre by ``scale`` times the action in x, y and z, by batched inverse kinematics.
+
+    It starts from the last command, not from the measured joints, so that the arm does not sag by its servo error at every
+    frame; and it keeps no target of its own, so that nothing winds up at the edge of the reach.
+    """
+
+    def __init__(self, env: EnvView, *, scale: float, iterations: int = 8) -> None:
+        """Builds the solver.
+
+        Args:
+            env: The environment.
+            scale: Distance for an action of 1 [m per frame].
+            iterations: Steps of damped least squares per frame.
+
+        Raises:
+            MjstackError: A parameter is out of range.
+        """
+        from mjstack.kinematics.batched_ik import BatchedIk  # loads Warp, which other actions do not need
+
+        _check_scale(scale)
+        if iterations < 1:
+            raise ParameterError("iterations", iterations, "an integer of at least 1")
+        tensors = robot(env)
+        self._ctrl, self._columns, self._n_arm = env.sim.ctrl, tensors.ctrl, env.index.n_arm
+        self._low, self._high = tensors.ctrl_range.unbind(1)
+        self._scale = scale
+        self._ik = BatchedIk(env.sim.model, env.cfg.robot, env.nworld, env.device, iterations=iterations)
+        self.dim = 3
+        self.low, self.high = _unit_bounds(3, tensors.home)
+
+    def write_commands(self, action: torch.Tensor) -> None:
+        """Writes the arm's commands."""
+        last = self._ctrl.index_select(1, self._columns)
+        target = self._ik.aperture(last) + self._scale * action.clamp(-1.0, 1.0).float()
+        command, _ = self._ik.solve(last, target)
+        arm = self._columns[: self._n_arm]
+        command = command[:, : self._n_arm].to(self._ctrl.dtype)
+        self._ctrl[:, arm] = torch.clamp(command, self._low[: self._n_arm], self._high[: self._n_arm])
+
+
+def _unit_bounds(dim: int, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    ones = torch.ones(dim, dtype=like.dtype, device=like.device)
+    return -ones, ones
+
+
+def _check_scale(scale: float) -> None:
+    if not (math.isfinite(scale) and scale > 0.0):
+        raise ParameterError("scale", scale, "a positive number")

@@ -1,0 +1,49 @@
+"""Where things are, read from the simulation's views: what observations, rewards and terminations share."""
+
+from __future__ import annotations
+
+import torch
+
+from mjstack.managers.base import EnvView
+from mjstack.scene.index import RobotTensors
+
+
+def robot(env: EnvView) -> RobotTensors:
+    """The robot's columns and limits on the environment's device."""
+    return env.index.on(env.device, env.sim.qpos.dtype)
+
+
+def joint_positions(env: EnvView) -> torch.Tensor:
+    """Arm joints [rad], then gripper joints [rad or m], shape ``(nworld, n)``."""
+    return env.sim.qpos.index_select(1, robot(env).qpos)
+
+
+def joint_velocities(env: EnvView) -> torch.Tensor:
+    """Likewise [rad/s, m/s]."""
+    return env.sim.qvel.index_select(1, robot(env).qvel)
+
+
+def aperture_center(env: EnvView) -> torch.Tensor:
+    """Midpoint between the jaws [m], world frame, shape ``(nworld, 3)``."""
+    first, second = env.index.aperture_sites
+    return 0.5 * (env.sim.site_xpos[:, first] + env.sim.site_xpos[:, second])
+
+
+def gripper_opening(env: EnvView) -> torch.Tensor:
+    """How far each gripper joint is open as measured, 0 closed to 1 open, shape ``(nworld, n_gripper)``."""
+    tensors = robot(env)
+    q = env.sim.qpos.index_select(1, tensors.qpos[env.index.n_arm :])
+    return (q - tensors.gripper_closed) / (tensors.gripper_open - tensors.gripper_closed)
+
+
+def pose_w(env: EnvView, name: str) -> torch.Tensor:
+    """Position [m] and quaternion (wxyz) of an object, from qpos, which is never stale, shape ``(nworld, 7)``."""
+    address, _ = env.index.object_address(name)
+    return env.sim.qpos[:, address : address + 7]
+
+
+def jaw_forces(env: EnvView, name: str) -> torch.Tensor:
+    """Size of the contact force [N] of each jaw on an object, at the last physics step, shape ``(nworld, 2)``."""
+    env.index.object_address(name)
+    parts = [env.sim.sensordata[:, a : a + 3] for a in env.index.jaw_force[name]]
+    return torch.linalg.vector_norm(torch.stack(parts, dim=1), dim=2)

@@ -1,0 +1,67 @@
+"""Observation terms: functions of the environment that return ``(nworld,)`` or ``(nworld, d)``."""
+
+from __future__ import annotations
+
+import torch
+
+from mjstack.managers.base import EnvView
+from mjstack.mdp.geometry import aperture_center, jaw_forces, joint_positions, joint_velocities, pose_w, robot
+
+
+def joint_pos(env: EnvView) -> torch.Tensor:
+    """Joint positions [rad, m], arm then gripper, shape ``(nworld, n)``."""
+    return joint_positions(env)
+
+
+def joint_pos_relative(env: EnvView) -> torch.Tensor:
+    """Joint positions less home [rad, m], shape ``(nworld, n)``."""
+    return joint_positions(env) - robot(env).home
+
+
+def joint_vel(env: EnvView) -> torch.Tensor:
+    """Joint velocities [rad/s, m/s], shape ``(nworld, n)``."""
+    return joint_velocities(env)
+
+
+def aperture_pos(env: EnvView) -> torch.Tensor:
+    """Aperture centre [m], world frame, shape ``(nworld, 3)``."""
+    return aperture_center(env)
+
+
+def aperture_to_object(env: EnvView, *, object: str, height: float = 0.0) -> torch.Tensor:
+    """From the aperture centre to a point above an object's centre [m], shape ``(nworld, 3)``.
+
+    Args:
+        env: The environment.
+        object: Scene object.
+        height: How far above [m].
+    """
+    offset = pose_w(env, object)[:, :3] - aperture_center(env)
+    offset[:, 2] += height
+    return offset
+
+
+def object_to_object(env: EnvView, *, a: str, b: str) -> torch.Tensor:
+    """From one object's centre to another's [m], shape ``(nworld, 3)``."""
+    return pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
+
+
+def object_pose(env: EnvView, *, object: str) -> torch.Tensor:
+    """Position [m] and quaternion (wxyz), world frame, shape ``(nworld, 7)``."""
+    return pose_w(env, object)
+
+
+def object_velocity(env: EnvView, *, object: str) -> torch.Tensor:
+    """Linear [m/s, world frame] and angular [rad/s, body frame] velocity, shape ``(nworld, 6)``."""
+    _, address = env.index.object_address(object)
+    return env.sim.qvel[:, address : address + 6]
+
+
+def jaw_force(env: EnvView, *, object: str) -> torch.Tensor:
+    """Size of each jaw's contact force on an object [N], at the last physics step, shape ``(nworld, 2)``."""
+    return jaw_forces(env, object)
+
+
+def last_action(env: EnvView) -> torch.Tensor:
+    """The policy's last action, shape ``(nworld, action_dim)``."""
+    return env.action

@@ -1,0 +1,62 @@
+"""Reward terms: functions of the environment that return ``(nworld,)``, mostly between 0 and 1."""
+
+from __future__ import annotations
+
+import torch
+
+from mjstack.managers.base import EnvView
+from mjstack.math import lowest_corner
+from mjstack.mdp.geometry import aperture_center, jaw_forces, joint_velocities, pose_w
+from mjstack.scene import table_top
+
+
+def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> torch.Tensor:
+    """Nearness of the aperture centre to a point above an object: ``1 - tanh(distance / scale)``.
+
+    Args:
+        env: The environment.
+        object: Scene object.
+        scale: Distance over which the reward falls [m].
+        height: How far above the object's centre the point is [m].
+    """
+    offset = pose_w(env, object)[:, :3] - aperture_center(env)
+    offset[:, 2] += height
+    return 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
+
+
+def grasp(env: EnvView, *, object: str, force: float = 0.05) -> torch.Tensor:
+    """1 while both jaws press on an object with more than ``force`` [N], else 0."""
+    return (jaw_forces(env, object) > force).all(1).to(torch.float32)
+
+
+def lift(env: EnvView, *, object: str, height: float) -> torch.Tensor:
+    """Height of a cube's lowest corner above the table as a fraction of ``height`` [m], from 0 to 1."""
+    return (_above_table(env, object) / height).clamp(0.0, 1.0)
+
+
+def place(env: EnvView, *, a: str, b: str, scale: float) -> torch.Tensor:
+    """Nearness of cube ``a`` to its place on cube ``b``, while it is off the table: ``1 - tanh(distance / scale)``."""
+    offset = pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
+    offset[:, 2] += 2.0 * env.cfg.scene.cube_half
+    near = 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
+    return near * (_above_table(env, a) > 0.005)
+
+
+def success(env: EnvView) -> torch.Tensor:
+    """1 in a frame in which the task is achieved."""
+    return env.success.to(torch.float32)
+
+
+def action_rate(env: EnvView) -> torch.Tensor:
+    """Squared change of the action since the last frame, summed."""
+    return (env.action - env.previous_action).square().sum(1)
+
+
+def joint_vel(env: EnvView) -> torch.Tensor:
+    """Squared joint velocities [rad^2/s^2], summed."""
+    return joint_velocities(env).square().sum(1)
+
+
+def _above_table(env: EnvView, name: str) -> torch.Tensor:
+    pose = pose_w(env, name)
+    return lowest_corner(pose[:, :3], pose[:, 3:], env.cfg.scene.cube_half) - table_top(env.cfg.scene)

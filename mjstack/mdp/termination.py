@@ -1,0 +1,78 @@
+"""Termination terms: functions or classes that return ``(nworld,)`` bool."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from mjstack.errors import ParameterError
+from mjstack.managers.base import EnvView
+from mjstack.mdp.geometry import joint_positions, pose_w, robot
+from mjstack.scene import table_top
+from mjstack.sim import LOST_PHYSICS
+
+
+def time_out(env: EnvView, *, frames: int) -> torch.Tensor:
+    """After this many frames."""
+    return env.frame >= frames
+
+
+def success(env: EnvView) -> torch.Tensor:
+    """Once the task is achieved."""
+    return env.success
+
+
+class CubeOffTable:
+    """When a cube's centre is beside the table or below its top."""
+
+    def __init__(self, env: EnvView) -> None:
+        """Reads the table's place."""
+        scene = env.cfg.scene
+        dtype = env.sim.qpos.dtype
+        self._center = torch.tensor(scene.table_center[:2], dtype=dtype, device=env.device)
+        self._half = torch.tensor(scene.table_half[:2], dtype=dtype, device=env.device)
+        self._top = table_top(scene)
+
+    def __call__(self, env: EnvView) -> torch.Tensor:
+        """True for worlds with a cube off the table, shape ``(nworld,)``."""
+        off = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
+        for name in env.index.objects:
+            pos = pose_w(env, name)[:, :3]
+            off |= ((pos[:, :2] - self._center).abs() > self._half).any(1) | (pos[:, 2] < self._top)
+        return off
+
+
+class JointLimit:
+    """When a joint of the robot is outside its range by more than a part of it: MuJoCo's limits are soft."""
+
+    def __init__(self, env: EnvView, *, margin: float) -> None:
+        """Reads the ranges.
+
+        Args:
+            env: The environment.
+            margin: How far outside is too far, as a fraction of each joint's range.
+
+        Raises:
+            ParameterError: The margin is negative or not finite.
+        """
+        if not (math.isfinite(margin) and margin >= 0.0):
+            raise ParameterError("margin", margin, "a number that is not negative")
+        limits = robot(env).range
+        room = margin * (limits[:, 1] - limits[:, 0])
+        self._low, self._high = limits[:, 0] - room, limits[:, 1] + room
+
+    def __call__(self, env: EnvView) -> torch.Tensor:
+        """True for worlds with a joint outside, shape ``(nworld,)``."""
+        q = joint_positions(env)
+        return ((q < self._low) | (q > self._high)).any(1)
+
+
+def non_finite(env: EnvView) -> torch.Tensor:
+    """When a position or velocity is NaN or infinite: such a world cannot go on."""
+    return ~(torch.isfinite(env.sim.qpos).all(1) & torch.isfinite(env.sim.qvel).all(1))
+
+
+def overflow(env: EnvView) -> torch.Tensor:
+    """When a buffer of the world was too small, so that physics was lost."""
+    return (env.sim.overflow & LOST_PHYSICS) != 0

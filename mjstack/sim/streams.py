@@ -1,0 +1,27 @@
+"""Orders Warp's work with torch's."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+# One object per torch stream, for ever: a second one for the same stream would unregister it when freed.
+_STREAMS: dict[tuple[str, int], wp.Stream] = {}
+
+
+def torch_stream_scope(device: wp.Device) -> wp.ScopedStream | wp.ScopedDevice:
+    """A context in which Warp's work on a device goes to torch's current stream there.
+
+    Reads and writes of shared memory by torch, before and after, are then ordered with it, and nobody waits. On Warp's CPU
+    device, which has no streams, it only makes the device the current one.
+
+    Args:
+        device: The Warp device.
+    """
+    if not device.is_cuda:
+        return wp.ScopedDevice(device)
+    current = torch.cuda.current_stream(wp.device_to_torch(device))
+    key = (str(device), current.cuda_stream)
+    if key not in _STREAMS:
+        _STREAMS[key] = wp.stream_from_torch(current)
+    return wp.ScopedStream(_STREAMS[key], sync_enter=False, sync_exit=False)

@@ -1,0 +1,48 @@
+"""Task *reach*: the aperture centre to a point above a cube."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from mjstack.errors import ParameterError
+from mjstack.managers.base import EnvView
+from mjstack.mdp.geometry import aperture_center, pose_w
+
+
+class ReachSuccess:
+    """Achieved while the aperture centre has been near the point for some frames in a row."""
+
+    def __init__(self, env: EnvView, *, object: str, height: float, distance: float, frames: int) -> None:
+        """Takes the thresholds.
+
+        Args:
+            env: The environment.
+            object: The cube.
+            height: How far above its centre the point is [m].
+            distance: What counts as near [m].
+            frames: How many frames in a row.
+
+        Raises:
+            MjstackError: There is no such object, or a number is out of range.
+        """
+        env.index.object_address(object)
+        if not (math.isfinite(distance) and distance > 0.0):
+            raise ParameterError("distance", distance, "a positive number [m]")
+        if frames < 1:
+            raise ParameterError("frames", frames, "an integer of at least 1")
+        self._object, self._height, self._distance, self._frames = object, height, distance, frames
+        self._run = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
+
+    def __call__(self, env: EnvView) -> torch.Tensor:
+        """Takes in a frame; shape ``(nworld,)``, bool."""
+        offset = pose_w(env, self._object)[:, :3] - aperture_center(env)
+        offset[:, 2] += self._height
+        near = torch.linalg.vector_norm(offset, dim=1) <= self._distance
+        self._run.add_(1).mul_(near)
+        return self._run >= self._frames
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Forgets the masked worlds."""
+        self._run.masked_fill_(mask, 0)

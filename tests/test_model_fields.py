@@ -1,0 +1,372 @@
+"""Model fields that differ from world to world."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from comparison import assert_same_run
+
+from mjstack.config import load_config
+from mjstack.config.schema import Backend
+from mjstack.errors import RebindError, UnknownName
+from mjstack.gates.episode import start_worlds
+from mjstack.gates.gate import GateContext
+from mjstack.sim import BatchSizes, Simulation, make_simulation
+from mjstack.sim.fields import FIELD_NAMES
+
+N = 3
+FIELDS = (
+    "body_mass",
+    "body_inertia",
+    "body_subtreemass",
+    "body_invweight0",
+    "dof_invweight0",
+    "dof_damping",
+    "geom_friction",
+    "actuator_gainprm",
+    "actuator_biasprm",
+)
+Make = Callable[..., Simulation]
+Stage = Callable[[str], GateContext]
+
+
+@pytest.fixture(scope="module")
+def make_fields(stage: Stage) -> Make:
+    """Simulations of the SO-101 scene with fields, reset and with the model's values, shared by the tests of this file."""
+    made: dict[tuple, Simulation] = {}
+
+    def make(backend: str, nworld: int = N, fields: tuple[str, ...] = FIELDS, *overrides: str) -> Simulation:
+        key = (backend, nworld, fields, overrides)
+        model = stage("so101").model
+        if key not in made:
+            kind = Backend.native if backend == "native" else Backend.mjwarp
+            device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
+            made[key] = make_simulation(model, load_config([*overrides]), nworld, backend=kind, device=device, fields=fields)
+        for name, field in made[key].fields.items():
+            field[:] = torch.from_numpy(getattr(model, name)).to(field)
+        made[key].reset()
+        return made[key]
+
+    return make
+
+
+def cube(context: GateContext) -> tuple[int, int, int]:
+    """First cube: its body, and where its position and velocity begin."""
+    q, v = int(context.index.cube_qpos[0]), int(context.index.cube_qvel[0])
+    return int(context.model.dof_bodyid[v]), q, v
+
+
+def scale_cube(sim: Simulation, context: GateContext, world: int, s: float) -> None:
+    """Makes the cube of one world s times as heavy, with all that MuJoCo derives from it."""
+    body, _, v = cube(context)
+    for name in ("body_mass", "body_inertia", "body_subtreemass"):
+        sim.fields[name][world, body] *= s
+    sim.fields["body_invweight0"][world, body] /= s
+    sim.fields["dof_invweight0"][world, v : v + 6] /= s
+
+
+def randomise(sim: Simulation, context: GateContext) -> None:
+    """Other mass, friction and gains in every world, the same for every backend."""
+    for k in range(sim.nworld):
+        rng = np.random.default_rng(k)
+        scale_cube(sim, context, k, rng.uniform(0.5, 2.0))
+        sim.fields["geom_friction"][k, :, 0] *= rng.uniform(0.6, 1.4)
+        gain = rng.uniform(0.8, 1.2)
+        sim.fields["actuator_gainprm"][k, :, 0] *= gain
+        sim.fields["actuator_biasprm"][k, :, 1] *= gain
+
+
+def start(sim: Simulation, context: GateContext) -> None:
+    """Home, jittered cubes, and a command that moves every joint."""
+    start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+    sim.ctrl[:, torch.from_numpy(context.index.ctrl)] += 0.05
+
+
+def test_every_field_has_mujocos_shape_and_values(backend: str, make_fields: Make, stage: Stage) -> None:
+    sim, m = make_fields(backend, N, FIELD_NAMES), stage("so101").model
+    assert tuple(sim.fields) == FIELD_NAMES
+    for name, field in sim.fields.items():
+        value = getattr(m, name)
+        assert tuple(field.shape) == (N, *value.shape), name
+        assert field.dtype is (torch.float64 if backend == "native" else torch.float32), name
+        assert field.device == sim.device, name
+        for k in range(N):
+            np.testing.assert_allclose(field[k].cpu().numpy(), value, rtol=1e-6, err_msg=name)
+
+
+def test_the_models_values_change_nothing(backend: str, make_fields: Make, make_sim: Make, stage: Stage) -> None:
+    finals = []
+    for sim in (make_sim(backend, N), make_fields(backend, N, FIELD_NAMES)):
+        start(sim, stage("so101"))
+        sim.step(20)
+        finals.append([sim.qpos.clone(), sim.qvel.clone(), sim.geom_xpos.clone()])
+    for a, b in zip(*finals, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
+
+
+def test_the_names_are_those_that_mjwarp_batches(make_fields: Make) -> None:
+    make_fields("mjwarp")  # sets Warp up
+    from dataclasses import fields as dataclass_fields
+
+    import mujoco_warp
+
+    floats = {
+        spec.name
+        for spec in dataclass_fields(mujoco_warp.Model)
+        if getattr(spec.type, "shape", ())
+        and spec.type.shape[0] == "*"
+        and not any(w in str(spec.type.dtype) for w in ("int", "bool", "vec2i"))
+    }
+    assert floats - set(FIELD_NAMES) == {"actuator_delay", "sensor_delay", "sensor_interval"}
+    assert set(FIELD_NAMES) <= floats
+
+
+def test_fields_keep_their_address(backend: str, make_fields: Make) -> None:
+    sim = make_fields(backend)
+    before = {name: field.data_ptr() for name, field in sim.fields.items()}
+    sim.step(5)
+    sim.forward()
+    sim.reset()
+    sim.fields["body_mass"] *= 2.0  # Python sets the item to the very same tensor
+    assert {name: field.data_ptr() for name, field in sim.fields.items()} == before
+    with pytest.raises(RebindError, match=r"^sim\.fields\['body_mass'\] is a view .* write sim\.fields\['body_mass'\]\[:\] = "):
+        sim.fields["body_mass"] = torch.zeros(N)
+    with pytest.raises(KeyError, match="geom_size is not a per-world field of this simulation"):
+        sim.fields["geom_size"]
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"), [("body_mas", "body_mass"), ("geom_frictoin", "geom_friction"), ("bodymass", "body_mass")]
+)
+def test_an_unknown_field_names_the_nearest(backend: str, stage: Stage, name: str, nearest: str) -> None:
+    kind = Backend.native if backend == "native" else Backend.mjwarp
+    with pytest.raises(
+        UnknownName, match=rf"^per-world model field '{name}' does not exist. Did you mean '{nearest}'\? "
+    ) as caught:
+        make_simulation(stage("so101").model, load_config([]), 1, backend=kind, device="cpu", fields=("body_mass", name))
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize("name", ["geom_dataid", "body_parentid", "dof_M0", "opt"])
+def test_a_field_that_cannot_differ_is_refused(stage: Stage, name: str) -> None:
+    for kind in (Backend.native, Backend.mjwarp):
+        with pytest.raises(UnknownName):
+            make_simulation(stage("so101").model, load_config([]), 1, backend=kind, device="cpu", fields=(name,))
+
+
+def test_a_heavy_cube_is_slowed_less(backend: str, make_fields: Make, stage: Stage) -> None:
+    """Damping c stops mass m as exp(-c t / m): the implicit integrator divides the speed by 1 + c dt / m in every step."""
+    context = stage("so101")
+    body, q, v = cube(context)
+    sim = make_fields(backend)
+    sim.step(10)  # a graph that is captured before anything is written sees it all the same
+    sim.reset()
+    sim.fields["dof_damping"][:, v : v + 3] = 0.8
+    sim.fields["dof_damping"][:, v + 3 : v + 6] = 1e-4
+    scale_cube(sim, context, 1, 4.0)
+    sim.qpos[:, q + 2] = 2.0
+    sim.qvel[:, v], sim.qvel[:, v + 5] = 1.0, 1.0
+    sim.step(10)
+    mass, inertia = (getattr(context.model, name)[body] for name in ("body_mass", "body_inertia"))
+    dt = context.model.opt.timestep
+    for k, s in enumerate((1.0, 4.0, 1.0)):
+        assert float(sim.qvel[k, v]) == pytest.approx((1 + 0.8 * dt / (s * mass)) ** -10, rel=1e-4), k
+        assert float(sim.qvel[k, v + 5]) == pytest.approx((1 + 1e-4 * dt / (s * inertia[2])) ** -10, rel=1e-4), k
+        # Gravity pulls a heavy cube as fast as a light one, apart from the damping.
+        fall = 0.0
+        for _ in range(10):
+            fall = (fall - 9.81 * dt) / (1 + 0.8 * dt / (s * mass))
+        assert float(sim.qvel[k, v + 2]) == pytest.approx(fall, rel=1e-3), k
+
+
+def test_friction_stops_a_cube_in_one_world_only(backend: str, make_fields: Make, stage: Stage) -> None:
+    context = stage("so101")
+    _, _, v = cube(context)
+    sim = make_fields(backend)
+    start(sim, context)
+    sim.step(50)
+    before = sim.qpos.clone()
+    _, q, _ = cube(context)
+    sim.fields["geom_friction"][:, :, 0] = torch.tensor([[1.0], [0.02], [1.0]], device=sim.device)
+    sim.qvel[:, v + 1] = 0.3
+    for _ in range(6):
+        sim.step(10)
+    slid = (sim.qpos - before)[:, q : q + 2].norm(dim=1).tolist()
+    # v^2 / (2 mu g) is 4.6 mm on the rough table; on the smooth one the cube has kept most of its 0.3 m/s for 0.12 s.
+    assert slid[0] < 0.008
+    assert slid[2] < 0.008
+    assert slid[1] > 0.025
+
+
+STATIC = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 0.1"/>
+    <body name="table" pos="0 0 0.3" euler="0 0 20">
+      <geom type="box" size="0.2 0.2 0.02"/>
+      <body pos="0.1 0 0"><geom type="box" size="0.02 0.02 0.1" pos="0 0 0.05"/></body>
+    </body>
+    <body name="ball" pos="-0.1 0 0.44"><freejoint/><geom size="0.03"/><site name="centre"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_static_geoms_follow_their_fields(backend: str) -> None:
+    """MJWarp by itself places geoms that never move once, when the data is made."""
+    m = mujoco.MjModel.from_xml_string(STATIC)
+    kind, device = (
+        (Backend.native, "cpu") if backend == "native" else (Backend.mjwarp, "cuda:0" if "cuda" in backend else "cpu")
+    )
+    names = ("body_pos", "geom_pos", "geom_quat", "site_pos")
+    sim = make_simulation(m, load_config([]), N, backend=kind, device=device, fields=names)
+    sim.step(1)
+    sim.fields["body_pos"][1, 1, 2] += 0.1  # the table, up to the ball
+    sim.fields["geom_pos"][2] += 0.01
+    sim.fields["geom_quat"][2] = torch.tensor([0.8, 0.0, 0.0, 0.6]).to(sim.qpos)
+    sim.fields["site_pos"][2] += 0.01
+    for refresh in (sim.forward, sim.kinematics, lambda: sim.step(1), lambda: sim.step(1, kinematics=True)):
+        sim.reset()
+        sim.geom_xpos.fill_(float("nan"))
+        refresh()
+        for k in range(N):
+            own = copy.copy(m)
+            own.geom_sameframe[:] = 0
+            own.site_sameframe[:] = 0
+            for name in names:
+                getattr(own, name)[:] = sim.fields[name][k].double().cpu()
+            data = mujoco.MjData(own)
+            mujoco.mj_kinematics(own, data)
+            np.testing.assert_allclose(sim.geom_xpos[k].double().cpu(), data.geom_xpos, atol=1e-4)
+            np.testing.assert_allclose(sim.site_xpos[k].double().cpu(), data.site_xpos, atol=1e-4)
+    assert sim.contact_count.tolist() == [0, 1, 0]
+
+
+def test_world_k_of_n_is_world_k_of_one(backend: str, make_fields: Make, stage: Stage) -> None:
+    many, one, context = make_fields(backend), make_fields(backend, 1), stage("so101")
+    randomise(many, context)
+    start(many, context)
+    initial = [many.qpos.clone(), many.qvel.clone(), many.ctrl.clone()]
+    for _ in range(3):
+        many.step(10)
+    for k in range(N):
+        one.reset()
+        for name, field in one.fields.items():
+            field[0] = many.fields[name][k]
+        for view, value in zip((one.qpos, one.qvel, one.ctrl), initial, strict=True):
+            view[0] = value[k]
+        one.forward()
+        for _ in range(3):
+            one.step(10)
+        assert_same_run(one.qpos[0], many.qpos[k], backend)
+        assert_same_run(one.qvel[0], many.qvel[k], backend)
+
+
+def test_reset_leaves_fields(backend: str, make_fields: Make, stage: Stage) -> None:
+    sim = make_fields(backend)
+    randomise(sim, stage("so101"))
+    before = {name: field.clone() for name, field in sim.fields.items()}
+    sim.reset(torch.tensor([True, False, True], device=sim.device))
+    sim.step(2)
+    sim.reset()
+    for name, field in sim.fields.items():
+        assert torch.equal(field, before[name]), name
+
+
+def test_reset_starts_from_the_worlds_own_qpos0(backend: str, make_fields: Make) -> None:
+    sim = make_fields(backend, N, ("qpos0",))
+    expected = sim.qpos.clone()
+    sim.fields["qpos0"][1, 0] += 0.25
+    expected[1, 0] += 0.25
+    sim.reset()
+    assert torch.equal(sim.qpos, expected)
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_backends_agree(make_fields: Make, stage: Stage, device: str) -> None:
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device here")
+    finals = []
+    for backend in ("native", "mjwarp" if device == "cpu" else "mjwarp-cuda"):
+        sim = make_fields(backend)
+        randomise(sim, stage("so101"))
+        start(sim, stage("so101"))
+        for _ in range(5):
+            sim.step(10, kinematics=True)
+        finals.append((sim.qpos.double().cpu(), sim.site_xpos.double().cpu()))
+    for native, mjwarp in zip(*finals, strict=True):
+        torch.testing.assert_close(native, mjwarp, rtol=0, atol=1e-4)
+
+
+def test_a_scaled_free_body_is_what_set_const_computes(stage: Stage) -> None:
+    """All that mj_setConst derives for a body of its own scales with its mass, or with one over it."""
+    context = stage("so101")
+    body, _, v = cube(context)
+    s, dofs = 1.7, slice(v, v + 6)
+    scaled, derived = copy.copy(context.model), copy.copy(context.model)
+    for name, where, factor in (
+        ("body_mass", body, s),
+        ("body_inertia", body, s),
+        ("body_subtreemass", body, s),
+        ("body_invweight0", body, 1 / s),
+        ("dof_invweight0", dofs, 1 / s),
+    ):
+        getattr(scaled, name)[where] *= factor
+    derived.body_mass[body] *= s
+    derived.body_inertia[body] *= s
+    mujoco.mj_setConst(derived, mujoco.MjData(derived))
+    derived.body_subtreemass[0] = scaled.body_subtreemass[0]  # the mass of the whole scene, which no physics reads
+    compared = 0
+    for name in dir(derived):
+        value = getattr(derived, name)
+        # Native worlds take care of dof_M0 themselves: the next test.
+        if isinstance(value, np.ndarray) and value.dtype.kind == "f" and name != "dof_M0":
+            np.testing.assert_allclose(getattr(scaled, name), value, rtol=1e-9, atol=1e-12, err_msg=name)
+            compared += 1
+    assert compared > 100
+    assert derived.body_mass[body] == s * context.model.body_mass[body]
+
+
+@pytest.mark.parametrize(
+    "joints",
+    [
+        "<freejoint/>",
+        "<joint type='ball'/>",
+        "<joint type='slide' axis='1 0 0' armature='0.1'/><joint type='slide' axis='0 0 1'/>",
+        "<joint type='hinge' axis='0 0 1' armature='0.2'/>",
+        "<joint type='hinge' axis='0 0 1' pos='0.1 0.2 0'/>",
+    ],
+)
+def test_native_mass_matrix_of_a_simple_body_follows_its_mass(joints: str) -> None:
+    """MuJoCo reads the inertia of such a body from dof_M0, made at compile time, and its weight from body_mass."""
+    xml = f"<mujoco><worldbody><body pos='0 0 1'>{joints}<geom type='box' size='.1 .2 .3'/></body></worldbody></mujoco>"
+    m = mujoco.MjModel.from_xml_string(xml)
+    fields = ("body_mass", "body_inertia", "dof_armature")
+    sim = make_simulation(m, load_config([]), 2, backend=Backend.native, fields=fields)
+    sim.fields["body_mass"][1] *= 3.0
+    sim.fields["body_inertia"][1] *= torch.tensor([2.0, 3.0, 4.0])
+    sim.fields["dof_armature"][1] += 0.05
+    own = copy.copy(m)
+    for name in fields:
+        getattr(own, name)[:] = sim.fields[name][1]
+    mujoco.mj_setConst(own, mujoco.MjData(own))
+    sim.qvel[:, -1] = 1.0
+    initial = sim.qvel.clone()
+    sim.step(5)
+    for model, k in ((m, 0), (own, 1)):
+        data = mujoco.MjData(model)
+        data.qvel[:] = initial[k]
+        mujoco.mj_step(model, data, 5)
+        np.testing.assert_allclose(sim.qvel[k], data.qvel, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(sim.qpos[k], data.qpos, rtol=1e-12, atol=1e-14)
+
+
+def test_buffer_sizes_can_be_given(make_fields: Make, stage: Stage) -> None:
+    sizes = BatchSizes(nconmax=40, njmax=200)
+    sim = make_simulation(stage("so101").model, load_config([]), 2, backend=Backend.mjwarp, device="cpu", sizes=sizes)
+    assert sim.sizes is sizes  # type: ignore[attr-defined]
