@@ -6,17 +6,13 @@ of 16 draws what world 5 of 2048 draws, and no draw depends on which other world
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 
 _MASK = 0xFFFFFFFF
 _M0, _M1 = 0xD2511F53, 0xCD9E8D57
 _W0, _W1 = 0x9E3779B9, 0xBB67AE85
-
-
-def _mul_hi_lo(a: int, b: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """High and low 32 bits of a 32 x 32 bit product. int64 wraps, and masking after the shift drops the sign."""
-    product = a * b
-    return (product >> 32) & _MASK, product & _MASK
 
 
 def philox(counter: torch.Tensor, key: tuple[int, int]) -> torch.Tensor:
@@ -29,14 +25,22 @@ def philox(counter: torch.Tensor, key: tuple[int, int]) -> torch.Tensor:
     Returns:
         Four random 32-bit words held in int64, shape ``(..., 4)``.
     """
-    c0, c1, c2, c3 = counter.unbind(-1)
-    k0, k1 = key
-    for _ in range(10):
-        hi0, lo0 = _mul_hi_lo(_M0, c0)
-        hi1, lo1 = _mul_hi_lo(_M1, c2)
-        c0, c1, c2, c3 = hi1 ^ c1 ^ k0, lo1, hi0 ^ c3 ^ k1, lo0
-        k0, k1 = (k0 + _W0) & _MASK, (k1 + _W1) & _MASK
-    return torch.stack((c0, c1, c2, c3), dim=-1)
+    multipliers, keys = _constants(key, counter.device)
+    # Words 0 and 2 are multiplied, words 1 and 3 are mixed in: both pairs go through each round together.
+    multiplied, mixed = counter[..., ::2], counter[..., 1::2]
+    for round_ in range(10):
+        product = multiplied * multipliers  # int64 wraps, and the mask after the shift drops the sign
+        high = (product >> 32).bitwise_and_(_MASK)
+        multiplied = high.flip(-1).bitwise_xor_(mixed).bitwise_xor_(keys[round_])
+        mixed = product.bitwise_and_(_MASK).flip(-1)
+    return torch.stack((multiplied, mixed), dim=-1).flatten(-2)
+
+
+@cache
+def _constants(key: tuple[int, int], device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    """Multipliers ``(2,)`` and the key of each round ``(10, 2)``; made once, because a captured step cannot copy them."""
+    rounds = [[(key[0] + i * _W0) & _MASK, (key[1] + i * _W1) & _MASK] for i in range(10)]
+    return torch.tensor([_M0, _M1], device=device), torch.tensor(rounds, device=device)
 
 
 def uniform(

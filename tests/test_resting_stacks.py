@@ -11,8 +11,7 @@ import torch
 from mjstack import load_config
 from mjstack.config.schema import Backend
 from mjstack.math import quat_from_yaw
-from mjstack.robots import robot_spec
-from mjstack.scene import SceneIndex, build_scene, table_top
+from mjstack.scene import SceneIndex, build_model, table_top
 from mjstack.sim import make_simulation
 
 NWORLD = 512
@@ -22,7 +21,7 @@ SECONDS = 5.0
 def moving_stacks(*, primitive: bool) -> int:
     """Stacks whose red cube still turns after SECONDS, of NWORLD dropped from half a millimetre."""
     cfg = load_config()
-    model = build_scene(robot_spec(cfg.robot, cfg.model), cfg.scene, cfg.timing, cfg.solver)
+    model = build_model(cfg)
     index = SceneIndex(model, cfg.robot)
     sim = make_simulation(model, cfg, NWORLD, backend=Backend.mjwarp, device="cuda:0")
     if not primitive:

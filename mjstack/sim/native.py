@@ -49,7 +49,7 @@ class _Worker:
 class NativeSimulation(FixedViews):
     """`Simulation` on native MuJoCo, float64 on the CPU.
 
-    A world's whole state, warm start included, is one row that goes into a thread's MjData before its substeps and comes
+    A world's whole state, warm start included (``qacc_warmstart``), is one row that goes into a thread's MjData before its substeps and comes
     back after them; so do its model fields into the thread's MjModel, if there are any. MuJoCo's automatic reset of a
     diverged world is switched off, because it would hide the divergence; a world whose state is not finite is not stepped
     any more, and its derived arrays are NaN.
@@ -73,7 +73,7 @@ class NativeSimulation(FixedViews):
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.nworld = nworld
         self.device = torch.device("cpu")
-        nthread = max(1, min(nthread or available_cores(), nworld))
+        self.nthread = nthread = max(1, min(nthread or available_cores(), nworld))
         self.description = f"MuJoCo {mujoco.__version__} on {nthread} threads, {platform.machine()} CPU"
         self._pool = ThreadPoolExecutor(nthread) if nthread > 1 else None
 
@@ -85,6 +85,7 @@ class NativeSimulation(FixedViews):
         self._physics = self._state[:, q : a + m.na]
         self.qpos, self.qvel = torch.from_numpy(self._qpos), torch.from_numpy(self._state[:, v:a])
         self.act, self.ctrl = torch.from_numpy(self._state[:, a : a + m.na]), torch.from_numpy(self._state[:, u:])
+        self.qacc_warmstart = torch.from_numpy(self._state[:, u - m.nv : u])
         self._initial = self._state[0].copy()
         mujoco.mj_getState(m, mujoco.MjData(m), self._initial, _SPEC)
 

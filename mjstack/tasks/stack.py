@@ -204,7 +204,8 @@ class StackSuccess:
         self._addresses = [env.index.objects[name] for name in (RED, BLUE)]
         n, window, device = env.nworld, self._t.window, env.device
         self._slot = torch.zeros(1, dtype=torch.int64, device=device)  # where the oldest frame is, in every world
-        self._pose = torch.zeros((n, window, 2, 7), device=device)
+        self._pos, self._quat = torch.zeros((n, window, 2, 3), device=device), torch.zeros((n, window, 2, 4), device=device)
+        self._apart, self._product = torch.zeros_like(self._pos), torch.zeros_like(self._quat)
         self._energy = torch.zeros((n, window, 2), device=device)  # squared speed
         self._far = torch.zeros((n, window, 2), device=device)  # per frame and cube: squared distance to later frames
         self._turned = torch.zeros((n, window, 2), device=device)  # likewise: 1 - |cosine of half the angle|
@@ -221,17 +222,6 @@ class StackSuccess:
         speed = torch.linalg.vector_norm(velocity[..., :3], dim=-1)
         speed = speed + math.sqrt(3.0) * half * torch.linalg.vector_norm(velocity[..., 3:], dim=-1)
 
-        # The new frame takes the oldest one's place, and is compared with all others, itself included.
-        self._pose.index_copy_(1, self._slot, pose[:, None])
-        self._energy.index_copy_(1, self._slot, speed.square()[:, None])
-        for ring in (self._far, self._turned):
-            ring.index_fill_(1, self._slot, 0.0)
-        far = (self._pose[..., :3] - pos[:, None]).square().sum(-1)
-        turned = 1.0 - (self._pose[..., 3:] * quat[:, None]).sum(-1).abs()
-        torch.maximum(self._far, far, out=self._far)
-        torch.maximum(self._turned, turned, out=self._turned)
-        self._slot.add_(1).remainder_(t.window)
-
         dz = pos[:, 0, 2] - pos[:, 1, 2]
         stacked = torch.linalg.vector_norm(pos[:, 0, :2] - pos[:, 1, :2], dim=1) <= t.xy_err
         stacked &= (dz >= t.dz_min) & (dz <= t.dz_max)
@@ -239,17 +229,27 @@ class StackSuccess:
         stacked &= (low.abs() <= t.support_gap) & ((pos[:, 1, :2] - self._center).abs() <= self._room).all(1)
         self._held.add_(1).mul_(stacked)
 
+        # The new frame takes the oldest one's place.
+        self._slot.add_(1).remainder_(t.window)
+        self._pos.index_copy_(1, self._slot, pos[:, None])
+        self._quat.index_copy_(1, self._slot, quat[:, None])
+        self._energy.index_copy_(1, self._slot, speed.square()[:, None])
+        for ring in (self._far, self._turned):
+            ring.index_fill_(1, self._slot, 0.0)
+        if not stacked.is_cuda and not bool(stacked.any()):
+            return torch.zeros_like(stacked)  # no window that holds this frame can pass, in any world
+        torch.sub(self._pos, pos[:, None], out=self._apart).square_()
+        torch.maximum(self._far, self._apart.sum(-1), out=self._far)
+        torch.mul(self._quat, quat[:, None], out=self._product)
+        torch.maximum(self._turned, 1.0 - self._product.sum(-1).abs(), out=self._turned)
+
         rest = (self._energy.mean(1) <= t.rest_speed**2).all(1)
         rest &= self._far.amax((1, 2)) <= t.rest_position**2
         rest &= self._turned.amax((1, 2)) <= 1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg))
         return (self._held >= t.window) & rest & (gripper_opening(env) >= self._open).all(1)
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Forgets the masked worlds.
-
-        What was in their ring is still there until it is overwritten, which the count of held frames waits for. NaN would
-        outlive that in no slot, but a maximum keeps it, so it is cleared.
-        """
+        """Forgets the masked worlds. What a diverged world has left, a maximum would keep for ever."""
         self._held.masked_fill_(mask, 0)
-        for ring in (self._pose, self._energy, self._far, self._turned):
+        for ring in (self._pos, self._quat, self._energy, self._far, self._turned):
             ring.masked_fill_(mask.view(-1, *[1] * (ring.dim() - 1)), 0.0)
