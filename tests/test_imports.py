@@ -22,7 +22,7 @@ LAYERS = [
     {"tasks"},
     {"envs"},
     {"adapters", "gates"},
-    {"job"},
+    {"job", "benchmark"},
     {"cli"},
 ]
 LEAVES = {"report": {"errors", "report"}}  # anything may import it, and it imports only these
@@ -35,7 +35,10 @@ HOMES = {
     "omegaconf": ("config/", "cli.py", "job.py"),
     "matplotlib": ("report/picture.py",),
     "imageio_ffmpeg": ("report/picture.py",),
-    "rich": ("job.py", "cli.py", "managers/base.py"),
+    "gymnasium": ("adapters/",),
+    "rsl_rl": ("adapters/",),
+    "tensordict": ("adapters/",),
+    "rich": ("job.py", "cli.py", "benchmark.py", "managers/base.py"),
 }
 
 
