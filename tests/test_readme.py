@@ -28,8 +28,8 @@ def test_python_blocks_run(capsys: pytest.CaptureFixture[str]) -> None:
     for block in blocks:  # one after the other: later blocks use what earlier ones defined
         exec(block, names)
     printed = capsys.readouterr().out
-    assert "Seeed reBot DevArm 0.02" in printed
-    assert "torch.Size([64, 22])" in printed
+    assert "'policy': (64, 24)" in printed
+    assert "Seeed reBot DevArm torch.Size([64, 22])" in printed
 
 
 def train(block: str, folder: Path) -> list[float]:

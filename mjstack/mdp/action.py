@@ -19,7 +19,7 @@ class JointPosition(ActionTerm):
     """Position commands of some joints, kept within the actuators' ranges.
 
     ``relative``: home plus ``scale`` times the action. ``absolute``: the action itself [rad, m]. ``delta``: the last
-    command plus ``scale`` times the action.
+    command plus ``scale`` times the action. Actions of the first and the last kind count from -1 to 1.
     """
 
     def __init__(self, env: EnvView, *, joints: str | list[str], mode: str = "relative", scale: float = 1.0) -> None:
@@ -62,9 +62,9 @@ class JointPosition(ActionTerm):
         if self._mode == "absolute":
             command = action
         elif self._mode == "relative":
-            command = self._home + self._scale * action
+            command = self._home + self._scale * action.clamp(-1.0, 1.0)
         else:
-            command = self._ctrl.index_select(1, self._columns) + self._scale * action
+            command = self._ctrl.index_select(1, self._columns) + self._scale * action.clamp(-1.0, 1.0)
         self._ctrl[:, self._columns] = torch.clamp(command, self._low, self._high)
 
 

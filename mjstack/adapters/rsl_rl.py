@@ -1,0 +1,115 @@
+"""RSL-RL's `VecEnv` over an environment, without leaving the device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from mjstack.adapters import MissingExtra
+from mjstack.config.schema import Config
+from mjstack.envs import Env
+from mjstack.errors import ArgumentError
+
+try:
+    from rsl_rl.env import VecEnv
+    from tensordict import TensorDict
+except ImportError as error:
+    raise MissingExtra("mjstack.adapters.rsl_rl", "rsl-rl-lib>=5", error) from error
+
+
+class RslRlVecEnv(VecEnv):
+    """All worlds of an environment for the runners of rsl-rl-lib 5.
+
+    Every observation group is an entry of the `TensorDict`. The runner's configuration says who sees which, such as
+    ``"obs_groups": {"actor": ["policy"], "critic": ["policy", "privileged"]}``.
+
+    Actions are clamped to the action manager's bounds, because a Gaussian policy has none.
+
+    Attributes:
+        env: The environment.
+        num_envs: Number of worlds.
+        num_actions: Width of the action.
+        max_episode_length: Frames after which an episode times out.
+        device: Where tensors live.
+        cfg: The environment's configuration, which loggers store.
+    """
+
+    def __init__(self, env: Env, *, log_interval: int = 24) -> None:
+        """Takes over an environment and starts its first episodes.
+
+        Args:
+            env: The environment.
+            log_interval: Steps between two readings of the episode statistics, each of which waits for the device. The
+                runner's ``num_steps_per_env`` gives one reading per iteration.
+
+        Raises:
+            MjstackError: The interval is out of range, or the worlds cannot start.
+        """
+        if log_interval < 1:
+            raise ArgumentError("log_interval", log_interval, "an integer of at least 1")
+        self.env = env
+        self.num_envs: int = env.nworld
+        self.num_actions: int = env.action_manager.action_dim
+        self.max_episode_length: int = env.max_episode_frames
+        self.device: torch.device = env.device
+        self.cfg: Config = env.cfg
+        self._low, self._high = env.action_manager.low.float(), env.action_manager.high.float()
+        self._log_interval, self._steps = log_interval, 0
+        env.reset()
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Frames since each world's last reset, shape ``(num_envs,)``, int64.
+
+        Assigning copies into the environment: runners start worlds at random times of an episode so that not all end at
+        once.
+        """
+        return self.env.frame
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: torch.Tensor) -> None:
+        if not isinstance(value, torch.Tensor) or value.shape != self.env.frame.shape:
+            found = f"shape {tuple(value.shape)}" if isinstance(value, torch.Tensor) else type(value).__name__
+            raise ArgumentError("episode_length_buf", found, f"a tensor of shape ({self.num_envs},)")
+        self.env.frame.copy_(value)
+
+    def get_observations(self) -> TensorDict:
+        """The current observations.
+
+        Returns:
+            Every group, each ``(num_envs, dim)``, float32.
+        """
+        return self._tensordict({name: group.clone() for name, group in self.env.observation_manager.groups.items()})
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advances every world by one control interval; worlds that end are reset in the same step.
+
+        Args:
+            actions: Shape ``(num_envs, num_actions)``, float32.
+
+        Returns:
+            ``observations``: every group, each ``(num_envs, dim)``, float32.
+            ``rewards``: shape ``(num_envs,)``, float32.
+            ``dones``: whether the episode ended, for whatever reason, shape ``(num_envs,)``, int64.
+            ``extras``: ``time_outs``, ended by the clock alone, shape ``(num_envs,)``, bool; and every ``log_interval``
+            steps ``log``, means over the episodes that ended since the last one.
+
+        Raises:
+            MjstackError: The actions cannot be used, or something went wrong in the worlds.
+        """
+        self.env.action_manager.check(actions)
+        obs, rewards, terminated, truncated, _ = self.env.step(torch.clamp(actions, self._low, self._high))
+        extras: dict[str, Any] = {"time_outs": truncated}
+        self._steps += 1
+        if self._steps % self._log_interval == 0:
+            # The slash keeps the runner's logger from putting names of its own in front.
+            extras["log"] = {f"episode/{name}": value for name, value in self.env.read_statistics().items()}
+        return self._tensordict(obs), rewards, (terminated | truncated).long(), extras
+
+    def close(self) -> None:
+        """Gives the simulation's threads and buffers back."""
+        self.env.close()
+
+    def _tensordict(self, obs: dict[str, torch.Tensor]) -> TensorDict:
+        return TensorDict(obs, batch_size=[self.num_envs], device=self.device)

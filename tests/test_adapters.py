@@ -1,0 +1,378 @@
+"""The adapters: Gymnasium's checker and conventions, and what rsl_rl's runners rely on."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import ClipAction, DictInfoToList, RecordEpisodeStatistics
+
+import mjstack
+from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
+from mjstack.adapters.rsl_rl import RslRlVecEnv
+from mjstack.errors import ArgumentError, MjstackError, UnknownName
+
+FRAMES = 5  # of an episode: short, so that several end in a test
+Make = Callable[..., mjstack.Env]
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    made: list[mjstack.Env] = []
+
+    def build(*overrides: str, nworld: int = 3, seed: int = 0) -> mjstack.Env:
+        base = ["task=reach", "sim=native", f"task.episode_frames={FRAMES}"]
+        made.append(mjstack.make_env([*base, *overrides], nworld=nworld, seed=seed))
+        return made[-1]
+
+    yield build
+    for env in made:
+        env.close()
+
+
+def zeros(env: Any) -> np.ndarray:
+    return np.zeros(env.action_space.shape, dtype=np.float32)
+
+
+# Gymnasium, many worlds
+
+
+def test_vector_spaces(make: Make) -> None:
+    inner = make()
+    env = GymnasiumVectorEnv(inner)
+    policy, actions = inner.observation_manager.group_dims["policy"], inner.action_manager.action_dim
+    assert env.num_envs == 3
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert env.single_observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (policy,), np.float32)
+    assert env.single_action_space == gymnasium.spaces.Box(-1.0, 1.0, (actions,), np.float32)
+    assert env.observation_space.shape == (3, policy)
+    obs, infos = env.reset(seed=1)
+    assert infos == {}
+    assert obs in env.observation_space
+    obs, reward, terminated, truncated, infos = env.step(env.action_space.sample())
+    assert obs in env.observation_space
+    assert (reward.shape, reward.dtype) == ((3,), np.float32)
+    assert (terminated.shape, terminated.dtype, truncated.dtype) == ((3,), np.bool_, np.bool_)
+    assert not infos["success"].any()
+    assert infos["_success"].all()
+    assert "final_obs" not in infos
+
+
+def test_vector_env_in_absolute_joint_commands_has_the_actuators_bounds(make: Make) -> None:
+    inner = make("action=joint_absolute")
+    space = GymnasiumVectorEnv(inner).single_action_space
+    assert isinstance(space, gymnasium.spaces.Box)
+    limits = inner.sim.model.actuator_ctrlrange.astype(np.float32)
+    np.testing.assert_array_equal(np.stack((space.low, space.high), 1), limits)
+
+
+def test_vector_groups(make: Make) -> None:
+    inner = make()
+    env = GymnasiumVectorEnv(inner, group=None)
+    obs, _ = env.reset(seed=0)
+    assert isinstance(obs, dict)
+    assert set(obs) == {"policy", "privileged"}
+    assert obs in env.observation_space
+    privileged, _ = GymnasiumVectorEnv(inner, group="privileged").reset(seed=0)
+    np.testing.assert_array_equal(privileged, obs["privileged"])
+    with pytest.raises(UnknownName, match=r"observation group 'polcy' does not exist\. Did you mean 'policy'"):
+        GymnasiumVectorEnv(inner, group="polcy")
+
+
+def test_vector_seeding(make: Make) -> None:
+    env = GymnasiumVectorEnv(make())
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1.0, 1.0, (2 * FRAMES, *env.action_space.shape)).astype(np.float32)
+
+    def rollout(seed: int) -> np.ndarray:
+        return np.stack([env.reset(seed=seed)[0], *(env.step(action)[0] for action in actions)])
+
+    first, other = rollout(7), rollout(8)
+    assert np.array_equal(first, rollout(7))
+    assert not np.isclose(first[0], other[0]).all(1).any()
+    assert env.np_random_seed == 7
+
+
+def test_vector_autoreset_in_the_same_step(make: Make) -> None:
+    """Against an identical environment without the adapter, over two episodes with unequal ends."""
+    inner, env = make(), GymnasiumVectorEnv(make())
+    raw, _ = inner.reset(seed=3)
+    obs, _ = env.reset(seed=3)
+    np.testing.assert_array_equal(obs, raw["policy"].numpy())
+    rng = np.random.default_rng(0)
+    for step in range(1, 2 * FRAMES + 1):
+        action = rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+        if step == 2:  # world 1 starts over, and from here on ends two frames after the others
+            mask = np.array([False, True, False])
+            raw, _ = inner.reset(mask=torch.from_numpy(mask))
+            before, (obs, _) = obs, env.reset(options={"reset_mask": mask})
+            np.testing.assert_array_equal(obs, raw["policy"].numpy())
+            np.testing.assert_array_equal(obs[[0, 2]], before[[0, 2]])
+            assert not np.isclose(obs[1], before[1]).all()
+        raw, raw_reward, _, raw_truncated, extras = inner.step(torch.from_numpy(action))
+        obs, reward, terminated, truncated, infos = env.step(action)
+        np.testing.assert_array_equal(obs, raw["policy"].numpy())
+        np.testing.assert_array_equal(reward, raw_reward.numpy())
+        np.testing.assert_array_equal(truncated, raw_truncated.numpy())
+        late = (step - 1) % FRAMES == 0
+        np.testing.assert_array_equal(truncated, [step % FRAMES == 0, late and step > 1, step % FRAMES == 0])
+        assert not terminated.any()
+        assert ("final_obs" in infos) == truncated.any()
+        if not truncated.any():
+            continue
+        assert list(infos["_final_obs"]) == list(infos["_final_info"]) == list(truncated)
+        for world in range(3):
+            if truncated[world]:
+                np.testing.assert_array_equal(infos["final_obs"][world], extras["final_obs"]["policy"][world].numpy())
+                assert not np.isclose(infos["final_obs"][world], obs[world]).all()
+            else:
+                assert infos["final_obs"][world] is None
+        assert list(infos["final_info"]["_success"]) == list(truncated)
+
+
+def test_vector_final_obs_of_all_groups(make: Make) -> None:
+    env = GymnasiumVectorEnv(make("task.episode_frames=1"), group=None)
+    env.reset(seed=0)
+    *_, infos = env.step(zeros(env))
+    assert infos["final_obs"].shape == (3,)
+    assert all(final in env.single_observation_space for final in infos["final_obs"])
+
+
+def test_vector_success_ends_an_episode(make: Make) -> None:
+    env = GymnasiumVectorEnv(make("task.success.params.distance=10.0", "task.success.params.frames=2"))
+    env.reset(seed=0)
+    assert not env.step(zeros(env))[2].any()
+    _, _, terminated, truncated, infos = env.step(zeros(env))
+    assert terminated.all()
+    assert not truncated.any()
+    assert infos["success"].all()
+    assert infos["final_info"]["success"].all()
+
+
+def test_vector_wrappers_of_gymnasium_work(make: Make) -> None:
+    env = DictInfoToList(ClipAction(RecordEpisodeStatistics(GymnasiumVectorEnv(make()))))
+    env.reset(seed=0)
+    for _ in range(FRAMES):
+        _, _, _, truncated, infos = env.step(zeros(env))
+    assert truncated.all()
+    assert [info["episode"]["l"] for info in infos] == [FRAMES] * 3
+    env.close()
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros((3, 2)), r"action: found shape \(3, 2\), expected a float32 array of shape \(3, 6\)"),
+        (np.zeros(6), r"action: found shape \(6,\), expected"),
+        ("up", r"action: found str, expected"),
+        (np.full((3, 6), np.nan), r"action: found \[nan.* in world 0, expected finite numbers"),
+    ],
+)
+def test_vector_wrong_actions(make: Make, action: Any, message: str) -> None:
+    env = GymnasiumVectorEnv(make())
+    env.reset()
+    with pytest.raises(ArgumentError, match=message):
+        env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"seed": -1}, "seed: found -1"),
+        ({"seed": [1, 2, 3]}, "seed: found"),
+        ({"options": {"mask": None}}, "reset option 'mask' does not exist"),
+        ({"options": {"reset_mask": [True, False, True]}}, "found list, expected a bool array"),
+        ({"options": {"reset_mask": np.ones(4, dtype=bool)}}, r"found bool of shape \(4,\), expected a bool array of shape"),
+        ({"options": {"reset_mask": np.ones(3)}}, r"found float64 of shape"),
+        ({"options": {"reset_mask": np.ones(3, dtype=bool)}, "seed": 1}, "no mask beside it"),
+    ],
+)
+def test_vector_wrong_resets(make: Make, arguments: dict[str, Any], message: str) -> None:
+    env = GymnasiumVectorEnv(make())
+    env.reset()
+    with pytest.raises(MjstackError, match=message):
+        env.reset(**arguments)
+
+
+def test_vector_step_before_reset(make: Make) -> None:
+    env = GymnasiumVectorEnv(make())
+    with pytest.raises(ArgumentError, match="reset"):
+        env.step(zeros(env))
+
+
+# Gymnasium, one world
+
+
+@pytest.mark.parametrize("group", ["policy", None])
+def test_single_env_passes_gymnasiums_checker(group: str | None) -> None:
+    def build(**_: Any) -> GymnasiumEnv:
+        return GymnasiumEnv(mjstack.make_env(["task=reach", "sim=native"], nworld=1), group=group)
+
+    # A registered environment is checked more thoroughly: for determinism, and by making it again.
+    gymnasium.register("mjstack-test/Reach-v0", entry_point=build)
+    try:
+        env = gymnasium.make("mjstack-test/Reach-v0").unwrapped
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            warnings.filterwarnings("ignore", message=r".*space (minimum|maximum) value is -?infinity")  # as it should be
+            check_env(env)
+        env.close()
+    finally:
+        del gymnasium.registry["mjstack-test/Reach-v0"]
+
+
+def test_single_env_is_the_one_world(make: Make) -> None:
+    """The done step returns the final observation, and ``reset`` the start of the episode that follows."""
+    inner, env = make(nworld=1), GymnasiumEnv(make(nworld=1))
+    raw, _ = inner.reset(seed=5)
+    obs, _ = env.reset(seed=5)
+    assert obs in env.observation_space
+    np.testing.assert_array_equal(obs, raw["policy"][0].numpy())
+    for episode in range(2):
+        for step in range(1, FRAMES + 1):
+            raw, raw_reward, _, _, extras = inner.step(torch.full((1, 6), 0.1))
+            obs, reward, terminated, truncated, info = env.step(np.full(6, 0.1, dtype=np.float32))
+            np.testing.assert_array_equal(obs, extras["final_obs"]["policy"][0].numpy())
+            assert (reward, terminated, truncated) == (float(raw_reward), False, step == FRAMES)
+            assert info == {"success": False}
+        with pytest.raises(ArgumentError, match="after the end of an episode"):
+            env.step(zeros(env))
+        obs, _ = env.reset()
+        np.testing.assert_array_equal(obs, raw["policy"][0].numpy())
+        assert int(env.inner.episode) == episode + 1
+    obs, _ = env.reset()  # in the middle of an episode: the next one
+    assert int(env.inner.episode) == 3
+
+
+def test_single_env_seed_after_the_end_of_an_episode(make: Make) -> None:
+    env = GymnasiumEnv(make("task.episode_frames=1", nworld=1))
+    first, _ = env.reset(seed=2)
+    env.step(zeros(env))
+    again, _ = env.reset(seed=2)
+    np.testing.assert_array_equal(first, again)
+
+
+def test_single_env_wrong_use(make: Make) -> None:
+    with pytest.raises(ArgumentError, match=r"env: found 3 worlds, expected one\. Build it with nworld=1"):
+        GymnasiumEnv(make())
+    env = GymnasiumEnv(make(nworld=1))
+    with pytest.raises(UnknownName, match="reset option 'reset_mask' does not exist"):
+        env.reset(options={"reset_mask": np.ones(1, dtype=bool)})
+    env.reset()
+    with pytest.raises(ArgumentError, match=r"action: found shape \(1, 6\), expected a float32 array of shape \(6,\)"):
+        env.step(np.zeros((1, 6)))
+
+
+# rsl_rl
+
+
+def test_rsl_rl_shapes(make: Make) -> None:
+    inner = make()
+    env = RslRlVecEnv(inner)
+    dims = inner.observation_manager.group_dims
+    assert (env.num_envs, env.num_actions, env.max_episode_length) == (3, 6, FRAMES)
+    assert env.cfg is inner.cfg
+    obs = env.get_observations()
+    assert obs.batch_size == torch.Size([3])
+    assert {name: tuple(value.shape) for name, value in obs.items()} == {name: (3, dim) for name, dim in dims.items()}
+    stepped, rewards, dones, extras = env.step(torch.zeros(3, 6))
+    assert {value.dtype for value in stepped.values()} == {torch.float32}
+    assert (rewards.shape, rewards.dtype) == ((3,), torch.float32)
+    assert (dones.shape, dones.dtype) == ((3,), torch.int64)
+    assert set(extras) == {"time_outs"}
+    current = env.get_observations()
+    for name, value in current.items():
+        assert torch.equal(value, stepped[name])
+        assert not torch.equal(value, obs[name])
+
+
+def test_rsl_rl_tells_time_outs_from_other_ends(make: Make) -> None:
+    env = RslRlVecEnv(make("task.success.params.distance=10.0", "task.success.params.frames=3"))
+    env.episode_length_buf = torch.tensor([0, FRAMES - 2, FRAMES - 3])
+    ends = [env.step(torch.zeros(3, 6))[2:] for _ in range(3)]
+    assert [dones.tolist() for dones, _ in ends] == [[0, 0, 0], [0, 1, 0], [1, 0, 1]]
+    # In the third frame world 2 is at its time limit too, but it is the success that ended it.
+    assert [extras["time_outs"].tolist() for _, extras in ends] == [[False] * 3, [False, True, False], [False] * 3]
+
+
+def test_rsl_rl_episode_length_is_the_environments_own(make: Make) -> None:
+    inner = make()
+    env = RslRlVecEnv(inner)
+    frame = inner.frame
+    env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
+    env.episode_length_buf = torch.tensor([0, 2, FRAMES - 1])
+    assert inner.frame is frame
+    assert inner.frame.tolist() == [0, 2, FRAMES - 1]
+    _, _, dones, _ = env.step(torch.zeros(3, 6))
+    assert dones.tolist() == [0, 0, 1]
+    assert env.episode_length_buf.tolist() == [1, 3, 0]
+    for wrong in (torch.zeros(4, dtype=torch.int64), 3):
+        with pytest.raises(ArgumentError, match="episode_length_buf: found"):
+            env.episode_length_buf = wrong
+
+
+def test_rsl_rl_log(make: Make) -> None:
+    env = RslRlVecEnv(make(), log_interval=FRAMES + 1)
+    logs = [env.step(torch.zeros(3, 6))[3].get("log") for _ in range(2 * FRAMES + 2)]
+    assert [i for i, log in enumerate(logs) if log is not None] == [FRAMES, 2 * FRAMES + 1]
+    log = logs[FRAMES]
+    assert log is not None
+    assert (log["episode/episodes"], log["episode/frames"], log["episode/success"]) == (3.0, FRAMES, 0.0)
+    terms = sum(value for name, value in log.items() if name.startswith("episode/reward/"))
+    assert log["episode/return"] == pytest.approx(terms, rel=1e-5)
+    with pytest.raises(ArgumentError, match="log_interval"):
+        RslRlVecEnv(env.env, log_interval=0)
+
+
+def test_rsl_rl_actions_are_clamped_and_checked(make: Make) -> None:
+    inner = make()
+    env = RslRlVecEnv(inner)
+    action = torch.tensor([[-3.0, -1.0, -0.5, 0.5, 1.0, 3.0]]).expand(3, -1)
+    env.step(action)
+    assert torch.equal(inner.action.float(), action.clamp(-1.0, 1.0))
+    for wrong, found in ((torch.zeros(3, 1), r"shape \(3, 1\)"), (np.zeros((3, 6)), "ndarray")):
+        with pytest.raises(ArgumentError, match=f"action: found {found}"):
+            env.step(wrong)
+
+
+def test_rsl_rl_steps_in_inference_mode_and_out_of_it(make: Make) -> None:
+    """Runners collect in inference mode, and whoever evaluates afterwards may not."""
+    env = RslRlVecEnv(make())
+    with torch.inference_mode():
+        for _ in range(FRAMES + 1):
+            env.step(torch.zeros(3, 6))
+    env.env.reset()
+    for _ in range(FRAMES + 1):
+        env.step(torch.zeros(3, 6))
+
+
+# Imports
+
+
+def test_import_of_mjstack_loads_no_adapter() -> None:
+    code = "import sys, mjstack; print(*({'gymnasium', 'rsl_rl', 'tensordict'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == ""
+
+
+@pytest.mark.parametrize(("adapter", "library"), [("gymnasium", "gymnasium"), ("rsl_rl", "rsl_rl"), ("rsl_rl", "tensordict")])
+def test_missing_extra_is_one_line(adapter: str, library: str) -> None:
+    code = (
+        f"import sys; sys.modules['{library}'] = None\n"
+        "from mjstack.errors import MjstackError\n"
+        f"try: import mjstack.adapters.{adapter}\n"
+        "except MjstackError as error: print(error)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert len(out.splitlines()) == 1
+    assert library in out
+    assert "pip install 'mjstack[train]'" in out
