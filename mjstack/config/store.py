@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -92,6 +93,9 @@ def _translate(error: Exception) -> MjstackError:
     cause = error.__cause__ if isinstance(error, ConfigCompositionException) and error.__cause__ else error
     key = getattr(cause, "full_key", None)
     text = str(cause).splitlines()[0] if str(cause) else type(cause).__name__
+    deleted = re.match(r"Could not delete from config\. '([^']+)' does not exist", text)
+    if deleted:
+        return _unknown_key(error, deleted.group(1))
     if isinstance(cause, ConfigKeyError | AttributeError) or "not in struct" in text or "not in 'Config'" in text:
         return _unknown_key(error, str(key or getattr(cause, "key", "") or ""))
     converted = re.search(r"Value '(.*)' of type '\w+' could not be converted to (\w+)", text)
@@ -136,15 +140,14 @@ def _unknown_key(error: Exception, key: str) -> MjstackError:
     leaf = key.rpartition(".")[2]
     same_leaf = [k for k in keys if k.rpartition(".")[2] == leaf]
     if same_leaf:
-        return CompositionError(f"configuration key '{key}' does not exist. Did you mean '{same_leaf[0]}'?")
+        nearest = max(same_leaf, key=lambda k: difflib.SequenceMatcher(None, key, k).ratio())
+        return CompositionError(f"configuration key '{key}' does not exist. Did you mean '{nearest}'?")
     siblings = [k for k in keys if k.rpartition(".")[0] == key.rpartition(".")[0]]
     pool = sorted({*siblings, *(k for k in keys if "." not in k)})
     return CompositionError(f"configuration key '{key}' does not exist. {suggest(key, _nearest_first(leaf, pool))}")
 
 
 def _nearest_first(leaf: str, keys: Sequence[str]) -> list[str]:
-    import difflib
-
     by_leaf = {k.rpartition(".")[2]: k for k in keys}
     near = difflib.get_close_matches(leaf, by_leaf, n=1, cutoff=0.6)
     return [by_leaf[near[0]]] if near else list(keys)

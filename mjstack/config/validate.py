@@ -17,8 +17,8 @@ _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
 def validate(cfg: Config) -> None:
     """Raises a `ConfigError` or `UnknownName` for the first value that cannot be used."""
     _positive_int("nworld", cfg.nworld)
-    if cfg.seed < 0:
-        raise ConfigError("seed", cfg.seed, "a non-negative integer")
+    if not 0 <= cfg.seed < 1 << 32:
+        raise ConfigError("seed", cfg.seed, "an integer from 0 to 4294967295")
     if not cfg.gates:
         raise ConfigError("gates", "[]", f"at least one of {', '.join(GATES)}")
     for name in cfg.gates:

@@ -320,8 +320,8 @@ class Env:
             per_world = -(-used // self.nworld)
             need = used if sizes.naconmax is not None else per_world
             raise FaultError(
-                f"batch.{key}={value}: the start of {self.nworld} worlds needs {used} contacts and collision pairs "
-                f"({per_world} per world), and there is room for {room}",
+                f"batch.{key}={value}: the start of {self.nworld} worlds needs at least {used} contacts and "
+                f"collision pairs ({per_world} per world), and there is room for {room}",
                 f"Raise it to more than batch.{key}={need}, or choose a reset with fewer contacts",
             )
         self._write_start(self._everyone)  # as if nobody had looked

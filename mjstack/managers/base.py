@@ -105,8 +105,10 @@ def resolve_func(label: str, path: str) -> Callable[..., Any]:
         raise TermError(label, f"func={path}: expected a dotted name, such as mjstack.mdp.reward.reach")
     try:
         module = importlib.import_module(module_name)
-    except ImportError as error:
-        raise TermError(label, f"func={path}: module '{module_name}' cannot be imported ({error})") from error
+    except Exception as error:  # the module is the user's, and may raise anything
+        reason = str(error).splitlines()[0] if str(error) else "no message"
+        kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
+        raise TermError(label, f"func={path}: module '{module_name}' cannot be imported ({kind}{reason})") from error
     func = getattr(module, attribute, None)
     if not callable(func):
         names = [

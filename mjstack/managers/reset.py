@@ -21,13 +21,14 @@ class ResetManager:
             TermError: A term cannot be found, or a parameter is wrong.
         """
         self._env = env
-        self._terms = {name: Term(f"reset.{name}", term, env, masked=True) for name, term in cfg.items()}
-        for term in self._terms.values():
-            lacking = [field for field in term.model_fields if field not in env.sim.fields]
+        for name, term in cfg.items():
+            wanted = required_fields({name: term})
+            lacking = [field for field in wanted if field not in env.sim.fields]
             if lacking:
                 raise TermError(
-                    term.label, f"writes {', '.join(lacking)}: build the simulation with fields={list(term.model_fields)}"
+                    f"reset.{name}", f"writes {', '.join(lacking)}: build the simulation with fields={list(wanted)}"
                 )
+        self._terms = {name: Term(f"reset.{name}", term, env, masked=True) for name, term in cfg.items()}
 
     def reset(self, mask: torch.Tensor) -> None:
         """Resets the worlds of a ``(nworld,)`` bool mask: qpos0 first, then every term."""

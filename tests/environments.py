@@ -1,0 +1,140 @@
+"""Environments for tests. Configurations and simulations are slow to make, so tests share them, one environment at a time."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Any
+
+import torch
+from comparison import assert_same_run
+
+from mjstack.config import load_config
+from mjstack.config.schema import Backend, Config
+from mjstack.envs import Env
+from mjstack.managers import required_fields
+from mjstack.scene import SceneIndex, build_model
+from mjstack.sim import Simulation, make_simulation
+from mjstack.sim.sizes import resolve_env_sizes
+
+TASKS = ("stack", "reach")
+STATE = ("qpos", "qvel", "act", "ctrl")
+POSES = ("xpos", "xquat", "site_xpos", "geom_xpos")
+COUNTS = ("contact_count", "constraint_count", "step_count", "overflow", "peak_contacts", "peak_constraints")
+VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata", *COUNTS)
+Trace = list[dict[str, torch.Tensor]]
+
+_composed = cache(lambda overrides: load_config(list(overrides)))
+_model = cache(lambda robot: build_model(_composed((f"robot={robot}",))))
+
+
+def configure(*overrides: str, robot: str = "so101") -> Config:
+    """A configuration of the caller's own."""
+    return copy.deepcopy(_composed((f"robot={robot}", *overrides)))
+
+
+def new_sim(backend: str, nworld: int, robot: str = "so101") -> Simulation:
+    """A simulation with every field that a reset term of mjstack writes, and room for random actions."""
+    cfg = _composed((f"robot={robot}", "reset=randomized"))
+    return make_simulation(
+        _model(robot),
+        cfg,
+        nworld,
+        backend=Backend.native if backend == "native" else Backend.mjwarp,
+        device="cuda:0" if backend == "mjwarp-cuda" else "cpu",
+        fields=required_fields(cfg.reset),
+        sizes=resolve_env_sizes(cfg),
+    )
+
+
+_shared = cache(new_sim)
+
+
+def on_shared_sim(backend: str, nworld: int, cfg: Config) -> Env:
+    """An environment on the simulation that tests share: it is the tests' only one until the next is built."""
+    sim = _shared(backend, nworld, cfg.robot.name)
+    for name, field in sim.fields.items():
+        field[:] = torch.from_numpy(getattr(sim.model, name)).to(field)
+    sim.reset()
+    return Env(sim, SceneIndex(sim.model, cfg.robot), cfg)
+
+
+def on_new_sim(backend: str, nworld: int, cfg: Config) -> Env:
+    """An environment on a simulation that nobody has used."""
+    sim = new_sim(backend, nworld, cfg.robot.name)
+    return Env(sim, SceneIndex(sim.model, cfg.robot), cfg)
+
+
+def actions(env: Env, frames: int, seed: int = 0) -> list[torch.Tensor]:
+    """Random actions between the bounds; world k's are the same in any environment that starts with world 0."""
+    low, high = env.action_manager.low.cpu(), env.action_manager.high.cpu()
+    rows = []
+    for world in env.world.tolist():
+        generator = torch.Generator().manual_seed(1000 * seed + world)
+        rows.append(torch.rand((frames, env.action_manager.action_dim), generator=generator, dtype=low.dtype))
+    draw = low + (high - low) * torch.stack(rows, dim=1)
+    return list(draw.to(env.device))
+
+
+def mask_of(env: Env, *worlds: int) -> torch.Tensor:
+    """A mask that selects some worlds."""
+    mask = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
+    mask[list(worlds)] = True
+    return mask
+
+
+def returned(step: tuple[Any, ...]) -> dict[str, torch.Tensor]:
+    """What `step` or `reset` returned, flat; the tensors themselves."""
+    obs, extras = step[0], step[-1]
+    out = {f"obs.{name}": value for name, value in obs.items()}
+    if len(step) == 5:
+        out |= dict(zip(("reward", "terminated", "truncated"), step[1:4], strict=True))
+        out |= {f"final.{name}": value for name, value in extras["final_obs"].items()} | {"success": extras["success"]}
+    return out
+
+
+def held(env: Env, views: tuple[str, ...] = VIEWS) -> dict[str, torch.Tensor]:
+    """Copies of everything that an environment and its simulation keep for each world."""
+    out = {name: getattr(env.sim, name).clone() for name in views}
+    out |= {f"fields.{name}": field.clone() for name, field in env.sim.fields.items()}
+    out |= {name: getattr(env, name).clone() for name in ("episode", "frame", "success", "action", "previous_action")}
+    out["episode_sums"] = env.reward_manager.episode_sums.clone()
+    return out
+
+
+def play(env: Env, moves: list[torch.Tensor], before: Callable[[int], None] | None = None) -> Trace:
+    """Steps through the moves; per frame what was returned, and the state, episode and frame after it."""
+    trace = []
+    for t, move in enumerate(moves):
+        if before is not None:
+            before(t)
+        row = returned(env.step(move))
+        row |= {name: getattr(env.sim, name).clone() for name in (*STATE, "site_xpos", "sensordata")}
+        trace.append(row | {"episode": env.episode.clone(), "frame": env.frame.clone()})
+    return trace
+
+
+def pairs(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
+    """Values of the same name; both have the same names."""
+    assert a.keys() == b.keys()
+    for name in a:
+        yield name, a[name], b[name]
+
+
+def assert_rows(
+    a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], rows: Any, other: Any, backend: str, where: str = ""
+) -> None:
+    """Rows of one are the other rows of the other."""
+    for name, x, y in pairs(a, b):
+        try:
+            assert_same_run(x[rows], y[other], backend)
+        except AssertionError as error:
+            raise AssertionError(f"{where} {name}: {x[rows]} is not {y[other]}") from error
+
+
+def assert_traces(a: Trace, b: Trace, rows: Any, other: Any, backend: str) -> None:
+    """Likewise frame by frame."""
+    assert len(a) == len(b) > 0
+    for t, (x, y) in enumerate(zip(a, b, strict=True)):
+        assert_rows(x, y, rows, other, backend, f"frame {t}:")

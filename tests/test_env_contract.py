@@ -1,0 +1,605 @@
+"""What an environment promises on every backend, for both tasks and both robots."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from comparison import assert_same_run
+from env_soak import soak
+from environments import (
+    COUNTS,
+    POSES,
+    STATE,
+    actions,
+    assert_rows,
+    assert_traces,
+    configure,
+    held,
+    mask_of,
+    on_new_sim,
+    on_shared_sim,
+    play,
+    returned,
+)
+
+from mjstack.config.schema import Config
+from mjstack.envs import Env
+from mjstack.sim import Overflow
+
+SCENES = [("stack", "so101"), ("reach", "rebot")]
+N = 4
+
+scenes = pytest.mark.parametrize(("task", "robot"), SCENES)
+
+
+def randomized(task: str, robot: str, *, frames: int | None = None) -> Config:
+    """Everything differs from world to world; episodes end after some frames, if given."""
+    cfg = configure(f"task={task}", "reset=randomized", robot=robot)
+    cfg.action["arm"].params["scale"] = 0.5  # rad: nothing but the clock ends an episode in these tests
+    if frames is not None:
+        cfg.termination["time_out"].params["frames"] = frames
+    return cfg
+
+
+def without_ends(cfg: Config) -> Config:
+    cfg.termination.clear()
+    return cfg
+
+
+# Resets
+
+
+@scenes
+def test_a_masked_reset_touches_nobody_else(backend: str, task: str, robot: str) -> None:
+    cfg = randomized(task, robot)
+    env = on_shared_sim(backend, N, cfg)
+    moves = actions(env, 12)
+    env.reset(seed=3)
+    undisturbed = play(env, moves)
+
+    env.reset(seed=3)
+    before_reset = play(env, moves[:6])
+    assert_traces(before_reset, undisturbed[:6], slice(None), slice(None), backend)
+    others, chosen = [0, 2], [1, 3]
+    before = held(env)
+    start = returned(env.reset(mask=mask_of(env, *chosen)))
+    after = held(env)
+    for name in before:
+        assert torch.equal(after[name][others], before[name][others]), name
+    for name, value in start.items():
+        assert torch.equal(value[others], before_reset[-1][name][others]), name
+    assert after["episode"].tolist() == [0, 1, 0, 1]
+    assert after["frame"].tolist() == [6, 0, 6, 0]
+    assert before["action"][chosen].any()
+    for name in ("action", "previous_action", "sensordata", "qvel", "episode_sums", "success", *COUNTS[:1], *COUNTS[2:]):
+        assert not after[name][chosen].any(), name
+    later = play(env, moves[6:])
+    assert_traces(later, undisturbed[6:], others, others, backend)
+
+    fresh = on_new_sim(backend, N, cfg)
+    fresh.reset(seed=3)
+    fresh_start = returned(fresh.reset())
+    assert fresh.episode.tolist() == [1] * N
+    assert_rows(start, fresh_start, chosen, chosen, backend, "reset")
+    new = held(fresh)
+    for name in [n for n in after if n in (*STATE, *POSES) or n.startswith("fields.")]:
+        assert_same_run(after[name][chosen], new[name][chosen], backend)
+    assert_traces(later, play(fresh, moves[6:]), chosen, chosen, backend)
+
+
+def test_starts_depend_on_seed_world_and_episode_alone(robot: str) -> None:
+    """On how many worlds there are, which of them reset with it, and the backend they do not."""
+    cfg = randomized("reach", robot)
+    names = ("qpos", "qvel", "ctrl", "site_xpos")
+
+    def starts(env: Env) -> dict[str, torch.Tensor]:
+        kept = held(env, names)
+        return {name: v.double().cpu() for name, v in kept.items() if name in names or name.startswith("fields.")}
+
+    runs = {}
+    for backend, nworld in (("native", N), ("native", 2), ("mjwarp", N)):
+        env = on_shared_sim(backend, nworld, cfg)
+        env.reset(seed=5)
+        if nworld == N:
+            env.reset(mask=mask_of(env, 1, 3))
+            env.step(actions(env, 1)[0])
+            env.reset(mask=mask_of(env, 0, 1))
+            assert env.episode.tolist() == [1, 2, 0, 1]
+        else:
+            env.reset()
+            env.step(actions(env, 1)[0])
+            env.reset(mask=mask_of(env, 0))
+            env.reset(mask=mask_of(env, 1))
+            assert env.episode.tolist() == [2, 2]
+        runs[backend, nworld] = starts(env)
+    four, two, warp = runs.values()
+    for name in four:
+        assert torch.equal(four[name][1], two[name][1]), name
+        # float32 holds seven digits: gains up to a thousand, metres and radians of order one.
+        torch.testing.assert_close(warp[name][[0, 1]], four[name][[0, 1]], rtol=1e-6, atol=2e-6)
+    assert not torch.equal(four["qpos"][0], two["qpos"][0])  # another episode
+
+
+@scenes
+def test_world_k_of_n_is_world_k_of_one(backend: str, task: str, robot: str) -> None:
+    """Over random actions and two automatic resets each."""
+    cfg = randomized(task, robot, frames=5)
+    many = on_shared_sim(backend, N, cfg)
+    many.reset(seed=1)
+    many_trace = play(many, actions(many, 13))
+    assert many_trace[-1]["episode"].tolist() == [2] * N
+    one = on_shared_sim(backend, 1, cfg)
+    for k in range(N):
+        one.world.fill_(k)
+        one.reset(seed=1)
+        assert_traces(play(one, actions(one, 13)), many_trace, 0, k, backend)
+    rows = many_trace[-1]["qpos"]
+    assert len({tuple(row) for row in rows.tolist()}) == N
+
+
+# Reproducibility
+
+
+@scenes
+def test_the_seed_decides_the_episode(backend: str, task: str, robot: str) -> None:
+    cfg = randomized(task, robot, frames=6)
+    cfg.seed = 11
+    env = on_shared_sim(backend, 3, cfg)
+    moves = actions(env, 8)
+    first_start = returned(env.reset())  # the configuration's own seed
+    first = play(env, moves)
+    again_start = returned(env.reset(seed=11))
+    again = play(env, moves)
+    assert_rows(first_start, again_start, slice(None), slice(None), backend)
+    assert_traces(first, again, slice(None), slice(None), backend)
+    assert first[-1]["episode"].tolist() == [1, 1, 1]
+
+    next_start = returned(env.reset())
+    assert env.episode.tolist() == [2, 2, 2]
+    other_start = returned(env.reset(seed=12))
+    assert env.episode.tolist() == [0, 0, 0]
+    for start in (next_start, other_start):
+        for k in range(3):
+            for name in start:
+                assert not torch.equal(start[name][k], first_start[name][k]), name
+
+
+# Outputs are written anew
+
+
+@scenes
+def test_outputs_filled_with_nan_change_nothing(backend: str, task: str, robot: str) -> None:
+    cfg = randomized(task, robot, frames=4)
+    env = on_shared_sim(backend, 3, cfg)
+    sim, moves = env.sim, actions(env, 10)
+    model = sim.model
+    # Geoms of the world are placed once, when the data is made.
+    moving = torch.from_numpy(np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)).to(env.device)
+
+    def poison(_: int = 0) -> None:
+        sim.geom_xpos[:, moving] = math.nan
+        managers = env.reward_manager, env.termination_manager
+        for view in (sim.xpos[:, 1:], sim.xquat[:, 1:], sim.site_xpos, sim.sensordata, sim.qfrc_actuator):
+            view.fill_(math.nan)
+        for view in (*env.observation_manager.groups.values(), managers[0].reward, managers[0].values):
+            view.fill_(math.nan)
+        env.action_manager.previous_action.fill_(math.nan)
+        for flags in (managers[1].terminated, managers[1].truncated, managers[1].values, env.success):
+            flags.fill_(True)
+        sim.contact_count.fill_(-1)
+        sim.constraint_count.fill_(-1)
+
+    clean_start = returned(env.reset(seed=2))
+    clean = play(env, moves)
+    poison()
+    env.action_manager.action.fill_(math.nan)
+    start = returned(env.reset(seed=2))
+    dirty = play(env, moves, before=poison)
+    assert_rows(start, clean_start, slice(None), slice(None), backend, "reset")
+    assert_traces(dirty, clean, slice(None), slice(None), backend)
+    for row in (start, *dirty):
+        for name, value in row.items():
+            assert torch.isfinite(value).all(), name
+    assert sum(int(row["truncated"].sum()) for row in clean) == 6
+
+
+# Terminal observation, history, noise
+
+
+@scenes
+def test_terminal_observation_and_the_one_to_go_on_with(backend: str, task: str, robot: str) -> None:
+    env = on_shared_sim(backend, 3, without_ends(randomized(task, robot)))
+    moves = actions(env, 9)
+    env.reset(seed=4)
+    endless = play(env, moves[:5])
+    env.reset(seed=4)
+    next_start = returned(env.reset())
+
+    env = on_shared_sim(backend, 3, randomized(task, robot, frames=5))
+    env.reset(seed=4)
+    trace = play(env, moves[:2])
+    env.reset(mask=mask_of(env, 1))  # so that world 1 is not done with the others
+    trace += play(env, moves[2:])
+    assert [row["truncated"].tolist() for row in trace[4:7]] == [[True, False, True], [False] * 3, [False, True, False]]
+    done = trace[4]
+    for group in env.observation_manager.groups:
+        obs, final = done[f"obs.{group}"], done[f"final.{group}"]
+        assert_same_run(final[[0, 2]], endless[4][f"obs.{group}"][[0, 2]], backend)
+        assert_same_run(obs[[0, 2]], next_start[f"obs.{group}"][[0, 2]], backend)
+        assert torch.equal(final[1], obs[1])
+        assert not torch.equal(final[0], obs[0])
+        for row in trace[5:6]:
+            assert torch.equal(row[f"obs.{group}"], row[f"final.{group}"])
+
+
+def test_returned_tensors_are_the_callers(backend: str) -> None:
+    env = on_shared_sim(backend, 3, randomized("stack", "so101", frames=3))
+    moves = actions(env, 7)
+    kept = [returned(env.reset(seed=0)), *(returned(env.step(move)) for move in moves[:3])]  # the last one with resets
+    copies = [{name: value.clone() for name, value in row.items()} for row in kept]
+    play(env, moves[3:])
+    env.reset(mask=mask_of(env, 0))
+    env.reset(seed=9)
+    for row, copied in zip(kept, copies, strict=True):
+        for name, value in row.items():
+            assert torch.equal(value, copied[name]), name
+            value.zero_()  # nor does it matter to the environment what they do with them
+    env.reset(seed=0)
+    assert_rows(returned(env.step(moves[0])), copies[1], slice(None), slice(None), backend)
+
+
+def split(env: Env, group: str, obs: torch.Tensor) -> dict[str, torch.Tensor]:
+    """A group's terms by name, from the widths that the configuration implies."""
+    n = len(env.cfg.robot.home)
+    width = {
+        "joint_pos": n,
+        "joint_pos_relative": n,
+        "joint_vel": n,
+        "aperture_pos": 3,
+        "aperture_to_object": 3,
+        "object_to_object": 3,
+        "object_pose": 7,
+        "object_velocity": 6,
+        "jaw_force": 2,
+        "last_action": env.action_manager.action_dim,
+    }
+    terms = env.cfg.observation[group].terms
+    parts = obs.split([t.history * width[t.func.rpartition(".")[2]] for t in terms.values()], dim=1)
+    return dict(zip(terms, parts, strict=True))
+
+
+def test_history_starts_full_and_slides(backend: str) -> None:
+    cfg = randomized("reach", "so101", frames=4)
+    terms = cfg.observation["policy"].terms
+    terms["joint_pos"].history = 3
+    env = on_shared_sim(backend, 3, cfg)
+
+    def read(obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        parts = split(env, "policy", obs)
+        return parts["joint_pos"].reshape(3, 3, -1), parts["aperture_to_goal"].reshape(3, 2, -1)
+
+    trace = [returned(env.reset(seed=0)), *(returned(env.step(move)) for move in actions(env, 6))]
+    frames = [read(row["obs.policy"]) for row in trace]
+    for t in (0, 4):  # the first frame, also of the second episode
+        for part in frames[t]:
+            assert (part == part[:, :1]).all()
+    for t in (1, 2, 3, 5, 6):
+        for new, old in zip(frames[t], frames[t - 1], strict=True):
+            assert torch.equal(new[:, :-1], old[:, 1:])
+            assert not torch.equal(new[:, -1], old[:, -1])
+    # The terminal observation slides too: it is the old episode's.
+    for final, old in zip(read(trace[4]["final.policy"]), frames[3], strict=True):
+        assert torch.equal(final[:, :-1], old[:, 1:])
+    # A masked reset fills the history of its worlds alone.
+    old = frames[-1]
+    new = read(env.reset(mask=mask_of(env, 1))[0]["policy"])
+    for a, b in zip(new, old, strict=True):
+        assert (a[1] == a[1, :1]).all()
+        assert not (b[1] == b[1, :1]).all()
+        assert torch.equal(a[[0, 2]], b[[0, 2]])
+
+
+def test_noise_is_keyed_and_within_its_width() -> None:
+    base = randomized("reach", "so101", frames=5)
+    env = on_shared_sim("native", 3, base)
+    moves = actions(env, 8)
+
+    def noises(env: Env, seed: int, worlds: list[int] | None = None) -> torch.Tensor:
+        if worlds is not None:
+            env.world.copy_(torch.tensor(worlds))
+        env.reset(seed=seed)
+        out = []
+        for move in moves:
+            obs = env.step(move)[0]
+            pos, clean = split(env, "policy", obs["policy"])["joint_pos"], split(env, "privileged", obs["privileged"])
+            out.append(pos - clean["joint_pos"])
+        return torch.stack(out)
+
+    noise = noises(env, 0)
+    width = base.observation["policy"].terms["joint_pos"].noise
+    assert (noise.abs() <= width + 1e-6).all()
+    assert 0.8 * width < noise.abs().max()
+    assert abs(float(noise.mean())) < 0.25 * width
+    # Each frame, each world and each episode has its own: frame 5 is the start of episode 1, so it differs from frame 0's.
+    flat = noise.flatten(0, 1)
+    assert len({tuple(row) for row in (flat * 1e4).round().int().tolist()}) == len(flat)
+    torch.testing.assert_close(noises(env, 0), noise, rtol=0, atol=0)
+    assert not torch.isclose(noises(env, 1), noise, atol=1e-5, rtol=0).all(-1).any()
+
+    # In worlds that start alike and do alike, the noise is all that differs; a world's number alone decides its own.
+    cfg = configure("task=reach", "reset=nominal")
+    env = on_shared_sim("native", 3, cfg)
+    moves = [move[:1].expand(3, -1) for move in moves]
+    a, b = noises(env, 0), noises(env, 0, [2, 0, 7])
+    torch.testing.assert_close(b[:, 0], a[:, 2], rtol=0, atol=1e-6)
+    torch.testing.assert_close(b[:, 1], a[:, 0], rtol=0, atol=1e-6)
+
+    cfg.observation["policy"].noise = False
+    env = on_shared_sim("native", 3, cfg)
+    assert not noises(env, 0).any()
+
+
+def test_noise_then_clip_then_scale(backend: str) -> None:
+    cfg = configure("task=stack", "reset=nominal")
+    term = cfg.observation["policy"].terms["joint_vel"]
+    seen = {}
+    for name, noise, clip, scale in (
+        ("plain", 0.0, None, 1.0),
+        ("noisy", 0.3, None, 1.0),
+        ("clipped", 0.3, [-0.5, 0.25], 1.0),
+        ("all", 0.3, [-0.5, 0.25], 0.1),
+    ):
+        term.noise, term.clip, term.scale = noise, clip, scale
+        env = on_shared_sim(backend, 2, cfg)
+        env.reset(seed=0)
+        rows = [split(env, "policy", row["obs.policy"])["joint_vel"] for row in play(env, actions(env, 6))]
+        seen[name] = torch.stack(rows)
+    added = (seen["noisy"] - seen["plain"]).abs()
+    assert (added <= 0.3 + 1e-4).all()
+    assert added.max() > 0.2
+    assert_same_run(seen["clipped"], seen["noisy"].clamp(-0.5, 0.25), backend)
+    assert_same_run(seen["all"], 0.1 * seen["clipped"], backend)
+    assert (seen["clipped"] == 0.25).any()
+    assert (seen["clipped"] == -0.5).any()
+
+
+# Every action group and every reset group
+
+
+def assert_layout(env: Env, row: dict[str, torch.Tensor]) -> None:
+    """Shapes, types and finiteness of what step or reset returned."""
+    for name, value in row.items():
+        assert value.device == env.device
+        assert torch.isfinite(value).all(), name
+        if name.startswith(("obs.", "final.")):
+            group = name.partition(".")[2]
+            assert value.shape == (env.nworld, env.observation_manager.group_dims[group])
+            assert value.dtype is torch.float32
+            assert all(part.shape[1] for part in split(env, group, value).values())
+        else:
+            assert value.shape == (env.nworld,)
+            assert value.dtype is (torch.float32 if name == "reward" else torch.bool)
+
+
+@pytest.mark.parametrize("action", ["joint_relative", "joint_absolute", "joint_delta", "ee_delta"])
+def test_every_action_group_steps(backend: str, robot: str, action: str) -> None:
+    cfg = without_ends(configure("task=stack", f"action={action}", "reset=jitter", robot=robot))
+    env = on_shared_sim(backend, 3, cfg)
+    n, n_arm, scale = len(env.cfg.robot.home), len(env.cfg.robot.arm_joints), cfg.action["arm"].params.get("scale")
+    manager = env.action_manager
+    assert manager.action_dim == {"joint_absolute": n, "ee_delta": 4}.get(action, n_arm + 1)
+    assert manager.low.shape == manager.high.shape == (manager.action_dim,)
+    assert (manager.low < manager.high).all()
+    assert_layout(env, returned(env.reset(seed=0)))
+    ctrl = torch.as_tensor(env.index.ctrl).to(env.device)
+    limits = torch.as_tensor(env.index.ctrl_range).to(env.sim.ctrl)
+    home = torch.as_tensor(env.cfg.robot.home).to(env.sim.ctrl)
+    before = env.sim.ctrl[:, ctrl].clone()
+    torch.testing.assert_close(before, home.expand(3, -1))
+    rest = torch.zeros((3, manager.action_dim), device=env.device)
+    if action == "joint_absolute":
+        rest[:] = home
+    env.step(rest)  # the arm's commands stay where they are
+    torch.testing.assert_close(env.sim.ctrl[:, ctrl[:n_arm]], before[:, :n_arm], rtol=0, atol=1e-4)
+    for move in actions(env, 6):
+        assert_layout(env, returned(env.step(move)))
+        assert_same_run(env.action, move.to(env.action.dtype), backend)
+        command = env.sim.ctrl[:, ctrl]
+        assert ((command >= limits[:, 0]) & (command <= limits[:, 1])).all()
+        moved = (command - before)[:, :n_arm].abs()
+        assert (moved.amax(1) > 1e-4).all()
+        if action == "joint_delta":
+            assert (moved <= scale + 1e-6).all()
+        if action == "joint_relative":
+            expected = (home[:n_arm] + scale * move[:, :n_arm]).clamp(limits[:n_arm, 0], limits[:n_arm, 1])
+            torch.testing.assert_close(command[:, :n_arm], expected.to(command))
+        if action == "joint_absolute":
+            torch.testing.assert_close(command, move.to(command))
+        else:  # the gripper's fraction of its way from closed to open
+            closed, opened = (torch.tensor(v).to(command) for v in (env.cfg.robot.gripper_closed, env.cfg.robot.gripper_open))
+            part = 0.5 * (move[:, -1:] + 1.0)
+            torch.testing.assert_close(command[:, n_arm:], (closed + part * (opened - closed)).to(command))
+        before = command.clone()
+
+
+def test_end_effector_delta_moves_the_commanded_aperture(backend: str, robot: str) -> None:
+    """The command's forward kinematics, by native MuJoCo, moves by 1 cm along each axis in turn."""
+    env = on_shared_sim(backend, 3, configure("task=stack", "action=ee_delta", "reset=jitter", robot=robot))
+    env.reset(seed=0)
+    model = env.sim.model
+    data = mujoco.MjData(model)
+
+    def commanded() -> np.ndarray:
+        rows = []
+        for k in range(3):
+            data.qpos[:] = model.qpos0
+            data.qpos[env.index.robot_qpos] = env.sim.ctrl[k].double().cpu().numpy()[env.index.ctrl]
+            mujoco.mj_kinematics(model, data)
+            rows.append(np.mean([data.site(name).xpos for name in env.cfg.robot.aperture_sites], axis=0))
+        return np.array(rows)
+
+    move = torch.zeros((3, 4), device=env.device)
+    move[:, :3] = 0.8 * torch.eye(3, device=env.device)
+    move[:, 2] -= 0.2
+    # The commands are IK targets with the gripper where it was last: the gripper's own command comes after the arm's.
+    env.step(torch.cat((torch.zeros_like(move[:, :3]), torch.ones_like(move[:, 3:])), dim=1))
+    move[:, 3] = 1.0
+    for _ in range(3):
+        before = commanded()
+        env.step(move)
+        np.testing.assert_allclose(commanded() - before, 0.01 * move[:, :3].cpu().numpy(), atol=5e-4)
+
+
+@pytest.mark.parametrize("reset", ["nominal", "jitter", "randomized"])
+@pytest.mark.parametrize("task", ["stack", "reach"])
+def test_every_reset_group_steps(backend: str, task: str, robot: str, reset: str) -> None:
+    env = on_shared_sim(backend, 3, configure(f"task={task}", f"reset={reset}", robot=robot))
+    assert_layout(env, returned(env.reset(seed=0)))
+    rows = {tuple(row) for row in env.sim.qpos.tolist()}
+    assert len(rows) == (1 if reset == "nominal" else 3)
+    for move in actions(env, 3):
+        assert_layout(env, returned(env.step(move)))
+
+
+# Ends of episodes
+
+
+@pytest.fixture
+def ended(backend: str, robot: str) -> Env:
+    """Three worlds that have just started."""
+    env = on_shared_sim(backend, 3, configure("task=stack", robot=robot))
+    env.reset(seed=0)
+    return env
+
+
+def hold(env: Env) -> torch.Tensor:
+    """The action that holds home."""
+    return torch.zeros((env.nworld, env.action_manager.action_dim), device=env.device)
+
+
+def assert_ends(env: Env, term: str, worlds: list[int]) -> None:
+    """One step ends exactly these worlds, by exactly this term, and all of them go on."""
+    before = env.episode.clone()
+    obs, reward, terminated, truncated, extras = env.step(hold(env))
+    expected = mask_of(env, *worlds)
+    said = env.termination_manager.values
+    for column, name in enumerate(env.termination_manager.names):
+        assert torch.equal(said[:, column], expected if name == term else ~expected & False), name
+    assert torch.equal(terminated, expected if term != "time_out" else ~expected & False)
+    assert torch.equal(truncated, expected if term == "time_out" else ~expected & False)
+    assert torch.equal(env.episode - before, expected.long())
+    assert not env.frame[expected].any()
+    assert torch.isfinite(reward).all()
+    for group in obs.values():
+        assert torch.isfinite(group).all()
+    if term != "non_finite":
+        assert all(torch.isfinite(group).all() for group in extras["final_obs"].values())
+    assert not env.step(hold(env))[2].any()
+
+
+def test_end_by_a_cube_beside_the_table(ended: Env) -> None:
+    red, blue = ended.index.cube_qpos
+    center, half = ended.cfg.scene.table_center, ended.cfg.scene.table_half
+    ended.sim.qpos[1, blue + 1] = center[1] + half[1] + 0.002
+    assert_ends(ended, "cube_off_table", [1])
+    ended.sim.qpos[1, blue + 1] = center[1] + half[1] - 0.002  # on its edge, but on it
+    assert_ends(ended, "cube_off_table", [])
+    ended.sim.qpos[2, red] = center[0] - half[0] - 0.002
+    assert_ends(ended, "cube_off_table", [2])
+
+
+def test_end_by_a_cube_below_the_table(ended: Env) -> None:
+    red, _ = ended.index.cube_qpos
+    top = ended.cfg.scene.table_center[2] + ended.cfg.scene.table_half[2]
+    ended.sim.qpos[0, red + 2] = top - ended.cfg.scene.table_half[2] * 2 - 0.03  # under the table top
+    assert_ends(ended, "cube_off_table", [0])
+
+
+def test_end_by_a_joint_beyond_its_range(ended: Env) -> None:
+    """With more margin than a frame can bring back: MuJoCo pushes with all its might."""
+    index = ended.index
+    low, high = index.robot_range[0]
+    ended.sim.qpos[2, index.robot_qpos[0]] = high + 0.5 * (high - low)
+    assert_ends(ended, "joint_limit", [2])
+
+
+def test_end_by_nan(ended: Env) -> None:
+    ended.sim.qvel[1, ended.index.cube_qvel[0]] = math.nan
+    assert_ends(ended, "non_finite", [1])
+
+
+def test_end_by_overflow(ended: Env) -> None:
+    ended.sim.overflow[0] |= int(Overflow.NEFC)
+    assert_ends(ended, "overflow", [0])
+
+
+def test_time_out_at_exactly_its_frame(backend: str) -> None:
+    env = on_shared_sim(backend, 3, randomized("stack", "so101", frames=5))
+    env.reset(seed=0)
+    for frame in range(1, 12):
+        if frame == 3:
+            env.reset(mask=mask_of(env, 1))  # after two frames
+        _, _, terminated, truncated, _ = env.step(hold(env))
+        assert not terminated.any()
+        assert truncated.tolist() == [frame in (5, 10), frame == 7, frame in (5, 10)]
+
+
+def test_what_happened_outweighs_the_clock(backend: str) -> None:
+    env = on_shared_sim(backend, 3, randomized("stack", "so101", frames=2))
+    env.reset(seed=0)
+    env.step(hold(env))
+    env.sim.qpos[1, env.index.cube_qpos[0] + 1] += 1.0
+    _, _, terminated, truncated, _ = env.step(hold(env))
+    assert terminated.tolist() == [False, True, False]
+    assert truncated.tolist() == [True, False, True]
+    said = dict(zip(env.termination_manager.names, env.termination_manager.values.unbind(1), strict=True))
+    assert said["time_out"].tolist() == [True] * 3
+
+
+def test_statistics_are_those_of_the_episodes_that_ended(backend: str) -> None:
+    cfg = randomized("reach", "so101", frames=4)
+    env = on_shared_sim(backend, 3, cfg)
+    env.read_statistics()
+    env.reset(seed=0)
+    moves = actions(env, 9)
+    totals = torch.zeros(3)
+    returns, lengths = [], []
+    for t, move in enumerate(moves):
+        if t == 5:
+            env.sim.qpos[0, env.index.cube_qpos[0] + 1] += 1.0
+        _, reward, terminated, truncated, _ = env.step(move)
+        totals += reward.cpu()
+        for k in (terminated | truncated).nonzero()[:, 0].tolist():
+            returns.append(float(totals[k]))
+            totals[k] = 0.0
+            lengths.append({3: 4, 5: 2, 7: 4}[t])
+    assert sorted(lengths) == [2, 4, 4, 4, 4, 4]
+    read = env.read_statistics()
+    assert read["episodes"] == 6
+    assert read["frames"] == pytest.approx(22 / 6)
+    assert read["return"] == pytest.approx(sum(returns) / 6, rel=1e-5)
+    parts = [value for name, value in read.items() if name.startswith("reward/")]
+    assert len(parts) == len(cfg.reward)
+    assert sum(parts) == pytest.approx(read["return"], rel=1e-5)
+    assert read["termination/time_out"] == pytest.approx(5 / 6)
+    assert read["termination/cube_off_table"] == pytest.approx(1 / 6)
+    assert read["success"] == 0.0
+    assert env.read_statistics() == {"episodes": 0.0}
+
+
+# Long runs
+
+
+@pytest.mark.parametrize(("kind", "nworld", "steps"), [("native", 16, 300), ("mjwarp", 4, 60)])
+def test_random_actions_for_a_while(kind: str, nworld: int, steps: int) -> None:
+    """`python tests/env_soak.py` makes it long."""
+    found = soak(kind, nworld, steps, episode_frames=40)
+    assert found["finite"]
+    assert found["steps"] == steps
+    assert found["episodes"] >= nworld * (steps // 40)
+    assert found["distinct_starts"] == found["episodes"]
+    assert found["rss_growth_percent"] < 2.0

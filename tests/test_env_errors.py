@@ -1,0 +1,514 @@
+"""What a user can do wrong with an environment: one line each, that names the term or argument and says what to do."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from environments import configure, mask_of, on_shared_sim
+
+from mjstack import make_env
+from mjstack.config.schema import (
+    Backend,
+    Config,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    TermCfg,
+    TerminationTermCfg,
+)
+from mjstack.envs import Env, build_env
+from mjstack.errors import ArgumentError, ConfigError, FaultError, MjstackError, TermError
+
+HERE = __name__  # terms below are found by dotted name, as a user's own are
+
+
+@pytest.fixture
+def cfg() -> Config:
+    """A small configuration to be spoilt."""
+    return configure("task=stack", "reset=jitter")
+
+
+@pytest.fixture
+def env(cfg: Config) -> Env:
+    """Three native worlds that have started."""
+    env = on_shared_sim("native", 3, cfg)
+    env.reset(seed=0)
+    return env
+
+
+def zeros(env: Env, **kwargs: object) -> torch.Tensor:
+    return torch.zeros((env.nworld, env.action_manager.action_dim), **kwargs)  # type: ignore[arg-type]
+
+
+def fails(kind: type[MjstackError], call: Callable[[], object], *words: str) -> str:
+    """The one-line message of the error that a call has to raise."""
+    with pytest.raises(kind) as caught:
+        call()
+    assert type(caught.value) is kind
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.endswith(".")
+    assert not message.endswith("..")
+    for word in words:
+        assert word in message, message
+    return message
+
+
+# Actions
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        (lambda env: zeros(env)[:2], ["shape (2, 6)", "(3, 6)"]),
+        (lambda env: zeros(env)[:, :5], ["shape (3, 5)", "(3, 6)"]),
+        (lambda env: zeros(env)[0], ["shape (6,)", "(3, 6)"]),
+        (lambda env: zeros(env).int(), ["dtype torch.int32", "float32"]),
+        (lambda env: zeros(env).half(), ["dtype torch.float16", "float32"]),
+        (lambda env: zeros(env, device="meta"), ["device meta", "cpu"]),
+        (lambda env: zeros(env).numpy(), ["ndarray", "float32 tensor"]),
+        (lambda env: None, ["NoneType", "float32 tensor"]),
+    ],
+)
+def test_action_of_the_wrong_kind(env: Env, action: Callable[[Env], object], words: list[str]) -> None:
+    fails(ArgumentError, lambda: env.step(action(env)), "action: found", "expected", *words)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_action_that_is_not_finite_names_its_world(env: Env, bad: float) -> None:
+    action = zeros(env)
+    action[1, 4] = bad
+    fails(ArgumentError, lambda: env.step(action), "action: found", "in world 1", "finite")
+
+
+def test_argument_errors_leave_the_environment_as_it_was(env: Env) -> None:
+    action = 0.3 * torch.ones_like(zeros(env))
+    expected = [env.step(action)[0], env.step(action)[0]]
+    env.reset(seed=0)
+    nan, meta = action.clone(), action.to("meta")
+    nan[0, 0] = float("nan")
+    attempts: list[Callable[[], object]] = [
+        lambda: env.step(nan),
+        lambda: env.step(meta),
+        lambda: env.step(action[:1]),
+        lambda: env.reset(seed=-1),
+        lambda: env.reset(seed=1, mask=mask_of(env, 0)),
+        lambda: env.reset(mask=torch.ones(2, dtype=torch.bool)),
+    ]
+    for result in expected:
+        for attempt in attempts:
+            fails(ArgumentError, attempt)
+        obs = env.step(action)[0]
+        for group in obs:
+            assert torch.equal(obs[group], result[group])
+
+
+# Resets
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        (torch.ones(2, dtype=torch.bool), ["shape (2,)"]),
+        (torch.ones((3, 1), dtype=torch.bool), ["shape (3, 1)"]),
+        (torch.ones(3), ["torch.float32"]),
+        (torch.tensor([0, 1, 2]), ["torch.int64"]),
+        (torch.ones(3, dtype=torch.bool, device="meta"), ["on meta"]),
+        ([True, False, True], ["list"]),
+    ],
+)
+def test_reset_mask_of_the_wrong_kind(env: Env, mask: object, words: list[str]) -> None:
+    fails(ArgumentError, lambda: env.reset(mask=mask), "mask: found", "bool tensor of shape (3,) on cpu", *words)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("seed", [-1, 1 << 32, 1.5, "7", True])
+def test_seed_out_of_range(env: Env, seed: object) -> None:
+    fails(ArgumentError, lambda: env.reset(seed=seed), "seed: found", repr(seed), "0 to 4294967295")  # type: ignore[arg-type]
+
+
+def test_seed_of_some_worlds(env: Env) -> None:
+    fails(ArgumentError, lambda: env.reset(seed=1, mask=mask_of(env, 1)), "seed", "mask")
+
+
+def test_step_before_reset(cfg: Config) -> None:
+    env = on_shared_sim("native", 3, cfg)
+    fails(ArgumentError, lambda: env.step(zeros(env)), "before reset()", "env.reset()")
+    fails(ArgumentError, lambda: env.reset(mask=mask_of(env, 1)), "mask", "env.reset()")
+    env.reset()
+    env.step(zeros(env))
+
+
+@pytest.mark.parametrize("seed", [-1, 1 << 32])
+def test_configured_seed_out_of_range(seed: int) -> None:
+    fails(ConfigError, lambda: make_env(["sim=native"], nworld=1, seed=seed), f"seed={seed}")
+
+
+# Configuration
+
+
+def test_overrides_as_a_string() -> None:
+    fails(ArgumentError, lambda: make_env("task=reach"), "overrides", "'task=reach'", "['task=reach']")
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("task=reech", ["reech", "reach", "stack"]),
+        ("action=ee_detla", ["ee_detla", "ee_delta"]),
+        ("reset=randomised", ["randomised", "randomized"]),
+        ("observation=none", ["none", "reach", "stack"]),
+        ("rewards=stack", ["rewards", "reward"]),
+        ("~reward.graps", ["graps", "grasp"]),
+        ("reward.lift.wait=3", ["wait", "weight"]),
+        ("reward.lfit.weight=3", ["lfit", "lift"]),
+        ("termination.time_out.params.frame=3", ["frame", "frames"]),
+    ],
+)
+def test_unknown_group_or_key(override: str, words: list[str]) -> None:
+    with pytest.raises(MjstackError) as caught:
+        make_env([override, "sim=native"], nworld=1)
+    assert "\n" not in str(caught.value)
+    for word in words:
+        assert word in str(caught.value)
+
+
+# Terms
+
+
+def wrong_shape(env: Env) -> torch.Tensor:
+    return torch.zeros(env.nworld + 1)
+
+
+def wide(env: Env) -> torch.Tensor:
+    return torch.zeros(env.nworld, 1)
+
+
+def deep(env: Env) -> torch.Tensor:
+    return torch.zeros(env.nworld, 2, 2)
+
+
+def whole_number(env: Env) -> torch.Tensor:
+    return torch.zeros(env.nworld, dtype=torch.int64)
+
+
+def number(env: Env) -> torch.Tensor:
+    return torch.zeros(env.nworld)
+
+
+def elsewhere(env: Env) -> torch.Tensor:
+    return torch.zeros(env.nworld, device="meta")
+
+
+def nothing(env: Env) -> None:
+    return None
+
+
+def raises(env: Env, mask: torch.Tensor | None = None) -> torch.Tensor:
+    raise ValueError("first line\nsecond line")
+
+
+def nan_after_start(env: Env) -> torch.Tensor:
+    return torch.where((env.frame > 1) & (env.world == 2), float("nan"), 1.0)
+
+
+class NeedsScale:
+    """A term with a parameter."""
+
+    def __init__(self, env: Env, *, scale: float) -> None:
+        self._scale = scale
+
+    def __call__(self, env: Env) -> torch.Tensor:
+        return torch.full((env.nworld,), self._scale)
+
+
+KINDS: dict[str, Callable[[Config, str, dict], None]] = {
+    "reward.mine": lambda cfg, func, p: cfg.reward.update(mine=RewardTermCfg(func=func, params=p, weight=1.0)),
+    "termination.mine": lambda cfg, func, p: cfg.termination.update(mine=TerminationTermCfg(func=func, params=p)),
+    "observation.policy.terms.mine": lambda cfg, func, p: cfg.observation["policy"].terms.update(
+        mine=ObservationTermCfg(func=func, params=p)
+    ),
+    "task.success": lambda cfg, func, p: setattr(cfg.task, "success", TermCfg(func=func, params=p)),
+    "reset.mine": lambda cfg, func, p: cfg.reset.update(mine=TermCfg(func=func, params=p)),
+}
+VALUES = [kind for kind in KINDS if kind != "reset.mine"]
+
+
+def build(cfg: Config) -> Env:
+    return on_shared_sim("native", 3, cfg)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_misspelt_function(cfg: Config, kind: str) -> None:
+    KINDS[kind](cfg, "mjstack.mdp.reward.lfit", {})
+    fails(
+        TermError, lambda: build(cfg), f"{kind}: func=mjstack.mdp.reward.lfit", "'lfit' does not exist", "Did you mean 'lift'?"
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("func", ["mjstack.mdp.rewards.lift", "no_such_package.term"])
+def test_misspelt_module(cfg: Config, kind: str, func: str) -> None:
+    KINDS[kind](cfg, func, {})
+    fails(TermError, lambda: build(cfg), f"{kind}: func={func}", f"'{func.rpartition('.')[0]}' cannot be imported")
+
+
+def test_function_without_a_module(cfg: Config) -> None:
+    KINDS["reward.mine"](cfg, "lift", {})
+    fails(TermError, lambda: build(cfg), "reward.mine: func=lift", "dotted name")
+
+
+def test_module_that_cannot_be_read(cfg: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A user's own module by name: what is wrong in it is said, in a line."""
+    (tmp_path / "terms_with_a_typo.py").write_text("import torhc\n")
+    (tmp_path / "terms_that_work.py").write_text("import torch\ndef one(env):\n    return torch.ones(env.nworld)\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    KINDS["reward.mine"](cfg, "terms_with_a_typo.one", {})
+    fails(TermError, lambda: build(cfg), "reward.mine", "terms_with_a_typo", "torhc")
+    KINDS["reward.mine"](cfg, "terms_that_work.one", {})
+    assert "mine" in build(cfg).reward_manager.names
+
+
+def test_module_that_raises(cfg: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "terms_that_raise.py").write_text("raise RuntimeError('broken\\nin two lines')\n")
+    (tmp_path / "terms_of_bad_syntax.py").write_text("def one(env:\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for module, word in (("terms_that_raise", "broken"), ("terms_of_bad_syntax", "SyntaxError")):
+        KINDS["reward.mine"](cfg, f"{module}.one", {})
+        fails(TermError, lambda: build(cfg), "reward.mine", module, word)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_missing_and_misspelt_parameters(cfg: Config, kind: str) -> None:
+    KINDS[kind](cfg, f"{HERE}.NeedsScale", {})
+    fails(TermError, lambda: build(cfg), f"{kind}: parameter 'scale' is missing", f"{kind}.params.scale")
+    KINDS[kind](cfg, f"{HERE}.NeedsScale", {"scael": 1.0})
+    fails(TermError, lambda: build(cfg), f"{kind}: parameter 'scael' does not exist", "Did you mean 'scale'?")
+
+
+def test_parameters_of_functions_and_actions(cfg: Config) -> None:
+    cfg.reward["lift"].params = {"object": "red_cube"}
+    fails(TermError, lambda: build(cfg), "reward.lift: parameter 'height' is missing")
+    cfg.reward["lift"].params = {"object": "red_cube", "hieght": 0.05}
+    fails(TermError, lambda: build(cfg), "reward.lift: parameter 'hieght' does not exist", "Did you mean 'height'?")
+    cfg.reward["lift"].params = {"object": "red_cub", "height": 0.05}
+    fails(TermError, lambda: build(cfg), "reward.lift", "'red_cub' does not exist", "Did you mean 'red_cube'?")
+    cfg.reward.pop("lift")
+    cfg.action["arm"].params["sacle"] = 1.0
+    fails(TermError, lambda: build(cfg), "action.arm: parameter 'sacle' does not exist", "Did you mean 'scale'?")
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "params", "words"),
+    [
+        ("action", "arm", {"joints": "arms"}, ["action.arm", "'arms' does not exist", "arm"]),
+        ("action", "arm", {"joints": ["elbow"]}, ["action.arm", "'elbow' does not exist", "elbow_flex"]),
+        ("action", "arm", {"joints": "arm", "mode": "absolut"}, ["action.arm", "'absolut' does not exist", "absolute"]),
+        ("action", "arm", {"joints": "arm", "scale": 0.0}, ["action.arm.params.scale=0.0", "positive"]),
+        ("termination", "joint_limit", {"margin": -0.1}, ["termination.joint_limit.params.margin=-0.1", "not negative"]),
+        ("reset", "cubes", {"xy": -0.1, "yaw": 0.0}, ["reset.cubes.params.xy=-0.1", "not negative"]),
+        ("reset", "cubes", {"xy": 0.2, "yaw": 0.0}, ["reset.cubes.params.xy=0.2", "table"]),
+    ],
+)
+def test_parameters_out_of_range(cfg: Config, group: str, name: str, params: dict, words: list[str]) -> None:
+    getattr(cfg, group)[name].params = params
+    with pytest.raises(MjstackError) as caught:
+        build(cfg)
+    assert "\n" not in str(caught.value)
+    for word in words:
+        assert word in str(caught.value), str(caught.value)
+
+
+def test_end_effector_action_out_of_range() -> None:
+    cfg = configure("action=ee_delta")
+    cfg.action["arm"].params = {"scale": 0.01, "iterations": 0}
+    fails(ConfigError, lambda: build(cfg), "action.arm.params.iterations=0", "at least 1")
+
+
+@pytest.mark.parametrize("open_fraction", [-0.1, 1.5])
+def test_success_out_of_range(cfg: Config, open_fraction: float) -> None:
+    assert cfg.task.success is not None
+    cfg.task.success.params["open_fraction"] = open_fraction
+    fails(ConfigError, lambda: build(cfg), f"task.success.params.open_fraction={open_fraction}", "0 to 1")
+
+
+def test_action_that_is_no_action_term(cfg: Config) -> None:
+    cfg.action["arm"].func = "mjstack.mdp.reward.lift"
+    fails(TermError, lambda: build(cfg), "action.arm", "mjstack.mdp.reward.lift", "ActionTerm")
+
+
+@pytest.mark.parametrize("kind", VALUES)
+@pytest.mark.parametrize(
+    ("func", "words"),
+    [
+        ("wrong_shape", ["returned shape (4,)", "(3,)"]),
+        ("deep", ["returned shape (3, 2, 2)", "(3,)"]),
+        ("whole_number", ["returned torch.int64"]),
+        ("nothing", ["returned NoneType"]),
+        ("raises", ["raised ValueError: first line"]),
+    ],
+)
+def test_term_that_returns_what_its_manager_cannot_use(cfg: Config, kind: str, func: str, words: list[str]) -> None:
+    KINDS[kind](cfg, f"{HERE}.{func}", {})
+    fails(TermError, lambda: build(cfg), f"{kind}: ", *words)
+
+
+def test_term_of_the_wrong_type_or_width(cfg: Config) -> None:
+    for kind in ("reward.mine", "termination.mine", "task.success"):
+        spoilt = configure("task=stack", "reset=jitter")
+        KINDS[kind](spoilt, f"{HERE}.wide", {})
+        fails(TermError, lambda spoilt=spoilt: build(spoilt), f"{kind}: returned shape (3, 1)", "(3,)")
+    for kind in ("termination.mine", "task.success"):
+        spoilt = configure("task=stack", "reset=jitter")
+        KINDS[kind](spoilt, f"{HERE}.number", {})
+        fails(TermError, lambda spoilt=spoilt: build(spoilt), f"{kind}: returned torch.float32", "expected a bool tensor")
+    KINDS["reward.mine"](cfg, f"{HERE}.elsewhere", {})
+    fails(TermError, lambda: build(cfg), "reward.mine: returned a tensor on meta", "cpu")
+
+
+def test_reset_term_that_raises(cfg: Config) -> None:
+    KINDS["reset.mine"](cfg, f"{HERE}.raises", {})
+    fails(TermError, lambda: build(cfg), "reset.mine: raised ValueError: first line")
+
+
+def test_reset_term_without_its_fields(cfg: Config) -> None:
+    from mjstack.sim import make_simulation
+
+    env = on_shared_sim("native", 3, cfg)
+    bare = make_simulation(env.sim.model, cfg, 3, backend=Backend.native)
+    cfg.reset["mass"] = TermCfg(func="mjstack.mdp.reset.CubeMass", params={"scale": [0.9, 1.1]})
+    fails(TermError, lambda: Env(bare, env.index, cfg), "reset.mass", "body_mass", "fields=")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("history", 0, ["history=0", "at least 1"]),
+        ("noise", -1.0, ["noise=-1.0", "not negative"]),
+        ("noise", float("nan"), ["noise=nan"]),
+        ("scale", float("inf"), ["scale=inf", "finite"]),
+        ("clip", [1.0, -1.0], ["clip=[1.0, -1.0]", "smaller one first"]),
+        ("clip", [1.0], ["clip=[1.0]", "two numbers"]),
+    ],
+)
+def test_observation_settings_out_of_range(cfg: Config, key: str, value: object, words: list[str]) -> None:
+    setattr(cfg.observation["policy"].terms["joint_pos"], key, value)
+    fails(TermError, lambda: build(cfg), "observation.policy.terms.joint_pos", *words)
+
+
+def test_reward_weight_that_is_not_finite(cfg: Config) -> None:
+    cfg.reward["lift"].weight = float("nan")
+    fails(TermError, lambda: build(cfg), "reward.lift", "weight=nan", "finite")
+
+
+def test_observation_group_without_terms(cfg: Config) -> None:
+    cfg.observation["empty"] = ObservationGroupCfg(terms={})
+    fails(TermError, lambda: build(cfg), "observation.empty", "no terms")
+
+
+# Faults while stepping
+
+
+def test_reward_that_becomes_nan_is_named(cfg: Config) -> None:
+    KINDS["reward.mine"](cfg, f"{HERE}.nan_after_start", {})
+    env = build(cfg)
+    env.reset()
+    env.step(zeros(env))
+    message = fails(FaultError, lambda: env.step(zeros(env)), "reward is not finite", "reward.mine", "1 of 3 worlds (2)")
+    assert "reward.lift" not in message
+
+
+def test_observation_that_becomes_nan_is_named(cfg: Config) -> None:
+    KINDS["observation.policy.terms.mine"](cfg, f"{HERE}.nan_after_start", {})
+    env = build(cfg)
+    env.reset()
+    env.step(zeros(env))
+    fails(FaultError, lambda: env.step(zeros(env)), "observation", "observation.policy.terms.mine", "1 of 3 worlds (2)")
+    env.reset(seed=0)  # a full reset clears what has been reported
+    env.step(zeros(env))
+
+
+def test_state_that_becomes_nan_is_named_without_its_termination(cfg: Config) -> None:
+    cfg.termination.pop("non_finite")
+    env = build(cfg)
+    env.reset()
+    env.sim.qvel[1, 0] = float("nan")
+    fails(FaultError, lambda: env.step(zeros(env)), "state is not finite", "1 of 3 worlds (1)", "non_finite")
+
+
+@pytest.mark.parametrize("xy", [[0.5, 0.5], [0.14, 0.3]])
+def test_randomisation_that_leaves_no_free_place(xy: list[float]) -> None:
+    cfg = configure("reset=randomized")
+    cfg.reset["cubes"].params.update(xy=xy, gap=0.12, candidates=2)
+    fails(ConfigError, lambda: build(cfg), "reset.cubes.params.xy", "free place", "20000 trials", "smaller")
+
+
+@pytest.mark.parametrize(("key", "value"), [("xy", [0.05]), ("gap", -0.01), ("candidates", 0), ("yaw", float("nan"))])
+def test_randomisation_out_of_range(key: str, value: object) -> None:
+    cfg = configure("reset=randomized")
+    cfg.reset["cubes"].params[key] = value
+    fails(ConfigError, lambda: build(cfg), f"reset.cubes.params.{key}=")
+
+
+@pytest.mark.parametrize(
+    ("name", "params"), [("mass", {"scale": [1.3, 0.7]}), ("friction", {"sliding": [0.0, 1.0]}), ("gains", {"scale": [1.0]})]
+)
+def test_randomisation_bounds(name: str, params: dict) -> None:
+    cfg = configure("reset=randomized")
+    cfg.reset["cubes"] = configure("reset=jitter").reset["cubes"]  # builds faster
+    cfg.reset[name].params = params
+    fails(ConfigError, lambda: build(cfg), f"reset.{name}.params.{next(iter(params))}=", "smaller one first")
+
+
+def warp_env(cfg: Config, **batch: int) -> Env:
+    for name, value in batch.items():
+        setattr(cfg.batch, name, value)
+    return build_env(cfg, nworld=2, backend=Backend.mjwarp, device="cpu")
+
+
+def test_contact_pool_too_small_for_the_start() -> None:
+    env = warp_env(configure("reset=randomized"), nconmax=1)
+    message = fails(FaultError, env.reset, "batch.nconmax=1", "the start of 2 worlds", "Raise it to more than batch.nconmax=")
+    fails(ArgumentError, lambda: env.step(zeros(env)), "before reset()")
+    sizes = [1]
+    while message:  # pairs that did not fit had no contacts, so that the advice has to be followed twice
+        wanted = re.search(r"more than batch\.nconmax=(\d+)", message)
+        assert wanted is not None
+        sizes.append(int(wanted[1]) + 1)
+        env = warp_env(configure("reset=randomized"), nconmax=sizes[-1])
+        try:
+            env.reset()
+            message = ""
+        except FaultError as error:
+            message = str(error)
+    assert len(sizes) <= 3, sizes
+    assert sizes == sorted(set(sizes))
+    # The start fits now; what comes after it does not, which is said too.
+    fails(FaultError, lambda: env.step(zeros(env)), "NARROWPHASE", f"Raise batch.nconmax (nconmax={sizes[-1]})")
+    whole = warp_env(configure("reset=randomized"), naconmax=2)
+    fails(FaultError, whole.reset, "batch.naconmax=2", "Raise it to more than batch.naconmax=")
+
+
+def test_constraint_rows_too_few_without_the_termination(cfg: Config) -> None:
+    """Each frame of a resting start needs some 100 rows; the environment says so at the first step."""
+    cfg.termination.pop("overflow")
+    env = warp_env(cfg, njmax=40)
+    env.reset()
+    message = fails(
+        FaultError, lambda: env.step(zeros(env)), "NEFC overflow in 2 of 2 worlds (0, 1)", "Raise batch.njmax", "njmax=40"
+    )
+    rows = re.search(r"up to (\d+) rows", message)
+    assert rows is not None
+    assert int(rows[1]) > 40
+
+
+def test_constraint_rows_too_few_end_episodes_with_the_termination(cfg: Config) -> None:
+    env = warp_env(cfg, njmax=40)
+    env.reset()
+    _, _, terminated, _, _ = env.step(zeros(env))
+    assert terminated.all()
+    said = dict(zip(env.termination_manager.names, env.termination_manager.values.unbind(1), strict=True))
+    assert said["overflow"].all()

@@ -1,0 +1,904 @@
+"""Terms and managers: values against NumPy and MuJoCo, managers without an environment, and how worlds start."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from environments import actions, configure, held, mask_of, new_sim, on_shared_sim, returned
+from stack_checker import BLUE, RED, lowest_corner, rotation_matrix
+
+from mjstack import make_env
+from mjstack.config.schema import Config
+from mjstack.envs import Env
+from mjstack.gates.gate import GateContext
+from mjstack.managers import ActionManager, ObservationManager, ResetManager, RewardManager, TerminationManager
+from mjstack.managers.base import Term
+from mjstack.mdp import observation as observation_terms
+from mjstack.mdp import reset as reset_terms
+from mjstack.mdp import reward as reward_terms
+from mjstack.mdp import termination as termination_terms
+from mjstack.scene import SceneIndex
+from mjstack.tasks.reach import ReachSuccess
+from mjstack.tasks.stack import StackSuccess
+
+CUBES = ("red_cube", "blue_cube")
+OBJECT = {"object": "red_cube"}
+Stage = Callable[[str], GateContext]
+
+
+def table_top(cfg: Config) -> float:
+    return cfg.scene.table_center[2] + cfg.scene.table_half[2]
+
+
+# Every term of mjstack, by what its docstring says. "n": the robot's joints; "a": the action.
+OBSERVATIONS = {
+    "joint_pos": ({}, "n"),
+    "joint_pos_relative": ({}, "n"),
+    "joint_vel": ({}, "n"),
+    "aperture_pos": ({}, 3),
+    "aperture_to_object": (OBJECT, 3),
+    "object_to_object": ({"a": "red_cube", "b": "blue_cube"}, 3),
+    "object_pose": (OBJECT, 7),
+    "object_velocity": (OBJECT, 6),
+    "jaw_force": (OBJECT, 2),
+    "last_action": ({}, "a"),
+}
+REWARDS = {  # whether it is a fraction, from 0 to 1
+    "reach": ({**OBJECT, "scale": 0.1}, True),
+    "grasp": (OBJECT, True),
+    "lift": ({**OBJECT, "height": 0.05}, True),
+    "place": ({"a": "red_cube", "b": "blue_cube", "scale": 0.1}, True),
+    "success": ({}, True),
+    "action_rate": ({}, False),
+    "joint_vel": ({}, False),
+}
+TERMINATIONS = {
+    "time_out": {"frames": 3},
+    "success": {},
+    "CubeOffTable": {},
+    "JointLimit": {"margin": 0.1},
+    "non_finite": {},
+    "overflow": {},
+}
+RESETS = ("home", "JointNoise", "JitterCubes", "RandomizeCubes", "CubeMass", "CubeFriction", "ActuatorGains")
+
+
+def test_no_term_is_left_out() -> None:
+    for module, known in (
+        (observation_terms, OBSERVATIONS),
+        (reward_terms, REWARDS),
+        (termination_terms, TERMINATIONS),
+        (reset_terms, RESETS),
+    ):
+        own = [
+            name
+            for name, value in vars(module).items()
+            if callable(value) and inspect.getmodule(value) is module and not name.startswith("_")
+        ]
+        assert sorted(own) == sorted(known)
+
+
+def test_every_term_has_its_shape_and_range(backend: str, robot: str) -> None:
+    env = on_shared_sim(backend, 3, configure("task=stack", robot=robot))
+    env.reset(seed=0)
+    for move in actions(env, 4):
+        env.step(move)
+    widths = {"n": len(env.cfg.robot.home), "a": env.action_manager.action_dim}
+    for name, (params, width) in OBSERVATIONS.items():
+        value = getattr(observation_terms, name)(env, **params)
+        assert value.shape == (3, widths.get(width, width)), name  # type: ignore[call-overload]
+        assert value.dtype is env.sim.qpos.dtype, name
+        assert torch.isfinite(value).all(), name
+    for name, (params, is_fraction) in REWARDS.items():
+        value = getattr(reward_terms, name)(env, **params)
+        assert value.shape == (3,), name
+        assert value.dtype.is_floating_point, name
+        assert (value >= 0.0).all(), name
+        assert not is_fraction or (value <= 1.0).all(), name
+    for name, params in TERMINATIONS.items():
+        term = getattr(termination_terms, name)
+        value = term(env, **params)(env) if inspect.isclass(term) else term(env, **params)
+        assert value.shape == (3,), name
+        assert value.dtype is torch.bool, name
+        assert value.all() == (name == "time_out"), name
+
+
+# Observations against MuJoCo
+
+
+class Reference:
+    """One world's state in native MuJoCo, read by names."""
+
+    def __init__(self, env: Env, world: int) -> None:
+        self.data = mujoco.MjData(env.sim.model)
+        self.data.qpos[:], self.data.qvel[:] = env.sim.qpos[world].double().cpu(), env.sim.qvel[world].double().cpu()
+        mujoco.mj_forward(env.sim.model, self.data)
+        self.robot = env.cfg.robot
+
+    @property
+    def aperture(self) -> np.ndarray:
+        return np.mean([self.data.site(name).xpos for name in self.robot.aperture_sites], axis=0)
+
+    def joints(self, kind: str) -> np.ndarray:
+        names = [*self.robot.arm_joints, *self.robot.gripper_joints]
+        return np.concatenate([getattr(self.data.joint(name), kind) for name in names])
+
+    def object(self, name: str) -> np.ndarray:
+        return self.data.body(name).xpos
+
+    def observations(self, action: np.ndarray) -> dict[str, np.ndarray]:
+        """The terms of conf/observation/stack.yaml and reach.yaml, without noise, clip and scale."""
+        red, blue = (self.object(name) for name in CUBES)
+        return {
+            "joint_pos": self.joints("qpos") - self.robot.home,
+            "joint_vel": self.joints("qvel"),
+            "aperture_to_red": red - self.aperture,
+            "aperture_to_goal": red + np.array([0.0, 0.0, 0.06]) - self.aperture,
+            "red_to_blue": blue - red,
+            "red_pose": np.concatenate((red, self.data.body("red_cube").xquat)),
+            "red_velocity": self.data.joint("red_cube").qvel,
+            "blue_pose": np.concatenate((blue, self.data.body("blue_cube").xquat)),
+            "last_action": action,
+        }
+
+
+@pytest.mark.parametrize("task", ["stack", "reach"])
+def test_observation_groups_hold_what_mujoco_says(backend: str, task: str, robot: str) -> None:
+    env = on_shared_sim(backend, 3, configure(f"task={task}", robot=robot))
+    env.reset(seed=0)
+    for cube in env.index.cube_qvel:
+        env.sim.qvel[:, cube : cube + 6] += 0.2  # so that no velocity is zero
+    moves = actions(env, 6)
+    for move in moves:
+        obs = env.step(move)[0]
+    assert (env.frame == 6).all()
+    for k in range(3):
+        expected = Reference(env, k).observations(moves[-1][k].double().cpu().numpy())
+        for group, cfg in env.cfg.observation.items():
+            values, start = obs[group][k].double().cpu().numpy(), 0
+            for name, term in cfg.terms.items():
+                if name == "jaw_force":
+                    width = 2
+                    np.testing.assert_array_equal(values[start : start + 2], 0.0)  # nobody touches the cube yet
+                else:
+                    width = len(expected[name])
+                    want = term.scale * (np.clip(expected[name], *term.clip) if term.clip else expected[name])
+                    noise = (term.noise * abs(term.scale)) if cfg.noise else 0.0
+                    last = start + width * (term.history - 1)  # the newest frame of a history
+                    np.testing.assert_allclose(values[last : last + width], want, atol=noise + 2e-5, err_msg=f"{group} {name}")
+                start += width * term.history
+            assert start == len(values)
+
+
+# A scripted episode, through the environment
+
+
+def record(env: Env, stage: Stage, frames: int = 600) -> SimpleNamespace:
+    """Plays the scripted grasp; per frame the state, the returned values and each term's reward."""
+    planner = stage(env.cfg.robot.name).planner
+    env.reset(seed=0)
+    cubes = torch.cat([env.sim.qpos[:, a : a + 2] for a in env.index.cube_qpos], dim=1)
+    tape = planner.plan(cubes.double().cpu().numpy())
+    rows: dict[str, list[torch.Tensor]] = {}
+    for frame in range(frames):
+        row = returned(env.step(tape.command(frame).float())) | {
+            "qpos": env.sim.qpos.clone(),
+            "qvel": env.sim.qvel.clone(),
+            "ctrl": env.sim.ctrl.clone(),
+            "aperture": env.sim.site_xpos[:, env.index.aperture_sites].mean(1),
+            "values": env.reward_manager.values.clone(),
+            "action": env.action.clone(),
+            "episode": env.episode.clone(),
+        }
+        for name, value in row.items():
+            rows.setdefault(name, []).append(value)
+    return SimpleNamespace(cfg=env.cfg, index=env.index, phases=planner.phases, **{n: torch.stack(v) for n, v in rows.items()})
+
+
+def scripted_cfg(robot: str) -> Config:
+    cfg = configure("task=stack", "action=joint_absolute", "reset=jitter", robot=robot)
+    cfg.termination.clear()
+    return cfg
+
+
+@pytest.fixture(scope="module")
+def scripted(stage: Stage) -> Callable[[str], SimpleNamespace]:
+    """The whole episode in three native worlds, without any termination."""
+    made: dict[str, SimpleNamespace] = {}
+
+    def get(robot: str) -> SimpleNamespace:
+        if robot not in made:
+            env = on_shared_sim("native", 3, scripted_cfg(robot))
+            made[robot] = record(env, stage)
+        return made[robot]
+
+    return get
+
+
+def cubes_of(rec: SimpleNamespace, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Poses and velocities of both cubes, shape ``(..., 2, 7)`` and ``(..., 2, 6)``."""
+    pose = [qpos[..., a : a + 7] for a in rec.index.cube_qpos]
+    velocity = [qvel[..., a : a + 6] for a in rec.index.cube_qvel]
+    return torch.stack(pose, -2).numpy(), torch.stack(velocity, -2).numpy()
+
+
+def test_rewards_of_a_scripted_episode(robot: str, scripted: Callable[[str], SimpleNamespace]) -> None:
+    rec = scripted(robot)
+    cfg, dt = rec.cfg, rec.cfg.timing.frame_dt
+    names = list(cfg.reward)
+    got = {name: rec.values[..., i].double().numpy() / (cfg.reward[name].weight * dt) for i, name in enumerate(names)}
+    pose, _ = cubes_of(rec, rec.qpos, rec.qvel)
+    half, top = cfg.scene.cube_half, table_top(cfg)
+    low = np.array([[lowest_corner(p[RED], half) - top for p in frame] for frame in pose])
+    red, blue = pose[..., RED, :3], pose[..., BLUE, :3]
+    above_blue = blue + np.array([0.0, 0.0, 2.0 * half])
+    action = rec.action.double().numpy()
+    change = np.diff(action, axis=0, prepend=np.zeros_like(action[:1]))
+    qvel = rec.qvel[..., torch.from_numpy(rec.index.robot_qvel)].numpy()
+    expected = {
+        "reach": 1.0 - np.tanh(np.linalg.norm(red - rec.aperture.numpy(), axis=-1) / 0.1),
+        "lift": np.clip(low / 0.05, 0.0, 1.0),
+        "place": (1.0 - np.tanh(np.linalg.norm(above_blue - red, axis=-1) / 0.1)) * (low > 0.005),
+        "success": rec.success.numpy(),
+        "action_rate": np.square(change).sum(-1),
+        "joint_vel": np.square(qvel).sum(-1),
+    }
+    assert {*expected, "grasp"} == set(names)
+    for name, value in expected.items():
+        np.testing.assert_allclose(got[name], value, rtol=1e-4, atol=1e-5, err_msg=name)
+    np.testing.assert_allclose(rec.reward.numpy(), rec.values.sum(-1).numpy(), rtol=1e-5, atol=1e-7)
+
+    span = {p.name: slice(p.start, p.stop) for p in rec.phases}
+    assert set(np.unique(got["grasp"].round(5))) == {0.0, 1.0}
+    assert not got["grasp"][span["above_red"]].any()
+    np.testing.assert_allclose(got["grasp"][span["above_blue"]], 1.0, rtol=1e-5)  # held all the way
+    assert not got["grasp"][span["done"]].any()
+    assert got["lift"][span["lift_red"].stop - 1].min() == pytest.approx(1.0, rel=1e-5)
+    assert got["lift"][span["descend_red"]].max() < 0.05
+    assert got["place"][-1].min() > 0.8
+    assert got["success"][-1].min() == pytest.approx(1.0, rel=1e-5)
+
+
+def test_jaw_force_is_mujocos_contact_force(robot: str, backend: str, scripted: Callable[[str], SimpleNamespace]) -> None:
+    """Nothing before the grasp; in a steady grasp what mj_contactForce adds up to, jaw by jaw."""
+    rec = scripted(robot)
+    cfg = configure("task=stack", "action=joint_absolute", "reset=jitter", robot=robot)
+    env = on_shared_sim(backend, 3, cfg)
+    phases = {p.name: p for p in rec.phases}
+    for frame, grasped in ((phases["above_red"].stop, False), (phases["lift_red"].stop - 20, True)):
+        env.reset(seed=0)
+        for view, values in ((env.sim.qpos, rec.qpos), (env.sim.qvel, rec.qvel), (env.sim.ctrl, rec.ctrl)):
+            view.copy_(values[frame])
+        for t in range(1, 4):
+            obs = env.step(rec.action[frame + t].to(env.device).float())[0]["privileged"]
+        column = sum(width for width in (*[len(cfg.robot.home)] * 2, 3, 3, 7, 6, 7))
+        force = 10.0 * obs[:, column : column + 2].double().cpu().numpy()  # its scale is 0.1
+        grasp = env.reward_manager.values[:, list(cfg.reward).index("grasp")]
+        assert (grasp > 0).tolist() == [grasped] * 3
+        for k in range(3):
+            expected = jaw_forces(env, k)
+            if not grasped:
+                assert expected == [0.0, 0.0]
+                assert not force[k].any()
+            else:
+                assert min(expected) > 0.5
+                np.testing.assert_allclose(force[k], expected, rtol=0.05)
+
+
+def jaw_forces(env: Env, world: int) -> list[float]:
+    """Contact force of each jaw on the red cube [N], added up from MuJoCo's contacts."""
+    m = env.sim.model
+    data = mujoco.MjData(m)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = (v[world].double().cpu() for v in (env.sim.qpos, env.sim.qvel, env.sim.ctrl))
+    mujoco.mj_forward(m, data)
+    cube = m.body("red_cube").id
+    out = []
+    for name in env.cfg.robot.jaw_bodies:
+        jaw, total = m.body(name).id, np.zeros(3)
+        for i, contact in enumerate(data.contact):
+            bodies = [m.geom_bodyid[g] for g in contact.geom]
+            if sorted(bodies) == sorted((jaw, cube)):
+                force = np.zeros(6)
+                mujoco.mj_contactForce(m, data, i, force)
+                turned = contact.frame.reshape(3, 3).T @ force[:3]  # from the first geom to the second
+                total += turned if bodies[1] == cube else -turned
+        out.append(float(np.linalg.norm(total)))
+    return out
+
+
+def test_success_ends_a_scripted_episode(robot: str, stage: Stage, scripted: Callable[[str], SimpleNamespace]) -> None:
+    """In the frame in which it is first achieved, and not before the cubes have rested for a whole window."""
+    rec = scripted(robot)
+    first = rec.success.int().argmax(0).tolist()
+    window = rec.cfg.gate.acceptance.window
+    placed = next(p for p in rec.phases if p.name == "place_stack").stop
+    assert all(frame >= placed + window // 2 for frame in first)
+    assert rec.success[-1].all()
+    cfg = configure("task=stack", "action=joint_absolute", "reset=jitter", robot=robot)
+    env = on_shared_sim("native", 3, cfg)
+    run = record(env, stage, max(first) + 1)
+    for k, frame in enumerate(first):
+        assert not run.terminated[:frame, k].any()
+        assert run.terminated[frame, k]
+        assert run.success[frame, k]
+        assert run.episode[frame, k] == 1
+        assert torch.equal(run.qpos[:frame, k], rec.qpos[:frame, k])
+        for group in cfg.observation:
+            assert torch.equal(getattr(run, f"final.{group}")[frame, k], getattr(rec, f"obs.{group}")[frame, k])
+    assert not run.truncated.any()
+
+
+# Success of the stack task against NumPy
+
+
+def rested(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray, cfg: Config, since: np.ndarray) -> np.ndarray:
+    """Rules 4 and 5 over the window that ends at each frame, and an open gripper in that frame.
+
+    Args:
+        pose: Shape ``(frames, 2, 7)``.
+        velocity: Shape ``(frames, 2, 6)``.
+        opening: Of every finger, shape ``(frames, n)``.
+        cfg: Thresholds, table and cubes.
+        since: First frame of the episode that each frame belongs to, shape ``(frames,)``.
+    """
+    t, scene = cfg.gate.acceptance, cfg.scene
+    half, top = scene.cube_half, table_top(cfg)
+    red, blue = pose[:, RED], pose[:, BLUE]
+    good = np.linalg.norm(red[:, :2] - blue[:, :2], axis=1) <= t.xy_err
+    good &= (red[:, 2] - blue[:, 2] >= t.dz_min) & (red[:, 2] - blue[:, 2] <= t.dz_max)
+    for i, p in enumerate(blue):
+        good[i] &= bool(np.isfinite(p).all()) and abs(lowest_corner(p, half) - top) <= t.support_gap
+        good[i] &= all(abs(p[j] - scene.table_center[j]) <= scene.table_half[j] - half for j in (0, 1))
+    speed = np.linalg.norm(velocity[..., :3], axis=-1) + math.sqrt(3.0) * half * np.linalg.norm(velocity[..., 3:], axis=-1)
+    out = np.zeros(len(pose), dtype=bool)
+    for frame in range(t.window - 1, len(pose)):
+        part = slice(frame - t.window + 1, frame + 1)
+        if part.start < since[frame] or not good[part].all() or not (opening[frame] >= 0.8).all():
+            continue
+        rms = np.sqrt(np.square(speed[part]).mean(0))
+        places, turns = pose[part, :, :3], pose[part, :, 3:]
+        distance = np.linalg.norm(places[:, None] - places[None], axis=-1).max()
+        chord = np.minimum(
+            np.linalg.norm(turns[:, None] - turns[None], axis=-1), np.linalg.norm(turns[:, None] + turns[None], axis=-1)
+        )
+        angle = 4.0 * np.arcsin(np.minimum(1.0, 0.5 * chord)).max()
+        out[frame] = (rms <= t.rest_speed).all() and distance <= t.rest_position and angle <= math.radians(t.rest_rotation_deg)
+    return out
+
+
+FROM = 115  # where trajectories are altered: the world has been successful for a while
+Alter = Callable[[np.ndarray, np.ndarray, np.ndarray], None]
+VARIANTS: dict[str, tuple[Alter | None, bool]] = {}  # what is done, and whether the world is successful again at the end
+
+
+def variant(*, recovers: bool) -> Callable[[Alter], Alter]:
+    def register(alter: Alter) -> Alter:
+        VARIANTS[alter.__name__] = (alter, recovers)
+        return alter
+
+    return register
+
+
+VARIANTS["untouched"] = (None, True)
+
+
+@variant(recovers=True)
+def red_shifted(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    pose[FROM:, RED, 0] += 0.006
+
+
+@variant(recovers=True)
+def both_shifted(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    pose[FROM:, :, 1] += 0.006
+
+
+@variant(recovers=True)
+def red_rotated(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    half = math.radians(4.0) / 2.0
+    turn = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+    for frame in range(FROM, len(pose)):
+        out = np.zeros(4)
+        mujoco.mju_mulQuat(out, turn, pose[frame, RED, 3:])
+        pose[frame, RED, 3:] = -out  # the other sign is the same orientation
+
+
+@variant(recovers=True)
+def red_shifted_for_one_frame(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    pose[FROM, RED, 2] += 0.0065
+
+
+@variant(recovers=True)
+def blue_hops(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    pose[FROM : FROM + 2, :, 2] += 0.02
+
+
+@variant(recovers=False)
+def drifting(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    pose[FROM:, :, 0] += 0.00013 * np.arange(len(pose) - FROM)[:, None]
+
+
+@variant(recovers=False)
+def moving(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    velocity[FROM:, RED, 0] = 0.06
+
+
+@variant(recovers=False)
+def spinning(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    velocity[FROM:, BLUE, 5] = 1.5
+
+
+@variant(recovers=True)
+def kicked(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    velocity[FROM, RED, :3] = 0.4
+
+
+@variant(recovers=True)
+def kicked_gently(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    velocity[FROM, RED, :3] = 0.15  # far above the threshold for one frame, below it as RMS over the window
+
+
+@variant(recovers=True)
+def closing_and_opening(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    opening[FROM : FROM + 10, -1] = 0.7
+
+
+@variant(recovers=False)
+def swapped(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    pose[FROM:] = pose[FROM:, ::-1].copy()
+
+
+@variant(recovers=False)
+def fallen_off(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    pose[FROM:, RED, 1] += 0.02
+
+
+@variant(recovers=True)
+def started_anew(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    pass  # the episode ends at FROM
+
+
+@variant(recovers=True)
+def broken_and_started_anew(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    pose[FROM - 1, RED, 1] = math.nan
+    velocity[FROM - 1, BLUE, 1] = math.inf
+
+
+def assert_success(rec: SimpleNamespace, worlds: list[tuple[str, torch.Tensor, torch.Tensor]], expected: np.ndarray) -> None:
+    """The term says what is expected, shape ``(worlds, frames)``; some worlds start anew when their trajectory is altered."""
+    names, qpos, qvel = zip(*worlds, strict=True)
+    state = torch.stack(qpos, 1), torch.stack(qvel, 1)
+    env = SimpleNamespace(nworld=len(names), device=torch.device("cpu"), cfg=rec.cfg, index=rec.index, sim=SimpleNamespace())
+    env.sim.qpos, env.sim.qvel = state[0][0], state[1][0]
+    term = StackSuccess(env, open_fraction=0.8)
+    anew = torch.tensor(["anew" in name for name in names])
+    for frame, want in enumerate(expected.T.tolist()):
+        if frame == FROM:
+            term.reset(anew)
+        env.sim.qpos, env.sim.qvel = state[0][frame], state[1][frame]
+        got = term(env).tolist()
+        assert got == want, f"frame {frame}: {[name for name, a, b in zip(names, got, want, strict=True) if a != b]}"
+
+
+def test_stack_success_is_rules_four_and_five(robot: str, scripted: Callable[[str], SimpleNamespace]) -> None:
+    """Frame by frame, over the recorded episodes and altered ends of the first, some of whose worlds start anew in between."""
+    rec = scripted(robot)
+    closed, opened = (np.array(v) for v in (rec.cfg.robot.gripper_closed, rec.cfg.robot.gripper_open))
+    gripper = torch.from_numpy(rec.index.robot_qpos[rec.index.n_arm :])
+
+    def opening(qpos: torch.Tensor) -> np.ndarray:
+        return (qpos[:, gripper].numpy() - closed) / (opened - closed)
+
+    whole, expected = [], []
+    for k in range(3):
+        qpos, qvel = rec.qpos[:, k], rec.qvel[:, k]
+        whole.append((f"world {k}", qpos, qvel))
+        expected.append(rested(*cubes_of(rec, qpos, qvel), opening(qpos), rec.cfg, np.zeros(len(qpos))))
+        assert expected[-1][-1]
+        assert not expected[-1][:480].any()
+        assert rec.success[:, k].tolist() == expected[-1].tolist()  # what the environment said
+    assert_success(rec, whole, np.array(expected))
+
+    # The last 170 frames, and then the cubes just stand there for another 75.
+    qpos = torch.cat((rec.qpos[430:, 0], rec.qpos[-1:, 0].expand(75, -1)))
+    qvel = torch.cat((rec.qvel[430:, 0], torch.zeros_like(rec.qvel[-1:, 0]).expand(75, -1)))
+    altered, expected = [], []
+    for name, (alter, recovers) in VARIANTS.items():
+        q, v, fingers = qpos.clone(), qvel.clone(), opening(qpos)
+        pose, velocity = cubes_of(rec, q, v)
+        if alter is not None:
+            alter(pose, velocity, fingers)
+        for i, (a, b) in enumerate(zip(rec.index.cube_qpos, rec.index.cube_qvel, strict=True)):
+            q[:, a : a + 7], v[:, b : b + 6] = torch.from_numpy(pose[:, i]), torch.from_numpy(velocity[:, i])
+        q[:, gripper] = torch.from_numpy(closed + fingers * (opened - closed))
+        since = np.where(np.arange(len(q)) >= FROM, FROM, 0) if "anew" in name else np.zeros(len(q))
+        want = rested(pose, velocity, fingers, rec.cfg, since)
+        unharmed = name in ("untouched", "kicked_gently", "closing_and_opening")
+        assert want[FROM - 2], name
+        assert want[FROM + 44 : FROM + 48].tolist() == [unharmed] * 4, name
+        assert want[-1] == recovers, name
+        altered.append((name, q, v))
+        expected.append(want)
+    assert_success(rec, altered, np.array(expected))
+
+
+# Success of the reach task
+
+
+def test_reach_success_counts_frames_in_a_row() -> None:
+    n, frames = 4, 80
+    near = np.random.default_rng(0).random((frames, n)) < 0.85
+    index = SimpleNamespace(aperture_sites=[0, 2], object_address=lambda name: (3, 0))
+    env = SimpleNamespace(nworld=n, device=torch.device("cpu"), index=index, sim=SimpleNamespace())
+    term = ReachSuccess(env, object="red_cube", height=0.06, distance=0.02, frames=5)
+    run, seen = np.zeros(n, dtype=int), []
+    for frame in range(frames):
+        if frame == 40:
+            term.reset(torch.tensor([True, False, False, True]))
+            run[[0, 3]] = 0
+        rng = np.random.default_rng(frame)
+        direction = rng.normal(size=(n, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        goal = rng.normal(size=(n, 3))
+        aperture = goal + direction * np.where(near[frame], 0.0199, 0.0201)[:, None]
+        spread = rng.normal(size=(n, 3))
+        env.sim.site_xpos = torch.from_numpy(np.stack((aperture + spread, goal, aperture - spread), axis=1))
+        env.sim.qpos = torch.zeros((n, 10), dtype=torch.float64)
+        env.sim.qpos[:, 3:6] = torch.from_numpy(goal - [0.0, 0.0, 0.06])
+        run = np.where(near[frame], run + 1, 0)
+        got = term(env)
+        seen.append(got.tolist())
+        assert seen[-1] == (run >= 5).tolist(), frame
+    assert 0.2 < np.mean(seen) < 0.8
+
+
+def test_reaching_ends_the_episode_after_ten_frames_in_a_row(backend: str) -> None:
+    """The goal is carried to the aperture: in world 1 all the time, in world 2 with an interruption."""
+    cfg = configure("task=reach", "reset=nominal")
+    cfg.termination.pop("cube_off_table")
+    env = on_shared_sim(backend, 3, cfg)
+    env.reset(seed=0)
+    q, v = env.index.objects["red_cube"]
+    hold = torch.zeros((3, env.action_manager.action_dim), device=env.device)
+    for frame in range(1, 17):
+        aperture = env.sim.site_xpos[:, env.index.aperture_sites].mean(1)
+        env.sim.qpos[1:, q : q + 3] = aperture[1:] - torch.tensor([0.0, 0.0, cfg.task.goal_height], device=env.device)
+        env.sim.qvel[1:, v : v + 6] = 0.0
+        if frame == 6:
+            env.sim.qpos[2, q] += 0.03
+        _, _, terminated, truncated, extras = env.step(hold)
+        expected = [False, frame == 10, frame == 16]
+        assert terminated.tolist() == expected, frame
+        assert extras["success"].tolist() == expected
+        assert not truncated.any()
+        success = env.reward_manager.values[:, list(cfg.reward).index("success")]
+        assert (success > 0).tolist() == expected
+
+
+# Terminations at their thresholds
+
+
+def test_joint_limit_at_its_threshold(robot: str) -> None:
+    env = on_shared_sim("native", 3, configure(robot=robot))
+    term = termination_terms.JointLimit(env, margin=0.1)
+    for j, (low, high) in enumerate(env.index.robot_range):
+        for sign, end in ((-1, low), (1, high)):
+            for part, out in ((0.09, False), (0.11, True)):
+                env.sim.reset()
+                env.sim.qpos[:, torch.from_numpy(env.index.robot_qpos)] = torch.tensor(env.cfg.robot.home).double()
+                env.sim.qpos[1, env.index.robot_qpos[j]] = end + sign * part * (high - low)
+                assert term(env).tolist() == [False, out, False]
+
+
+def test_cube_off_table_at_its_threshold(robot: str) -> None:
+    env = on_shared_sim("native", 3, configure(robot=robot))
+    term = termination_terms.CubeOffTable(env)
+    scene = env.cfg.scene
+    for a in env.index.cube_qpos:
+        for axis in (0, 1):
+            for sign in (-1, 1):
+                for by, out in ((-0.001, False), (0.001, True)):
+                    env.sim.reset()
+                    env.sim.qpos[2, a + axis] = scene.table_center[axis] + sign * (scene.table_half[axis] + by)
+                    assert term(env).tolist() == [False, False, out]
+        for by, out in ((0.001, False), (-0.001, True)):
+            env.sim.reset()
+            env.sim.qpos[0, a + 2] = table_top(env.cfg) + by
+            assert term(env).tolist() == [out, False, False]
+
+
+# Managers without an environment
+
+
+class Bench:
+    """The smallest thing that managers work on: see mjstack.managers.EnvView."""
+
+    def __init__(self, cfg: Config, backend: str, nworld: int) -> None:
+        self.cfg, self.nworld, self.seed = cfg, nworld, cfg.seed
+        self.sim = new_sim(backend, nworld, cfg.robot.name)
+        self.index = SceneIndex(self.sim.model, cfg.robot)
+        self.device = self.sim.device
+        self.world = torch.arange(nworld, device=self.device)
+        self.episode, self.frame = torch.zeros_like(self.world), torch.zeros_like(self.world)
+        self.success = torch.zeros(nworld, dtype=torch.bool, device=self.device)
+        self.actions: ActionManager | None = None
+
+    @property
+    def action(self) -> torch.Tensor:
+        assert self.actions is not None
+        return self.actions.action
+
+    @property
+    def previous_action(self) -> torch.Tensor:
+        assert self.actions is not None
+        return self.actions.previous_action
+
+
+@pytest.mark.parametrize("kind", ["native", "mjwarp"])
+def test_managers_work_on_any_object_of_that_shape(kind: str) -> None:
+    """And do there what they do in an environment: the same numbers from the same seed."""
+    cfg = configure("task=reach", "reset=randomized", "action=joint_delta")
+    cfg.task.success = None
+    cfg.reward.pop("success"), cfg.termination.pop("success")
+    env = on_shared_sim(kind, 3, cfg)
+    moves = actions(env, 5)
+    start = returned(env.reset())
+    expected = [returned(env.step(move)) for move in moves]
+
+    bench = Bench(cfg, kind, 3)
+    resets = ResetManager(bench, cfg.reset)
+    everyone = torch.ones(3, dtype=torch.bool)
+    resets.reset(everyone)
+    bench.sim.kinematics()
+    bench.actions = ActionManager(bench, cfg.action)
+    ends = TerminationManager(bench, cfg.termination)
+    rewards = RewardManager(bench, cfg.reward)
+    observations = ObservationManager(bench, cfg.observation)
+    for group, value in observations.refresh(everyone).items():
+        assert torch.equal(value, start[f"obs.{group}"])
+    for move, row in zip(moves, expected, strict=True):
+        bench.actions.process(move)
+        bench.actions.write_commands()
+        bench.sim.step(cfg.timing.substeps, kinematics=True)
+        bench.frame += 1
+        ends.compute()
+        assert torch.equal(rewards.compute(), row["reward"])
+        assert torch.equal(ends.terminated, row["terminated"])
+        for group, value in observations.compute().items():
+            assert torch.equal(value, row[f"final.{group}"])
+    torch.testing.assert_close(rewards.episode_sums.sum(1), torch.stack([row["reward"] for row in expected]).sum(0))
+    before = {name: getattr(bench.sim, name).clone() for name in ("qpos", "qvel", "ctrl")}
+    bench.episode += mask_of(env, 1)
+    resets.reset(mask_of(env, 1))
+    for name, value in before.items():
+        now = getattr(bench.sim, name)
+        assert torch.equal(now[[0, 2]], value[[0, 2]])
+        assert not torch.equal(now[1], value[1])
+
+    for manager, names in (
+        (resets, cfg.reset),
+        (bench.actions, cfg.action),
+        (ends, cfg.termination),
+        (rewards, cfg.reward),
+        (observations, [*cfg.observation, *(name for group in cfg.observation.values() for name in group.terms)]),
+    ):
+        text = str(manager)
+        for name in names:
+            assert name in text, f"{name} is not in\n{text}"
+
+
+def test_tables_show_settings_and_the_environment_shows_all_tables() -> None:
+    env = on_shared_sim("native", 3, configure("task=stack"))
+    shown = str(env)
+    assert "stack with SO-101: 3 worlds, MuJoCo" in shown
+    scale = env.cfg.action["arm"].params["scale"]
+    for text in ("action: 6 numbers", f"joints=arm, mode=relative, scale={scale}", "privileged", "weight per s", "truncated"):
+        assert text in shown
+    for manager in (
+        env.action_manager,
+        env.reset_manager,
+        env.termination_manager,
+        env.reward_manager,
+        env.observation_manager,
+    ):
+        assert str(manager) in shown
+    (row,) = [line for line in str(env.reward_manager).splitlines() if "│ lift " in line]
+    assert "2.0" in row
+    assert "height=0.05" in row
+
+
+def test_overrides_change_exactly_what_they_name() -> None:
+    env = make_env(
+        ["sim=native", "action=ee_delta", "reset=nominal", "~reward.grasp", "reward.lift.weight=3"], nworld=2, seed=5
+    )
+    expected = configure("sim=native")
+    expected.nworld, expected.seed = 2, 5
+    expected.action, expected.reset = configure("action=ee_delta").action, configure("reset=nominal").reset
+    expected.reward.pop("grasp")
+    expected.reward["lift"].weight = 3.0
+    assert env.cfg == expected
+    assert env.cfg.action != configure("sim=native").action
+    assert list(env.action_manager.terms) == ["arm", "gripper"]
+    assert type(env.action_manager.terms["arm"]).__name__ == "EndEffectorDelta"
+    assert env.action_manager.action_dim == 4
+    assert env.reward_manager.names == ["reach", "lift", "place", "success", "action_rate", "joint_vel"]
+    assert "3.0" in next(line for line in str(env.reward_manager).splitlines() if "lift" in line)
+    assert (env.nworld, env.seed) == (2, 5)
+    env.reset()
+    env.step(torch.zeros(2, 4))
+    # Lift is worth three instead of two per second.
+    env.sim.qpos[:, env.index.cube_qpos[0] + 2] += 0.2
+    env.step(torch.zeros(2, 4))
+    column = env.reward_manager.values[:, 1]
+    torch.testing.assert_close(column, torch.full_like(column, 3.0 * env.cfg.timing.frame_dt))
+    env.close()
+
+
+# How worlds start
+
+MANY = 200
+
+
+def start_of(cfg: Config, seed: int = 0) -> Env:
+    env = on_shared_sim("native", MANY, cfg)
+    env.reset(seed=seed)
+    return env
+
+
+def corners(pose: np.ndarray, half: float) -> np.ndarray:
+    signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8)
+    return (pose[:3, None] + rotation_matrix(pose[3:]) @ (half * signs)).T
+
+
+@pytest.mark.parametrize("reset", ["nominal", "jitter", "randomized"])
+def test_cubes_start_on_the_table_and_touch_nothing_else(robot: str, reset: str) -> None:
+    env = start_of(configure(f"reset={reset}", robot=robot))
+    m, scene = env.sim.model, env.cfg.scene
+    data = mujoco.MjData(m)
+    table = m.geom("table").id
+    cubes = [m.geom(name).id for name in CUBES]
+    gap = math.inf
+    for k in range(MANY):
+        data.qpos[:] = env.sim.qpos[k]
+        mujoco.mj_forward(m, data)
+        for a in env.index.cube_qpos:
+            at = corners(data.qpos[a : a + 7], scene.cube_half)
+            assert at[:, 2].min() == pytest.approx(table_top(env.cfg), abs=1e-9)
+            assert np.ptp(at[:, 2]) == pytest.approx(2.0 * scene.cube_half)
+            assert (np.abs(at[:, :2] - scene.table_center[:2]) <= scene.table_half[:2]).all()
+        touching = {
+            tuple(sorted(contact.geom)) for contact in data.contact if contact.dist < 0.0 or set(contact.geom) & {*cubes}
+        }
+        assert {pair for pair in touching if set(pair) & {*cubes}} <= {tuple(sorted((table, cube))) for cube in cubes}
+        gap = min(gap, mujoco.mj_geomDistance(m, data, *cubes, 1.0, None))
+        for geom in range(m.ngeom):
+            if m.geom_bodyid[geom] and geom not in cubes and (m.geom_contype[geom] or m.geom_conaffinity[geom]):
+                for cube in cubes:
+                    assert mujoco.mj_geomDistance(m, data, geom, cube, 0.05, None) > 0.0
+        np.testing.assert_array_equal(env.sim.qvel[k], 0.0)
+    assert gap > (0.01 if reset == "randomized" else 0.0)
+
+
+def test_home_jitter_and_noise_stay_within_their_widths(robot: str) -> None:
+    nominal = start_of(configure("reset=nominal", robot=robot))
+    qpos0 = torch.from_numpy(nominal.sim.model.qpos0.copy())
+    columns, ctrl = torch.from_numpy(nominal.index.robot_qpos), torch.from_numpy(nominal.index.ctrl)
+    home = torch.tensor(nominal.cfg.robot.home, dtype=torch.float64)
+    expected = qpos0.clone()
+    expected[columns] = home
+    torch.testing.assert_close(nominal.sim.qpos, expected.expand(MANY, -1), rtol=0, atol=1e-12)
+    torch.testing.assert_close(nominal.sim.ctrl[:, ctrl], home.expand(MANY, -1), rtol=0, atol=1e-12)
+
+    jitter = start_of(configure("reset=jitter", robot=robot))
+    assert torch.equal(jitter.sim.qpos[:, columns], nominal.sim.qpos[:, columns])
+    for a in jitter.index.cube_qpos:
+        off = jitter.sim.qpos[:, a : a + 3] - qpos0[a : a + 3]
+        yaw = 2.0 * torch.atan2(jitter.sim.qpos[:, a + 6], jitter.sim.qpos[:, a + 3])
+        for values, width in ((off[:, 0], 0.002), (off[:, 1], 0.002), (yaw, 0.05)):
+            assert values.abs().max() <= width
+            assert 0.9 * width < values.max()
+            assert values.min() < -0.9 * width
+            assert abs(float(values.mean())) < 0.15 * width
+        assert not off[:, 2].any()
+
+    noisy = start_of(configure("reset=randomized", robot=robot))
+    n_arm = noisy.index.n_arm
+    off = noisy.sim.qpos[:, columns] - home
+    assert torch.equal(noisy.sim.qpos[:, columns], noisy.sim.ctrl[:, ctrl])
+    assert off[:, :n_arm].abs().max() <= 0.02 + 1e-12
+    limits = torch.from_numpy(noisy.index.ctrl_range)
+    assert ((noisy.sim.ctrl[:, ctrl] >= limits[:, 0]) & (noisy.sim.ctrl[:, ctrl] <= limits[:, 1])).all()
+    assert not off[:, n_arm:].any()
+    for j in range(n_arm):
+        assert len(torch.unique(off[:, j])) > MANY // 3, j  # home may lie on a limit, as the SO-101's does not
+    for a in noisy.index.cube_qpos:
+        off = noisy.sim.qpos[:, a : a + 2] - qpos0[a : a + 2]
+        yaw = 2.0 * torch.atan2(noisy.sim.qpos[:, a + 6], noisy.sim.qpos[:, a + 3])
+        assert off.abs().max() <= 0.05
+        assert (off.amax(0) > 0.04).all()
+        assert (off.amin(0) < -0.04).all()
+        # Whole turns: every quarter of them is taken.
+        assert torch.histc(torch.remainder(yaw, 2 * math.pi), 4, 0.0, 2 * math.pi).min() > MANY // 10
+
+
+def test_masses_friction_and_gains_are_drawn_anew_from_the_models_own(robot: str) -> None:
+    env = start_of(configure("reset=randomized", robot=robot))
+    m, index = env.sim.model, env.index
+    bodies, geoms = [m.body(name).id for name in CUBES], [m.geom(name).id for name in CUBES]
+    servos = torch.from_numpy(index.ctrl)
+    seen: dict[str, list[torch.Tensor]] = {"mass": [], "friction": [], "gain": []}
+    for _ in range(6):
+        fields = {name: field.clone() for name, field in env.sim.fields.items()}
+        ratio = {name: field / torch.from_numpy(getattr(m, name)) for name, field in fields.items()}
+        mass = ratio["body_mass"][:, bodies]
+        dofs = [[v + i for i in range(6)] for v in index.cube_qvel]
+        for other in (
+            ratio["body_inertia"][:, bodies],
+            ratio["body_subtreemass"][:, bodies, None],
+            1.0 / ratio["body_invweight0"][:, bodies],
+            1.0 / ratio["dof_invweight0"][:, dofs],
+        ):
+            torch.testing.assert_close(other, mass[..., None].expand_as(other), rtol=1e-6, atol=0)
+        gain = fields["actuator_gainprm"][:, servos, 0] / torch.from_numpy(m.actuator_gainprm)[servos, 0]
+        bias = fields["actuator_biasprm"][:, servos, 1:3] / torch.from_numpy(m.actuator_biasprm)[servos, 1:3]
+        finite = torch.isfinite(bias)  # no damping stays no damping
+        torch.testing.assert_close(bias[finite], gain[..., None].expand_as(bias)[finite], rtol=1e-6, atol=0)
+        assert finite[..., 0].all()
+        seen["mass"].append(mass)
+        seen["friction"].append(fields["geom_friction"][:, geoms, 0])
+        seen["gain"].append(gain)
+        # Nothing else is touched.
+        for name, columns in (
+            ("body_mass", bodies),
+            ("body_inertia", bodies),
+            ("body_invweight0", bodies),
+            ("geom_friction", geoms),
+            ("actuator_gainprm", index.ctrl.tolist()),
+        ):
+            rest = [i for i in range(fields[name].shape[1]) if i not in columns]
+            model = torch.from_numpy(getattr(m, name))
+            assert (fields[name][:, rest] == model[rest]).all()
+        assert (fields["geom_friction"][..., 1:] == torch.from_numpy(m.geom_friction)[:, 1:]).all()
+        env.reset()
+    for name, (low, high) in (("mass", (0.7, 1.3)), ("friction", (0.8, 1.4)), ("gain", (0.9, 1.1))):
+        values = torch.stack(seen[name])  # episodes, worlds, elements
+        margin = 0.03 * (high - low)
+        assert (values >= low - 1e-9).all()
+        assert (values <= high + 1e-9).all()
+        # The whole range in every episode: factors upon factors would leave it or close in on something.
+        assert (values.amin((1, 2)) < low + margin).all()
+        assert (values.amax((1, 2)) > high - margin).all()
+        assert len(torch.unique(values[0, :, 0])) == MANY
+        assert not (values[0] == values[1]).any()
+        assert not (values[0, :, 0] == values[0, :, 1]).any()
+
+
+def test_a_masked_reset_draws_for_its_worlds_alone(robot: str) -> None:
+    env = start_of(configure("reset=randomized", robot=robot))
+    before = held(env)
+    mask = torch.rand(MANY, generator=torch.Generator().manual_seed(0)) < 0.3
+    env.reset(mask=mask)
+    after = held(env)
+    changed = ("qpos", "ctrl", "episode", "fields.body_mass", "fields.geom_friction", "fields.actuator_gainprm")
+    for name in before:
+        assert torch.equal(after[name][~mask], before[name][~mask]), name
+    for name in changed:
+        differs = (after[name][mask] != before[name][mask]).flatten(1 if before[name].dim() > 1 else 0)
+        assert (differs.any(1) if differs.dim() > 1 else differs).all(), name
+
+
+def test_terms_with_parameters_are_built_once() -> None:
+    """A class is built with its parameters, a function is called with them."""
+    env = on_shared_sim("native", 3, configure())
+    cfg = env.cfg.termination
+    limit, clock = Term("a", cfg["joint_limit"], env), Term("b", cfg["time_out"], env)
+    env.frame.copy_(torch.tensor([599, 600, 601]))
+    assert clock(env).tolist() == [False, True, True]
+    assert limit(env).tolist() == [False] * 3
+    limit.reset(mask_of(env, 1))  # no memory, nothing to forget
