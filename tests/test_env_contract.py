@@ -65,6 +65,7 @@ def test_a_masked_reset_touches_nobody_else(backend: str, task: str, robot: str)
     before_reset = play(env, moves[:6])
     assert_traces(before_reset, undisturbed[:6], slice(None), slice(None), backend)
     others, chosen = [0, 2], [1, 3]
+    env.sim.sensordata.fill_(1.0)  # as if they had touched something
     before = held(env)
     start = returned(env.reset(mask=mask_of(env, *chosen)))
     after = held(env)
@@ -424,6 +425,13 @@ def test_every_action_group_steps(backend: str, robot: str, action: str) -> None
             part = 0.5 * (move[:, -1:] + 1.0)
             torch.testing.assert_close(command[:, n_arm:], (closed + part * (opened - closed)).to(command))
         before = command.clone()
+    if action != "joint_absolute":  # more than one is one
+        commands = []
+        for size in (1.0, 3.0):
+            env.reset(seed=0)
+            env.step(size * torch.ones_like(rest))
+            commands.append(env.sim.ctrl.clone())
+        assert_same_run(*commands, backend)
 
 
 def test_end_effector_delta_moves_the_commanded_aperture(backend: str, robot: str) -> None:

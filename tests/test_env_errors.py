@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from environments import configure, mask_of, on_shared_sim
+from environments import assert_rows, configure, mask_of, on_shared_sim, returned
 
 from mjstack import make_env
 from mjstack.config.schema import (
@@ -87,7 +87,7 @@ def test_action_that_is_not_finite_names_its_world(env: Env, bad: float) -> None
 
 def test_argument_errors_leave_the_environment_as_it_was(env: Env) -> None:
     action = 0.3 * torch.ones_like(zeros(env))
-    expected = [env.step(action)[0], env.step(action)[0]]
+    expected = [returned(env.step(action)), returned(env.step(-action))]
     env.reset(seed=0)
     nan, meta = action.clone(), action.to("meta")
     nan[0, 0] = float("nan")
@@ -99,12 +99,10 @@ def test_argument_errors_leave_the_environment_as_it_was(env: Env) -> None:
         lambda: env.reset(seed=1, mask=mask_of(env, 0)),
         lambda: env.reset(mask=torch.ones(2, dtype=torch.bool)),
     ]
-    for result in expected:
+    for move, result in zip((action, -action), expected, strict=True):
         for attempt in attempts:
             fails(ArgumentError, attempt)
-        obs = env.step(action)[0]
-        for group in obs:
-            assert torch.equal(obs[group], result[group])
+        assert_rows(returned(env.step(move)), result, slice(None), slice(None), "native")
 
 
 # Resets

@@ -41,7 +41,7 @@ class Placement:
         self._apart = 2.0 * self._radius + gap
         self._height = table_top(scene) + half
         nominal = torch.tensor([scene.red_xy, scene.blue_xy], dtype=torch.float64)
-        center, room = torch.tensor(scene.table_center[:2]).double(), torch.tensor(scene.table_half[:2]).double() - half
+        center, room = torch.tensor(scene.table_center[:2]).double(), torch.tensor(scene.table_half[:2]).double() - self._radius
         self._tensors = [nominal, torch.tensor(region).double(), center, room, self._obstacles(cfg, model, index, region, gap)]
 
     def to(self, device: torch.device, dtype: torch.dtype) -> None:
