@@ -110,6 +110,19 @@ class Unreachable(MjstackError):
         self.distance = distance
 
 
+class MissingField(MjstackError, KeyError):
+    """A per-world model field that the simulation was made without. It is a KeyError too, as of any mapping."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(
+            f"sim.fields['{name}'] is not a per-world field of this simulation: make it with fields=['{name}'], or mark the "
+            f"reset term with uses_fields('{name}')."
+        )
+
+    def __str__(self) -> str:  # KeyError's own would quote the message
+        return str(self.args[0])
+
+
 class RebindError(MjstackError):
     """A view of a simulation was assigned to instead of written into."""
 

@@ -6,7 +6,7 @@ of 16 draws what world 5 of 2048 draws, and no draw depends on which other world
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 
 import torch
 
@@ -36,7 +36,7 @@ def philox(counter: torch.Tensor, key: tuple[int, int]) -> torch.Tensor:
     return torch.stack((multiplied, mixed), dim=-1).flatten(-2)
 
 
-@cache
+@lru_cache(maxsize=1024)
 def _constants(key: tuple[int, int], device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
     """Multipliers ``(2,)`` and the key of each round ``(10, 2)``; made once, because a captured step cannot copy them."""
     rounds = [[(key[0] + i * _W0) & _MASK, (key[1] + i * _W1) & _MASK] for i in range(10)]

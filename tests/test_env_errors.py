@@ -149,7 +149,7 @@ def test_configured_seed_out_of_range(seed: int) -> None:
 
 
 def test_overrides_as_a_string() -> None:
-    fails(ArgumentError, lambda: make_env("task=reach"), "overrides", "'task=reach'", "['task=reach']")
+    fails(ArgumentError, lambda: make_env("task=reach"), "overrides", "'task=reach'", "['task=reach', 'robot=rebot']")
 
 
 @pytest.mark.parametrize(
@@ -485,7 +485,7 @@ def test_contact_pool_too_small_for_the_start() -> None:
     assert len(sizes) <= 3, sizes
     assert sizes == sorted(set(sizes))
     # The start fits now; what comes after it does not, which is said too.
-    fails(FaultError, lambda: env.step(zeros(env)), "NARROWPHASE", f"Raise batch.nconmax (nconmax={sizes[-1]})")
+    fails(FaultError, lambda: env.step(zeros(env)), "NARROWPHASE", f"Raise batch.nconmax (nconmax={sizes[-1]};", "per world")
     whole = warp_env(configure("reset=randomized"), naconmax=2)
     fails(FaultError, whole.reset, "batch.naconmax=2", "Raise it to more than batch.naconmax=")
 

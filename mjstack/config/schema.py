@@ -55,7 +55,10 @@ class LayoutCfg:
 
 @dataclass(kw_only=True, slots=True)
 class RobotCfg:
-    """An arm: names of its parts and the commands of the task."""
+    """An arm: names of its parts and the commands of the task.
+
+    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments.
+    """
 
     name: str = MISSING
     title: str = MISSING
@@ -64,6 +67,7 @@ class RobotCfg:
     arm_joints: list[str] = MISSING
     gripper_joints: list[str] = MISSING
     home: list[float] = MISSING
+    start: list[float] = MISSING
     gripper_open: list[float] = MISSING
     gripper_closed: list[float] = MISSING
     ik_joints: list[str] = MISSING

@@ -23,6 +23,7 @@ from mjstack.errors import MjstackError, UnknownName, suggest
 
 CONFIG_MODULE = "mjstack.conf"
 CONFIG_NAME = "config"
+_TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 _KINDS = {"Integer": "an integer", "Float": "a number", "Boolean": "true or false"}
 
 ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
@@ -138,13 +139,26 @@ def _unknown_key(error: Exception, key: str) -> MjstackError:
         base = OmegaConf.to_container(compose(CONFIG_NAME), resolve=False)
     keys = _flat_keys(base)
     leaf = key.rpartition(".")[2]
-    same_leaf = [k for k in keys if k.rpartition(".")[2] == leaf]
+    if key.partition(".")[0] in _TERM_GROUPS:
+        return _unknown_term_key(key, keys)
+    same_leaf = [k for k in keys if k.rpartition(".")[2] == leaf and k != key]
     if same_leaf:
         nearest = max(same_leaf, key=lambda k: difflib.SequenceMatcher(None, key, k).ratio())
         return CompositionError(f"configuration key '{key}' does not exist. Did you mean '{nearest}'?")
     siblings = [k for k in keys if k.rpartition(".")[0] == key.rpartition(".")[0]]
     pool = sorted({*siblings, *(k for k in keys if "." not in k)})
     return CompositionError(f"configuration key '{key}' does not exist. {suggest(key, _nearest_first(leaf, pool))}")
+
+
+def _unknown_term_key(key: str, keys: Sequence[str]) -> MjstackError:
+    """Terms may be added, so the way to do that is part of the answer."""
+    group = key.partition(".")[0]
+    depth = key.count(".")
+    near = difflib.get_close_matches(
+        key, [k for k in keys if k.startswith(f"{group}.") and k.count(".") == depth and k != key], n=1, cutoff=0.8
+    )
+    hint = f" Did you mean '{near[0]}'?" if near else ""
+    return CompositionError(f"'{key}' is not in the configuration.{hint} To add it, write +{key}=...")
 
 
 def _nearest_first(leaf: str, keys: Sequence[str]) -> list[str]:

@@ -70,6 +70,7 @@ def _robot(cfg: Config) -> None:
     robot = cfg.robot
     n_arm, n_grip = len(robot.arm_joints), len(robot.gripper_joints)
     _length("robot.home", robot.home, n_arm + n_grip)
+    _length("robot.start", robot.start, n_arm + n_grip)
     _length("robot.gripper_open", robot.gripper_open, n_grip)
     _length("robot.gripper_closed", robot.gripper_closed, n_grip)
     _length("robot.aperture_sites", robot.aperture_sites, 2)

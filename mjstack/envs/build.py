@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import mujoco
+import torch
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
@@ -34,12 +35,13 @@ def make_env(
     Raises:
         MjstackError: An override or a term cannot be used; the message says which and what to do.
     """
-    if isinstance(overrides, str):
-        raise ArgumentError("overrides", f"the string '{overrides}'", f"a list of strings, such as ['{overrides}']")
+    if isinstance(overrides, str) or not all(isinstance(override, str) for override in overrides):
+        raise ArgumentError("overrides", repr(overrides), "a list of strings, such as ['task=reach', 'robot=rebot']")
     given = {"nworld": nworld, "seed": seed, "sim.device": device}
     return build_env(load_config([*overrides, *(f"{k}={v}" for k, v in given.items() if v is not None)]))
 
 
+@torch.inference_mode(False)  # buffers made in inference mode could not be written outside it
 def build_env(
     cfg: Config,
     *,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from enum import IntFlag
 from typing import Any
 
@@ -87,7 +88,7 @@ class Env:
         self._overflow = torch.zeros_like(self._faults)
         self._steps = 0
         self._check_faults = check_faults
-        self._started = False
+        self._started = self._closed = False
         self._substeps = cfg.timing.substeps
 
         # Terms are checked on worlds that have started, because a term may read anything.
@@ -117,8 +118,9 @@ class Env:
 
     @property
     def max_episode_frames(self) -> int:
-        """Frames after which the task times out."""
-        return self.cfg.task.episode_frames
+        """Frames after which an episode times out: the time-out term's, or the task's where there is none."""
+        limits = [t.params["frames"] for t in self.cfg.termination.values() if t.time_out and "frames" in t.params]
+        return min(limits, default=self.cfg.task.episode_frames)
 
     def reset(
         self, *, seed: int | None = None, mask: torch.Tensor | None = None
@@ -136,15 +138,17 @@ class Env:
             ArgumentError: The seed or the mask cannot be used.
             FaultError: The start does not fit the batch sizes.
         """
+        if self._closed:
+            raise ArgumentError("env", "reset() after close()", "an open environment", "Make a new one")
         mask = self._everyone if mask is None else self._check_mask(mask)
         if seed is not None:
             if mask is not self._everyone:
                 raise ArgumentError(
                     "seed", str(seed), "no mask beside it, because a seed starts every world anew", "Leave one out"
                 )
-            if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 1 << 32:
+            if isinstance(seed, bool) or not hasattr(seed, "__index__") or not 0 <= operator.index(seed) < 1 << 32:
                 raise ArgumentError("seed", repr(seed), "an integer from 0 to 4294967295")
-            self.seed = seed
+            self.seed = operator.index(seed)
             self.episode.fill_(-1)
         self.episode += mask
         self.frame.masked_fill_(mask, 0)
@@ -180,7 +184,7 @@ class Env:
             FaultError: Physics was lost, or a term gave a number that is not finite; on CUDA within 200 steps.
         """
         if not self._started:
-            raise ArgumentError("env", "step() before reset()", "reset() first", "Call env.reset()")
+            raise ArgumentError("env", "step() before reset(), or after close()", "reset() first", "Call env.reset()")
         self.action_manager.process(action)
         self._advance()
         self._steps += 1
@@ -219,7 +223,9 @@ class Env:
                 raise FaultError(f"{what} in {name_worlds(worlds, self.nworld)}{self._culprits(fault, worlds[0])}", fix)
 
     def close(self) -> None:
-        """Gives the simulation's threads and buffers back."""
+        """Gives the simulation's threads and buffers back. Nothing can be stepped afterwards."""
+        self._started = False
+        self._closed = True
         self.sim.close()
 
     def __str__(self) -> str:
@@ -238,7 +244,7 @@ class Env:
         self.action_manager.write_commands()
         self.sim.step(self._substeps, kinematics=True)
         self.frame += 1
-        broken = ~(torch.isfinite(self.sim.qpos).all(1) & torch.isfinite(self.sim.qvel).all(1))
+        broken = self._broken = ~(torch.isfinite(self.sim.qpos).all(1) & torch.isfinite(self.sim.qvel).all(1))
         if self._success is not None:
             self.success.copy_(self._success(self))
         self.success &= ~broken
@@ -273,7 +279,9 @@ class Env:
         managers = self.termination_manager, self.reward_manager
         done = managers[0].terminated | managers[0].truncated
         self._achieved = self.success.clone()
-        final = _copies(self.observation_manager.groups)
+        # What a diverged world saw last is 0, not NaN, which a value times 0 would hand on.
+        broken = self._broken[:, None]
+        final = {n: torch.where(broken, g.nan_to_num(0.0, 0.0, 0.0), g) for n, g in self.observation_manager.groups.items()}
         if not managers[0].names or (not done.is_cuda and not bool(done.any())):
             return _copies(final), final  # nothing to reset; on CUDA looking would stop the device
         self.statistics.update(done, self.frame, self.success, managers[1].episode_sums, managers[0].values)
@@ -312,6 +320,7 @@ class Env:
         sizes, pool = getattr(self.sim, "sizes", None), getattr(self.sim, "peak_pool", None)
         if sizes is None or pool is None:
             return
+        pool.zero_()  # it has the peak of everything before
         self.sim.forward()
         used = max(pool.tolist())
         room = sizes.contact_pool(self.nworld)
@@ -328,12 +337,19 @@ class Env:
 
     def _capacity_hint(self, bits: int) -> str:
         sizes = getattr(self.sim, "sizes", None)
-        by_key = {"njmax": Overflow.NEFC | Overflow.NJMAX_NNZ, "nconmax": _POOL, "nccdmax": Overflow.CCD}
+        # The pools' own sizes take precedence where they are set.
+        contacts = "nconmax" if getattr(sizes, "naconmax", None) is None else "naconmax"
+        convex = "nccdmax" if getattr(sizes, "naccdmax", None) is None else "naccdmax"
+        by_key = {"njmax": Overflow.NEFC | Overflow.NJMAX_NNZ, contacts: _POOL, convex: Overflow.CCD}
         keys = [key for key, flags in by_key.items() if bits & flags]
         if not keys:
             return "Simplify the model, or use sim=native"
         held = ", ".join(f"{key}={getattr(sizes, key, None)}" for key in keys)
         peak = f"; up to {int(self.sim.peak_constraints.max())} rows were needed" if "njmax" in keys else ""
+        pool = getattr(self.sim, "peak_pool", None)
+        if contacts in keys and pool is not None:
+            most = max(pool.tolist())
+            peak += f"; all worlds together needed {most}, {-(-most // self.nworld)} per world"
         return f"Raise {' and '.join(f'batch.{key}' for key in keys)} ({held}{peak})"
 
     def _culprits(self, fault: Fault, world: int) -> str:

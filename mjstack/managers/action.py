@@ -20,12 +20,14 @@ class ActionTerm(ABC):
         low: Smallest meaningful action, shape ``(dim,)``.
         high: Largest, shape ``(dim,)``.
         unit: Unit of the action, for tables.
+        actuators: Columns of ctrl that it writes; no two terms may share one.
     """
 
     dim: int
     low: torch.Tensor
     high: torch.Tensor
     unit: str = "-1 to 1"
+    actuators: tuple[int, ...] = ()
 
     @abstractmethod
     def write_commands(self, action: torch.Tensor) -> None:
@@ -54,6 +56,7 @@ class ActionManager:
         self.terms: dict[str, ActionTerm] = {}
         self._slices: list[tuple[ActionTerm, slice]] = []
         self._rows: list[tuple[object, ...]] = []
+        driven: dict[int, str] = {}
         start = 0
         for name, term_cfg in cfg.items():
             label = f"action.{name}"
@@ -62,6 +65,12 @@ class ActionManager:
                 raise TermError(label, f"func={term_cfg.func}: expected a subclass of mjstack.managers.ActionTerm")
             check_params(label, cls, dict(term_cfg.params), 1)
             term = build_instance(label, cls, env, dict(term_cfg.params))
+            for actuator in term.actuators:
+                if actuator in driven:
+                    raise TermError(
+                        label, f"drives actuator {actuator}, which {driven[actuator]} drives too: leave one of them out"
+                    )
+                driven[actuator] = label
             self.terms[name] = term
             self._slices.append((term, slice(start, start + term.dim)))
             self._rows.append((name, term.dim, term.unit, show_params(dict(term_cfg.params))))
@@ -87,6 +96,7 @@ class ActionManager:
             ArgumentError: Wrong shape, dtype or device, or values that are not finite.
         """
         self.check(action)
+        action = action.detach()  # physics has no gradient, and a buffer must not acquire one
         bad = ~torch.isfinite(action)
         if not action.is_cuda and bool(bad.any()):
             world = int(bad.any(1).nonzero()[0, 0])

@@ -7,7 +7,8 @@ import inspect
 import io
 import zlib
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from types import UnionType
+from typing import Any, Protocol, Union, get_args, get_origin, get_type_hints
 
 import torch
 from rich.console import Console
@@ -124,7 +125,12 @@ def check_params(label: str, func: Callable[..., Any], params: dict[str, Any], l
     Raises:
         TermError: A parameter is unknown or missing.
     """
-    accepted = list(inspect.signature(func).parameters.values())[leading:]
+    every = list(inspect.signature(func).parameters.values())
+    given = [p for p in every if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD, p.VAR_POSITIONAL)]
+    if len(given) < leading and not any(p.kind is p.VAR_POSITIONAL for p in given):
+        form = "(env, mask, *, ...)" if leading == 2 else "(env, *, ...)"
+        raise TermError(label, f"{getattr(func, '__name__', func)} does not take what its manager gives, expected {form}")
+    accepted = every[leading:]
     if any(p.kind is p.VAR_KEYWORD for p in accepted):
         return
     names = [p.name for p in accepted]
@@ -134,6 +140,31 @@ def check_params(label: str, func: Callable[..., Any], params: dict[str, Any], l
     missing = [p.name for p in accepted if p.default is p.empty and p.name not in params]
     if missing:
         raise TermError(label, f"parameter '{missing[0]}' is missing: set {label}.params.{missing[0]}")
+    try:
+        hints = get_type_hints(func.__init__ if inspect.isclass(func) else func)
+    except (NameError, TypeError):  # a user's annotations may name what cannot be resolved here
+        return
+    for name, value in params.items():
+        expected = _mismatch(value, hints.get(name, Any))
+        if expected:
+            raise ConfigError(f"{label}.params.{name}", value, expected)
+
+
+def _mismatch(value: Any, hint: Any) -> str:
+    """What an annotation expects where a value from YAML does not fit it; empty where it fits or nobody can tell."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        problems = [_mismatch(value, option) for option in inner]
+        return "" if "" in problems else " or ".join(problems)
+    if origin in (list, Sequence) and not isinstance(value, str):
+        if not isinstance(value, list | tuple):
+            return f"a list, such as [{value}, {value}]"
+        return next((f"a list, each of it {p}" for p in (_mismatch(v, inner[0]) for v in value) if p), "")
+    names = {float: "a number", int: "an integer", bool: "true or false", str: "a name", type(None): "null"}
+    if hint not in names:
+        return f"a list of {names.get(inner[0], 'values')}" if origin in (list, Sequence) else ""
+    fits = isinstance(value, int | float) if hint is float else isinstance(value, hint)
+    return "" if fits and (hint is bool or not isinstance(value, bool)) else names[hint]
 
 
 def build_instance(label: str, cls: Callable[..., Any], env: EnvView, params: dict[str, Any]) -> Any:
@@ -144,15 +175,22 @@ def build_instance(label: str, cls: Callable[..., Any], env: EnvView, params: di
         TermError: It raised an error of its own.
     """
     try:
-        return cls(env, **params)
+        instance = cls(env, **params)
     except ParameterError as error:
-        name, value, expected, fix = error.facts
-        raise ConfigError(f"{label}.params.{name}", value, expected, fix) from error
+        raise _located(label, error) from error
     except MjstackError as error:
         raise TermError(label, str(error)) from error
     except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else "no message"
         raise TermError(label, f"raised {type(error).__name__}: {reason}") from error
+    if hasattr(cls, "label"):
+        instance.label = label
+    return instance
+
+
+def _located(label: str, error: ParameterError) -> ConfigError:
+    name, value, expected, fix = error.facts
+    return ConfigError(f"{label}.params.{name}", value, expected, fix)
 
 
 class Term:
@@ -183,6 +221,11 @@ class Term:
             self._reset = getattr(self._call, "reset", None)
         else:
             self._call, self.params_of_call = func, self.params
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether the term keeps something from frame to frame."""
+        return self._reset is not None
 
     def __call__(self, *args: Any) -> Any:
         """Calls the term with the environment, and a mask if it takes one."""
@@ -229,6 +272,8 @@ def first_value(term: Term, env: EnvView, *, dims: tuple[int, ...], boolean: boo
     """
     try:
         value = term(env)
+    except ParameterError as error:
+        raise _located(term.label, error) from error
     except MjstackError as error:
         raise TermError(term.label, str(error)) from error
     except Exception as error:

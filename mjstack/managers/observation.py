@@ -26,6 +26,12 @@ class _Part:
             raise TermError(label, f"clip={list(cfg.clip)}: expected two numbers, the smaller one first")
         self.cfg = cfg
         self.term = Term(label, cfg, env)
+        if self.term.has_memory:
+            raise TermError(
+                label,
+                "has a reset(mask), so it keeps something from frame to frame, and observations are computed twice where a "
+                "world resets: use history, or keep it in a reward or termination term",
+            )
         value = first_value(self.term, env, dims=(1, 2))
         self.width = 1 if value.dim() == 1 else value.shape[1]
         self.dim = self.width * cfg.history
@@ -77,9 +83,7 @@ class ObservationManager:
 
     def refresh(self, mask: torch.Tensor) -> dict[str, torch.Tensor]:
         """Computes the masked worlds anew after their reset; their whole history becomes the first frame."""
-        for group, parts in self._parts.items():
-            for part in parts.values():
-                part.term.reset(mask)
+        for group in self._parts:
             self._write(group, mask)
         return self.groups
 

@@ -9,7 +9,7 @@ import torch
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
 from mjstack.managers.base import EnvView
-from mjstack.mdp.geometry import robot
+from mjstack.mdp.geometry import named_pose, robot
 
 MODES = ("relative", "absolute", "delta")
 PARTS = ("arm", "gripper", "all")
@@ -18,11 +18,14 @@ PARTS = ("arm", "gripper", "all")
 class JointPosition(ActionTerm):
     """Position commands of some joints, kept within the actuators' ranges.
 
-    ``relative``: home plus ``scale`` times the action. ``absolute``: the action itself [rad, m]. ``delta``: the last
-    command plus ``scale`` times the action. Actions of the first and the last kind count from -1 to 1.
+    ``relative``: a pose of the robot's, home by default, plus ``scale`` times the action. ``absolute``: the action itself
+    [rad, m]. ``delta``: the last command plus ``scale`` times the action. Actions of the first and the last kind count from
+    -1 to 1.
     """
 
-    def __init__(self, env: EnvView, *, joints: str | list[str], mode: str = "relative", scale: float = 1.0) -> None:
+    def __init__(
+        self, env: EnvView, *, joints: str | list[str], mode: str = "relative", scale: float = 1.0, pose: str = "home"
+    ) -> None:
         """Chooses joints.
 
         Args:
@@ -30,6 +33,7 @@ class JointPosition(ActionTerm):
             joints: ``arm``, ``gripper``, ``all``, or names of joints.
             mode: One of `MODES`.
             scale: Command for an action of 1 [rad, m]; not used by ``absolute``.
+            pose: ``home`` or ``start``: what ``relative`` counts from.
 
         Raises:
             MjstackError: A joint or mode does not exist, or the scale is not finite.
@@ -48,13 +52,16 @@ class JointPosition(ActionTerm):
                 if name not in names:
                     raise UnknownName("action joint", name, names)
             chosen = [names.index(name) for name in joints]
+            if not chosen or len(set(chosen)) < len(chosen):
+                raise ParameterError("joints", joints, "at least one joint, each once")
         tensors = robot(env)
         self._ctrl = env.sim.ctrl
         self._mode, self._scale = mode, scale
-        self._columns, self._home = tensors.ctrl[chosen], tensors.home[chosen]
+        self._columns, self._pose = tensors.ctrl[chosen], named_pose(env, pose)[chosen]
         self._low, self._high = tensors.ctrl_range[chosen].unbind(1)
         self.dim = len(chosen)
-        self.low, self.high = (self._low, self._high) if mode == "absolute" else _unit_bounds(self.dim, self._home)
+        self.actuators = tuple(env.index.ctrl[chosen].tolist())
+        self.low, self.high = (self._low, self._high) if mode == "absolute" else _unit_bounds(self.dim, self._pose)
         self.unit = "rad, m" if mode == "absolute" else "-1 to 1"
 
     def write_commands(self, action: torch.Tensor) -> None:
@@ -62,7 +69,7 @@ class JointPosition(ActionTerm):
         if self._mode == "absolute":
             command = action
         elif self._mode == "relative":
-            command = self._home + self._scale * action.clamp(-1.0, 1.0)
+            command = self._pose + self._scale * action.clamp(-1.0, 1.0)
         else:
             command = self._ctrl.index_select(1, self._columns) + self._scale * action.clamp(-1.0, 1.0)
         self._ctrl[:, self._columns] = torch.clamp(command, self._low, self._high)
@@ -77,6 +84,7 @@ class Gripper(ActionTerm):
         self._ctrl, self._columns = env.sim.ctrl, tensors.ctrl[env.index.n_arm :]
         self._closed, self._opening = tensors.gripper_closed, tensors.gripper_open - tensors.gripper_closed
         self.dim = 1
+        self.actuators = tuple(env.index.ctrl[env.index.n_arm :].tolist())
         self.low, self.high = _unit_bounds(1, tensors.home)
 
     def write_commands(self, action: torch.Tensor) -> None:
@@ -88,7 +96,8 @@ class EndEffectorDelta(ActionTerm):
     """Moves the commanded aperture centre by ``scale`` times the action in x, y and z, by batched inverse kinematics.
 
     It starts from the last command, not from the measured joints, so that the arm does not sag by its servo error at every
-    frame; and it keeps no target of its own, so that nothing winds up at the edge of the reach.
+    frame; and it keeps no target of its own, so that nothing winds up at the edge of the reach. The gripper's last command
+    counts too: where a jaw swings, as SO-101's does, closing it moves the aperture centre, by up to 16 mm there.
     """
 
     def __init__(self, env: EnvView, *, scale: float, iterations: int = 8) -> None:
@@ -113,6 +122,7 @@ class EndEffectorDelta(ActionTerm):
         self._scale = scale
         self._ik = BatchedIk(env.sim.model, env.cfg.robot, env.nworld, env.device, iterations=iterations)
         self.dim = 3
+        self.actuators = tuple(env.index.ctrl[: env.index.n_arm].tolist())
         self.low, self.high = _unit_bounds(3, tensors.home)
 
     def write_commands(self, action: torch.Tensor) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView
 from mjstack.scene.index import RobotTensors
 
@@ -11,6 +12,20 @@ from mjstack.scene.index import RobotTensors
 def robot(env: EnvView) -> RobotTensors:
     """The robot's columns and limits on the environment's device."""
     return env.index.on(env.device, env.sim.qpos.dtype)
+
+
+POSES = ("home", "start")
+
+
+def named_pose(env: EnvView, pose: str) -> torch.Tensor:
+    """One of the robot's own commands, `POSES`, shape ``(n,)``.
+
+    Raises:
+        ParameterError: There is no such pose.
+    """
+    if pose not in POSES:
+        raise ParameterError("pose", pose, " or ".join(POSES))
+    return getattr(robot(env), pose)
 
 
 def joint_positions(env: EnvView) -> torch.Tensor:

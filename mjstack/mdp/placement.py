@@ -1,8 +1,9 @@
-"""Where cubes can stand: on the table, apart from each other, clear of the arm at home."""
+"""Where cubes can stand: on the table, apart from each other, clear of the arm."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -24,7 +25,15 @@ class Placement:
     """
 
     def __init__(
-        self, cfg: Config, model: mujoco.MjModel, index: SceneIndex, *, region: tuple[float, float], gap: float
+        self,
+        cfg: Config,
+        model: mujoco.MjModel,
+        index: SceneIndex,
+        *,
+        region: tuple[float, float],
+        gap: float,
+        pose: Sequence[float],
+        noise: float = 0.0,
     ) -> None:
         """Finds what could be in the way.
 
@@ -34,6 +43,8 @@ class Placement:
             index: Its addresses.
             region: Half-widths of the region in x and y [m].
             gap: Free room around a cube [m].
+            pose: Where the robot's joints are [rad, m].
+            noise: How far each arm joint may be from there [rad].
         """
         scene = cfg.scene
         half = scene.cube_half
@@ -42,7 +53,13 @@ class Placement:
         self._height = table_top(scene) + half
         nominal = torch.tensor([scene.red_xy, scene.blue_xy], dtype=torch.float64)
         center, room = torch.tensor(scene.table_center[:2]).double(), torch.tensor(scene.table_half[:2]).double() - self._radius
-        self._tensors = [nominal, torch.tensor(region).double(), center, room, self._obstacles(cfg, model, index, region, gap)]
+        self._tensors = [
+            nominal,
+            torch.tensor(region).double(),
+            center,
+            room,
+            self._obstacles(cfg, model, index, region, gap, pose, noise),
+        ]
 
     def to(self, device: torch.device, dtype: torch.dtype) -> None:
         """Moves the constants to where worlds are placed."""
@@ -109,20 +126,30 @@ class Placement:
         return torch.where(both[:, None, None], chosen, 0.0), both
 
     def _obstacles(
-        self, cfg: Config, model: mujoco.MjModel, index: SceneIndex, region: tuple[float, float], gap: float
+        self,
+        cfg: Config,
+        model: mujoco.MjModel,
+        index: SceneIndex,
+        region: tuple[float, float],
+        gap: float,
+        pose: Sequence[float],
+        noise: float,
     ) -> torch.Tensor:
         """Spheres (centre, distance to keep) around the arm's geoms that a cube could come near, shape ``(n, 4)``."""
         data = mujoco.MjData(model)
-        data.qpos[index.robot_qpos] = cfg.robot.home
+        data.qpos[index.robot_qpos] = pose
         mujoco.mj_kinematics(model, data)
         reach = math.sqrt(3.0) * cfg.scene.cube_half + gap
+        joints = [model.joint(name).id for name in cfg.robot.arm_joints]
         spheres = []
         for geom in range(model.ngeom):
             body = model.geom_bodyid[geom]
             collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
             if body == 0 or body in index.bodies.values() or not collides:
                 continue
-            keep = model.geom_rbound[geom] + reach
+            # A joint that is off moves the geom by at most its distance from the joint times the angle.
+            levers = np.linalg.norm(data.xanchor[joints] - data.geom_xpos[geom], axis=1)
+            keep = model.geom_rbound[geom] + reach + noise * levers.sum()
             for xy in (cfg.scene.red_xy, cfg.scene.blue_xy):
                 offset = np.abs(data.geom_xpos[geom] - [*xy, self._height]) - [*region, 0.0]
                 if np.linalg.norm(np.maximum(offset, 0.0)) < keep:

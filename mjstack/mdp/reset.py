@@ -10,19 +10,20 @@ import torch
 from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
-from mjstack.mdp.geometry import pose_w, robot
+from mjstack.mdp.geometry import named_pose, pose_w, robot
 from mjstack.mdp.placement import Placement
 
 
-def home(env: EnvView, mask: torch.Tensor) -> None:
-    """Puts the robot at its home command, at rest. Writes qpos, qvel and ctrl."""
-    tensors = robot(env)
-    _write_robot(env, mask, tensors.home.expand(env.nworld, -1))
+def home(env: EnvView, mask: torch.Tensor, *, pose: str = "home") -> None:
+    """Puts the robot at its home command, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
+    _write_robot(env, mask, named_pose(env, pose).expand(env.nworld, -1))
     env.sim.qvel.masked_fill_(mask[:, None], 0.0)
 
 
 class JointNoise:
     """Adds uniform noise to the robot's joint positions and commands, within the joints' ranges."""
+
+    label = "reset.joints"  # the manager sets the term's own, so that two of them draw different numbers
 
     def __init__(self, env: EnvView, *, arm: float, gripper: float = 0.0) -> None:
         """Takes the half-widths.
@@ -42,13 +43,15 @@ class JointNoise:
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes qpos and ctrl."""
-        noise = random_uniform(env, "reset.joints", self._width.shape[0])
+        noise = random_uniform(env, self.label, self._width.shape[0])
         command = env.sim.ctrl.index_select(1, robot(env).ctrl) + self._width * noise
         _write_robot(env, mask, torch.clamp(command, self._low, self._high))
 
 
 class JitterCubes:
     """Moves each cube a little off the model's own place."""
+
+    label = "reset.cubes"
 
     def __init__(self, env: EnvView, *, xy: float, yaw: float) -> None:
         """Takes the half-widths.
@@ -60,12 +63,13 @@ class JitterCubes:
         """
         _not_negative("xy", xy)
         _not_negative("yaw", yaw)
-        Placement(env.cfg, env.sim.model, env.index, region=(xy, xy), gap=0.0).require_all_free("xy", xy)
+        placement = Placement(env.cfg, env.sim.model, env.index, region=(xy, xy), gap=0.0, pose=env.cfg.robot.home)
+        placement.require_all_free("xy", xy)
         self._xy, self._yaw = xy, yaw
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes qpos."""
-        draw = random_uniform(env, "reset.cubes", 3 * len(env.index.objects))
+        draw = random_uniform(env, self.label, 3 * len(env.index.objects))
         for number, name in enumerate(env.index.objects):
             dx, dy, yaw = draw[:, 3 * number : 3 * number + 3].unbind(1)
             _write_cube(env, mask, name, self._xy * dx, self._xy * dy, self._yaw * yaw)
@@ -74,12 +78,21 @@ class JitterCubes:
 class RandomizeCubes:
     """Puts each cube anywhere in a region around its place where nothing is in its way.
 
-    Both cubes stay on the table, apart from each other, and clear of the arm at home. Each world draws some candidates
-    and takes the first that fits, so that the number of operations is fixed.
+    Both cubes stay on the table, apart from each other, and clear of the arm at its start, joint noise included. Each world
+    draws some candidates and takes the first that fits, so that the number of operations is fixed.
     """
 
+    label = "reset.cubes"
+
     def __init__(
-        self, env: EnvView, *, xy: Sequence[float], yaw: float = math.pi, gap: float = 0.01, candidates: int = 16
+        self,
+        env: EnvView,
+        *,
+        xy: Sequence[float],
+        yaw: float = math.pi,
+        gap: float = 0.01,
+        candidates: int = 16,
+        pose: str = "start",
     ) -> None:
         """Checks that the region has room.
 
@@ -89,6 +102,7 @@ class RandomizeCubes:
             yaw: Half-width of the rotation about z [rad].
             gap: Free room around a cube, for fingers [m].
             candidates: Draws per cube and world.
+            pose: Where the arm is then, ``home`` or ``start``.
 
         Raises:
             ParameterError: A value is out of range, or the region leaves no free place.
@@ -100,13 +114,22 @@ class RandomizeCubes:
         if candidates < 1:
             raise ParameterError("candidates", candidates, "an integer of at least 1")
         self._yaw, self._candidates = yaw, candidates
-        self._placement = Placement(env.cfg, env.sim.model, env.index, region=(xy[0], xy[1]), gap=gap)
+        noise = [term.params.get("arm", 0.0) for term in env.cfg.reset.values() if term.func.endswith(".JointNoise")]
+        self._placement = Placement(
+            env.cfg,
+            env.sim.model,
+            env.index,
+            region=(xy[0], xy[1]),
+            gap=gap,
+            pose=named_pose(env, pose).tolist(),
+            noise=sum(noise),
+        )
         self._placement.require_room("xy", list(xy), candidates)
         self._placement.to(env.device, env.sim.qpos.dtype)
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes qpos."""
-        draws = random_uniform(env, "reset.cubes", 2 * (2 * self._candidates + 1)).view(env.nworld, 2, -1)
+        draws = random_uniform(env, self.label, 2 * (2 * self._candidates + 1)).view(env.nworld, 2, -1)
         offsets = self._placement.choose(draws[..., 1:].reshape(env.nworld, 2, self._candidates, 2))
         for number, name in enumerate(env.index.objects):
             dx, dy = offsets[:, number].unbind(1)
@@ -120,6 +143,8 @@ class CubeMass:
     A cube is a body of its own on a free joint, so that what the compiler derives from the mass scales with it, and need
     not be computed anew.
     """
+
+    label = "reset.mass"
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Takes the smallest and largest factor."""
@@ -138,7 +163,7 @@ class CubeMass:
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes the mass fields."""
-        factors = random_uniform(env, "reset.mass", len(env.index.bodies), self._low, self._high)
+        factors = random_uniform(env, self.label, len(env.index.bodies), self._low, self._high)
         for columns in self._columns.values():
             columns.write(mask, factors)
         self._inverse["body_invweight0"].write(mask, 1.0 / factors)
@@ -147,25 +172,42 @@ class CubeMass:
 
 @uses_fields("geom_friction")
 class CubeFriction:
-    """Draws each cube's sliding friction."""
+    """Draws the sliding friction of each cube, and of the grip.
+
+    MuJoCo takes the larger coefficient of the two geoms in a contact, or that of the geom with the higher priority. So the
+    table, and jaws of the cubes' own priority, get the smallest coefficient, which leaves the cube's draw in force; jaws of
+    higher priority (SO-101's) get a draw of their own, the same for both.
+    """
+
+    label = "reset.friction"
 
     def __init__(self, env: EnvView, *, sliding: Sequence[float]) -> None:
         """Takes the smallest and largest coefficient."""
         self._low, self._high = _bounds("sliding", sliding)
-        self._geoms = [torch.tensor(geoms, device=env.device) for geoms in env.index.geoms.values()]
+        model, device = env.sim.model, env.device
+        cubes = list(env.index.geoms.values())
+        priority = model.geom_priority[cubes[0][0]]
+        bodies = [model.body(name).id for name in env.cfg.robot.jaw_bodies]
+        jaws = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies]
+        above = [g for g in jaws if model.geom_priority[g] > priority]
+        level = [model.geom("table").id, *(g for g in jaws if g not in above)]
+        self._drawn = [torch.tensor(geoms, device=device) for geoms in (*cubes, above) if geoms]
+        self._lowered = torch.tensor(level, device=device)
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes geom_friction."""
-        values = random_uniform(env, "reset.friction", len(self._geoms), self._low, self._high)
         sliding = env.sim.fields["geom_friction"][..., 0]
-        for number, geoms in enumerate(self._geoms):
-            old = sliding.index_select(1, geoms)
-            sliding[:, geoms] = torch.where(mask[:, None], values[:, number, None].to(old.dtype), old)
+        values = random_uniform(env, self.label, len(self._drawn), self._low, self._high).to(sliding.dtype)
+        for number, geoms in enumerate(self._drawn):
+            sliding[:, geoms] = torch.where(mask[:, None], values[:, number, None], sliding.index_select(1, geoms))
+        sliding[:, self._lowered] = torch.where(mask[:, None], self._low, sliding.index_select(1, self._lowered))
 
 
 @uses_fields("actuator_gainprm", "actuator_biasprm")
 class ActuatorGains:
     """Scales the stiffness and damping of each of the robot's position servos by one factor per servo."""
+
+    label = "reset.gains"
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Takes the smallest and largest factor."""
@@ -176,7 +218,7 @@ class ActuatorGains:
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes gains and biases."""
-        factors = random_uniform(env, "reset.gains", len(env.index.ctrl), self._low, self._high)
+        factors = random_uniform(env, self.label, len(env.index.ctrl), self._low, self._high)
         for columns in self._columns:
             columns.write(mask, factors)
 

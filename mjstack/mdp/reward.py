@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
+from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView
 from mjstack.math import lowest_corner
 from mjstack.mdp.geometry import aperture_center, jaw_forces, joint_velocities, pose_w
@@ -19,6 +22,7 @@ def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> to
         scale: Distance over which the reward falls [m].
         height: How far above the object's centre the point is [m].
     """
+    _require_positive("scale", scale)
     offset = pose_w(env, object)[:, :3] - aperture_center(env)
     offset[:, 2] += height
     return 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
@@ -31,11 +35,13 @@ def grasp(env: EnvView, *, object: str, force: float = 0.05) -> torch.Tensor:
 
 def lift(env: EnvView, *, object: str, height: float) -> torch.Tensor:
     """Height of a cube's lowest corner above the table as a fraction of ``height`` [m], from 0 to 1."""
+    _require_positive("height", height)
     return (_above_table(env, object) / height).clamp(0.0, 1.0)
 
 
 def place(env: EnvView, *, a: str, b: str, scale: float) -> torch.Tensor:
     """Nearness of cube ``a`` to its place on cube ``b``, while it is off the table: ``1 - tanh(distance / scale)``."""
+    _require_positive("scale", scale)
     offset = pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
     offset[:, 2] += 2.0 * env.cfg.scene.cube_half
     near = 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
@@ -55,6 +61,11 @@ def action_rate(env: EnvView) -> torch.Tensor:
 def joint_vel(env: EnvView) -> torch.Tensor:
     """Squared joint velocities [rad^2/s^2], summed."""
     return joint_velocities(env).square().sum(1)
+
+
+def _require_positive(name: str, value: float) -> None:
+    if not 0.0 < value < math.inf:
+        raise ParameterError(name, value, "a positive number")
 
 
 def _above_table(env: EnvView, name: str) -> torch.Tensor:

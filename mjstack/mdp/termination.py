@@ -15,6 +15,8 @@ from mjstack.sim import LOST_PHYSICS
 
 def time_out(env: EnvView, *, frames: int) -> torch.Tensor:
     """After this many frames."""
+    if frames < 1:
+        raise ParameterError("frames", frames, "an integer of at least 1")
     return env.frame >= frames
 
 

@@ -26,6 +26,7 @@ class RobotTensors:
         range: Joint limits [rad, m], shape ``(n, 2)``.
         ctrl_range: Limits of the commands, shape ``(n, 2)``.
         home: Home command, shape ``(n,)``.
+        start: Start of environments, clear of the table, shape ``(n,)``.
         gripper_open: Command of the open gripper, shape ``(n_gripper,)``.
         gripper_closed: Likewise closed.
     """
@@ -36,6 +37,7 @@ class RobotTensors:
     range: torch.Tensor
     ctrl_range: torch.Tensor
     home: torch.Tensor
+    start: torch.Tensor
     gripper_open: torch.Tensor
     gripper_closed: torch.Tensor
 
@@ -93,6 +95,7 @@ class SceneIndex:
                 self.robot_range,
                 self.ctrl_range,
                 self._robot.home,
+                self._robot.start,
                 self._robot.gripper_open,
                 self._robot.gripper_closed,
             )

@@ -215,7 +215,13 @@ class NativeSimulation(FixedViews):
         # matter to it: the whole state is loaded. Taking the next item is atomic under the interpreter lock.
         queue = iter(worlds)
         jobs = [self._pool.submit(work, worker, queue) for worker in self._workers]
-        wait(jobs)
+        try:
+            wait(jobs)
+        except BaseException:  # Ctrl-C: nobody may write into the state, or use a thread's data, after this call has ended
+            for _ in queue:
+                pass
+            wait(jobs)
+            raise
         for job in jobs:
             job.result()
 

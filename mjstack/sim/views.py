@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import torch
 
-from mjstack.errors import ArgumentError, RebindError
+from mjstack.errors import ArgumentError, MissingField, RebindError
 
 
 class Fields(Mapping[str, torch.Tensor]):
@@ -17,9 +17,7 @@ class Fields(Mapping[str, torch.Tensor]):
 
     def __getitem__(self, name: str) -> torch.Tensor:
         if name not in self._tensors:
-            raise KeyError(
-                f"{name} is not a per-world field of this simulation: name it in fields when the simulation is made."
-            )
+            raise MissingField(name)
         return self._tensors[name]
 
     def __setitem__(self, name: str, value: torch.Tensor) -> None:

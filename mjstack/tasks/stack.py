@@ -249,7 +249,8 @@ class StackSuccess:
         return (self._held >= t.window) & rest & (gripper_opening(env) >= self._open).all(1)
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Forgets the masked worlds. What a diverged world has left, a maximum would keep for ever."""
+        """Forgets the masked worlds.
+
+        What they leave in the ring does not matter: every slot is written anew before `_held` can reach the window.
+        """
         self._held.masked_fill_(mask, 0)
-        for ring in (self._pos, self._quat, self._energy, self._far, self._turned):
-            ring.masked_fill_(mask.view(-1, *[1] * (ring.dim() - 1)), 0.0)

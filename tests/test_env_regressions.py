@@ -1,0 +1,223 @@
+"""Mistakes that were made once: each of these failed before it was mended."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable
+
+import mujoco
+import pytest
+import torch
+
+import mjstack
+from mjstack.config.schema import ObservationTermCfg, TermCfg
+from mjstack.envs import Env, build_env
+from mjstack.errors import ConfigError, FaultError, MissingField, TermError
+from mjstack.gates.gate import GateContext
+
+
+def native(*overrides: str, nworld: int = 2) -> Env:
+    return mjstack.make_env(["sim=native", *overrides], nworld=nworld)
+
+
+def zeros(env: Env) -> torch.Tensor:
+    return torch.zeros((env.nworld, env.action_manager.action_dim))
+
+
+def test_an_action_with_a_gradient_leaves_none_behind() -> None:
+    env = native()
+    env.reset(seed=0)
+    weight = torch.full_like(zeros(env), 0.1, requires_grad=True)
+    env.step(2.0 * weight)
+    _, reward, *_ = env.step(zeros(env))
+    for tensor in (reward, env.action, env.sim.ctrl, env.sim.qpos):
+        assert not tensor.requires_grad
+
+
+class Counter:
+    """Counts its calls per world: a memory."""
+
+    def __init__(self, env: Env) -> None:
+        self.count = torch.zeros(env.nworld)
+
+    def __call__(self, env: Env) -> torch.Tensor:
+        self.count += 1.0
+        return self.count
+
+    def reset(self, mask: torch.Tensor) -> None:
+        self.count.masked_fill_(mask, 0.0)
+
+
+def test_an_observation_with_a_memory_is_refused() -> None:
+    cfg = mjstack.load_config(["sim=native"])
+    cfg.observation["policy"].terms["counter"] = ObservationTermCfg(func=f"{__name__}.Counter")
+    with pytest.raises(TermError, match=r"observation\.policy\.terms\.counter: has a reset\(mask\).*use history"):
+        build_env(cfg, nworld=1)
+
+
+def test_a_reset_after_an_overflow_counts_the_start_alone() -> None:
+    """Most contacts of a run are more than those of its start."""
+    env = mjstack.make_env(["sim=mjwarp", "sim.device=cpu", "batch.naconmax=54", "reset=nominal"], nworld=2)
+    env.reset(seed=0)
+    env.sim.peak_pool.fill_(1000)
+    env.reset(seed=0)
+
+
+def test_an_overflow_names_the_size_that_is_in_force() -> None:
+    env = mjstack.make_env(["sim=mjwarp", "sim.device=cpu", "batch.naconmax=40", "reset=randomized"], nworld=2)
+    env.reset(seed=0)
+    env.sim.overflow.fill_(8)  # NARROWPHASE; latched as if a step had raised it
+    env._overflow |= 8
+    env.sim.peak_pool.fill_(77)
+    with pytest.raises(FaultError, match=r"Raise batch\.naconmax \(naconmax=40; all worlds together needed 77"):
+        env.raise_faults()
+
+
+def test_ctrl_c_leaves_no_thread_at_work(stage: Callable[[str], GateContext]) -> None:
+    from mjstack.sim.native import NativeSimulation
+
+    sim = NativeSimulation(stage("so101").model, 64, nthread=2)
+    timer = threading.Timer(0.2, lambda: signal.raise_signal(signal.SIGINT))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            sim.step(2000)
+        held = sim.qpos.clone()
+        time.sleep(0.3)
+        assert torch.equal(sim.qpos, held)
+    finally:
+        timer.join()
+        signal.signal(signal.SIGINT, before)
+    sim.close()
+
+
+@pytest.mark.parametrize("robot", ["so101", "rebot"])
+def test_drawn_friction_is_that_of_the_contact(robot: str) -> None:
+    """MuJoCo combines two geoms' coefficients, so a field alone says little."""
+    env = native(f"robot={robot}", "reset=randomized", "reset.friction.params.sliding=[0.3,0.5]", nworld=8)
+    env.reset(seed=0)
+    model, grips = env.sim.model, set()
+    data = mujoco.MjData(model)
+    table = model.geom("table").id
+    for w in range(env.nworld):
+        model.geom_friction[:] = env.sim.fields["geom_friction"][w].numpy()
+        data.qpos[:] = env.sim.qpos[w].numpy()
+        red = env.index.cube_qpos[0]
+        # One cube in the jaws, the other one on the table.
+        data.qpos[red : red + 3] = (0.5 * env.sim.site_xpos[w, env.index.aperture_sites].sum(0)).numpy()
+        mujoco.mj_forward(model, data)
+        cubes = {geoms[0]: name for name, geoms in env.index.geoms.items()}
+        for contact in data.contact:
+            pair = set(contact.geom.tolist())
+            cube = next((g for g in pair if g in cubes), None)
+            if cube is None:
+                continue
+            (other,) = pair - {cube}
+            if other == table:
+                assert contact.friction[0] == pytest.approx(float(env.sim.fields["geom_friction"][w, cube, 0]))
+            else:
+                grips.add(round(float(contact.friction[0]), 6))
+    assert len(grips) > 1 or robot == "rebot"  # the reBot's open fingers do not touch the cube
+    assert all(0.3 <= friction <= 0.5 for friction in grips)
+
+
+@pytest.mark.parametrize("robot", ["so101", "rebot"])
+def test_randomized_starts_touch_nothing(robot: str) -> None:
+    env = native(f"robot={robot}", "reset=randomized", nworld=64)
+    env.reset(seed=3)
+    data = mujoco.MjData(env.sim.model)
+    cubes = {geom for geoms in env.index.geoms.values() for geom in geoms}
+    for qpos in env.sim.qpos:
+        data.qpos[:] = qpos.numpy()
+        mujoco.mj_forward(env.sim.model, data)
+        for contact in data.contact:
+            pair = set(contact.geom.tolist())
+            assert pair & cubes, [env.sim.model.geom(g).name for g in pair]
+
+
+def test_action_zero_holds_the_start() -> None:
+    env = native("task=stack", "action=joint_relative", "reset=randomized", "~reset.joints", "~reset.gains")
+    env.reset(seed=0)
+    begin = env.sim.qpos[:, :5].clone()
+    for _ in range(50):
+        env.step(torch.cat((torch.zeros((2, 5)), torch.ones((2, 1))), dim=1))
+    assert (env.sim.qpos[:, :5] - begin).abs().max() < 0.03
+
+
+def test_two_terms_of_one_class_draw_different_numbers() -> None:
+    once = native("reset=nominal", "+reset.a={func: mjstack.mdp.reset.JointNoise, params: {arm: 0.01}}")
+    twice = native(
+        "reset=nominal",
+        "+reset.a={func: mjstack.mdp.reset.JointNoise, params: {arm: 0.01}}",
+        "+reset.b={func: mjstack.mdp.reset.JointNoise, params: {arm: 0.01}}",
+    )
+    plain = native("reset=nominal")
+    for env in (once, twice, plain):
+        env.reset(seed=0)
+    first, both = once.sim.ctrl - plain.sim.ctrl, twice.sim.ctrl - plain.sim.ctrl
+    assert not torch.allclose(both, 2.0 * first, atol=1e-6)
+
+
+def test_a_diverged_world_leaves_no_nan_behind() -> None:
+    env = native("task=reach")
+    env.reset(seed=0)
+    env.sim.qvel[1, 0] = float("nan")
+    obs, reward, terminated, _, extras = env.step(zeros(env))
+    assert terminated.tolist() == [False, True]
+    assert reward[1] == 0.0
+    for group in (*obs.values(), *extras["final_obs"].values()):
+        assert torch.isfinite(group).all()
+
+
+def test_episode_length_is_the_time_out_terms() -> None:
+    assert native("termination.time_out.params.frames=50").max_episode_frames == 50
+    assert native("~termination.time_out").max_episode_frames == 600
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["reset=randomized", "reset.cubes.params.xy=0.05"], "reset.cubes.params.xy=0.05: expected a list"),
+        (["reset=randomized", "reset.mass.params.scale=2"], "reset.mass.params.scale=2: expected a list"),
+        (["reward.reach.params.scale=abc"], "reward.reach.params.scale=abc: expected a number"),
+        (["reward.reach.params.scale=0"], "reward.reach.params.scale=0: expected a positive number"),
+        (["reward.lift.params.height=-1"], "reward.lift.params.height=-1: expected a positive number"),
+        (["termination.time_out.params.frames=0"], "termination.time_out.params.frames=0: expected an integer of at least 1"),
+        (["action=ee_delta", "action.arm.params.iterations=2.5"], "action.arm.params.iterations=2.5: expected an integer"),
+        (["action.arm.params.joints=[shoulder_pan,shoulder_pan]"], "action.arm.params.joints"),
+    ],
+)
+def test_parameter_values_are_checked(overrides: list[str], words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        native(*overrides)
+    assert words in str(caught.value)
+
+
+def test_two_actions_on_one_actuator_are_refused() -> None:
+    with pytest.raises(TermError, match=r"action\.gripper: drives actuator 5, which action\.arm drives too"):
+        native("action.arm.params.joints=all")
+
+
+def test_a_value_function_is_no_reset_term() -> None:
+    cfg = mjstack.load_config(["sim=native"])
+    cfg.reset["x"] = TermCfg(func="mjstack.mdp.reward.success")
+    with pytest.raises(TermError, match=r"reset\.x: success does not take .* expected \(env, mask, \*, \.\.\.\)"):
+        build_env(cfg, nworld=1)
+
+
+def test_keys_that_can_be_added_say_how() -> None:
+    with pytest.raises(mjstack.MjstackError, match=r"To add it, write \+reward\.grasp\.params\.force=\.\.\."):
+        native("reward.grasp.params.force=0.5")
+
+
+def test_a_closed_environment_and_a_missing_field_say_so() -> None:
+    env = native()
+    with pytest.raises(MissingField, match="uses_fields"):
+        env.sim.fields["body_mass"]
+    env.close()
+    for call in (lambda: env.step(zeros(env)), env.reset):
+        with pytest.raises(mjstack.MjstackError, match="close"):
+            call()
