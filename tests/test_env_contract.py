@@ -399,13 +399,16 @@ def test_every_action_group_steps(backend: str, robot: str, action: str) -> None
     ctrl = torch.as_tensor(env.index.ctrl).to(env.device)
     limits = torch.as_tensor(env.index.ctrl_range).to(env.sim.ctrl)
     home = torch.as_tensor(env.cfg.robot.home).to(env.sim.ctrl)
+    start = torch.as_tensor(env.cfg.robot.start).to(env.sim.ctrl)
     before = env.sim.ctrl[:, ctrl].clone()
     torch.testing.assert_close(before, home.expand(3, -1))
     rest = torch.zeros((3, manager.action_dim), device=env.device)
     if action == "joint_absolute":
         rest[:] = home
     env.step(rest)  # the arm's commands stay where they are
-    torch.testing.assert_close(env.sim.ctrl[:, ctrl[:n_arm]], before[:, :n_arm], rtol=0, atol=1e-4)
+    held = start.expand(3, -1) if action == "joint_relative" else before  # relative commands count from the start
+    torch.testing.assert_close(env.sim.ctrl[:, ctrl[:n_arm]], held[:, :n_arm], rtol=0, atol=1e-4)
+    before = env.sim.ctrl[:, ctrl].clone()
     for move in actions(env, 6):
         assert_layout(env, returned(env.step(move)))
         assert_same_run(env.action, move.to(env.action.dtype), backend)
@@ -416,7 +419,7 @@ def test_every_action_group_steps(backend: str, robot: str, action: str) -> None
         if action == "joint_delta":
             assert (moved <= scale + 1e-6).all()
         if action == "joint_relative":
-            expected = (home[:n_arm] + scale * move[:, :n_arm]).clamp(limits[:n_arm, 0], limits[:n_arm, 1])
+            expected = (start[:n_arm] + scale * move[:, :n_arm]).clamp(limits[:n_arm, 0], limits[:n_arm, 1])
             torch.testing.assert_close(command[:, :n_arm], expected.to(command))
         if action == "joint_absolute":
             torch.testing.assert_close(command, move.to(command))
