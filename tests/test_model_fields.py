@@ -136,7 +136,7 @@ def test_fields_keep_their_address(backend: str, make_fields: Make) -> None:
     assert {name: field.data_ptr() for name, field in sim.fields.items()} == before
     with pytest.raises(RebindError, match=r"^sim\.fields\['body_mass'\] is a view .* write sim\.fields\['body_mass'\]\[:\] = "):
         sim.fields["body_mass"] = torch.zeros(N)
-    with pytest.raises(KeyError, match="geom_size.* is not a per-world field of this simulation"):
+    with pytest.raises(KeyError, match=r"geom_size.* is not a per-world field of this simulation"):
         sim.fields["geom_size"]
 
 
