@@ -23,7 +23,7 @@ from rich.table import Table
 
 from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, own_hydra, to_config
 from mjstack.errors import MjstackError
-from mjstack.job import JobOutcome, check_machine, run_job
+from mjstack.jobs import JobOutcome, check_job, run_job
 from mjstack.report.markdown import escape_cell
 from mjstack.report.record import Status
 
@@ -49,7 +49,7 @@ def run(args: list[str]) -> int:
         for job in _expand(overrides) if sweep else [overrides]:
             config = to_config(compose_overrides([o for o in job if not _is_hydra(o)]))
             if not dry:
-                check_machine(config)
+                check_job(config)
         if not dry:
             check_writable(_output_folder(overrides, sweep))
     except MjstackError as error:

@@ -10,7 +10,7 @@ import pytest
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config, ModelSource
 from mjstack.errors import MjstackError
-from mjstack.job import check_machine
+from mjstack.jobs.gates import check_machine
 
 CONF = Path(next(iter(mjstack.conf.__path__)))
 GATE_FILES = sorted(path.stem for path in (CONF / "gate").glob("*.yaml"))

@@ -22,7 +22,8 @@ LAYERS = [
     {"tasks"},
     {"envs"},
     {"adapters", "gates"},
-    {"job", "benchmark"},
+    {"benchmark"},
+    {"jobs"},
     {"cli"},
 ]
 LEAVES = {"report": {"errors", "report"}}  # anything may import it, and it imports only these
@@ -32,13 +33,13 @@ HOMES = {
     "mink": ("kinematics/mink_ik.py",),
     "mujoco_menagerie": ("robots/source.py",),
     "hydra": ("config/", "cli.py"),
-    "omegaconf": ("config/", "cli.py", "job.py"),
+    "omegaconf": ("config/", "cli.py", "jobs/"),
     "matplotlib": ("report/picture.py",),
     "imageio_ffmpeg": ("report/picture.py",),
     "gymnasium": ("adapters/",),
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),
-    "rich": ("job.py", "cli.py", "benchmark.py", "managers/base.py"),
+    "rich": ("jobs/", "cli.py", "benchmark.py", "managers/base.py"),
 }
 
 

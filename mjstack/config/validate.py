@@ -9,6 +9,7 @@ from mjstack.config.schema import Config
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput")
+JOBS = ("gates",)
 ANCHORS = ("red", "blue", "on_blue")
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
@@ -24,8 +25,8 @@ def validate(cfg: Config) -> None:
     for name in cfg.gates:
         if name not in GATES:
             raise UnknownName("gate", name, GATES)
-    if cfg.job.name != "gates":
-        raise UnknownName("job", cfg.job.name, ["gates"])
+    if cfg.job.name not in JOBS:
+        raise UnknownName("job", cfg.job.name, JOBS)
     if not _DEVICE.fullmatch(cfg.sim.device):
         raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N")
     _timing(cfg)

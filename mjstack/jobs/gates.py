@@ -1,4 +1,4 @@
-"""One job: a configuration and a folder in, gates run, a report left behind."""
+"""Job *gates*: a configuration and a folder in, gates run, a report left behind."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 import os
 import sys
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
@@ -14,7 +13,6 @@ import numpy as np
 from omegaconf import OmegaConf
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from mjstack.config.schema import Backend, Config
@@ -24,6 +22,8 @@ from mjstack.errors import ConfigError, MjstackError
 from mjstack.gates.episode import FrameHook
 from mjstack.gates.gate import GateContext
 from mjstack.gates.runner import run_gates
+from mjstack.jobs.outcome import STATUS_COLOR, JobOutcome
+from mjstack.jobs.progress import ProgressBar
 from mjstack.report.markdown import headline
 from mjstack.report.picture import require_video, save_pictures, save_video
 from mjstack.report.provenance import collect_provenance
@@ -31,23 +31,6 @@ from mjstack.report.record import GateResult, Report, Status
 from mjstack.sim import Simulation, cuda_driver, cuda_name, resolve_backend
 
 log = logging.getLogger(__name__)
-
-_COLOR = {Status.passed: "green", Status.failed: "red", Status.skipped: "yellow", Status.interrupted: "red"}
-
-
-@dataclass(kw_only=True, slots=True)
-class JobOutcome:
-    """How a job ended."""
-
-    status: Status
-    folder: Path
-    overrides: list[str]
-    gates: list[GateResult] = field(default_factory=list)
-
-    @property
-    def exit_code(self) -> int:
-        """0 pass, 1 a gate failed, 130 interrupted."""
-        return {Status.passed: 0, Status.interrupted: 130}.get(self.status, 1)
 
 
 def check_machine(cfg: Config) -> None:
@@ -72,7 +55,7 @@ def check_machine(cfg: Config) -> None:
             raise
 
 
-def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
+def run_gates_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
     """Runs the gates of one configuration and writes its report after each.
 
     Args:
@@ -95,7 +78,7 @@ def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
         )
         report = Report(provenance=_provenance(cfg, context))
         report.write(folder)
-        with _ProgressBar(console) as bar:
+        with ProgressBar(console) as bar:
             context.say, context.advance = bar.say, bar.advance
             context.on_frame = _viewer(context) if cfg.view else None
             run_gates(context, bar.start, lambda result: _record(report, result, folder, bar))
@@ -123,7 +106,7 @@ def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
     return outcome
 
 
-def _record(report: Report, result: GateResult, folder: Path, bar: _ProgressBar) -> None:
+def _record(report: Report, result: GateResult, folder: Path, bar: ProgressBar) -> None:
     report.gates.append(result)
     report.write(folder)
     bar.finish(result)
@@ -192,71 +175,11 @@ def _print_summary(console: Console, report: Report, folder: Path) -> None:
     table.add_column("s", justify="right")
     table.add_column("what it says", overflow="fold")
     for gate in report.gates:
-        color = _COLOR[gate.status]
+        color = STATUS_COLOR[gate.status]
         table.add_row(gate.name, f"[{color}]{gate.status.value}[/]", f"{gate.seconds:.1f}", escape(headline(gate)))
     console.print(table)
     console.print(f"report: {escape(str(folder))}/report.md", soft_wrap=True)
     for gate in report.gates:
         if gate.status is Status.skipped:
             console.print(f"skipped: {gate.name}: {escape(gate.reason)}", soft_wrap=True)
-    console.print(f"status: [{_COLOR[report.status]}]{report.status.value}[/]")
-
-
-class _ProgressBar:
-    """A bar per gate with rate and time left on a terminal; a line now and then elsewhere."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[unit]}"),
-            TextColumn("{task.fields[rate]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._gate, self._unit = "", ""
-        self._task: TaskID | None = None
-        self._began = self._spoke = time.monotonic()
-
-    def __enter__(self) -> _ProgressBar:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def say(self, line: str) -> None:
-        self._progress.console.print(line, soft_wrap=True)
-
-    def start(self, gate: str) -> None:
-        self._gate = gate
-        self._drop()
-        self._task = self._progress.add_task(gate, total=1, unit="", rate="starting (MJWarp compiles at its first use)")
-        self._spoke = time.monotonic()
-
-    def advance(self, unit: str, done: int, total: int) -> None:
-        now = time.monotonic()
-        if unit != self._unit or done <= 1 or self._task is None:
-            self._drop()
-            self._unit, self._began = unit, now
-            self._task = self._progress.add_task(f"{self._gate}: {unit}", total=total, unit="", rate="")
-        rate = f"{done / (now - self._began):.1f}/s" if now > self._began and done > 1 else ""
-        self._progress.update(self._task, completed=done, rate=rate)
-        if self._progress.disable and now - self._spoke > 15.0:
-            self._spoke = now
-            left = (total - done) * (now - self._began) / max(done, 1)
-            self.say(f"{self._gate}: {unit} {done}/{total}, {rate}, {left:.0f} s left")
-
-    def finish(self, result: GateResult) -> None:
-        self._drop()
-        color = _COLOR[result.status]
-        self.say(f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s): {escape(headline(result))}")
-
-    def _drop(self) -> None:
-        if self._task is not None:
-            self._progress.remove_task(self._task)
-            self._task = None
+    console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status.value}[/]")

@@ -1,0 +1,77 @@
+"""Shows how far a job is: a bar on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import time
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from mjstack.jobs.outcome import STATUS_COLOR
+from mjstack.report.markdown import headline
+from mjstack.report.record import GateResult
+
+
+class ProgressBar:
+    """A bar per gate with rate and time left on a terminal; a line now and then elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[unit]}"),
+            TextColumn("{task.fields[rate]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._gate, self._unit = "", ""
+        self._task: TaskID | None = None
+        self._began = self._spoke = time.monotonic()
+
+    def __enter__(self) -> ProgressBar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def say(self, line: str) -> None:
+        """Prints a line above the bar."""
+        self._progress.console.print(line, soft_wrap=True)
+
+    def start(self, gate: str) -> None:
+        """Begins something with a name."""
+        self._gate = gate
+        self._drop()
+        self._task = self._progress.add_task(gate, total=1, unit="", rate="starting (MJWarp compiles at its first use)")
+        self._spoke = time.monotonic()
+
+    def advance(self, unit: str, done: int, total: int) -> None:
+        """Shows how much of something is done."""
+        now = time.monotonic()
+        if unit != self._unit or done <= 1 or self._task is None:
+            self._drop()
+            self._unit, self._began = unit, now
+            self._task = self._progress.add_task(f"{self._gate}: {unit}", total=total, unit="", rate="")
+        rate = f"{done / (now - self._began):.1f}/s" if now > self._began and done > 1 else ""
+        self._progress.update(self._task, completed=done, rate=rate)
+        if self._progress.disable and now - self._spoke > 15.0:
+            self._spoke = now
+            left = (total - done) * (now - self._began) / max(done, 1)
+            self.say(f"{self._gate}: {unit} {done}/{total}, {rate}, {left:.0f} s left")
+
+    def finish(self, result: GateResult) -> None:
+        """Prints a gate's result."""
+        self._drop()
+        color = STATUS_COLOR[result.status]
+        self.say(f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s): {escape(headline(result))}")
+
+    def _drop(self) -> None:
+        if self._task is not None:
+            self._progress.remove_task(self._task)
+            self._task = None
