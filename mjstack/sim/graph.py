@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 _nesting = 0
 _arenas: dict[str, Arena] = {}
 _capture_streams: dict[str, torch.cuda.Stream] = {}
+_side_streams: dict[str, list[torch.cuda.Stream]] = {}
 
 
 def inside_graph() -> bool:
@@ -166,6 +167,32 @@ class StepGraph:
             memory = wp.ScopedAllocator(self._device, arena)
         with _inside(), memory:
             yield
+
+
+def side_by_side(device: torch.device, *works: Callable[[], None]) -> None:
+    """Does independent works: in a CUDA graph that is being captured as parallel branches, else one after the other.
+
+    Args:
+        device: Where they run.
+        works: No one may write what another reads or writes, nor keep a temporary that another one uses.
+    """
+    if device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
+        for work in works:
+            work()
+        return
+    main = torch.cuda.current_stream(device)
+    streams = _side_streams.setdefault(str(device), [])
+    while len(streams) < len(works) - 1:
+        streams.append(torch.cuda.Stream(device))
+    used = streams[: len(works) - 1]
+    for stream in used:
+        stream.wait_stream(main)
+    for stream, work in zip(used, works[1:], strict=True):
+        with torch.cuda.stream(stream), torch_stream_scope(wp.get_device(str(device))):
+            work()
+    works[0]()
+    for stream in used:
+        main.wait_stream(stream)
 
 
 def _recover(device: wp.Device) -> None:
