@@ -77,6 +77,7 @@ class StepGraph:
         self._version, self._culprit = version, culprit
         self._device = wp.get_device(str(device))
         self._replay: Callable[[], None] | None = None
+        self._memory: torch.cuda.MemPool | None = None
         self._warm = self._failed = False
         self._seen = version()
         self.warm_up_seconds = self.capture_seconds = 0.0
@@ -146,10 +147,16 @@ class StepGraph:
         # second Warp object for it would unregister it when freed.
         stream = _capture_streams.setdefault(torch_device, torch.cuda.Stream(torch_device))
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-            scope = torch_stream_scope(self._device)
-            with scope, wp.ScopedCapture(stream=wp.get_stream(self._device), external=True):
-                self._work()
+        # A conditional node makes Warp interrupt the capture, and what goes on after it has another number. By that number
+        # torch knows what to allocate from the graph's own memory, which nobody else gets. So there is a second such pool.
+        self._memory = torch.cuda.MemPool()
+        with (
+            torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+            torch.cuda.use_mem_pool(self._memory),
+            torch_stream_scope(self._device),
+            wp.ScopedCapture(stream=wp.get_stream(self._device), external=True),
+        ):
+            self._work()
         return graph.replay
 
     def _capture_cpu(self) -> Callable[[], None]:

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import fields as dataclass_fields
 from dataclasses import is_dataclass
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -15,16 +16,15 @@ import warp as wp
 from mjstack.config.schema import GraphMode
 from mjstack.errors import UnsupportedModel
 from mjstack.sim.counters import clear_counters, record_convex_contacts, record_usage
+from mjstack.sim.engine import mjw
 from mjstack.sim.fields import PLACING_FIELDS, check_fields
-from mjstack.sim.graph import StepGraph, inside_graph
+from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.sim.sizes import BatchSizes
 from mjstack.sim.static_geoms import place_static_geoms
 from mjstack.sim.streams import torch_stream_scope
+from mjstack.sim.substep import can_rearrange, rearranged_step
 from mjstack.sim.views import Fields, FixedViews, check_mask
-
-wp.config.log_level = wp.LOG_ERROR  # before mujoco_warp, which starts Warp on import
-import mujoco_warp as mjw  # noqa: E402
 
 
 class MjwarpSimulation(FixedViews):
@@ -87,6 +87,7 @@ class MjwarpSimulation(FixedViews):
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
+            self._rearranged = can_rearrange(model, self._m)
             self._contacts = wp.zeros(nworld, dtype=int)
             self._peak_nefc = wp.zeros(nworld, dtype=int)
             self._peak_contacts = wp.zeros(nworld, dtype=int)
@@ -234,11 +235,20 @@ class MjwarpSimulation(FixedViews):
 
     def _substeps(self, n: int, kinematics: bool) -> None:
         self._place()
-        for _ in range(n):
-            mjw.step(self._m, self._d)
-            self._count(steps=1)
-        if kinematics:
-            self._pose()
+        count = partial(self._count, steps=1)
+        if not self._rearranged:
+            for _ in range(n):
+                mjw.step(self._m, self._d)
+                count()
+            if kinematics:
+                self._pose()
+            return
+        # What a step has used is counted while the next one begins, which touches neither contacts nor rows.
+        beside: tuple[Callable[[], None], ...] = ()
+        for i in range(n):
+            rearranged_step(self._m, self._d, self.device, sensors=i == n - 1, beside_kinematics=beside)
+            beside = (count,)
+        side_by_side(self.device, *((self._pose,) if kinematics else ()), *beside)
 
     def _pose(self) -> None:
         """Poses of the current qpos, and nothing that a later step would start from: its forward computes them anew."""
