@@ -407,7 +407,7 @@ class Env:
         on_cuda = broken.is_cuda
         done = ends.terminated | ends.truncated
         # On CUDA, where looking would stop the device, worlds are always reset: those of an empty mask, if need be.
-        ending = bool(ends.names) and (on_cuda or bool(done.any()))
+        ending = len(ends.names) > 0 and (on_cuda or bool(done.any()))
 
         def hand_out() -> None:
             out["success"].copy_(self.success)

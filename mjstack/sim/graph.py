@@ -6,7 +6,7 @@ import gc
 import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 
 import torch
 import warp as wp
@@ -19,7 +19,8 @@ from mjstack.sim.streams import torch_stream_scope
 log = logging.getLogger(__name__)
 
 _nesting = 0
-_arenas: dict[str, Arena] = {}
+# What a broken capture leaves: torch counts its memory as in use for ever, and aborts when it is destroyed.
+_abandoned: list[tuple[torch.cuda.CUDAGraph, torch.cuda.MemPool]] = []
 _capture_streams: dict[str, torch.cuda.Stream] = {}
 _side_streams: dict[str, list[torch.cuda.Stream]] = {}
 
@@ -77,7 +78,7 @@ class StepGraph:
         self._version, self._culprit = version, culprit
         self._device = wp.get_device(str(device))
         self._replay: Callable[[], None] | None = None
-        self._memory: torch.cuda.MemPool | None = None
+        self._memory: tuple[torch.cuda.MemPool, wp.ScopedAllocator] | None = None
         self._warm = self._failed = False
         self._seen = version()
         self.warm_up_seconds = self.capture_seconds = 0.0
@@ -105,12 +106,12 @@ class StepGraph:
 
     def drop(self) -> None:
         """Forgets the capture: the next call runs eagerly again, and the one after it captures."""
-        self._replay, self._warm, self._failed = None, False, False
+        self._replay, self._memory, self._warm, self._failed = None, None, False, False
         self._seen = self._version()
 
     def _warm_up(self) -> None:
         began = time.perf_counter()
-        with self._scope():
+        with _inside():
             self._work()
             wp.synchronize_device(self._device)  # Warp's temporaries are freed on a stream that torch's do not wait for
         self._warm = True
@@ -123,7 +124,7 @@ class StepGraph:
         collecting = gc.isenabled()
         gc.disable()
         try:
-            with self._scope():
+            with _inside():
                 self._replay = self._capture_cuda() if self._device.is_cuda else self._capture_cpu()
         except Exception as error:
             self._failed = True
@@ -149,14 +150,18 @@ class StepGraph:
         graph = torch.cuda.CUDAGraph()
         # A conditional node makes Warp interrupt the capture, and what goes on after it has another number. By that number
         # torch knows what to allocate from the graph's own memory, which nobody else gets. So there is a second such pool.
-        self._memory = torch.cuda.MemPool()
+        memory = torch.cuda.MemPool()
+        _abandoned.append((graph, memory))
         with (
             torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
-            torch.cuda.use_mem_pool(self._memory),
+            torch.cuda.use_mem_pool(memory),
+            wp.ScopedAllocator(self._device, Arena(self._device)) as arena,
             torch_stream_scope(self._device),
             wp.ScopedCapture(stream=wp.get_stream(self._device), external=True),
         ):
             self._work()
+        _abandoned.pop()
+        self._memory = memory, arena
         return graph.replay
 
     def _capture_cpu(self) -> Callable[[], None]:
@@ -164,16 +169,6 @@ class StepGraph:
             self._work()
         graph = capture.graph
         return lambda: wp.capture_launch(graph)
-
-    @contextmanager
-    def _scope(self) -> Iterator[None]:
-        """Marks the work as a graph's, its temporaries from the arena."""
-        memory: AbstractContextManager = nullcontext()
-        if self._device.is_cuda:
-            arena = _arenas.setdefault(str(self._device), Arena(self._device))
-            memory = wp.ScopedAllocator(self._device, arena)
-        with _inside(), memory:
-            yield
 
 
 def side_by_side(device: torch.device, *works: Callable[[], None]) -> None:
@@ -208,9 +203,3 @@ def _recover(device: wp.Device) -> None:
         torch.cuda.synchronize(wp.device_to_torch(device))
     except RuntimeError:
         log.debug("the first synchronize after a failed capture reports it once more", exc_info=True)
-
-
-def arena_bytes(device: torch.device | str) -> int:
-    """Scratch memory that graphs on a device hold [bytes]."""
-    arena = _arenas.get(str(wp.get_device(str(device))))
-    return 0 if arena is None else arena.size
