@@ -14,7 +14,7 @@ from mjstack.sim import make_simulation
 from mjstack.sim.engine import mjw
 from mjstack.sim.mjwarp import MjwarpSimulation
 from mjstack.sim.sizes import resolve_env_sizes
-from mjstack.sim.substep import can_rearrange
+from mjstack.sim.substep import Arrangement, can_rearrange
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
@@ -33,8 +33,8 @@ def worlds(robot: str, device: str, *overrides: str) -> MjwarpSimulation:
 def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
     """Random commands, cubes thrown about: on the CPU device bit for bit, sensors included."""
     ours, plain = worlds(robot, device), worlds(robot, device)
-    assert ours._rearranged
-    plain._rearranged = False
+    assert ours._can_rearrange
+    plain.arrange(Arrangement(own_stages=False))
     low, high = torch.from_numpy(ours.model.actuator_ctrlrange).float().unbind(1)
     generator = torch.Generator().manual_seed(0)
     most, touched = 0, False

@@ -62,6 +62,7 @@ class StepGraph:
         name: str,
         version: Callable[[], int] = lambda: 0,
         culprit: Callable[[], str] = lambda: "",
+        scratch: Callable[[], bool] = lambda: True,
     ) -> None:
         """Takes the work without running it.
 
@@ -73,12 +74,13 @@ class StepGraph:
             name: What it is called in messages.
             version: A number that changes when the graph has to be captured anew.
             culprit: Names what was running, for the message of a failed capture.
+            scratch: Whether Warp's temporaries come from an `Arena`.
         """
         self._work, self._mode, self._name = work, mode, name
-        self._version, self._culprit = version, culprit
+        self._version, self._culprit, self._scratch = version, culprit, scratch
         self._device = wp.get_device(str(device))
         self._replay: Callable[[], None] | None = None
-        self._memory: tuple[torch.cuda.MemPool, wp.ScopedAllocator] | None = None
+        self._memory: tuple[torch.cuda.MemPool, Arena | None] | None = None
         self._warm = self._failed = False
         self._seen = version()
         self.warm_up_seconds = self.capture_seconds = 0.0
@@ -151,11 +153,12 @@ class StepGraph:
         # A conditional node makes Warp interrupt the capture, and what goes on after it has another number. By that number
         # torch knows what to allocate from the graph's own memory, which nobody else gets. So there is a second such pool.
         memory = torch.cuda.MemPool()
+        arena = Arena(self._device) if self._scratch() else None
         _abandoned.append((graph, memory))
         with (
             torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
             torch.cuda.use_mem_pool(memory),
-            wp.ScopedAllocator(self._device, Arena(self._device)) as arena,
+            wp.ScopedAllocator(self._device, arena),
             torch_stream_scope(self._device),
             wp.ScopedCapture(stream=wp.get_stream(self._device), external=True),
         ):
@@ -171,14 +174,15 @@ class StepGraph:
         return lambda: wp.capture_launch(graph)
 
 
-def side_by_side(device: torch.device, *works: Callable[[], None]) -> None:
+def side_by_side(device: torch.device, *works: Callable[[], None], branches: bool = True) -> None:
     """Does independent works: in a CUDA graph that is being captured as parallel branches, else one after the other.
 
     Args:
         device: Where they run.
         works: No one may write what another reads or writes, nor keep a temporary that another one uses.
+        branches: False for one after the other in any case.
     """
-    if device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
+    if not branches or device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
         for work in works:
             work()
         return

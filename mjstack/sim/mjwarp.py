@@ -23,7 +23,7 @@ from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.sim.sizes import BatchSizes
 from mjstack.sim.static_geoms import place_static_geoms
 from mjstack.sim.streams import torch_stream_scope
-from mjstack.sim.substep import can_rearrange, rearranged_step
+from mjstack.sim.substep import Arrangement, can_rearrange, rearranged_step
 from mjstack.sim.views import Fields, FixedViews, check_mask
 
 
@@ -38,6 +38,7 @@ class MjwarpSimulation(FixedViews):
         peak_pool: Most contacts, broad-phase pairs, and contacts of one kind of convex collision, of all worlds at once since
             the last full reset, shape ``(3,)``, int32. The third bounds what nccdmax must hold.
         version: Grows whenever something changes that a graph has baked in.
+        arrangement: How a captured step is arranged.
         solver_limits: MJWarp's bits for worlds whose solver stopped at an iteration limit, shape ``(nworld,)``, int32.
     """
 
@@ -72,7 +73,7 @@ class MjwarpSimulation(FixedViews):
         self._device = wp.get_device(device)
         self._graph_mode = graph
         self._graphs: dict[tuple[int, bool], StepGraph] = {}
-        self.version = 0
+        self.version, self.arrangement = 0, Arrangement()
         names = check_fields(fields)
         self._placing = not PLACING_FIELDS.isdisjoint(names)
         name = self._device.name if self._device.is_cuda else "Warp's CPU device"
@@ -87,7 +88,7 @@ class MjwarpSimulation(FixedViews):
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
-            self._rearranged = can_rearrange(model, self._m)
+            self._can_rearrange = can_rearrange(model, self._m)
             self._contacts = wp.zeros(nworld, dtype=int)
             self._peak_nefc = wp.zeros(nworld, dtype=int)
             self._peak_contacts = wp.zeros(nworld, dtype=int)
@@ -175,9 +176,14 @@ class MjwarpSimulation(FixedViews):
         }
 
     def bare_step(self) -> Callable[[], None]:
-        """One plain ``mujoco_warp.step``, replayed from a graph of its own: what everything else is measured against."""
+        """One plain ``mujoco_warp.step``, replayed as Warp captures it: what everything else is measured by."""
         graph = StepGraph(
-            lambda: mjw.step(self._m, self._d), self.device, self._graph_mode, name="a bare step", version=lambda: self.version
+            lambda: mjw.step(self._m, self._d),
+            self.device,
+            self._graph_mode,
+            name="a bare step",
+            version=lambda: self.version,
+            scratch=lambda: False,
         )
 
         def step() -> None:
@@ -198,6 +204,11 @@ class MjwarpSimulation(FixedViews):
             for count in (fresh.nacon, fresh.nefc, fresh.ncollision):
                 count.zero_()
         self._d, self.sizes = fresh, sizes
+        self.version += 1
+
+    def arrange(self, arrangement: Arrangement) -> None:
+        """Chooses how a captured step is arranged; for measurements, because the numbers stay the same."""
+        self.arrangement = arrangement
         self.version += 1
 
     def set_options(
@@ -236,7 +247,8 @@ class MjwarpSimulation(FixedViews):
     def _substeps(self, n: int, kinematics: bool) -> None:
         self._place()
         count = partial(self._count, steps=1)
-        if not self._rearranged:
+        arrangement = self.arrangement
+        if not (self._can_rearrange and arrangement.own_stages):
             for _ in range(n):
                 mjw.step(self._m, self._d)
                 count()
@@ -246,9 +258,16 @@ class MjwarpSimulation(FixedViews):
         # What a step has used is counted while the next one begins, which touches neither contacts nor rows.
         beside: tuple[Callable[[], None], ...] = ()
         for i in range(n):
-            rearranged_step(self._m, self._d, self.device, sensors=i == n - 1, beside_kinematics=beside)
+            rearranged_step(
+                self._m,
+                self._d,
+                self.device,
+                sensors=i == n - 1 or not arrangement.sensors_once,
+                branches=arrangement.branches,
+                beside_kinematics=beside,
+            )
             beside = (count,)
-        side_by_side(self.device, *((self._pose,) if kinematics else ()), *beside)
+        side_by_side(self.device, *((self._pose,) if kinematics else ()), *beside, branches=arrangement.branches)
 
     def _pose(self) -> None:
         """Poses of the current qpos, and nothing that a later step would start from: its forward computes them anew."""
@@ -316,6 +335,7 @@ class MjwarpSimulation(FixedViews):
                 self._graph_mode,
                 name=f"step({n})",
                 version=lambda: self.version,
+                scratch=lambda: self.arrangement.scratch,
             )
         return self._graphs[key]
 

@@ -3,12 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import mujoco
 import torch
 
 from mjstack.sim.engine import mjw
 from mjstack.sim.graph import side_by_side
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Arrangement:
+    """What is done to make a captured step faster than MJWarp's own. All of it leaves the numbers as they are.
+
+    Attributes:
+        branches: Contacts beside smooth dynamics, and counting beside the next step's kinematics, as parallel branches.
+        sensors_once: Sensors in the last of several steps alone: nobody sees the others'.
+        own_stages: Only the stages that the model needs: no cameras, lights, tendons, flexes or energy.
+        scratch: Temporaries at fixed addresses (`Arena`), not allocated and freed by the graph.
+    """
+
+    branches: bool = True
+    sensors_once: bool = True
+    own_stages: bool = True
+    scratch: bool = True
 
 
 def can_rearrange(model: mujoco.MjModel, m: mjw.Model) -> bool:
@@ -36,6 +54,7 @@ def rearranged_step(
     device: torch.device,
     *,
     sensors: bool,
+    branches: bool = True,
     beside_kinematics: tuple[Callable[[], None], ...] = (),
 ) -> None:
     """`mujoco_warp.step`, with contacts and smooth dynamics as parallel branches: neither needs the other.
@@ -45,6 +64,7 @@ def rearranged_step(
         d: The worlds.
         device: Where they are.
         sensors: Whether sensordata is computed; of several steps only the last one's is seen.
+        branches: Whether a captured graph gets branches.
         beside_kinematics: Work that may run while the poses are computed.
     """
 
@@ -63,8 +83,8 @@ def rearranged_step(
         mjw.collision(m, d)
         mjw.make_constraint(m, d)
 
-    side_by_side(device, kinematics, *beside_kinematics)
-    side_by_side(device, contacts, dynamics)
+    side_by_side(device, kinematics, *beside_kinematics, branches=branches)
+    side_by_side(device, contacts, dynamics, branches=branches)
     mjw.solve(m, d)
     if sensors:
         d.sensordata.zero_()
