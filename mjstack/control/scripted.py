@@ -65,7 +65,8 @@ class CommandTape:
     def command(self, frame: int) -> torch.Tensor:
         """Commands of one frame, shape ``(nworld, nu)``."""
         first = self._segments[frame]
-        return torch.einsum("k,nku->nu", self._weights[frame], self._knots[:, first : first + self._k])
+        # Not einsum, whose rounding depends on nworld: a world's commands would not be those it gets alone.
+        return (self._weights[frame][:, None] * self._knots[:, first : first + self._k]).sum(1)
 
 
 class ScriptedPlanner:

@@ -24,7 +24,7 @@ from mjstack.jobs.reported import Record, check_showing, run_provenance, run_rep
 from mjstack.report.record import GateResult, Status, Value, write_atomic
 from mjstack.scene import SceneIndex
 from mjstack.sim import resolve_backend, resolve_device
-from mjstack.tasks.stack import describe_rules
+from mjstack.tasks.stack import Rule, describe_rules
 
 KEYS = ("job", "run", "world", "sim", "view", "video")
 """What its command line may set. All else is the earlier run's."""
@@ -209,4 +209,7 @@ def _compare(plan: ReplayPlan, done: ReplayedWorld, backend: Backend, device: st
     ends = f"its cubes end {1e3 * apart:.3g} mm from where they did"
     cuda = device.startswith("cuda") or record.device.startswith("cuda")
     why = ", and runs on CUDA agree to rounding only" if cuda else ""
-    return f"as recorded, but {ends}{why}" if same else f"NOT as recorded ({told}): {ends}{why}"
+    if same:
+        return f"as recorded, but {ends}{why}"
+    pool = ", and a world alone shares no contact pool" if bits & Rule.OVERFLOW else ""
+    return f"NOT as recorded ({told}): {ends}{why}{pool}"
