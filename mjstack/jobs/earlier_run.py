@@ -45,7 +45,9 @@ class EarlierRun:
         try:
             cfg = load_saved(saved)
         except MjstackError as error:
-            raise RunError(f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error}") from error
+            raise RunError(
+                f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error} Use the one that ran it."
+            ) from error
         if cfg.job.name != "gates":
             raise RunError(f"run={name}: is a run of job={cfg.job.name}, expected one of job=gates. Name that run's folder.")
         try:
