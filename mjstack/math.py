@@ -50,8 +50,10 @@ def quat_angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 def quat_z_row(quat: torch.Tensor) -> torch.Tensor:
     """Third row of the rotation matrix: the world-z components of the body's axes, shape ``(..., 3)``."""
-    w, x, y, z = quat.unbind(-1)
-    return torch.stack((2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)), dim=-1)
+    w, xy, z = quat[..., :1], quat[..., 1:3], quat[..., 3:]
+    x, y = quat[..., 1:2], quat[..., 2:3]
+    turned = torch.cat((-y, x), dim=-1)
+    return torch.cat((2.0 * torch.addcmul(xy * z, turned, w), 1.0 - 2.0 * xy.square().sum(-1, keepdim=True)), dim=-1)
 
 
 def lowest_corner(pos: torch.Tensor, quat: torch.Tensor, half: float) -> torch.Tensor:

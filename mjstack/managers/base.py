@@ -6,7 +6,8 @@ import importlib
 import inspect
 import io
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import UnionType
 from typing import Any, Protocol, Union, get_args, get_origin, get_type_hints
 
@@ -31,6 +32,7 @@ class EnvView(Protocol):
         nworld: Number of worlds.
         device: Where tensors live.
         seed: Seed of every random number.
+        key: The same on the device, shape ``(1,)``, int64: what a captured step reads.
         world: Number of each world, shape ``(nworld,)``, int64.
         episode: Episode of each world, shape ``(nworld,)``, int64.
         frame: Frames since each world's last reset, shape ``(nworld,)``, int64.
@@ -45,6 +47,7 @@ class EnvView(Protocol):
     nworld: int
     device: torch.device
     seed: int
+    key: torch.Tensor
     world: torch.Tensor
     episode: torch.Tensor
     frame: torch.Tensor
@@ -88,11 +91,16 @@ def random_uniform(
     Returns:
         Shape ``(nworld, size)``, in the type of the simulation's floats.
     """
+    stream = zlib.crc32(name.encode())
+    if env.device.type == "cuda":
+        from mjstack.sim.draws import draw_uniform  # one kernel; loads Warp, which native runs do not need
+
+        return draw_uniform(
+            key=env.key, stream=stream, world=env.world, episode=env.episode, step=step, size=size, low=low, high=high
+        )
     step = torch.zeros_like(env.world) if step is None else step
-    draw = uniform(
-        seed=env.seed, world=env.world, episode=env.episode, step=step, stream=zlib.crc32(name.encode()), size=size
-    ).to(env.sim.qpos.dtype)
-    return low + 0.5 * (high - low) * (draw + 1.0)
+    draw = uniform(seed=env.seed, world=env.world, episode=env.episode, step=step, stream=stream, size=size)
+    return low + 0.5 * (high - low) * (draw.to(env.sim.qpos.dtype) + 1.0)
 
 
 def resolve_func(label: str, path: str) -> Callable[..., Any]:
@@ -115,7 +123,7 @@ def resolve_func(label: str, path: str) -> Callable[..., Any]:
         names = [
             name for name, value in vars(module).items() if callable(value) and getattr(value, "__module__", "") == module_name
         ]
-        raise TermError(label, f"func={path}: '{attribute}' does not exist. {suggest(attribute, names)}"[:-1])
+        raise TermError(label, f"func={path}: '{attribute}' does not exist. {suggest(attribute, names)}")
     return func
 
 
@@ -136,7 +144,7 @@ def check_params(label: str, func: Callable[..., Any], params: dict[str, Any], l
     names = [p.name for p in accepted]
     for name in params:
         if name not in names:
-            raise TermError(label, f"parameter '{name}' does not exist. {suggest(name, names)}"[:-1])
+            raise TermError(label, f"parameter '{name}' does not exist. {suggest(name, names)}")
     missing = [p.name for p in accepted if p.default is p.empty and p.name not in params]
     if missing:
         raise TermError(label, f"parameter '{missing[0]}' is missing: set {label}.params.{missing[0]}")
@@ -193,6 +201,45 @@ def _located(label: str, error: ParameterError) -> ConfigError:
     return ConfigError(f"{label}.params.{name}", value, expected, fix)
 
 
+class Running:
+    """What terms are doing right now.
+
+    Attributes:
+        label: Dotted configuration key of the term that was called last: the one to name if a capture fails.
+        values: What has been computed from the state that a pass looks at, by what and for whom; None outside a pass.
+    """
+
+    label = ""
+    values: dict[Any, torch.Tensor] | None = None
+
+
+running = Running()
+
+
+@contextmanager
+def one_pass() -> Iterator[None]:
+    """While nothing changes the state: what two terms have in common is computed once."""
+    outer, running.values = running.values, {}
+    try:
+        yield
+    finally:
+        running.values = outer
+
+
+def shared(key: Any, compute: Callable[[], torch.Tensor]) -> torch.Tensor:
+    """A value that others may want in the same pass too. Nobody may write into it.
+
+    Args:
+        key: What it is, the environment included.
+        compute: Computes it.
+    """
+    if running.values is None:
+        return compute()
+    if key not in running.values:
+        running.values[key] = compute()
+    return running.values[key]
+
+
 class Term:
     """A term ready to be called: a function with its parameters, or an instance of a class built with them."""
 
@@ -221,6 +268,8 @@ class Term:
             self._reset = getattr(self._call, "reset", None)
         else:
             self._call, self.params_of_call = func, self.params
+        # Two groups may ask for the same: a function of the state gives both the same answer. Others may keep something.
+        self._shared_by = None if is_class or masked else (func, repr(sorted(self.params.items())))
 
     @property
     def has_memory(self) -> bool:
@@ -229,7 +278,10 @@ class Term:
 
     def __call__(self, *args: Any) -> Any:
         """Calls the term with the environment, and a mask if it takes one."""
-        return self._call(*args, **self.params_of_call)
+        running.label = self.label
+        if self._shared_by is None:
+            return self._call(*args, **self.params_of_call)
+        return shared((id(args[0]), *self._shared_by), lambda: self._call(*args, **self.params_of_call))
 
     def reset(self, mask: torch.Tensor) -> None:
         """Lets a term with a memory forget the masked worlds."""

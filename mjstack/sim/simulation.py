@@ -81,6 +81,7 @@ class Simulation(Protocol):
             alone raises none on MJWarp.
         peak_contacts: Largest contact_count over all substeps since the world's last reset, shape ``(nworld,)``, int32.
         peak_constraints: Largest constraint_count likewise, shape ``(nworld,)``, int32.
+        version: Grows when something changes that a captured graph has baked in.
     """
 
     model: mujoco.MjModel
@@ -105,6 +106,7 @@ class Simulation(Protocol):
     overflow: torch.Tensor
     peak_contacts: torch.Tensor
     peak_constraints: torch.Tensor
+    version: int
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
         """Advances every world by n physics steps under the current ctrl.
@@ -136,6 +138,16 @@ class Simulation(Protocol):
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as this backend holds them, by MuJoCo's names."""
+
+    def set_options(
+        self,
+        *,
+        iterations: int | None = None,
+        ls_iterations: int | None = None,
+        tolerance: float | None = None,
+        impratio: float | None = None,
+    ) -> None:
+        """Changes the constraint solver's limits in all worlds, from the next step on."""
 
     def synchronize(self) -> None:
         """Waits for the device."""
