@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from mjstack.config.schema import Config
+from mjstack.envs.parts import StepParts
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.errors import ArgumentError, FaultError, name_worlds
 from mjstack.managers.action import ActionManager
@@ -222,6 +223,20 @@ class Env:
             if worlds:
                 raise FaultError(f"{what} in {name_worlds(worlds, self.nworld)}{self._culprits(fault, worlds[0])}", fix)
 
+    def parts(self) -> StepParts:
+        """Physics and managers of a step, each by itself."""
+
+        def managers() -> None:
+            self.action_manager.write_commands()
+            self._judge()
+            self._observe_and_reset()
+
+        def whole() -> None:
+            self._advance()
+            self._observe_and_reset()
+
+        return StepParts(self._physics, managers, whole)
+
     def close(self) -> None:
         """Gives the simulation's threads and buffers back. Nothing can be stepped afterwards."""
         self._started = False
@@ -242,7 +257,13 @@ class Env:
     def _advance(self) -> None:
         """Physics, then what looks at the new state."""
         self.action_manager.write_commands()
+        self._physics()
+        self._judge()
+
+    def _physics(self) -> None:
         self.sim.step(self._substeps, kinematics=True)
+
+    def _judge(self) -> None:
         self.frame += 1
         broken = self._broken = ~(torch.isfinite(self.sim.qpos).all(1) & torch.isfinite(self.sim.qvel).all(1))
         if self._success is not None:

@@ -41,6 +41,7 @@ class Episode:
         verdict: The acceptance of every world.
         tape: The commands that were played.
         seconds: Wall time of the frames alone.
+        capture_seconds: Wall time of capturing graphs, which is not in it [s].
         qpos: World 0 at every frame end, shape ``(frames, nq)``, if it was recorded.
         states: Snapshots of all worlds after the frames that were asked for.
     """
@@ -50,6 +51,7 @@ class Episode:
     seconds: float
     qpos: np.ndarray | None = None
     states: dict[int, State] = field(default_factory=dict)
+    capture_seconds: float = 0.0
 
 
 def start_worlds(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import torch
@@ -148,6 +148,18 @@ class MjwarpSimulation(FixedViews):
         counters = (self.overflow, self.solver_limits, self.peak_contacts, self.peak_constraints, self.contact_count)
         for buffer in (self.step_count, *counters):
             buffer *= keep
+
+    def bare_step(self) -> Callable[[], None]:
+        """One plain ``mujoco_warp.step``, replayed where graphs are allowed, and nothing else."""
+        self.synchronize()
+        with wp.ScopedDevice(self._device), wp.ScopedCapture() as capture:
+            mjw.step(self._m, self._d)
+
+        def step() -> None:
+            with torch_stream_scope(self._device):
+                wp.capture_launch(capture.graph)
+
+        return step
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as uploaded."""
