@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mjstack.errors import name_worlds
-from mjstack.gates.gate import GateContext, acceptance_thresholds, failing_rules
+from mjstack.gates.gate import GateContext, TimedEpisode, acceptance_thresholds, failing_rules
 from mjstack.report.record import GateResult, Status, Value
 from mjstack.tasks.stack import RULE_TEXT
 
@@ -17,6 +17,7 @@ def run_batch(context: GateContext) -> list[GateResult]:
     last = context.phase_start(cfg.gate.throughput.from_phase) - 1
     episode = context.run(sim, cfg.reset, snapshots=frozenset([last]))
     context.carry_start = episode.states.get(last)
+    context.timed_episode = TimedEpisode.of(episode, sim)
     verdict = episode.verdict
     failed = verdict.failed.cpu().numpy()
     final = sim.qpos.cpu().numpy()
