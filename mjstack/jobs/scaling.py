@@ -62,7 +62,7 @@ def scaling_folder(cfg: Config) -> Path:
 
 
 def run_scaling_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
-    """Runs the cases that are not done, and leaves table, plot and report; see `JobCfg` for what ends a call.
+    """Runs the cases that are not done, and leaves table, plot and report; see `ScalingJobCfg` for what ends a call.
 
     Args:
         cfg: The configuration.
@@ -203,8 +203,8 @@ def _notes(cfg: Config) -> list[str]:
         "managers: what they add to its physics.",
         "MJWarp: accepted worlds of the whole episode; its seconds include the acceptance's evidence; over bare steps: "
         "against replayed mujoco_warp.step alone on the same commands.",
-        f"native: {job.native_frames} frames of physics per repetition on all cores and no episode; beyond {t.start_worlds} "
-        "worlds the start states repeat.",
+        f"native: {job.native_frames} frames of physics per repetition on all cores; no episode, so these worlds are not judged; "
+        f"beyond {t.start_worlds} worlds the start states repeat.",
     ]
 
 
