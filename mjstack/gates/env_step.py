@@ -22,7 +22,7 @@ from mjstack.gates.timing import frames_that_fit, timed
 from mjstack.sim import LOST_PHYSICS
 
 WARM_UP = 3  # steps: eager, captured, replayed
-_COST = 2.5  # of a turn over that of its whole steps
+_COST = 4.0  # of a turn over that of its whole steps from the start, when fewer things touch
 _LOSSES = ("mjstack.mdp.termination.overflow", "mjstack.mdp.termination.non_finite")
 
 

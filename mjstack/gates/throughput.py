@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import sys
@@ -101,7 +102,7 @@ def _on_scripted_worlds(
 ) -> list[Section]:
     """Sections *physics* and *episode*, on the same worlds."""
     cfg, wanted = context.cfg, context.cfg.gate.throughput.sections
-    sim = None
+    gc.collect()  # environments hold on to their worlds in cycles, and a GPU has not room for all
     began = time.perf_counter()
     try:
         sim = context.simulation(cfg.nworld, backend, device)
@@ -127,6 +128,7 @@ def _on_environment(
 ) -> Section:
     """Section *env_step*, on an environment with room for random actions."""
     cfg = context.cfg
+    gc.collect()
     began = time.perf_counter()
     env = build_env(cfg, model=context.model, backend=backend, device=device)
     facts.setdefault("backend", env.sim.description)

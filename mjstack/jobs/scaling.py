@@ -203,8 +203,8 @@ def _notes(cfg: Config) -> list[str]:
         "managers: what they add to its physics.",
         "MJWarp: accepted worlds of the whole episode; its seconds include the acceptance's evidence; over bare steps: "
         "against replayed mujoco_warp.step alone on the same commands.",
-        f"native: {job.native_frames} frames of physics per repetition on all cores; no episode, so these worlds are not judged; "
-        f"beyond {t.start_worlds} worlds the start states repeat.",
+        f"native: {job.native_frames} frames of physics per repetition on all cores; no episode, so these worlds are not "
+        f"judged; beyond {t.start_worlds} worlds the start states repeat.",
     ]
 
 

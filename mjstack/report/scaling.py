@@ -34,7 +34,7 @@ class ScalingRow:
         bare_ratio: That over bare steps of the same commands.
         gpu_memory_arrays_mib: GPU memory that arrays hold [MiB], most of all sections.
         gpu_memory_whole_gpu_mib: GPU memory that is taken on the whole GPU [MiB], likewise.
-        gpu_power_mean_w: Mean power during the episodes [W].
+        gpu_power_mean_w: Mean power during the episodes and the bare steps [W].
         process_peak_mib: Host memory [MiB]; of native cases.
         build_s: Building the worlds, compilation included [s].
         capture_s: Capturing an episode's graphs [s].
