@@ -27,6 +27,37 @@ def _silent(_: str) -> None:
     pass
 
 
+@dataclass(kw_only=True, slots=True)
+class TimedEpisode:
+    """How long an episode took, and where it failed.
+
+    Attributes:
+        description: Backend and hardware.
+        nworld: Number of worlds.
+        seconds: Wall time of the frames [s].
+        capture_seconds: Wall time of capturing graphs [s].
+        failed: Worlds that were not accepted.
+    """
+
+    description: str
+    nworld: int
+    seconds: float
+    capture_seconds: float
+    failed: list[int]
+
+    @classmethod
+    def of(cls, episode: Episode, sim: Simulation) -> TimedEpisode:
+        """What is kept of an episode once its simulation is gone."""
+        failed = np.flatnonzero(episode.verdict.failed.cpu().numpy()).tolist()
+        return cls(
+            description=sim.description,
+            nworld=sim.nworld,
+            seconds=episode.seconds,
+            capture_seconds=episode.capture_seconds,
+            failed=failed,
+        )
+
+
 @dataclass(eq=False)
 class GateContext:
     """Everything gates need, and what one leaves for the next.
@@ -48,6 +79,7 @@ class GateContext:
     on_frame: FrameHook | None = None
     results: dict[str, GateResult] = field(default_factory=dict)
     carry_start: State | None = None
+    timed_episode: TimedEpisode | None = None
     shown: Episode | None = None
     shown_by: str = ""
 
@@ -84,6 +116,11 @@ class GateContext:
         hook = self.on_frame if "parity" not in self.cfg.gates else None
         episode = self.run(sim, NOMINAL, record=True, snapshots=frames, on_frame=hook)
         return sim, episode
+
+    def tell(self, what: str, done: int, total: int) -> None:
+        """Reports progress, if anyone listens."""
+        if self.advance is not None:
+            self.advance(what, done, total)
 
     def run(self, sim: Simulation, reset: Reset, *, seed: int | None = None, **kwargs: Any) -> Episode:
         """`run_episode` with this context's scene and planner, under the configured seed or another one."""
