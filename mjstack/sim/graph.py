@@ -193,18 +193,21 @@ def side_by_side(device: torch.device, *works: Callable[[], None], branches: boo
             work()
         return
     main = torch.cuda.current_stream(device)
-    streams = _side_streams.setdefault(str(device), [])
-    while len(streams) < len(works) - 1:
-        streams.append(torch.cuda.Stream(device))
-    used = streams[: len(works) - 1]
-    for stream in used:
-        stream.wait_stream(main)
-    for stream, work in zip(used, works[1:], strict=True):
-        with torch.cuda.stream(stream), torch_stream_scope(wp.get_device(str(device))):
-            work()
-    works[0]()
-    for stream in used:
-        main.wait_stream(stream)
+    free = _side_streams.setdefault(str(device), [])
+    while len(free) < len(works) - 1:
+        free.append(torch.cuda.Stream(device))
+    used = [free.pop() for _ in works[1:]]  # a branch may fork again, and takes others then
+    try:
+        for stream in used:
+            stream.wait_stream(main)
+        for stream, work in zip(used, works[1:], strict=True):
+            with torch.cuda.stream(stream), torch_stream_scope(wp.get_device(str(device))):
+                work()
+        works[0]()
+        for stream in used:
+            main.wait_stream(stream)
+    finally:
+        free.extend(used)
 
 
 def _recover(device: wp.Device) -> None:

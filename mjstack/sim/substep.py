@@ -17,7 +17,8 @@ class Arrangement:
     """What is done to make a captured step faster than MJWarp's own. All of it leaves the numbers as they are.
 
     Attributes:
-        branches: Contacts beside smooth dynamics, and counting beside the next step's kinematics, as parallel branches.
+        branches: Contacts beside smooth dynamics, there inertia beside forces, and counting beside the next step's
+            kinematics, as parallel branches.
         sensors_once: Sensors in the last of several steps alone: nobody sees the others'.
         own_stages: Only the stages that the model needs: no cameras, lights, tendons, flexes or energy.
         scratch: Temporaries at fixed addresses (`Arena`), not allocated and freed by the graph.
@@ -72,11 +73,13 @@ def rearranged_step(
         mjw.kinematics(m, d)
         mjw.com_pos(m, d)
 
-    def dynamics() -> None:
-        mjw.crb(m, d)
+    def forces() -> None:
         mjw.transmission(m, d)
         mjw.fwd_velocity(m, d)
         mjw.fwd_actuation(m, d)
+
+    def dynamics() -> None:
+        side_by_side(device, forces, lambda: mjw.crb(m, d), branches=branches)
         mjw.fwd_acceleration(m, d, factorize=True)
 
     def contacts() -> None:
