@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import re
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, SolverCfg, StudyCfg
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput")
-JOBS = ("gates",)
+JOBS = ("gates", "study")
+CONDIMS = (1, 3, 4, 6)
 ANCHORS = ("red", "blue", "on_blue")
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
@@ -35,6 +36,7 @@ def validate(cfg: Config) -> None:
     _scene(cfg)
     _controller(cfg)
     _gates(cfg)
+    _study(cfg)
 
 
 def _timing(cfg: Config) -> None:
@@ -57,14 +59,35 @@ def _solver_and_batch(cfg: Config) -> None:
         value = getattr(cfg.batch, name)
         if value is not None:
             _positive_int(f"batch.{name}", value)
+    _solver("solver", cfg.solver)
+
+
+def _solver(key: str, solver: SolverCfg) -> None:
     for name in ("iterations", "ls_iterations"):
-        value = getattr(cfg.solver, name)
+        value = getattr(solver, name)
         if value is not None:
-            _positive_int(f"solver.{name}", value)
+            _positive_int(f"{key}.{name}", value)
     for name in ("impratio", "tolerance"):
-        value = getattr(cfg.solver, name)
+        value = getattr(solver, name)
         if value is not None:
-            _positive(f"solver.{name}", value)
+            _positive(f"{key}.{name}", value)
+    if solver.gripper_condim is not None and solver.gripper_condim not in CONDIMS:
+        raise ConfigError(f"{key}.gripper_condim", solver.gripper_condim, "1, 3, 4, 6, or null for the model's own")
+
+
+def _study(cfg: Config) -> None:
+    study = cfg.job.study
+    if cfg.job.name != "study":
+        if study != StudyCfg():
+            raise ConfigError("job.study", "...", f"nothing with job={cfg.job.name}", "Add job=study")
+        return
+    _positive_int("job.study.repetitions", study.repetitions)
+    _positive_int("job.study.frames", study.frames)
+    _positive("job.study.max_seconds", study.max_seconds, "s")
+    if not study.variants:
+        raise ConfigError("job.study.variants", "{}", "at least one variant of the solver")
+    for name, variant in study.variants.items():
+        _solver(f"job.study.variants.{name}", variant)
 
 
 def _robot(cfg: Config) -> None:
@@ -163,7 +186,12 @@ def _gates(cfg: Config) -> None:
         for field in PARITY_FIELDS:
             if not (field in limits and math.isfinite(limits[field]) and limits[field] >= 0.0):
                 raise ConfigError(f"gate.parity.{name}.{field}", limits.get(field), "a number that is not negative")
-    _positive_int("gate.capacity.cpu_nworld", gate.capacity.cpu_nworld)
+    for name in ("cpu_nworld", "probe_nworld", "probe_frames"):
+        _positive_int(f"gate.capacity.{name}", getattr(gate.capacity, name))
+    if gate.capacity.random_frames is not None:
+        _positive_int("gate.capacity.random_frames", gate.capacity.random_frames)
+    if not (math.isfinite(gate.capacity.margin) and gate.capacity.margin >= 1.0):
+        raise ConfigError("gate.capacity.margin", gate.capacity.margin, "a number of at least 1, such as 1.25")
     _positive_int("gate.throughput.repetitions", gate.throughput.repetitions)
     _positive_int("gate.throughput.frames", gate.throughput.frames)
     _positive("gate.throughput.max_seconds", gate.throughput.max_seconds, "s")

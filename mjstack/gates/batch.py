@@ -24,6 +24,7 @@ def run_batch(context: GateContext) -> list[GateResult]:
     # Rounded: on CUDA even identical worlds differ in the last digits.
     distinct = len(np.unique(np.round(final, 4), axis=0))
     steps = cfg.nworld * episode.tape.frames * cfg.timing.substeps
+    sizes = getattr(sim, "sizes", None)
     metrics: dict[str, Value] = {
         "backend": sim.description,
         "worlds": cfg.nworld,
@@ -40,6 +41,7 @@ def run_batch(context: GateContext) -> list[GateResult]:
         "waypoint_error_max_m": float(episode.tape.waypoint_error.max()),
         "peak_contacts_per_world": int(sim.peak_contacts.max()),
         "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
+        "sizes": f"{sizes.as_overrides()} ({sizes.source})" if sizes else "native MuJoCo has no fixed buffers",
         "episode_s": episode.seconds,
         "world_steps_per_s": steps / episode.seconds,
     }

@@ -96,7 +96,7 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
     steps = frames * cfg.timing.substeps
     ms = [1e3 * seconds / steps for seconds in times]
     rate = [cfg.nworld * steps / seconds for seconds in times]
-    sizes = resolve_sizes(cfg)
+    sizes = getattr(sim, "sizes", None) or resolve_sizes(cfg)
     metrics: dict[str, Value] = {
         "backend": sim.description,
         "cpu_count": os.cpu_count(),
@@ -114,6 +114,7 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
         "nconmax": sizes.nconmax,
         "naconmax": sizes.contact_pool(cfg.nworld),
         "njmax": sizes.njmax,
+        "sizes_from": sizes.source,
     }
     sim.close()
     batch = context.results.get("batch")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import logging
 import warnings
@@ -15,6 +16,7 @@ from mjstack.config.schema import GraphMode
 from mjstack.errors import MjstackError, UnsupportedModel
 from mjstack.sim.counters import count_contacts, record_peaks
 from mjstack.sim.fields import PLACING_FIELDS, check_fields
+from mjstack.sim.memory import array_bytes, borrowed_bytes
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.sim.sizes import BatchSizes
 from mjstack.sim.static_geoms import place_static_geoms
@@ -82,7 +84,7 @@ class MjwarpSimulation(FixedViews):
                 raise UnsupportedModel((str(error) or repr(error)).splitlines()[0].rstrip(".")) from error
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
-            self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
+            self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
             self._contacts = wp.zeros(nworld, dtype=int)
             self._peak_nefc = wp.zeros(nworld, dtype=int)
             self._peak_contacts = wp.zeros(nworld, dtype=int)
@@ -109,6 +111,9 @@ class MjwarpSimulation(FixedViews):
         self.solver_limits = wp.to_torch(self._limits)
         self.step_count = wp.to_torch(self._steps)
         self._torch_mask = wp.to_torch(self._mask)
+        # What masked resets would erase. It is taken in there, just before, and not in every substep: nothing else lowers a
+        # counter, so the two together never miss one, and it costs a captured step three small operations.
+        self._most_contacts, self._most_constraints, self._overflow_ever = (torch.zeros_like(self.overflow) for _ in range(3))
         self._warm_up()
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
@@ -142,12 +147,36 @@ class MjwarpSimulation(FixedViews):
         else:
             check_mask(mask, self.nworld, self.device)
             self._torch_mask.copy_(mask)
+        self._keep_peaks(clear=mask is None)
         with torch_stream_scope(self._device):
             mjw.reset_data(self._m, self._d, reset=self._mask)
         keep = ~self._torch_mask
         counters = (self.overflow, self.solver_limits, self.peak_contacts, self.peak_constraints, self.contact_count)
         for buffer in (self.step_count, *counters):
             buffer *= keep
+
+    @property
+    def most_contacts(self) -> torch.Tensor:
+        """Largest contact_count since the last full reset."""
+        return torch.maximum(self._most_contacts, self.peak_contacts)
+
+    @property
+    def most_constraints(self) -> torch.Tensor:
+        """Largest constraint_count since the last full reset."""
+        return torch.maximum(self._most_constraints, self.peak_constraints)
+
+    @property
+    def overflow_ever(self) -> torch.Tensor:
+        """Overflow bits since the last full reset."""
+        return self._overflow_ever | self.overflow
+
+    def memory_bytes(self) -> int:
+        """Bytes of MJWarp's data: all that grows with nworld, but for per-world fields and what a step borrows."""
+        return array_bytes(self._d)
+
+    def borrowed_bytes(self) -> int | None:
+        """The most that a step borrows at once beside it, or None if Warp does not tell. Convex pairs are most of it."""
+        return borrowed_bytes(self.forward)
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as uploaded."""
@@ -172,6 +201,16 @@ class MjwarpSimulation(FixedViews):
     def close(self) -> None:
         """Drops the graphs; buffers go with the object."""
         self._graphs.clear()
+
+    def _keep_peaks(self, *, clear: bool) -> None:
+        """Takes in the counters that a reset is about to erase, or forgets all of them."""
+        if clear:
+            for buffer in (self._most_contacts, self._most_constraints, self._overflow_ever):
+                buffer.zero_()
+            return
+        torch.maximum(self._most_contacts, self.peak_contacts, out=self._most_contacts)
+        torch.maximum(self._most_constraints, self.peak_constraints, out=self._most_constraints)
+        self._overflow_ever |= self.overflow
 
     def _substeps(self, n: int, kinematics: bool) -> None:
         self._place()
@@ -258,3 +297,25 @@ class MjwarpSimulation(FixedViews):
             if collecting:
                 gc.enable()
         return capture.graph
+
+
+def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
+    """What `MjwarpSimulation.memory_bytes` would be for these sizes, without allocating it.
+
+    Every array is as long as nworld, as the contact pool, or constant. So two small ones on the CPU tell the rest.
+
+    Args:
+        model: The compiled model.
+        nworld: Number of worlds.
+        sizes: Buffer sizes.
+    """
+    share = dataclasses.replace(sizes, naconmax=None, naccdmax=None)
+    with wp.ScopedDevice("cpu"):
+        one, two, longer = (
+            array_bytes(mjw.make_data(model, nworld=n, **dataclasses.replace(share, nconmax=c).as_kwargs(n)))
+            for n, c in ((1, sizes.nconmax), (2, sizes.nconmax), (1, sizes.nconmax + 1))
+        )
+    per_contact = longer - one
+    per_world = two - one - sizes.nconmax * per_contact
+    constant = one - per_world - sizes.nconmax * per_contact
+    return constant + nworld * per_world + sizes.contact_pool(nworld) * per_contact

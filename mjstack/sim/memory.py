@@ -1,0 +1,39 @@
+"""What worlds cost in memory: arrays that stay, what a step borrows, and what the device has given out."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable
+
+import warp as wp
+
+_UNITS = {"B": 1, "KB": 1 << 10, "MB": 1 << 20, "GB": 1 << 30}
+
+
+def array_bytes(node: object) -> int:
+    """Bytes of all Warp arrays in a dataclass and in the dataclasses in it."""
+    if isinstance(node, wp.array):
+        return int(node.capacity)
+    if dataclasses.is_dataclass(node):
+        return sum(array_bytes(getattr(node, field.name)) for field in dataclasses.fields(node))
+    return 0
+
+
+def borrowed_bytes(call: Callable[[], None]) -> int | None:
+    """The most that Warp allocates at once in a call, or None if its report cannot be read."""
+    lines: list[str] = []
+    with wp.ScopedMemoryTracker("mjstack", report_func=lines.append) as tracker:
+        tracker.clear()
+        call()
+    peak = re.search(r"Peak usage:\s+\S+\s+([\d.]+) (B|KB|MB|GB)", "".join(lines))
+    return None if peak is None else int(float(peak[1]) * _UNITS[peak[2]])
+
+
+def used_bytes(device: str) -> int | None:
+    """Bytes that Warp's memory pool of a CUDA device has given out, or None where there is no such pool."""
+    where = wp.get_device(device)
+    if not where.is_cuda or not wp.is_mempool_enabled(where):
+        return None
+    wp.synchronize_device(where)
+    return int(wp.get_mempool_used_mem_current(where))
