@@ -136,6 +136,26 @@ class RebindError(MjstackError):
         self.view = view
 
 
+class CaptureError(MjstackError):
+    """Work that cannot be captured into a graph."""
+
+    def __init__(self, name: str, culprit: str, error: Exception) -> None:
+        """Builds the message.
+
+        Args:
+            name: What was to be captured.
+            culprit: What was running, if that is known.
+            error: What the capture says.
+        """
+        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+        where = f" because of {culprit}" if culprit else ""
+        super().__init__(
+            f"{name} cannot be captured{where} ({reason}): expected fixed shapes and no host read (.item(), .cpu(), nonzero, "
+            "if tensor). Correct it, or set graph=off."
+        )
+        self.culprit = culprit
+
+
 class ArgumentError(MjstackError):
     """An argument of a function cannot be used."""
 

@@ -52,20 +52,31 @@ class CommandTape:
         """
         self.waypoint_error = waypoint_error
         self.frames, self._k = weights.shape
-        self._segments = segments.tolist()
+        self._segments = torch.from_numpy(segments)
         self._weights = torch.from_numpy(weights)
         self._knots = torch.from_numpy(knots)
+        self._offsets = torch.arange(self._k)
 
     def to(self, device: torch.device, dtype: torch.dtype) -> CommandTape:
         """The same tape on a device."""
         moved = copy.copy(self)
         moved._weights, moved._knots = self._weights.to(device, dtype), self._knots.to(device, dtype)
+        moved._segments, moved._offsets = self._segments.to(device), self._offsets.to(device)
         return moved
 
-    def command(self, frame: int) -> torch.Tensor:
-        """Commands of one frame, shape ``(nworld, nu)``."""
-        first = self._segments[frame]
-        return torch.einsum("k,nku->nu", self._weights[frame], self._knots[:, first : first + self._k])
+    def command(self, frame: int | torch.Tensor) -> torch.Tensor:
+        """Commands of one frame.
+
+        Args:
+            frame: Its number; or shape ``(1,)``, int64, on the tape's device, for a captured graph.
+
+        Returns:
+            Shape ``(nworld, nu)``.
+        """
+        if isinstance(frame, int):
+            frame = torch.tensor([frame], device=self._offsets.device)
+        knots = self._knots.index_select(1, self._segments.index_select(0, frame) + self._offsets)
+        return torch.einsum("k,nku->nu", self._weights.index_select(0, frame)[0], knots)
 
 
 class ScriptedPlanner:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import operator
-from enum import IntFlag
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from mjstack.config.schema import Config
+from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.errors import ArgumentError, FaultError, name_worlds
 from mjstack.managers.action import ActionManager
-from mjstack.managers.base import Term, first_value
+from mjstack.managers.base import Term, first_value, running
 from mjstack.managers.observation import ObservationManager
 from mjstack.managers.reset import ResetManager
 from mjstack.managers.reward import RewardManager
@@ -20,16 +23,41 @@ from mjstack.managers.termination import TerminationManager
 from mjstack.scene import SceneIndex
 from mjstack.sim import LOST_PHYSICS, Overflow, Simulation, describe_overflow
 
+if TYPE_CHECKING:
+    from mjstack.sim.graph import StepGraph
+
 FAULT_WINDOW = 200  # steps between two looks at the faults on CUDA; on the CPU looking costs nothing
 
 
-class Fault(IntFlag):
-    """What went wrong in a world, latched on the device until the host looks."""
+class Fault(Enum):
+    """What went wrong in a world, latched on the device until the host looks; in the order of `Env._latch`."""
 
-    ACTION = 1 << 0
-    STATE = 1 << 1
-    REWARD = 1 << 2
-    OBSERVATION = 1 << 3
+    ACTION = "actions were not finite"
+    STATE = "the state is not finite"
+    REWARD = "the reward is not finite"
+    OBSERVATION = "an observation is not finite"
+
+
+@dataclass(frozen=True, slots=True)
+class StepParts:
+    """A step taken apart, for measurements. Each part acts in place on the action that was last taken in.
+
+    On CUDA each is a graph of its own, captured at its second call, unless ``graph=off``; elsewhere the managers run eagerly.
+
+    Attributes:
+        physics: The substeps, and the poses after them.
+        managers: Everything else of a step: commands, success, terminations, rewards, observations, resets.
+        whole: Both, in the order of a step.
+    """
+
+    physics: Callable[[], None]
+    managers: Callable[[], None]
+    whole: Callable[[], None]
+
+    @property
+    def capture_seconds(self) -> float:
+        """What the captures took so far [s]."""
+        return sum(getattr(part, "capture_seconds", 0.0) for part in (self.physics, self.managers, self.whole))
 
 
 class Env:
@@ -44,6 +72,10 @@ class Env:
     5. finished episodes go into the statistics;
     6. the worlds that ended are reset, and observed again.
 
+    On CUDA the whole step is one graph: the first step after a build runs eagerly, the second is captured, and later ones
+    replay it. It is captured anew after ``sim.resize`` and ``sim.set_options``; after a change of anything else that it has
+    baked in, such as a term's Python number, call `recapture`.
+
     What derives from contacts (``sensordata``, ``contact_count``) is that of the last physics step before, and zero in a
     world that has just been reset.
 
@@ -54,6 +86,7 @@ class Env:
         nworld: Number of worlds.
         device: Where tensors live.
         seed: Seed of every random number; `reset` may set it.
+        key: The same on the device, shape ``(1,)``, int64.
         world: Number of each world, shape ``(nworld,)``, int64.
         episode: Episode of each world, shape ``(nworld,)``, int64.
         frame: Frames since each world's last reset, shape ``(nworld,)``, int64.
@@ -78,15 +111,19 @@ class Env:
             MjstackError: A term cannot be found, built or used; the message names it.
         """
         self.sim, self.index, self.cfg = sim, index, cfg
-        self.nworld, self.device, self.seed = sim.nworld, sim.device, cfg.seed
+        self.nworld, self.device = sim.nworld, sim.device
+        self.key = torch.zeros(1, dtype=torch.int64, device=sim.device)
+        self.seed = cfg.seed
         self.world = torch.arange(sim.nworld, device=sim.device)
         self.episode = torch.full_like(self.world, -1)
         self.frame = torch.zeros_like(self.world)
         self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
         self._everyone = torch.ones_like(self.success)
-        self._faults = torch.zeros(sim.nworld, dtype=torch.int32, device=sim.device)
-        self._overflow = torch.zeros_like(self._faults)
-        self._steps = 0
+        self._nobody = torch.zeros_like(self.success)
+        self._faults = torch.zeros((sim.nworld, len(Fault)), dtype=torch.bool, device=sim.device)
+        self._overflow = torch.zeros(sim.nworld, dtype=torch.int32, device=sim.device)
+        self._ends_on_overflow, self._ends_on_non_finite = self._ends_on("overflow"), self._ends_on("non_finite")
+        self._steps = self._version = 0
         self._check_faults = check_faults
         self._started = self._closed = False
         self._substeps = cfg.timing.substeps
@@ -105,6 +142,18 @@ class Env:
         self.statistics = EpisodeStatistics(self.reward_manager.names, self.termination_manager.names, sim.device)
         self._forget(self._everyone)
         self.episode.fill_(-1)
+        self._bind_outputs()
+        self._frame: Callable[[], None] = self.captured(self.advance, "env.step")
+
+    @property
+    def seed(self) -> int:
+        """Seed of every random number."""
+        return self._seed
+
+    @seed.setter
+    def seed(self, value: int) -> None:
+        self._seed = value
+        self.key.fill_(value)
 
     @property
     def action(self) -> torch.Tensor:
@@ -185,15 +234,66 @@ class Env:
         """
         if not self._started:
             raise ArgumentError("env", "step() before reset(), or after close()", "reset() first", "Call env.reset()")
-        self.action_manager.process(action)
-        self._advance()
+        self.action_manager.take(action)
+        self._frame()
         self._steps += 1
-        if self._check_faults and (not self._everyone.is_cuda or self._steps % FAULT_WINDOW == 0):
+        if self._check_faults and self._everyone.is_cuda and self._steps % FAULT_WINDOW == 0:
             self.raise_faults()
-        obs, final = self._observe_and_reset()
-        t = self.termination_manager
-        extras = {"final_obs": final, "success": self._achieved}
-        return obs, self.reward_manager.reward.clone(), t.terminated.clone(), t.truncated.clone(), extras
+        out = self._outputs.copy()
+        obs = {name: out[f"obs/{name}"] for name in self.observation_manager.groups}
+        final = {name: out[f"final/{name}"] for name in self.observation_manager.groups}
+        return obs, out["reward"], out["terminated"], out["truncated"], {"final_obs": final, "success": out["success"]}
+
+    def advance(self) -> None:
+        """The part of `step` that is the same at every frame: it acts on the action that was taken in, and returns nothing.
+
+        On CUDA it has fixed shapes and no host read, so that a larger graph may hold it.
+        """
+        self._command()
+        self._move()
+        self._judge()
+
+    def captured(self, work: Callable[[], None], name: str) -> Callable[[], None]:
+        """Work of this environment as a graph on CUDA; elsewhere as it is.
+
+        Args:
+            work: `advance`, and whatever is to be captured along with it.
+            name: What it is called in messages.
+        """
+        if self.device.type != "cuda":
+            return work
+        from mjstack.sim.graph import StepGraph
+
+        return StepGraph(
+            work,
+            self.device,
+            self.cfg.graph,
+            name=name,
+            version=lambda: self.sim.version + self._version,
+            culprit=lambda: running.label,
+        )
+
+    def recapture(self) -> None:
+        """Has every graph of this environment captured anew: for a change of something that a graph has baked in."""
+        self._version += 1
+
+    def parts(self) -> StepParts:
+        """A step taken apart, for measurements."""
+
+        def managers() -> None:
+            self._command()
+            self._judge()
+
+        return StepParts(
+            self.captured(self._move, "the physics"),
+            self.captured(managers, "the managers"),
+            self.captured(self.advance, "env.step"),
+        )
+
+    @property
+    def graph(self) -> StepGraph | None:
+        """The graph that `step` replays; None where there is none."""
+        return None if self.device.type != "cuda" else self._frame  # type: ignore[return-value]
 
     def read_statistics(self) -> dict[str, float]:
         """Means over the episodes that ended since the last call; see `EpisodeStatistics.read`. Waits for the device."""
@@ -206,9 +306,9 @@ class Env:
         Raises:
             FaultError: Something did; names the worlds and what to do.
         """
-        if not bool((self._overflow | self._faults).any()):
+        if not bool(self._faults.any() | (self._overflow != 0).any()):
             return
-        overflow, faults = torch.stack((self._overflow, self._faults)).tolist()
+        overflow = self._overflow.tolist()
         lost = [w for w, bits in enumerate(overflow) if bits]
         if lost:
             bits = 0
@@ -217,10 +317,11 @@ class Env:
             raise FaultError(
                 f"{describe_overflow(bits)} overflow in {name_worlds(lost, self.nworld)}", self._capacity_hint(bits)
             )
-        for fault, what, fix in _FAULTS:
-            worlds = [w for w, value in enumerate(faults) if value & fault]
+        for column, fault in enumerate(Fault):
+            worlds = self._faults[:, column].nonzero()[:, 0].tolist()
             if worlds:
-                raise FaultError(f"{what} in {name_worlds(worlds, self.nworld)}{self._culprits(fault, worlds[0])}", fix)
+                where = f"{name_worlds(worlds, self.nworld)}{self._culprits(fault, worlds[0])}"
+                raise FaultError(f"{fault.value} in {where}", _FIXES[fault])
 
     def close(self) -> None:
         """Gives the simulation's threads and buffers back. Nothing can be stepped afterwards."""
@@ -239,57 +340,81 @@ class Env:
         )
         return "\n".join((head, *(str(manager) for manager in managers)))
 
-    def _advance(self) -> None:
-        """Physics, then what looks at the new state."""
+    def _bind_outputs(self) -> None:
+        """Moves what `step` returns side by side."""
+        rewards, ends, observations = self.reward_manager, self.termination_manager, self.observation_manager
+        returned = {f"obs/{name}": group for name, group in observations.groups.items()}
+        returned |= {f"final/{name}": group for name, group in observations.groups.items()}
+        returned |= {"reward": rewards.reward, "terminated": ends.terminated, "truncated": ends.truncated}
+        self._outputs = Outputs(returned | {"success": self.success}, self.device)
+        out = self._outputs.tensors
+        rewards.reward, ends.terminated, ends.truncated = out["reward"], out["terminated"], out["truncated"]
+        for name in observations.groups:
+            observations.groups[name] = out[f"obs/{name}"]
+
+    def _command(self) -> None:
+        running.label = ""
+        self.action_manager.accept()
         self.action_manager.write_commands()
+
+    def _move(self) -> None:
+        running.label = ""
         self.sim.step(self._substeps, kinematics=True)
+
+    def _judge(self) -> None:
+        """What looks at the new state, and the resets."""
         self.frame += 1
-        broken = self._broken = ~(torch.isfinite(self.sim.qpos).all(1) & torch.isfinite(self.sim.qvel).all(1))
+        # 0 times a number that is not finite is NaN, which is no longer 0.
+        broken = ((self.sim.qpos * 0.0).sum(1) + (self.sim.qvel * 0.0).sum(1)) != 0.0
         if self._success is not None:
-            self.success.copy_(self._success(self))
-        self.success &= ~broken
+            torch.logical_and(self._success(self), ~broken, out=self.success)
         self.termination_manager.compute()
         reward = self.reward_manager.compute(void=broken)
         self.observation_manager.compute()
+        running.label = ""
         if self._check_faults:
             self._latch(broken, reward)
+            if not broken.is_cuda:
+                self.raise_faults()
+        self._reset_ended(broken)
 
     def _latch(self, broken: torch.Tensor, reward: torch.Tensor) -> None:
         """Keeps what went wrong, before a reset can erase it."""
-        lost = self.sim.overflow & LOST_PHYSICS
         # A world's own overflow may end its episode; that of the shared pool voids the whole batch.
-        self._overflow |= lost & _POOL if self._ends_on("overflow") else lost
-        self._mark(Fault.ACTION, self.action_manager.not_finite)
-        self.action_manager.not_finite.zero_()
-        self._mark(Fault.REWARD, ~torch.isfinite(reward))
+        self._overflow |= self.sim.overflow & (_POOL if self._ends_on_overflow else LOST_PHYSICS)
+        bad_action = self.action_manager.not_finite
+        seen = torch.zeros_like(reward)
         for group in self.observation_manager.groups.values():
-            self._mark(Fault.OBSERVATION, ~(torch.isfinite(group).all(1) | broken))
-        if not self._ends_on("non_finite"):
-            self._mark(Fault.STATE, broken)
-
-    def _mark(self, fault: Fault, worlds: torch.Tensor) -> None:
-        self._faults |= int(fault) * worlds.to(torch.int32)
+            seen = seen + (group * 0.0).sum(1)
+        state = self._nobody if self._ends_on_non_finite else broken
+        self._faults |= torch.stack((bad_action, state, reward * 0.0 != 0.0, (seen != 0.0) & ~broken), dim=1)
+        bad_action.zero_()
 
     def _ends_on(self, term: str) -> bool:
         """Whether one of mjstack's own terminations is in use, under whatever name."""
         return any(cfg.func == f"mjstack.mdp.termination.{term}" for cfg in self.cfg.termination.values())
 
-    def _observe_and_reset(self) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
-        """The statistics, the terminal observation, the reset of the worlds that ended, and the observation to go on with."""
-        managers = self.termination_manager, self.reward_manager
-        done = managers[0].terminated | managers[0].truncated
-        self._achieved = self.success.clone()
+    def _reset_ended(self, broken: torch.Tensor) -> None:
+        """The terminal observation, the statistics, the reset of the worlds that ended, and the observation to go on with."""
+        ends, rewards, out = self.termination_manager, self.reward_manager, self._outputs.tensors
+        out["success"].copy_(self.success)
         # What a diverged world saw last is 0, not NaN, which a value times 0 would hand on.
-        broken = self._broken[:, None]
-        final = {n: torch.where(broken, g.nan_to_num(0.0, 0.0, 0.0), g) for n, g in self.observation_manager.groups.items()}
-        if not managers[0].names or (not done.is_cuda and not bool(done.any())):
-            return _copies(final), final  # nothing to reset; on CUDA looking would stop the device
-        self.statistics.update(done, self.frame, self.success, managers[1].episode_sums, managers[0].values)
+        for name, group in self.observation_manager.groups.items():
+            torch.where(broken[:, None], group.nan_to_num(0.0, 0.0, 0.0), group, out=out[f"final/{name}"])
+        done = ends.terminated | ends.truncated
+        if not ends.names or (not done.is_cuda and not bool(done.any())):
+            if not done.is_cuda and not bool(broken.any()):
+                return
+            # nothing to reset; on CUDA looking would stop the device
+            for name, group in self.observation_manager.groups.items():
+                group.copy_(out[f"final/{name}"])
+            return
+        self.statistics.update(done, self.frame, self.success, rewards.episode_sums, ends.values)
         self.episode += done
         self.frame.masked_fill_(done, 0)
         self._write_start(done)
         self._forget(done)
-        return _copies(self.observation_manager.refresh(done)), final
+        self.observation_manager.refresh(done)
 
     def _write_start(self, mask: torch.Tensor) -> None:
         """Start states of the masked worlds; a function of seed, world and episode alone."""
@@ -365,12 +490,12 @@ class Env:
 
 
 _POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
-_FAULTS = (
-    (Fault.ACTION, "actions were not finite", "Check what the policy returns"),
-    (Fault.STATE, "the state is not finite", "Lower the gains or the timestep, or add the termination non_finite"),
-    (Fault.REWARD, "the reward is not finite", "Correct the term"),
-    (Fault.OBSERVATION, "an observation is not finite", "Correct the term"),
-)
+_FIXES = {
+    Fault.ACTION: "Check what the policy returns",
+    Fault.STATE: "Lower the gains or the timestep, or add the termination non_finite",
+    Fault.REWARD: "Correct the term",
+    Fault.OBSERVATION: "Correct the term",
+}
 
 
 def _copies(groups: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

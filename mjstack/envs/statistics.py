@@ -12,6 +12,7 @@ class EpisodeStatistics:
         """Allocates the sums."""
         self._rewards, self._terminations = reward_names, termination_names
         width = 4 + len(reward_names) + len(termination_names)
+        self._one = torch.ones((1, 1), device=device)
         # float64 counts exactly far beyond the 16.7 million at which float32 stops.
         self._sums = torch.zeros(width, dtype=torch.float64, device=device)
 
@@ -27,11 +28,10 @@ class EpisodeStatistics:
             rewards: Episode sum of every reward term, shape ``(nworld, nterm)``.
             terminations: What every termination term says, shape ``(nworld, nterm)``, bool.
         """
-        one = torch.ones_like(frames)
-        columns = torch.stack((one, frames, success.to(frames.dtype)), dim=1).double()
-        total = rewards.sum(1, keepdim=True)
-        row = torch.cat((columns, total.double(), rewards.double(), terminations.double()), dim=1)
-        self._sums += torch.where(done[:, None], row, 0.0).sum(0)
+        columns = (self._one.expand(len(frames), 1), frames[:, None], success[:, None], rewards.sum(1, keepdim=True))
+        # A frame count is exact in float32 up to 16.7 million; the sums are float64.
+        row = torch.cat([column.float() for column in (*columns, rewards, terminations)], dim=1)
+        self._sums += torch.where(done[:, None], row, 0.0).sum(0, dtype=torch.float64)
 
     def read(self) -> dict[str, float]:
         """Means over the episodes that ended since the last read, and starts anew. Waits for the device.

@@ -40,9 +40,10 @@ class Episode:
     Attributes:
         verdict: The acceptance of every world.
         tape: The commands that were played.
-        seconds: Wall time of the frames alone.
+        seconds: Wall time of the frames alone [s]; where they are captured, of as many replayed ones.
         qpos: World 0 at every frame end, shape ``(frames, nq)``, if it was recorded.
         states: Snapshots of all worlds after the frames that were asked for.
+        capture_seconds: Warm-up and capture [s]; 0 where nothing is captured.
     """
 
     verdict: Verdict
@@ -50,6 +51,7 @@ class Episode:
     seconds: float
     qpos: np.ndarray | None = None
     states: dict[int, State] = field(default_factory=dict)
+    capture_seconds: float = 0.0
 
 
 def start_worlds(
@@ -96,20 +98,28 @@ def run_episode(
         reset: How worlds differ at the start.
         record: Keep world 0's qpos at every frame end.
         snapshots: Frames after which the state of all worlds is kept.
-        on_frame: Called after each frame, before the evidence is taken.
+        on_frame: Called after each frame.
         advance: Told about progress.
     """
     env, tape = start_worlds(sim, index, cfg, reset, planner, advance)
     evidence = StackEvidence(cfg, index, planner.phases, sim.nworld, sim.device)
+    now = torch.zeros(1, dtype=torch.int64, device=sim.device)
+
+    def work() -> None:
+        env.action_manager.take(tape.command(now))
+        env.advance()
+        evidence.update(sim)
+        now.add_(1)
+
+    play = env.captured(work, "a frame of the episode")
     trajectory = np.full((tape.frames, sim.qpos.shape[1]), np.nan) if record else None
     states: dict[int, State] = {}
     sim.synchronize()
     began = time.perf_counter()
     for frame in range(tape.frames):
-        env.step(tape.command(frame))
+        play()
         if on_frame is not None:
             on_frame(frame, sim)
-        evidence.update(sim)
         if trajectory is not None:
             trajectory[frame] = sim.qpos[0].cpu().numpy()
         if frame in snapshots:
@@ -120,7 +130,10 @@ def run_episode(
             advance("frames", frame + 1, tape.frames)
     sim.synchronize()
     seconds = time.perf_counter() - began
-    return Episode(evidence.verdict(sim), tape, seconds, trajectory, states)
+    capture_seconds = getattr(play, "warm_up_seconds", 0.0) + getattr(play, "capture_seconds", 0.0)
+    if capture_seconds:  # the first frame was the warm-up
+        seconds = (seconds - capture_seconds) * tape.frames / (tape.frames - 1)
+    return Episode(evidence.verdict(sim), tape, seconds, trajectory, states, capture_seconds)
 
 
 def snapshot(sim: Simulation) -> State:

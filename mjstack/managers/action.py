@@ -9,7 +9,7 @@ import torch
 
 from mjstack.config.schema import ActionTermCfg
 from mjstack.errors import ArgumentError, TermError
-from mjstack.managers.base import EnvView, build_instance, check_params, render_table, resolve_func, show_params
+from mjstack.managers.base import EnvView, build_instance, check_params, render_table, resolve_func, running, show_params
 
 
 class ActionTerm(ABC):
@@ -77,14 +77,14 @@ class ActionManager:
             start += term.dim
         self.action_dim = start
         zeros = torch.zeros((env.nworld, start), dtype=env.sim.qpos.dtype, device=env.device)
-        self.action, self.previous_action = zeros, zeros.clone()
+        self.action, self.previous_action, self._taken = zeros, zeros.clone(), zeros.clone()
         bounds = [(term.low, term.high) for term, _ in self._slices]
         self.low = torch.cat([low for low, _ in bounds]) if bounds else zeros[0]
         self.high = torch.cat([high for _, high in bounds]) if bounds else zeros[0]
         self.not_finite = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
 
     def process(self, action: torch.Tensor) -> None:
-        """Takes in an action.
+        """Takes in an action: `take`, which checks it, and `accept`.
 
         A value that is not finite is an error at once on the CPU. On CUDA, where looking would stop the device, it counts
         as 0 and its world is marked in ``not_finite``.
@@ -95,17 +95,25 @@ class ActionManager:
         Raises:
             ArgumentError: Wrong shape, dtype or device, or values that are not finite.
         """
+        self.take(action)
+        self.accept()
+
+    def take(self, action: torch.Tensor) -> None:
+        """Checks an action and copies it to where `accept` finds it; this part of a step is never captured."""
         self.check(action)
         action = action.detach()  # physics has no gradient, and a buffer must not acquire one
-        bad = ~torch.isfinite(action)
-        if not action.is_cuda and bool(bad.any()):
-            world = int(bad.any(1).nonzero()[0, 0])
+        if not action.is_cuda and not bool(torch.isfinite(action).all()):
+            world = int((~torch.isfinite(action)).any(1).nonzero()[0, 0])
             raise ArgumentError(
                 "action", f"{action[world].tolist()} in world {world}", "finite numbers", "Check what the policy returns"
             )
-        self.not_finite |= bad.any(1)
+        self._taken.copy_(action)
+
+    def accept(self) -> None:
+        """Makes the action that was taken the current one, and the current one the previous one."""
         self.previous_action.copy_(self.action)
-        self.action.copy_(action.masked_fill(bad, 0.0))
+        torch.nan_to_num(self._taken, 0.0, 0.0, 0.0, out=self.action)
+        self.not_finite |= (self.action != self._taken).any(1)
 
     def check(self, action: torch.Tensor) -> None:
         """Raises an `ArgumentError` for an action of wrong type, shape, dtype or device."""
@@ -121,7 +129,8 @@ class ActionManager:
 
     def write_commands(self) -> None:
         """Writes ``sim.ctrl`` in all worlds, term by term."""
-        for term, part in self._slices:
+        for (name, term), (_, part) in zip(self.terms.items(), self._slices, strict=True):
+            running.label = f"action.{name}"
             term.write_commands(self.action[:, part])
 
     def reset(self, mask: torch.Tensor) -> None:

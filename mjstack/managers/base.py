@@ -31,6 +31,7 @@ class EnvView(Protocol):
         nworld: Number of worlds.
         device: Where tensors live.
         seed: Seed of every random number.
+        key: The same on the device, shape ``(1,)``, int64: what a captured step reads.
         world: Number of each world, shape ``(nworld,)``, int64.
         episode: Episode of each world, shape ``(nworld,)``, int64.
         frame: Frames since each world's last reset, shape ``(nworld,)``, int64.
@@ -45,6 +46,7 @@ class EnvView(Protocol):
     nworld: int
     device: torch.device
     seed: int
+    key: torch.Tensor
     world: torch.Tensor
     episode: torch.Tensor
     frame: torch.Tensor
@@ -88,11 +90,16 @@ def random_uniform(
     Returns:
         Shape ``(nworld, size)``, in the type of the simulation's floats.
     """
+    stream = zlib.crc32(name.encode())
+    if env.device.type == "cuda":
+        from mjstack.sim.draws import draw_uniform  # one kernel; loads Warp, which native runs do not need
+
+        return draw_uniform(
+            key=env.key, stream=stream, world=env.world, episode=env.episode, step=step, size=size, low=low, high=high
+        )
     step = torch.zeros_like(env.world) if step is None else step
-    draw = uniform(
-        seed=env.seed, world=env.world, episode=env.episode, step=step, stream=zlib.crc32(name.encode()), size=size
-    ).to(env.sim.qpos.dtype)
-    return low + 0.5 * (high - low) * (draw + 1.0)
+    draw = uniform(seed=env.seed, world=env.world, episode=env.episode, step=step, stream=stream, size=size)
+    return low + 0.5 * (high - low) * (draw.to(env.sim.qpos.dtype) + 1.0)
 
 
 def resolve_func(label: str, path: str) -> Callable[..., Any]:
@@ -115,7 +122,7 @@ def resolve_func(label: str, path: str) -> Callable[..., Any]:
         names = [
             name for name, value in vars(module).items() if callable(value) and getattr(value, "__module__", "") == module_name
         ]
-        raise TermError(label, f"func={path}: '{attribute}' does not exist. {suggest(attribute, names)}"[:-1])
+        raise TermError(label, f"func={path}: '{attribute}' does not exist. {suggest(attribute, names)}")
     return func
 
 
@@ -136,7 +143,7 @@ def check_params(label: str, func: Callable[..., Any], params: dict[str, Any], l
     names = [p.name for p in accepted]
     for name in params:
         if name not in names:
-            raise TermError(label, f"parameter '{name}' does not exist. {suggest(name, names)}"[:-1])
+            raise TermError(label, f"parameter '{name}' does not exist. {suggest(name, names)}")
     missing = [p.name for p in accepted if p.default is p.empty and p.name not in params]
     if missing:
         raise TermError(label, f"parameter '{missing[0]}' is missing: set {label}.params.{missing[0]}")
@@ -193,6 +200,19 @@ def _located(label: str, error: ParameterError) -> ConfigError:
     return ConfigError(f"{label}.params.{name}", value, expected, fix)
 
 
+class Running:
+    """Which term was called last: the one to name if a capture fails.
+
+    Attributes:
+        label: Its dotted configuration key; empty outside the managers' terms.
+    """
+
+    label = ""
+
+
+running = Running()
+
+
 class Term:
     """A term ready to be called: a function with its parameters, or an instance of a class built with them."""
 
@@ -229,6 +249,7 @@ class Term:
 
     def __call__(self, *args: Any) -> Any:
         """Calls the term with the environment, and a mask if it takes one."""
+        running.label = self.label
         return self._call(*args, **self.params_of_call)
 
     def reset(self, mask: torch.Tensor) -> None:

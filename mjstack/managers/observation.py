@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import torch
 
@@ -13,7 +13,7 @@ from mjstack.managers.base import EnvView, Term, first_value, random_uniform, re
 
 
 class _Part:
-    """One term of a group: its slice, and its last values where it keeps a history."""
+    """One term of a group."""
 
     def __init__(self, label: str, cfg: ObservationTermCfg, env: EnvView) -> None:
         if cfg.history < 1:
@@ -35,15 +35,90 @@ class _Part:
         value = first_value(self.term, env, dims=(1, 2))
         self.width = 1 if value.dim() == 1 else value.shape[1]
         self.dim = self.width * cfg.history
-        self.past = torch.zeros((env.nworld, cfg.history, self.width), dtype=torch.float32, device=env.device)
 
-    def value(self, env: EnvView, noise: torch.Tensor | None) -> torch.Tensor:
-        value = self.term(env).to(torch.float32).view(env.nworld, self.width)
-        if noise is not None:
-            value = value + self.cfg.noise * noise
-        if self.cfg.clip is not None:
-            value = value.clamp(*self.cfg.clip)
-        return value if self.cfg.scale == 1.0 else self.cfg.scale * value
+    def spread(self, value: float) -> list[float]:
+        """A number for each column of one frame."""
+        return [value] * self.width
+
+
+class _Group:
+    """The terms of one group: noise, clipping and scaling are done for all columns at once."""
+
+    def __init__(self, name: str, cfg: ObservationGroupCfg, env: EnvView) -> None:
+        self.name, self.noisy, self._env = name, cfg.noise, env
+        self.parts = {term: _Part(f"observation.{name}.terms.{term}", c, env) for term, c in cfg.terms.items()}
+        if not self.parts:
+            raise TermError(f"observation.{name}", "has no terms: expected at least one, or no such group")
+        parts = self.parts.values()
+
+        def row(values: Callable[[_Part], float]) -> torch.Tensor:
+            return torch.tensor([x for p in parts for x in p.spread(values(p))], dtype=torch.float32, device=env.device)
+
+        self.dim = sum(part.dim for part in parts)
+        noise = [x for part in parts for x in part.spread(part.cfg.noise if cfg.noise else 0.0)]
+        # Only columns with noise get numbers: where one stands in the draw follows from them alone.
+        columns = [i for i, x in enumerate(noise) if x > 0.0]
+        self._noise = torch.tensor([noise[i] for i in columns], dtype=torch.float32, device=env.device)
+        self._noise_columns = torch.tensor(columns, dtype=torch.int64, device=env.device)
+        clips = any(part.cfg.clip is not None for part in parts)
+        self._low = row(lambda p: -math.inf if p.cfg.clip is None else p.cfg.clip[0]) if clips else None
+        self._high = row(lambda p: math.inf if p.cfg.clip is None else p.cfg.clip[1]) if clips else None
+        self._scale = row(lambda p: p.cfg.scale) if any(part.cfg.scale != 1.0 for part in parts) else None
+        # Where each frame of the history stands in the group: all columns of the last one, and for older ones those that
+        # have a history that long. A frame moves to where the next older one was.
+        starts, at = [], 0
+        for part in parts:
+            starts.append(at)
+            at += part.dim
+        newest = [s + p.dim - p.width + i for p, s in zip(parts, starts, strict=True) for i in range(p.width)]
+        older = [s + i for p, s in zip(parts, starts, strict=True) for i in range(p.dim - p.width)]
+        widths = [p.width for p in parts for _ in range(p.dim - p.width)]
+        self._newest = torch.tensor(newest, device=env.device) if older else None
+        self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
+        self._older = torch.tensor(older, dtype=torch.int64, device=env.device)
+        self._next = torch.tensor([i + w for i, w in zip(older, widths, strict=True)], dtype=torch.int64, device=env.device)
+        source = [i for p, first in _first_columns(parts) for _ in range(p.cfg.history) for i in range(first, first + p.width)]
+        self._repeat = torch.tensor(source, dtype=torch.int64, device=env.device)
+
+    def compute(self) -> torch.Tensor:
+        """One frame of every world, shape ``(nworld, sum of widths)``."""
+        n = self._env.nworld
+        values = [part.term(self._env).float().reshape(n, part.width) for part in self.parts.values()]
+        frame = torch.cat(values, dim=1)
+        if len(self._noise_columns):
+            size = len(self._noise_columns)
+            draw = random_uniform(self._env, f"observation.{self.name}", size, step=self._env.frame).float()
+            frame.index_add_(1, self._noise_columns, self._noise * draw)
+        if self._low is not None:
+            frame.clamp_(self._low, self._high)
+        return frame if self._scale is None else frame.mul_(self._scale)
+
+    def append(self, out: torch.Tensor) -> None:
+        """Takes in a new frame of every world, and forgets the oldest."""
+        frame = self.compute()
+        if self._newest is None:
+            out.copy_(frame)
+            return
+        self._past[:, self._older] = self._past.index_select(1, self._next)
+        self._past[:, self._newest] = frame
+        out.copy_(self._past)
+
+    def restart(self, out: torch.Tensor, mask: torch.Tensor) -> None:
+        """The whole history of the masked worlds becomes the current frame."""
+        frame = self.compute()
+        if self._newest is None:
+            torch.where(mask[:, None], frame, out, out=out)
+            return
+        torch.where(mask[:, None], frame.index_select(1, self._repeat), self._past, out=self._past)
+        out.copy_(self._past)
+
+
+def _first_columns(parts: Iterable[_Part]) -> Iterator[tuple[_Part, int]]:
+    """Each part with its first column within one frame."""
+    first = 0
+    for part in parts:
+        yield part, first
+        first += part.width
 
 
 class ObservationManager:
@@ -60,70 +135,41 @@ class ObservationManager:
         Raises:
             TermError: A term cannot be found, or returns what a group cannot hold.
         """
-        self._env = env
-        self._parts = {
-            group: {name: _Part(f"observation.{group}.terms.{name}", term, env) for name, term in group_cfg.terms.items()}
-            for group, group_cfg in cfg.items()
-        }
-        for group, parts in self._parts.items():
-            if not parts:
-                raise TermError(f"observation.{group}", "has no terms: expected at least one, or no such group")
-        self._noisy = {group: group_cfg.noise for group, group_cfg in cfg.items()}
-        self.group_dims = {group: sum(part.dim for part in parts.values()) for group, parts in self._parts.items()}
+        self._groups = {name: _Group(name, group, env) for name, group in cfg.items()}
+        self.group_dims = {name: group.dim for name, group in self._groups.items()}
         self.groups = {
-            group: torch.full((env.nworld, dim), math.nan, dtype=torch.float32, device=env.device)
-            for group, dim in self.group_dims.items()
+            name: torch.full((env.nworld, dim), math.nan, dtype=torch.float32, device=env.device)
+            for name, dim in self.group_dims.items()
         }
 
     def compute(self) -> dict[str, torch.Tensor]:
         """Takes in a new frame of every world, and returns `groups`."""
-        for group in self._parts:
-            self._write(group, None)
+        for name, group in self._groups.items():
+            group.append(self.groups[name])
         return self.groups
 
     def refresh(self, mask: torch.Tensor) -> dict[str, torch.Tensor]:
         """Computes the masked worlds anew after their reset; their whole history becomes the first frame."""
-        for group in self._parts:
-            self._write(group, mask)
+        for name, group in self._groups.items():
+            group.restart(self.groups[name], mask)
         return self.groups
 
     def not_finite_terms(self, world: int) -> list[str]:
         """Names of the terms whose last value in a world is not finite. Waits for the device."""
-        return [
-            part.term.label
-            for parts in self._parts.values()
-            for part in parts.values()
-            if not bool(torch.isfinite(part.past[world]).all())
-        ]
-
-    def _write(self, group: str, mask: torch.Tensor | None) -> None:
-        out, start = self.groups[group], 0
-        for part, noise in zip(self._parts[group].values(), self._noise(group), strict=True):
-            value = part.value(self._env, noise)
-            if mask is not None:
-                part.past.copy_(torch.where(mask[:, None, None], value[:, None], part.past))
-            elif part.cfg.history > 1:
-                part.past.copy_(torch.cat((part.past[:, 1:], value[:, None]), dim=1))
-            else:
-                part.past[:, 0] = value
-            out[:, start : start + part.dim] = part.past.flatten(1)
-            start += part.dim
-
-    def _noise(self, group: str) -> list[torch.Tensor | None]:
-        """Numbers in [-1, 1) for every term that has noise, from one draw."""
-        parts = self._parts[group].values()
-        wanted = [part.width if self._noisy[group] and part.cfg.noise > 0.0 else 0 for part in parts]
-        if not any(wanted):
-            return [None] * len(wanted)
-        draw = random_uniform(self._env, f"observation.{group}", sum(wanted), step=self._env.frame).float()
-        return [piece if piece.shape[1] else None for piece in draw.split(wanted, dim=1)]
+        names = []
+        for name, group in self._groups.items():
+            values = self.groups[name][world].split([part.dim for part in group.parts.values()])
+            for part, value in zip(group.parts.values(), values, strict=True):
+                if not bool(torch.isfinite(value).all()):
+                    names.append(part.term.label)
+        return names
 
     def __str__(self) -> str:
         rows = []
-        for group, parts in self._parts.items():
-            for name, part in parts.items():
+        for group, terms in self._groups.items():
+            for name, part in terms.parts.items():
                 cfg = part.cfg
-                noise = cfg.noise if self._noisy[group] else 0.0
+                noise = cfg.noise if terms.noisy else 0.0
                 params = show_params(part.term.params)
                 rows.append((group, name, part.dim, cfg.history, noise, cfg.clip or "", cfg.scale, params))
         title = "observation: " + ", ".join(f"{group} {dim}" for group, dim in self.group_dims.items())

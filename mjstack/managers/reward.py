@@ -17,6 +17,7 @@ class RewardManager:
 
     Attributes:
         names: The terms.
+        weights: ``weight x frame_dt`` of every term, shape ``(nterm,)``, float32. Write into it to change a weight later.
         reward: The sum at the last frame, shape ``(nworld,)``, float32.
         values: Its summands, shape ``(nworld, nterm)``, float32.
         episode_sums: The summands since each world's last reset, shape ``(nworld, nterm)``, float32.
@@ -35,7 +36,8 @@ class RewardManager:
                 raise TermError(term.label, f"weight={cfg[name].weight}: expected a finite number")
             first_value(term, env, dims=(1,))
         self.names = list(self._terms)
-        self._frame_dt = env.cfg.timing.frame_dt
+        weights = [cfg[name].weight * env.cfg.timing.frame_dt for name in self.names]
+        self.weights = torch.tensor(weights, dtype=torch.float32, device=env.device)
         self.reward = torch.zeros(env.nworld, dtype=torch.float32, device=env.device)
         self.values = torch.zeros((env.nworld, len(self.names)), dtype=torch.float32, device=env.device)
         self.episode_sums = torch.zeros_like(self.values)
@@ -46,8 +48,8 @@ class RewardManager:
         Args:
             void: Worlds whose state is not finite, shape ``(nworld,)``, bool: they get no reward for this frame.
         """
-        for column, (name, term) in enumerate(self._terms.items()):
-            self.values[:, column] = self._cfg[name].weight * self._frame_dt * term(self._env)
+        if self._terms:
+            torch.mul(torch.stack([term(self._env).float() for term in self._terms.values()], 1), self.weights, out=self.values)
         if void is not None:
             self.values.masked_fill_(void[:, None], 0.0)
         self.episode_sums += self.values

@@ -36,20 +36,17 @@ class TerminationManager:
             return torch.zeros((env.nworld, *shape), dtype=torch.bool, device=env.device)
 
         self.terminated, self.truncated, self.values = flags(), flags(), flags(len(self.names))
+        self._ends = torch.tensor([not cfg[name].time_out for name in self.names], dtype=torch.bool, device=env.device)
 
     def compute(self) -> None:
         """Writes `terminated`, `truncated` and `values`."""
-        self.terminated.zero_()
-        self.truncated.zero_()
-        for column, (name, term) in enumerate(self._terms.items()):
-            value = term(self._env)
-            self.values[:, column] = value
-            if self._cfg[name].time_out:
-                self.truncated |= value
-            else:
-                self.terminated |= value
+        if not self._terms:
+            return
+        torch.stack([term(self._env) for term in self._terms.values()], dim=1, out=self.values)
+        torch.any(self.values & self._ends, dim=1, out=self.terminated)
         # Where both hold, the state itself ended the episode: there is nothing left to bootstrap from.
-        self.truncated &= ~self.terminated
+        torch.any(self.values, dim=1, out=self.truncated)
+        self.truncated ^= self.terminated
 
     def reset(self, mask: torch.Tensor) -> None:
         """Lets terms with a memory forget the masked worlds."""

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
-import gc
-import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import fields as dataclass_fields
+from dataclasses import is_dataclass, replace
 
 import mujoco
+import numpy as np
 import torch
 import warp as wp
 
 from mjstack.config.schema import GraphMode
-from mjstack.errors import MjstackError, UnsupportedModel
-from mjstack.sim.counters import count_contacts, record_peaks
+from mjstack.errors import UnsupportedModel
+from mjstack.sim.counters import clear_counters, record_convex_contacts, record_usage
 from mjstack.sim.fields import PLACING_FIELDS, check_fields
+from mjstack.sim.graph import StepGraph, inside_graph
 from mjstack.sim.memory import array_bytes, borrowed_bytes
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.sim.sizes import BatchSizes
@@ -26,17 +27,18 @@ from mjstack.sim.views import Fields, FixedViews, check_mask
 wp.config.log_level = wp.LOG_ERROR  # before mujoco_warp, which starts Warp on import
 import mujoco_warp as mjw  # noqa: E402
 
-log = logging.getLogger(__name__)
-
 
 class MjwarpSimulation(FixedViews):
     """`Simulation` on MuJoCo Warp, float32.
 
     Box against box uses the primitive collider, as native MuJoCo does: with MJWarp's convex one the kept contacts of a
-    resting stack can alternate, and it never comes to rest. The substeps of one `step(n)` are captured into a graph.
+    resting stack can alternate, and it never comes to rest. The substeps of one `step(n)` are captured into a graph, unless
+    they are a part of a larger one.
 
     Attributes:
-        peak_pool: Most contacts, and most broad-phase pairs, of all worlds at once since the last full reset, shape ``(2,)``.
+        peak_pool: Most contacts, broad-phase pairs, and contacts of one kind of convex collision, of all worlds at once since
+            the last full reset, shape ``(3,)``, int32. The third bounds what nccdmax must hold.
+        version: Grows whenever something changes that a graph has baked in.
         solver_limits: MJWarp's bits for worlds whose solver stopped at an iteration limit, shape ``(nworld,)``, int32.
     """
 
@@ -70,7 +72,8 @@ class MjwarpSimulation(FixedViews):
         self.device = torch.device(device)
         self._device = wp.get_device(device)
         self._graph_mode = graph
-        self._graphs: dict[tuple[int, bool], object] = {}
+        self._graphs: dict[tuple[int, bool], StepGraph] = {}
+        self.version = 0
         names = check_fields(fields)
         self._placing = not PLACING_FIELDS.isdisjoint(names)
         name = self._device.name if self._device.is_cuda else "Warp's CPU device"
@@ -88,7 +91,10 @@ class MjwarpSimulation(FixedViews):
             self._contacts = wp.zeros(nworld, dtype=int)
             self._peak_nefc = wp.zeros(nworld, dtype=int)
             self._peak_contacts = wp.zeros(nworld, dtype=int)
-            self._peak_pool = wp.zeros(2, dtype=int)
+            self._peak_pool = wp.zeros(3, dtype=int)
+            kinds = _convex_kinds(model)
+            self._kinds = None if kinds is None else wp.array(kinds, dtype=int)
+            self._kind_counts = wp.zeros(0 if kinds is None else int(kinds.max()) + 1, dtype=int)
             self._lost = wp.zeros(nworld, dtype=int)
             self._limits = wp.zeros(nworld, dtype=int)
             self._steps = wp.zeros(nworld, dtype=wp.int64)
@@ -118,12 +124,11 @@ class MjwarpSimulation(FixedViews):
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
         """Advances every world by n physics steps under the current ctrl; the poses follow with kinematics."""
-        graph = self._graph(n, kinematics)
         with torch_stream_scope(self._device):
-            if graph is None:
+            if n == 0 or inside_graph():
                 self._substeps(n, kinematics)
             else:
-                wp.capture_launch(graph)
+                self._graph(n, kinematics)()
 
     def forward(self) -> None:
         """Computes everything that derives from the state, without advancing time."""
@@ -150,10 +155,12 @@ class MjwarpSimulation(FixedViews):
         self._keep_peaks(clear=mask is None)
         with torch_stream_scope(self._device):
             mjw.reset_data(self._m, self._d, reset=self._mask)
-        keep = ~self._torch_mask
-        counters = (self.overflow, self.solver_limits, self.peak_contacts, self.peak_constraints, self.contact_count)
-        for buffer in (self.step_count, *counters):
-            buffer *= keep
+            wp.launch(
+                clear_counters,
+                dim=self.nworld,
+                inputs=[self._mask],
+                outputs=[self._peak_contacts, self._peak_nefc, self._contacts, self._lost, self._limits, self._steps],
+            )
 
     @property
     def most_contacts(self) -> torch.Tensor:
@@ -193,6 +200,57 @@ class MjwarpSimulation(FixedViews):
             "solver": mujoco.mjtSolver(int(opt.solver)).name,
             "box_box": "primitive" if primitive else "convex",
         }
+
+    def bare_step(self) -> Callable[[], None]:
+        """One plain ``mujoco_warp.step``, replayed from a graph of its own: what everything else is measured against."""
+        graph = StepGraph(
+            lambda: mjw.step(self._m, self._d), self.device, self._graph_mode, name="a bare step", version=lambda: self.version
+        )
+
+        def step() -> None:
+            with torch_stream_scope(self._device):
+                graph()
+
+        return step
+
+    def resize(self, sizes: BatchSizes) -> None:
+        """Gives the worlds other buffer sizes. Their state and every view stay; contacts and rows are empty until a step.
+
+        Args:
+            sizes: The new sizes.
+        """
+        with wp.ScopedDevice(self._device):
+            fresh = mjw.make_data(self.model, nworld=self.nworld, **sizes.as_kwargs(self.nworld))
+            _keep_arrays(fresh, self._d)
+            for count in (fresh.nacon, fresh.nefc, fresh.ncollision):
+                count.zero_()
+        self._d, self.sizes = fresh, sizes
+        self.version += 1
+
+    def set_options(
+        self,
+        *,
+        iterations: int | None = None,
+        ls_iterations: int | None = None,
+        tolerance: float | None = None,
+        impratio: float | None = None,
+    ) -> None:
+        """Changes the constraint solver's limits; graphs, which have them baked in, are captured anew.
+
+        Args:
+            iterations: Most Newton iterations.
+            ls_iterations: Most line-search iterations.
+            tolerance: At which the solver stops; at least 1e-6 counts.
+            impratio: Ratio of frictional to normal constraint impedance.
+        """
+        opt = self._m.opt
+        opt.iterations = opt.iterations if iterations is None else iterations
+        opt.ls_iterations = opt.ls_iterations if ls_iterations is None else ls_iterations
+        if tolerance is not None:
+            opt.tolerance.fill_(max(tolerance, 1e-6))
+        if impratio is not None:
+            opt.impratio_invsqrt.fill_(impratio**-0.5)
+        self.version += 1
 
     def synchronize(self) -> None:
         """Waits for the device."""
@@ -240,29 +298,34 @@ class MjwarpSimulation(FixedViews):
         )
 
     def _count(self, *, steps: int) -> None:
-        """Two launches: steps made, what each world uses now, and the most it has used."""
-        d = self._d
+        """Steps made, what each world uses now, and the most it has used."""
+        d, contacts = self._d, self._d.contact
+        pool = contacts.worldid.shape[0]
+        # A thread per world, and at least one for every eighth place of the pool, which is mostly empty.
+        stride = max(self.nworld, pool // 8)
         self._contacts.zero_()
-        wp.launch(count_contacts, dim=d.contact.worldid.shape[0], inputs=[d.nacon, d.contact.worldid, self._contacts])
         wp.launch(
-            record_peaks,
-            dim=self.nworld,
-            inputs=[
-                d.nefc,
-                d.nacon,
-                d.ncollision,
+            record_usage,
+            dim=stride,
+            inputs=[d.nacon, contacts.worldid, d.nefc, d.ncollision, d.overflow, LOST_PHYSICS, steps, stride],
+            outputs=[
                 self._contacts,
-                d.overflow,
-                self._peak_nefc,
                 self._peak_contacts,
+                self._peak_nefc,
                 self._peak_pool,
-                LOST_PHYSICS,
                 self._lost,
                 self._limits,
-                steps,
                 self._steps,
             ],
         )
+        if self._kinds is not None:
+            self._kind_counts.zero_()
+            wp.launch(
+                record_convex_contacts,
+                dim=stride,
+                inputs=[d.nacon, contacts.geom, self._m.geom_type, self._kinds, stride],
+                outputs=[self._kind_counts, self._peak_pool],
+            )
 
     def _warm_up(self) -> None:
         """Compiles and loads every kernel, then leaves the worlds as new."""
@@ -272,31 +335,48 @@ class MjwarpSimulation(FixedViews):
         self.reset()
         self.synchronize()
 
-    def _graph(self, n: int, kinematics: bool) -> object | None:
-        if self._graph_mode is GraphMode.off or n == 0:
-            return None
+    def _graph(self, n: int, kinematics: bool) -> StepGraph:
         key = (n, kinematics)
         if key not in self._graphs:
-            self._graphs[key] = self._capture(n, kinematics)
+            self._graphs[key] = StepGraph(
+                lambda: self._substeps(n, kinematics),
+                self.device,
+                self._graph_mode,
+                name=f"step({n})",
+                version=lambda: self.version,
+            )
         return self._graphs[key]
 
-    def _capture(self, n: int, kinematics: bool) -> object | None:
-        """Captures n substeps. Python's collector waits, so that nothing is freed in the middle of a capture."""
-        self.synchronize()
-        collecting = gc.isenabled()
-        gc.disable()
-        try:
-            with wp.ScopedDevice(self._device), wp.ScopedCapture() as capture:
-                self._substeps(n, kinematics)
-        except Exception as error:
-            if self._graph_mode is GraphMode.require:
-                raise MjstackError(f"graph=require: {n} substeps cannot be captured: {error}. Use graph=auto.") from error
-            log.warning("substeps run uncaptured: %s", error)
-            return None
-        finally:
-            if collecting:
-                gc.enable()
-        return capture.graph
+
+def _convex_kinds(model: mujoco.MjModel) -> np.ndarray | None:
+    """Numbers the combinations of geom types that collide by the convex algorithm, else -1; None if the model has none.
+
+    Planes are always primitive, and so is everything among spheres, capsules and boxes, and a sphere with a cylinder.
+    """
+    g = mujoco.mjtGeom
+    present = {int(t) for t in model.geom_type}
+    shapes = [int(t) for t in (g.mjGEOM_HFIELD, g.mjGEOM_SPHERE, g.mjGEOM_CAPSULE, g.mjGEOM_ELLIPSOID, g.mjGEOM_CYLINDER)]
+    shapes += [int(t) for t in (g.mjGEOM_BOX, g.mjGEOM_MESH)]
+    simple = {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CAPSULE), int(g.mjGEOM_BOX)}
+    kinds = np.full(2 * (max(present) + 1,), -1, dtype=np.int32)
+    number = 0
+    for i, a in enumerate(shapes):
+        for b in shapes[i:]:
+            primitive = {a, b} <= simple or {a, b} == {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CYLINDER)}
+            if not primitive and {a, b} <= present:
+                kinds[a, b] = kinds[b, a] = number
+                number += 1
+    return kinds if number else None
+
+
+def _keep_arrays(fresh: object, old: object) -> None:
+    """Hands the arrays whose size is the same over to new data, so that whoever looks at them goes on doing so."""
+    for field in dataclass_fields(fresh):  # type: ignore[arg-type]
+        ours, theirs = getattr(fresh, field.name), getattr(old, field.name)
+        if isinstance(ours, wp.array) and ours.shape == theirs.shape and ours.dtype == theirs.dtype:
+            setattr(fresh, field.name, theirs)
+        elif is_dataclass(ours):
+            _keep_arrays(ours, theirs)
 
 
 def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
@@ -309,10 +389,10 @@ def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
         nworld: Number of worlds.
         sizes: Buffer sizes.
     """
-    share = dataclasses.replace(sizes, naconmax=None, naccdmax=None)
+    share = replace(sizes, naconmax=None, naccdmax=None)
     with wp.ScopedDevice("cpu"):
         one, two, longer = (
-            array_bytes(mjw.make_data(model, nworld=n, **dataclasses.replace(share, nconmax=c).as_kwargs(n)))
+            array_bytes(mjw.make_data(model, nworld=n, **replace(share, nconmax=c).as_kwargs(n)))
             for n, c in ((1, sizes.nconmax), (2, sizes.nconmax), (1, sizes.nconmax + 1))
         )
     per_contact = longer - one

@@ -56,6 +56,7 @@ class NativeSimulation(FixedViews):
     """
 
     backend = "native"
+    version = 0  # nothing is ever captured
 
     def __init__(self, model: mujoco.MjModel, nworld: int, *, fields: Sequence[str] = (), nthread: int | None = None) -> None:
         """Allocates nworld worlds at qpos0.
@@ -175,6 +176,21 @@ class NativeSimulation(FixedViews):
             "solver": mujoco.mjtSolver(opt.solver).name,
             "box_box": "primitive",
         }
+
+    def set_options(
+        self,
+        *,
+        iterations: int | None = None,
+        ls_iterations: int | None = None,
+        tolerance: float | None = None,
+        impratio: float | None = None,
+    ) -> None:
+        """Changes the constraint solver's limits."""
+        given = {"iterations": iterations, "ls_iterations": ls_iterations, "tolerance": tolerance, "impratio": impratio}
+        for model in (self.model, *(worker.model for worker in self._workers)):
+            for name, value in given.items():
+                if value is not None:
+                    setattr(model.opt, name, value)
 
     def synchronize(self) -> None:
         """Nothing to wait for: `step` returns when every thread has."""

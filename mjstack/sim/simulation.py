@@ -85,6 +85,7 @@ class Simulation(Protocol):
             resets leave it alone, so it is the peak of a run in which worlds end and start anew. Computed when it is read.
         most_constraints: Largest constraint_count likewise, shape ``(nworld,)``, int32.
         overflow_ever: Bits of `Overflow` raised since the last full reset likewise, shape ``(nworld,)``, int32.
+        version: Grows when something changes that a captured graph has baked in.
     """
 
     model: mujoco.MjModel
@@ -109,6 +110,7 @@ class Simulation(Protocol):
     overflow: torch.Tensor
     peak_contacts: torch.Tensor
     peak_constraints: torch.Tensor
+    version: int
 
     @property
     def most_contacts(self) -> torch.Tensor:
@@ -152,6 +154,16 @@ class Simulation(Protocol):
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as this backend holds them, by MuJoCo's names."""
+
+    def set_options(
+        self,
+        *,
+        iterations: int | None = None,
+        ls_iterations: int | None = None,
+        tolerance: float | None = None,
+        impratio: float | None = None,
+    ) -> None:
+        """Changes the constraint solver's limits in all worlds, from the next step on."""
 
     def synchronize(self) -> None:
         """Waits for the device."""

@@ -14,7 +14,7 @@ from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView
 from mjstack.math import lowest_corner, quat_angle
 from mjstack.mdp.geometry import gripper_opening
-from mjstack.scene import BLUE, RED, SceneIndex, table_top
+from mjstack.scene import SceneIndex, table_top
 from mjstack.sim.simulation import LOST_PHYSICS, Simulation
 
 
@@ -70,18 +70,64 @@ class Verdict:
     rest_rotation: torch.Tensor
 
 
+class CubePair:
+    """Both cubes of every world as the rules see them, red first, float32: they read qpos and qvel alone, never stale."""
+
+    def __init__(self, cfg: Config, index: SceneIndex, device: torch.device) -> None:
+        """Reads addresses, thresholds and the table's place."""
+        self._t, self._half = cfg.gate.acceptance, cfg.scene.cube_half
+        self._top = table_top(cfg.scene)
+        self._qpos, self._qvel = index.cube_qpos, index.cube_qvel
+        self._center = torch.tensor(cfg.scene.table_center[:2], dtype=torch.float32, device=device)
+        self._room = torch.tensor(cfg.scene.table_half[:2], dtype=torch.float32, device=device) - self._half
+
+    def pose(self, sim: Simulation) -> torch.Tensor:
+        """Position [m] and quaternion (wxyz), shape ``(nworld, 2, 7)``."""
+        return torch.stack([sim.qpos[:, a : a + 7] for a in self._qpos], dim=1).float()
+
+    def speed(self, sim: Simulation) -> torch.Tensor:
+        """Fastest that any point of a cube can be [m/s], shape ``(nworld, 2)``."""
+        velocity = torch.stack([sim.qvel[:, a : a + 6] for a in self._qvel], dim=1).float()
+        linear, angular = torch.linalg.vector_norm(velocity.unflatten(-1, (2, 3)), dim=-1).unbind(-1)
+        return linear + math.sqrt(3.0) * self._half * angular
+
+    def clearance(self, pose: torch.Tensor) -> torch.Tensor:
+        """Height of each lowest corner above the table [m], shape ``(nworld, 2)``."""
+        return lowest_corner(pose[..., :3], pose[..., 3:], self._half) - self._top
+
+    def offset(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Horizontal distance of the centres, and height of red above blue [m], each ``(nworld,)``."""
+        apart = pose[:, 0, :3] - pose[:, 1, :3]
+        return torch.linalg.vector_norm(apart[:, :2], dim=1), apart[:, 2]
+
+    def stacked(self, xy_err: torch.Tensor, dz: torch.Tensor) -> torch.Tensor:
+        """Whether red is where it belongs on blue, shape ``(nworld,)``, bool."""
+        return (xy_err <= self._t.xy_err) & (dz >= self._t.dz_min) & (dz <= self._t.dz_max)
+
+    def supported(self, pose: torch.Tensor, clearance: torch.Tensor) -> torch.Tensor:
+        """Whether blue stands on the table, shape ``(nworld,)``, bool."""
+        inside = ((pose[:, 1, :2] - self._center).abs() <= self._room).all(1)
+        return (clearance[:, 1].abs() <= self._t.support_gap) & inside
+
+
 class StackEvidence:
-    """Collects what the acceptance rules need. Memory: O(window) per world, whatever the episode's length."""
+    """Collects what the acceptance rules need. Memory: O(window) per world, whatever the episode's length.
+
+    The frame is counted on the device, so that a captured graph can hold `update`.
+    """
 
     def __init__(self, cfg: Config, index: SceneIndex, phases: list[Phase], nworld: int, device: torch.device) -> None:
         """Allocates for nworld worlds."""
-        self._t = cfg.gate.acceptance
-        self._scene, self._timing = cfg.scene, cfg.timing
-        self._qpos, self._qvel = index.cube_qpos, index.cube_qvel
+        self._t, self._timing = cfg.gate.acceptance, cfg.timing
+        self._cubes = CubePair(cfg, index, device)
         self._frames = phases[-1].stop
-        self._lift = _frames_of(phases, self._t.lift_phases)
-        self._carry = _frames_of(phases, [self._t.carry_phase])
-        self._frame = 0
+        self._frame = torch.zeros(1, dtype=torch.int64, device=device)
+        frames = [f for phase in phases for f in range(phase.start, phase.stop)]
+        lift, carry = _frames_of(phases, self._t.lift_phases), _frames_of(phases, [self._t.carry_phase])
+        window = set(range(self._frames - self._t.window, self._frames))
+        # What a frame counts for; the last row is for frames after the end, which count for nothing.
+        rows = [[f in lift, f in carry, f in window] for f in frames] + [[False] * 3]
+        self._counts_for = torch.tensor(rows, device=device)
 
         def buffer(*shape: int, value: float = 0.0) -> torch.Tensor:
             return torch.full((nworld, *shape), value, dtype=torch.float32, device=device)
@@ -96,40 +142,36 @@ class StackEvidence:
         self._xy_err, self._dz = buffer(value=math.nan), buffer(value=math.nan)
 
     def update(self, sim: Simulation) -> None:
-        """Takes in the state at the end of a frame. Reads qpos and qvel alone, which are never stale."""
-        frame, t = self._frame, self._t
+        """Takes in the state at the end of a frame. Fixed shapes, no host read."""
+        t, cubes = self._t, self._cubes
+        counts_for = self._counts_for.index_select(0, self._frame.clamp(max=self._frames))[0]
+        in_lift, in_carry, in_window = counts_for.unbind(0)
         finite, stacked, supported = self._ok.unbind(0)
-        finite &= torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1)
-        pose = torch.stack([sim.qpos[:, a : a + 7] for a in self._qpos], dim=1).float()
-        velocity = torch.stack([sim.qvel[:, a : a + 6] for a in self._qvel], dim=1).float()
-        pos, quat = pose[..., :3], pose[..., 3:]
-        low = lowest_corner(pos, quat, self._scene.cube_half) - table_top(self._scene)
+        # 0 times a number that is not finite is NaN, which is no longer 0.
+        finite &= ((sim.qpos * 0.0).sum(1) + (sim.qvel * 0.0).sum(1)) == 0.0
+        pose = cubes.pose(sim)
+        low = cubes.clearance(pose)
 
+        # A run that is not in its phase stays as it is: outside, nothing looks at it.
         airborne = low[:, 0] > t.airborne_height
-        if frame in self._lift:
-            self._lift_run.add_(1.0).mul_(airborne)
-            torch.maximum(self._lift_best, self._lift_run, out=self._lift_best)
-        if frame in self._carry:
-            red = pos[:, 0, :2]
-            starts = airborne & (self._carry_run == 0.0)
-            self._carry_from.copy_(torch.where(starts[:, None], red, self._carry_from))
-            self._carry_run.add_(1.0).mul_(airborne)
-            away = torch.linalg.vector_norm(red - self._carry_from, dim=1)
-            self._carry_far.copy_(torch.where(airborne, torch.maximum(self._carry_far, away), 0.0))
-            self._carried |= (self._carry_run >= t.carry_frames) & (self._carry_far >= t.carry_distance)
+        self._lift_run.copy_(torch.where(in_lift, (self._lift_run + 1.0) * airborne, self._lift_run))
+        torch.maximum(self._lift_best, self._lift_run, out=self._lift_best)
+        red, in_air = pose[:, 0, :2], airborne & in_carry
+        starts = in_air & (self._carry_run == 0.0)
+        self._carry_from.copy_(torch.where(starts[:, None], red, self._carry_from))
+        self._carry_run.add_(1.0).mul_(in_air)
+        away = torch.linalg.vector_norm(red - self._carry_from, dim=1)
+        self._carry_far.copy_(torch.where(in_air, torch.maximum(self._carry_far, away), 0.0))
+        self._carried |= (self._carry_run >= t.carry_frames) & (self._carry_far >= t.carry_distance)
 
-        torch.linalg.vector_norm(pos[:, 0, :2] - pos[:, 1, :2], dim=1, out=self._xy_err)
-        torch.sub(pos[:, 0, 2], pos[:, 1, 2], out=self._dz)
-        if frame >= self._frames - t.window:
-            stacked &= (self._xy_err <= t.xy_err) & (self._dz >= t.dz_min) & (self._dz <= t.dz_max)
-            centre = torch.tensor(self._scene.table_center[:2], dtype=torch.float32, device=pos.device)
-            half = torch.tensor(self._scene.table_half[:2], dtype=torch.float32, device=pos.device)
-            inside = ((pos[:, 1, :2] - centre).abs() <= half - self._scene.cube_half).all(1)
-            supported &= (low[:, 1].abs() <= t.support_gap) & inside
-        slot = frame % t.window
-        self._pose[:, slot] = pose
-        spin = math.sqrt(3.0) * self._scene.cube_half * torch.linalg.vector_norm(velocity[..., 3:], dim=-1)
-        self._speed[:, slot] = torch.linalg.vector_norm(velocity[..., :3], dim=-1) + spin
+        xy_err, dz = cubes.offset(pose)
+        self._xy_err.copy_(xy_err)
+        self._dz.copy_(dz)
+        stacked &= cubes.stacked(xy_err, dz) | ~in_window
+        supported &= cubes.supported(pose, low) | ~in_window
+        slot = self._frame.remainder(t.window)
+        self._pose.index_copy_(1, slot, pose[:, None])
+        self._speed.index_copy_(1, slot, cubes.speed(sim)[:, None])
         self._frame += 1
 
     def verdict(self, sim: Simulation) -> Verdict:
@@ -138,7 +180,7 @@ class StackEvidence:
         position, rotation = self._spread()
         rms = self._speed.square().mean(1).sqrt().amax(1)
         finite, stacked, supported = self._ok.unbind(0)
-        complete = self._frame == self._frames
+        complete = int(self._frame) == self._frames
         wanted = self._frames * self._timing.substeps
         held = {
             Rule.FINITE: finite,
@@ -200,8 +242,8 @@ class StackSuccess:
         """
         if not 0.0 <= open_fraction <= 1.0:
             raise ParameterError("open_fraction", open_fraction, "a number from 0 to 1")
-        self._t, self._scene, self._open = env.cfg.gate.acceptance, env.cfg.scene, open_fraction
-        self._addresses = [env.index.objects[name] for name in (RED, BLUE)]
+        self._t, self._open = env.cfg.gate.acceptance, open_fraction
+        self._cubes = CubePair(env.cfg, env.index, env.device)
         n, window, device = env.nworld, self._t.window, env.device
         self._slot = torch.zeros(1, dtype=torch.int64, device=device)  # where the oldest frame is, in every world
         self._pos, self._quat = torch.zeros((n, window, 2, 3), device=device), torch.zeros((n, window, 2, 4), device=device)
@@ -210,30 +252,20 @@ class StackSuccess:
         self._far = torch.zeros((n, window, 2), device=device)  # per frame and cube: squared distance to later frames
         self._turned = torch.zeros((n, window, 2), device=device)  # likewise: 1 - |cosine of half the angle|
         self._held = torch.zeros(n, dtype=torch.int32, device=device)  # frames in a row that were stacked and supported
-        self._center = torch.tensor(self._scene.table_center[:2], dtype=torch.float32, device=device)
-        self._room = torch.tensor(self._scene.table_half[:2], dtype=torch.float32, device=device) - self._scene.cube_half
 
     def __call__(self, env: EnvView) -> torch.Tensor:
         """Takes in a frame; shape ``(nworld,)``, bool."""
-        t, half = self._t, self._scene.cube_half
-        pose = torch.stack([env.sim.qpos[:, q : q + 7] for q, _ in self._addresses], dim=1).float()
-        velocity = torch.stack([env.sim.qvel[:, v : v + 6] for _, v in self._addresses], dim=1).float()
+        t, cubes = self._t, self._cubes
+        pose = cubes.pose(env.sim)
         pos, quat = pose[..., :3], pose[..., 3:]
-        speed = torch.linalg.vector_norm(velocity[..., :3], dim=-1)
-        speed = speed + math.sqrt(3.0) * half * torch.linalg.vector_norm(velocity[..., 3:], dim=-1)
-
-        dz = pos[:, 0, 2] - pos[:, 1, 2]
-        stacked = torch.linalg.vector_norm(pos[:, 0, :2] - pos[:, 1, :2], dim=1) <= t.xy_err
-        stacked &= (dz >= t.dz_min) & (dz <= t.dz_max)
-        low = lowest_corner(pos[:, 1], quat[:, 1], half) - table_top(self._scene)
-        stacked &= (low.abs() <= t.support_gap) & ((pos[:, 1, :2] - self._center).abs() <= self._room).all(1)
+        stacked = cubes.stacked(*cubes.offset(pose)) & cubes.supported(pose, cubes.clearance(pose))
         self._held.add_(1).mul_(stacked)
 
         # The new frame takes the oldest one's place.
         self._slot.add_(1).remainder_(t.window)
         self._pos.index_copy_(1, self._slot, pos[:, None])
         self._quat.index_copy_(1, self._slot, quat[:, None])
-        self._energy.index_copy_(1, self._slot, speed.square()[:, None])
+        self._energy.index_copy_(1, self._slot, cubes.speed(env.sim).square()[:, None])
         for ring in (self._far, self._turned):
             ring.index_fill_(1, self._slot, 0.0)
         if not stacked.is_cuda and not bool(stacked.any()):

@@ -1,0 +1,234 @@
+"""Captured work: what replays is what ran, what cannot be captured is named, and what changed is captured anew."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+import torch
+import warp as wp
+from environments import actions, configure, returned
+
+import mjstack
+from mjstack.config.schema import GraphMode
+from mjstack.envs import Env
+from mjstack.errors import CaptureError
+from mjstack.managers.base import EnvView
+from mjstack.rng import uniform
+from mjstack.sim.draws import draw_uniform
+from mjstack.sim.graph import StepGraph
+from mjstack.sim.sizes import BatchSizes
+
+CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+BACKENDS = ["mjwarp", pytest.param("mjwarp-cuda", marks=[pytest.mark.gpu, CUDA])]
+DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
+
+
+def make(backend: str, graph: str, nworld: int, *overrides: str) -> Env:
+    device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
+    return mjstack.make_env(["sim=mjwarp", "reset=randomized", f"graph={graph}", *overrides], nworld=nworld, device=device)
+
+
+def reads_the_device(env: EnvView) -> torch.Tensor:
+    """A termination that a graph cannot hold."""
+    return torch.full((env.nworld,), bool(env.sim.qpos[0, 0].item() > 1e9), device=env.device)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
+    """300 steps. On the CPU device bit for bit; on CUDA, where two runs of the same differ, the starts are equal."""
+    frames = 20
+    only_time_out = ["~termination.success", "~termination.cube_off_table", "~termination.joint_limit"]
+    common = ["task=reach", *only_time_out, f"termination.time_out.params.frames={frames}"]
+    nworld = 4 if backend == "mjwarp" else 64
+    eager, replayed = make(backend, "off", nworld, *common), make(backend, "require", nworld, *common)
+    starts = []
+    for a, b in ((eager.reset(seed=3), replayed.reset(seed=3)),):
+        for name in a[0]:
+            assert torch.equal(a[0][name], b[0][name])
+    spread = 0.0
+    for t, action in enumerate(actions(eager, 300)):
+        a, b = returned(eager.step(action)), returned(replayed.step(action))
+        assert torch.equal(eager.episode, replayed.episode)
+        assert torch.equal(eager.frame, replayed.frame)
+        if backend == "mjwarp":
+            assert all(torch.equal(a[name], b[name]) for name in a), t
+            assert torch.equal(eager.sim.qpos, replayed.sim.qpos)
+            continue
+        if (t + 1) % frames == 0:
+            assert a["truncated"].all()
+            assert b["truncated"].all()
+            # The new episodes' starts come from random numbers alone.
+            assert torch.equal(eager.sim.qpos, replayed.sim.qpos)
+            starts.append(replayed.sim.qpos.clone())
+        spread = max(spread, float((a["reward"] - b["reward"]).abs().median()))
+    assert eager.read_statistics()["episodes"] == replayed.read_statistics()["episodes"] == 15 * nworld
+    if backend == "mjwarp-cuda":
+        assert replayed.graph is not None
+        assert replayed.graph.captured
+        assert spread < 1e-4
+        # Random numbers advance at every replay.
+        assert len({tuple(start[0].tolist()) for start in starts}) == len(starts)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_kernel_draws_what_the_generator_draws(device: str) -> None:
+    n, size = 33, 11
+    world = torch.arange(n)
+    episode, step = world * 7 + 1, world * 1000003 + 5
+    for seed, stream in ((0, 0), (4294967295, 0x9ABCDEF0)):
+        expected = uniform(seed=seed, world=world, episode=episode, step=step, stream=stream, size=size)
+        out = draw_uniform(
+            key=torch.tensor([seed], device=device),
+            stream=stream,
+            world=world.to(device),
+            episode=episode.to(device),
+            step=step.to(device),
+            size=size,
+        )
+        assert torch.equal(out.cpu(), expected)
+        scaled = draw_uniform(
+            key=torch.tensor([seed], device=device),
+            stream=stream,
+            world=world.to(device),
+            episode=episode.to(device),
+            step=None,
+            size=size,
+            low=0.7,
+            high=1.3,
+        )
+        plain = uniform(seed=seed, world=world, episode=episode, step=torch.zeros_like(world), stream=stream, size=size)
+        torch.testing.assert_close(scaled.cpu(), 0.7 + 0.3 * (plain + 1.0), rtol=1e-6, atol=0.0)
+
+
+@pytest.mark.gpu
+@CUDA
+@pytest.mark.parametrize("graph", ["require", "auto"])
+def test_a_term_that_reads_the_device_is_named(graph: str, caplog: pytest.LogCaptureFixture) -> None:
+    bad = "+termination.spy={func: test_graph.reads_the_device}"
+    env = make("mjwarp-cuda", graph, 8, bad)
+    env.reset(seed=0)
+    zero = torch.zeros((8, env.action_manager.action_dim), device=env.device)
+    env.step(zero)
+    with caplog.at_level(logging.WARNING):
+        if graph == "require":
+            with pytest.raises(CaptureError, match=r"env\.step cannot be captured because of termination\.spy"):
+                env.step(zero)
+        else:
+            for _ in range(3):
+                env.step(zero)
+            assert int(env.frame[0]) == 4
+            said = [r.message for r in caplog.records if "termination.spy" in r.message]
+            assert len(said) == 1
+    # The device works on.
+    other = make("mjwarp-cuda", "require", 8)
+    other.reset(seed=0)
+    for _ in range(3):
+        other.step(zero)
+    assert torch.isfinite(other.sim.qpos).all()
+    assert int(other.sim.step_count[0]) == 30
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_new_size_is_captured_anew(backend: str) -> None:
+    env = make(backend, "auto", 4, "~termination.overflow")
+    env.reset(seed=0)
+    zero = torch.zeros((4, env.action_manager.action_dim), device=env.device)
+    for _ in range(3):
+        env.step(zero)
+    before, steps = env.sim.qpos.clone(), int(env.sim.step_count[0])
+    env.sim.resize(BatchSizes(nconmax=64, njmax=8))  # type: ignore[attr-defined]
+    assert torch.equal(env.sim.qpos, before)
+    with pytest.raises(mjstack.MjstackError, match="NEFC overflow in 4 of 4 worlds"):
+        _step_and_look(env, zero)
+    env.sim.resize(BatchSizes(nconmax=128, njmax=768))  # type: ignore[attr-defined]
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(zero)
+    env.raise_faults()
+    assert int(env.sim.step_count[0]) == 40
+    assert steps == 30
+
+
+def _step_and_look(env: Env, action: torch.Tensor) -> None:
+    for _ in range(4):
+        env.step(action)
+    env.raise_faults()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_new_option_is_captured_anew(backend: str) -> None:
+    """A captured step bakes the iteration limit in."""
+    ends = []
+    for graph in ("off", "require"):
+        env = make(backend, graph, 4)
+        env.reset(seed=1)
+        moves = actions(env, 12)
+        for move in moves[:4]:
+            env.step(move)
+        env.sim.set_options(iterations=1, ls_iterations=1)
+        for move in moves[4:]:
+            env.step(move)
+        assert env.sim.option_values()["iterations"] == 1
+        ends.append((env.sim.qpos.clone(), env.sim.solver_limits.clone()))  # type: ignore[attr-defined]
+    assert ends[0][1].any()
+    assert (ends[0][1] != 0).equal(ends[1][1] != 0)
+    if backend == "mjwarp":
+        assert torch.equal(ends[0][0], ends[1][0])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_graph_warms_up_captures_and_replays(device: str) -> None:
+    values = wp.zeros(3, dtype=float, device=device)
+    view = wp.to_torch(values)
+    version = 0
+    calls = 0
+
+    def work() -> None:
+        nonlocal calls
+        calls += 1
+        wp.launch(_add_one, dim=3, inputs=[values], device=device)
+
+    graph = StepGraph(work, device, GraphMode.require, name="adding", version=lambda: version)
+    for _ in range(5):
+        graph()
+    wp.synchronize_device(device)
+    assert view.tolist() == [5.0] * 3
+    assert calls == 2  # once eagerly, once captured
+    assert graph.captured
+    version = 1
+    assert not graph.captured
+    graph()
+    graph()
+    graph()
+    wp.synchronize_device(device)
+    assert view.tolist() == [8.0] * 3
+    assert calls == 4
+    assert graph.capture_seconds > 0.0
+
+
+def test_without_capture_the_work_just_runs() -> None:
+    calls = []
+    graph = StepGraph(lambda: calls.append(1), "cpu", GraphMode.off, name="counting")
+    for _ in range(3):
+        graph()
+    assert len(calls) == 3
+    assert not graph.captured
+
+
+@pytest.mark.gpu
+@CUDA
+def test_an_episode_of_the_gate_is_captured_and_accepted() -> None:
+    from mjstack.gates.gate import GateContext
+
+    context = GateContext(cfg=configure("nworld=32", "sim=mjwarp", "graph=require"))
+    sim = context.batch_simulation(32)
+    episode = context.run(sim, context.cfg.reset)
+    assert not episode.verdict.failed.any()
+    assert episode.capture_seconds > 0.0
+
+
+@wp.kernel
+def _add_one(values: wp.array[float]):
+    i = wp.tid()
+    values[i] = values[i] + 1.0
