@@ -328,25 +328,25 @@ class GateCfg:
 
 
 @dataclass(kw_only=True, slots=True)
-class StudyCfg:
-    """Solver study; empty but for ``job=study``.
-
-    ``variants`` maps a name to what it changes in `SolverCfg`; typed, each is a whole one. Times are taken as in
-    `ThroughputCfg`.
-    """
-
-    repetitions: int = 0
-    frames: int = 0
-    max_seconds: float = 0.0
-    variants: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(kw_only=True, slots=True)
 class JobCfg:
     """What the command line runs."""
 
     name: str = MISSING
-    study: StudyCfg = field(default_factory=StudyCfg)
+
+
+@dataclass(kw_only=True, slots=True)
+class StudyJobCfg(JobCfg):
+    """What settings of the solver cost, and whether every world is still accepted.
+
+    ``variants`` maps a name to what it changes in `SolverCfg`; typed, each is a whole one. ``repetitions`` of ``frames`` frames
+    are timed, or of as many as fit into ``max_seconds``.
+    """
+
+    repetitions: int = MISSING
+    frames: int = MISSING
+    max_seconds: float = MISSING
+    # Variants by name, untyped until `type_terms`, so that the command line may add one.
+    variants: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(kw_only=True, slots=True)

@@ -16,7 +16,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, StudyJobCfg
 from mjstack.config.terms import type_terms
 from mjstack.config.validate import validate
 from mjstack.errors import MjstackError, UnknownName, suggest
@@ -27,6 +27,7 @@ _TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 _KINDS = {"Integer": "an integer", "Float": "a number", "Boolean": "true or false"}
 
 ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
+ConfigStore.instance().store(group="job", name="study_schema", node=StudyJobCfg, provider="mjstack")
 
 
 class CompositionError(MjstackError):
@@ -90,7 +91,7 @@ def _translate(error: Exception) -> MjstackError:
     """One line from Hydra's and OmegaConf's chained, multi-line errors."""
     if isinstance(error, MissingConfigException) and error.options is not None and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        return UnknownName(f"{group}={name}:", name, error.options)
+        return UnknownName(f"{group}={name}:", name, [o for o in error.options if not o.endswith("_schema")])
     cause = error.__cause__ if isinstance(error, ConfigCompositionException) and error.__cause__ else error
     key = getattr(cause, "full_key", None)
     text = str(cause).splitlines()[0] if str(cause) else type(cause).__name__

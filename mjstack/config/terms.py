@@ -16,6 +16,7 @@ from mjstack.config.schema import (
     ObservationTermCfg,
     RewardTermCfg,
     SolverCfg,
+    StudyJobCfg,
     TermCfg,
     TerminationTermCfg,
 )
@@ -37,11 +38,11 @@ def type_terms(cfg: Config) -> None:
     cfg.observation = _terms("observation", cfg.observation, ObservationGroupCfg)
     for name, group in cfg.observation.items():
         group.terms = _terms(f"observation.{name}.terms", group.terms, ObservationTermCfg)
-    variants = cfg.job.study.variants
-    cfg.job.study.variants = {
-        name: _typed(f"job.study.variants.{name}", asdict(cfg.solver) | node if isinstance(node, dict) else node, SolverCfg)
-        for name, node in variants.items()
-    }
+    if isinstance(cfg.job, StudyJobCfg):
+        cfg.job.variants = {
+            name: _typed(f"job.variants.{name}", asdict(cfg.solver) | node if isinstance(node, dict) else node, SolverCfg)
+            for name, node in cfg.job.variants.items()
+        }
 
 
 def _terms(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 
-from mjstack.config.schema import Config, SolverCfg, StudyCfg
+from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput")
@@ -36,7 +36,8 @@ def validate(cfg: Config) -> None:
     _scene(cfg)
     _controller(cfg)
     _gates(cfg)
-    _study(cfg)
+    if isinstance(cfg.job, StudyJobCfg):
+        _study(cfg.job)
 
 
 def _timing(cfg: Config) -> None:
@@ -75,19 +76,14 @@ def _solver(key: str, solver: SolverCfg) -> None:
         raise ConfigError(f"{key}.gripper_condim", solver.gripper_condim, "1, 3, 4, 6, or null for the model's own")
 
 
-def _study(cfg: Config) -> None:
-    study = cfg.job.study
-    if cfg.job.name != "study":
-        if study != StudyCfg():
-            raise ConfigError("job.study", "...", f"nothing with job={cfg.job.name}", "Add job=study")
-        return
-    _positive_int("job.study.repetitions", study.repetitions)
-    _positive_int("job.study.frames", study.frames)
-    _positive("job.study.max_seconds", study.max_seconds, "s")
-    if not study.variants:
-        raise ConfigError("job.study.variants", "{}", "at least one variant of the solver")
-    for name, variant in study.variants.items():
-        _solver(f"job.study.variants.{name}", variant)
+def _study(job: StudyJobCfg) -> None:
+    _positive_int("job.repetitions", job.repetitions)
+    _positive_int("job.frames", job.frames)
+    _positive("job.max_seconds", job.max_seconds, "s")
+    if not job.variants:
+        raise ConfigError("job.variants", "{}", "at least one variant of the solver")
+    for name, variant in job.variants.items():
+        _solver(f"job.variants.{name}", variant)
 
 
 def _robot(cfg: Config) -> None:

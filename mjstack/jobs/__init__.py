@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mjstack.config.schema import Config
-from mjstack.jobs import gates
+from mjstack.jobs import gates, study
 from mjstack.jobs.outcome import JobOutcome
 
 __all__ = ["JOBS", "JobOutcome", "check_job", "run_job"]
@@ -28,6 +28,7 @@ class Job:
 
 JOBS = {
     "gates": Job(gates.check_machine, gates.run_gates_job),
+    "study": Job(study.check_study, study.run_study_job),
 }
 
 

@@ -1,7 +1,7 @@
 """Physics backends behind one protocol."""
 
 from mjstack.sim.build import cuda_driver, cuda_name, make_simulation, resolve_backend, resolve_device
-from mjstack.sim.simulation import LOST_PHYSICS, Overflow, Simulation, describe_overflow
+from mjstack.sim.simulation import LOST_PHYSICS, Overflow, Simulation, SolverLimit, describe_overflow
 from mjstack.sim.sizes import BatchSizes, resolve_sizes
 from mjstack.sim.views import Fields
 
@@ -11,6 +11,7 @@ __all__ = [
     "Fields",
     "Overflow",
     "Simulation",
+    "SolverLimit",
     "cuda_driver",
     "cuda_name",
     "describe_overflow",

@@ -39,7 +39,7 @@ class MjwarpSimulation(FixedViews):
         peak_pool: Most contacts, broad-phase pairs, and contacts of one kind of convex collision, of all worlds at once since
             the last full reset, shape ``(3,)``, int32. The third bounds what nccdmax must hold.
         version: Grows whenever something changes that a graph has baked in.
-        solver_limits: MJWarp's bits for worlds whose solver stopped at an iteration limit, shape ``(nworld,)``, int32.
+        solver_limits: Bits of `SolverLimit` for worlds whose solver stopped at a limit, shape ``(nworld,)``, int32.
     """
 
     backend = "mjwarp"

@@ -29,6 +29,13 @@ class Overflow(IntFlag):
     TACTILE = 1 << 11
 
 
+class SolverLimit(IntFlag):
+    """Where a world's solver stopped short of its tolerance. The values are those of MJWarp's ``OverflowType`` again."""
+
+    ITERATIONS = 1 << 9
+    LS_ITERATIONS = 1 << 10
+
+
 def describe_overflow(bits: int) -> str:
     """The names of the bits, such as ``NEFC, CCD``."""
     return ", ".join(flag.name or "" for flag in Overflow if bits & flag)
