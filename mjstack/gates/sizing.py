@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -140,4 +141,5 @@ def _play(context: GateContext, reset: Reset, sizes: BatchSizes | None, play: Ca
 def _used(device: str) -> int | None:
     from mjstack.sim.memory import used_bytes  # loads Warp, which native runs do not need
 
+    gc.collect()  # the worlds of the run before
     return used_bytes(device)

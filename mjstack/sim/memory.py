@@ -20,13 +20,14 @@ def array_bytes(node: object) -> int:
     return 0
 
 
-def borrowed_bytes(call: Callable[[], None]) -> int | None:
-    """The most that Warp allocates at once in a call, or None if its report cannot be read."""
+def borrowed_bytes(call: Callable[[], None], device: str) -> int | None:
+    """The most that Warp allocates at once on a device in a call, or None if its report cannot be read."""
     lines: list[str] = []
     with wp.ScopedMemoryTracker("mjstack", report_func=lines.append) as tracker:
         tracker.clear()
         call()
-    peak = re.search(r"Peak usage:\s+\S+\s+([\d.]+) (B|KB|MB|GB)", "".join(lines))
+    _, _, peaks = "".join(lines).partition("Peak usage:")
+    peak = re.search(rf"^\s+{re.escape(device)}\s+([\d.]+) (B|KB|MB|GB)$", peaks, re.MULTILINE)
     return None if peak is None else int(float(peak[1]) * _UNITS[peak[2]])
 
 

@@ -183,7 +183,7 @@ class MjwarpSimulation(FixedViews):
 
     def borrowed_bytes(self) -> int | None:
         """The most that a step borrows at once beside it, or None if Warp does not tell. Convex pairs are most of it."""
-        return borrowed_bytes(self.forward)
+        return borrowed_bytes(self.forward, self._device.alias)
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as uploaded."""
