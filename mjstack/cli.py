@@ -47,9 +47,10 @@ def run(args: list[str]) -> int:
     try:
         overrides = _overrides(args)
         for job in _expand(overrides) if sweep else [overrides]:
-            config = to_config(compose_overrides([o for o in job if not _is_hydra(o)]))
+            own = [o for o in job if not _is_hydra(o)]
+            config = to_config(compose_overrides(own))
             if not dry:
-                check_job(config)
+                check_job(config, own)
         if not dry:
             check_writable(_output_folder(overrides, sweep))
     except MjstackError as error:

@@ -55,6 +55,12 @@ class DeviceError(MjstackError):
     exit_code = 2
 
 
+class RunError(MjstackError):
+    """The folder of an earlier run that cannot be read, or has not what is asked for."""
+
+    exit_code = 2
+
+
 class UnsupportedModel(MjstackError):
     """MJWarp does not implement a feature of the model."""
 
@@ -182,8 +188,8 @@ def suggest(name: str, available: Iterable[str]) -> str:
     return f"{hint}Available: {', '.join(names) or 'none'}."
 
 
-def name_worlds(worlds: Sequence[int], nworld: int, limit: int = 8) -> str:
+def name_worlds(worlds: Sequence[int | str], nworld: int, limit: int = 8, what: str = "worlds") -> str:
     """Says how many worlds and names the first ones: ``17 of 4096 worlds (first: 3, 41, 96)``."""
     shown = ", ".join(str(w) for w in worlds[:limit])
     label = "first: " if len(worlds) > limit else ""
-    return f"{len(worlds)} of {nworld} worlds ({label}{shown})"
+    return f"{len(worlds)} of {nworld} {what} ({label}{shown})"

@@ -1,6 +1,11 @@
-"""Batched rotations on torch tensors. Quaternions are (w, x, y, z), the last dimension is the vector's own."""
+"""Batched rotations on torch tensors, and the interval of a rate.
+
+Quaternions are (w, x, y, z), the last dimension is the vector's own.
+"""
 
 from __future__ import annotations
+
+import math
 
 import torch
 
@@ -45,8 +50,10 @@ def quat_angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 def quat_z_row(quat: torch.Tensor) -> torch.Tensor:
     """Third row of the rotation matrix: the world-z components of the body's axes, shape ``(..., 3)``."""
-    w, x, y, z = quat.unbind(-1)
-    return torch.stack((2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)), dim=-1)
+    w, xy, z = quat[..., :1], quat[..., 1:3], quat[..., 3:]
+    x, y = quat[..., 1:2], quat[..., 2:3]
+    turned = torch.cat((-y, x), dim=-1)
+    return torch.cat((2.0 * torch.addcmul(xy * z, turned, w), 1.0 - 2.0 * xy.square().sum(-1, keepdim=True)), dim=-1)
 
 
 def lowest_corner(pos: torch.Tensor, quat: torch.Tensor, half: float) -> torch.Tensor:
@@ -61,3 +68,21 @@ def lowest_corner(pos: torch.Tensor, quat: torch.Tensor, half: float) -> torch.T
         World z of the lowest corner, shape ``(...)``.
     """
     return pos[..., 2] - half * quat_z_row(quat).abs().sum(-1)
+
+
+def wilson_interval(successes: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
+    """Confidence interval of a success rate (Wilson, "Probable inference", JASA 1927), sound at 0 and at all successes too.
+
+    Args:
+        successes: How many succeeded.
+        trials: Of how many, at least 1.
+        z: Quantile of the normal distribution; the default is for 95 %.
+
+    Returns:
+        Lower and upper end, from 0 to 1.
+    """
+    rate, share = successes / trials, z * z / trials
+    centre = (rate + 0.5 * share) / (1.0 + share)
+    half = z * math.sqrt(rate * (1.0 - rate) / trials + 0.25 * share / trials) / (1.0 + share)
+    # At the ends the exact bounds are 0 and 1; rounding must not miss them.
+    return 0.0 if successes == 0 else centre - half, 1.0 if successes == trials else centre + half

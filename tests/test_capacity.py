@@ -276,7 +276,7 @@ def test_environments_with_too_few_rows_by_choice_are_a_remark(
 def test_memory_is_that_of_the_arrays(
     too_small: tuple[GateContext, GateResult, list[str]], stage: Callable[[str], GateContext]
 ) -> None:
-    from mjstack.sim.mjwarp import data_bytes
+    from mjstack.sim.memory import data_bytes
 
     context, result, _ = too_small
     m, model = result.metrics, stage("so101").model

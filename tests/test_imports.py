@@ -22,7 +22,7 @@ LAYERS = [
     {"tasks"},
     {"envs"},
     {"adapters", "gates"},
-    {"benchmark"},
+    {"benchmark", "benchmark_physics"},
     {"jobs"},
     {"cli"},
 ]
@@ -39,7 +39,7 @@ HOMES = {
     "gymnasium": ("adapters/",),
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),
-    "rich": ("jobs/", "cli.py", "benchmark.py", "managers/base.py"),
+    "rich": ("jobs/", "cli.py", "benchmark.py", "benchmark_physics.py", "managers/base.py"),
 }
 
 

@@ -300,8 +300,9 @@ class CapacityCfg:
 
 @dataclass(kw_only=True, slots=True)
 class BatchGateCfg:
-    """The batch gate."""
+    """The batch gate. It plays ``seeds`` seeds, the configured one and those after it, and judges their worlds together."""
 
+    seeds: int = MISSING
     failed_worlds: int = MISSING
     distinct_fraction: float = MISSING
 
@@ -377,3 +378,5 @@ class Config:
     graph: GraphMode = MISSING
     view: bool = MISSING
     video: bool = MISSING
+    run: str | None = None
+    world: str | None = None

@@ -6,6 +6,7 @@ import difflib
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import cast
 
 from hydra import compose, initialize_config_module
@@ -67,6 +68,24 @@ def own_hydra() -> Iterator[None]:
             yield
     finally:
         Singleton.set_state(outer)
+
+
+def load_saved(path: Path) -> Config:
+    """The configuration that a run left in ``.hydra/config.yaml``, typed and checked as a new one is.
+
+    Raises:
+        MjstackError: The file cannot be read, or is no configuration of this version.
+    """
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.load(path))
+        missing = sorted(OmegaConf.missing_keys(merged))
+    except OmegaConfBaseException as error:
+        raise _translate(error) from error
+    except Exception as error:  # the YAML parser fails in its own ways
+        raise CompositionError(f"{path.name} cannot be read ({type(error).__name__}), expected YAML.") from error
+    if missing:
+        raise CompositionError(f"{missing[0]} is missing, expected every key of this version.")
+    return to_config(cast(DictConfig, merged))
 
 
 def to_config(cfg: DictConfig) -> Config:

@@ -9,11 +9,12 @@ from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput")
-JOBS = ("gates", "study")
+JOBS = ("gates", "replay", "study")
 CONDIMS = (1, 3, 4, 6)
 ANCHORS = ("red", "blue", "on_blue")
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
+_WORLD = re.compile(r"(\d+:)?\d+")
 
 
 def validate(cfg: Config) -> None:
@@ -28,6 +29,11 @@ def validate(cfg: Config) -> None:
             raise UnknownName("gate", name, GATES)
     if cfg.job.name not in JOBS:
         raise UnknownName("job", cfg.job.name, JOBS)
+    if cfg.world is not None and not _WORLD.fullmatch(cfg.world):
+        raise ConfigError("world", cfg.world, "a world such as 17, or a seed and a world such as 3:17")
+    for key in ("run", "world"):
+        if getattr(cfg, key) is not None and cfg.job.name != "replay":
+            raise ConfigError(key, getattr(cfg, key), "null, because it is for job=replay alone", "Add job=replay")
     if not _DEVICE.fullmatch(cfg.sim.device):
         raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N")
     _timing(cfg)
@@ -172,6 +178,9 @@ def _gates(cfg: Config) -> None:
         _positive_int(f"gate.acceptance.{name}", getattr(gate.acceptance, name))
     for name in ("carry_distance", "xy_err", "support_gap", "rest_speed", "rest_position", "rest_rotation_deg"):
         _positive(f"gate.acceptance.{name}", getattr(gate.acceptance, name))
+    _positive_int("gate.batch.seeds", gate.batch.seeds)
+    if cfg.seed + gate.batch.seeds > 1 << 32:
+        raise ConfigError("gate.batch.seeds", gate.batch.seeds, f"at most {(1 << 32) - cfg.seed}, because seeds are 32-bit")
     if gate.batch.failed_worlds < 0:
         raise ConfigError("gate.batch.failed_worlds", gate.batch.failed_worlds, "an integer of at least 0")
     for name in ("step1", "step50"):

@@ -76,7 +76,8 @@ class CommandTape:
         if isinstance(frame, int):
             frame = torch.tensor([frame], device=self._offsets.device)
         knots = self._knots.index_select(1, self._segments.index_select(0, frame) + self._offsets)
-        return torch.einsum("k,nku->nu", self._weights.index_select(0, frame)[0], knots)
+        # Not einsum, whose rounding depends on nworld: a world's commands would not be those it gets alone.
+        return (self._weights.index_select(0, frame)[0][:, None] * knots).sum(1)
 
 
 class ScriptedPlanner:

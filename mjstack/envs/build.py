@@ -52,7 +52,7 @@ def build_env(
     device: str | None = None,
     sizes: BatchSizes | None = None,
 ) -> Env:
-    """Builds the environment that every gate, script and adapter uses.
+    """Builds an environment on a simulation of its own. Gates, whose simulation is shared, build `Env` on that.
 
     Args:
         cfg: The configuration.

@@ -15,7 +15,7 @@ from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.errors import ArgumentError, FaultError, name_worlds
 from mjstack.managers.action import ActionManager
-from mjstack.managers.base import Term, first_value, running
+from mjstack.managers.base import Term, first_value, one_pass, running
 from mjstack.managers.observation import ObservationManager
 from mjstack.managers.reset import ResetManager
 from mjstack.managers.reward import RewardManager
@@ -368,21 +368,28 @@ class Env:
         broken = ((self.sim.qpos * 0.0).sum(1) + (self.sim.qvel * 0.0).sum(1)) != 0.0
         if self._success is not None:
             torch.logical_and(self._success(self), ~broken, out=self.success)
-        self.termination_manager.compute()
-        reward = self.reward_manager.compute(void=broken)
-        self.observation_manager.compute()
+
+        def reward() -> None:
+            with one_pass():
+                self.termination_manager.compute()
+                self.reward_manager.compute(void=broken)
+
+        def observe() -> None:
+            with one_pass():
+                self.observation_manager.compute()
+
+        self._side_by_side(reward, observe)
         running.label = ""
-        if self._check_faults:
-            self._latch(broken, reward)
-            if not broken.is_cuda:
-                self.raise_faults()
+        if self._check_faults and not broken.is_cuda:
+            self._latch(broken)
+            self.raise_faults()
         self._reset_ended(broken)
 
-    def _latch(self, broken: torch.Tensor, reward: torch.Tensor) -> None:
+    def _latch(self, broken: torch.Tensor) -> None:
         """Keeps what went wrong, before a reset can erase it."""
         # A world's own overflow may end its episode; that of the shared pool voids the whole batch.
         self._overflow |= self.sim.overflow & (_POOL if self._ends_on_overflow else LOST_PHYSICS)
-        bad_action = self.action_manager.not_finite
+        bad_action, reward = self.action_manager.not_finite, self.reward_manager.reward
         seen = torch.zeros_like(reward)
         for group in self.observation_manager.groups.values():
             seen = seen + (group * 0.0).sum(1)
@@ -397,24 +404,46 @@ class Env:
     def _reset_ended(self, broken: torch.Tensor) -> None:
         """The terminal observation, the statistics, the reset of the worlds that ended, and the observation to go on with."""
         ends, rewards, out = self.termination_manager, self.reward_manager, self._outputs.tensors
-        out["success"].copy_(self.success)
-        # What a diverged world saw last is 0, not NaN, which a value times 0 would hand on.
-        for name, group in self.observation_manager.groups.items():
-            torch.where(broken[:, None], group.nan_to_num(0.0, 0.0, 0.0), group, out=out[f"final/{name}"])
+        on_cuda = broken.is_cuda
         done = ends.terminated | ends.truncated
-        if not ends.names or (not done.is_cuda and not bool(done.any())):
-            if not done.is_cuda and not bool(broken.any()):
-                return
-            # nothing to reset; on CUDA looking would stop the device
+        # On CUDA, where looking would stop the device, worlds are always reset: those of an empty mask, if need be.
+        ending = len(ends.names) > 0 and (on_cuda or bool(done.any()))
+
+        def hand_out() -> None:
+            out["success"].copy_(self.success)
+            # What a diverged world saw last is 0, not NaN, which a value times 0 would hand on.
+            for name, group in self.observation_manager.groups.items():
+                torch.where(broken[:, None], group.nan_to_num(0.0, 0.0, 0.0), group, out=out[f"final/{name}"])
+
+        def count() -> None:
+            if ending:
+                self.statistics.update(done, self.frame, self.success, rewards.episode_sums, ends.values)
+
+        def latch() -> None:
+            if on_cuda and self._check_faults:
+                self._latch(broken)
+
+        self._side_by_side(hand_out, count, latch)
+        if ending:
+            self.episode += done
+            self.frame.masked_fill_(done, 0)
+            self._write_start(done)
+            self._forget(done)
+            with one_pass():
+                self.observation_manager.refresh(done)
+        elif on_cuda or bool(broken.any()):
             for name, group in self.observation_manager.groups.items():
                 group.copy_(out[f"final/{name}"])
-            return
-        self.statistics.update(done, self.frame, self.success, rewards.episode_sums, ends.values)
-        self.episode += done
-        self.frame.masked_fill_(done, 0)
-        self._write_start(done)
-        self._forget(done)
-        self.observation_manager.refresh(done)
+
+    def _side_by_side(self, *works: Callable[[], None]) -> None:
+        """Independent works; parallel branches where a graph is captured."""
+        if self.device.type == "cuda":
+            from mjstack.sim.graph import side_by_side
+
+            side_by_side(self.device, *works)
+        else:
+            for work in works:
+                work()
 
     def _write_start(self, mask: torch.Tensor) -> None:
         """Start states of the masked worlds; a function of seed, world and episode alone."""

@@ -21,7 +21,7 @@ def run_baseline(context: GateContext) -> list[GateResult]:
     metrics["peak_contacts"] = int(sim.peak_contacts[0])
     metrics["peak_constraint_rows"] = int(sim.peak_constraints[0])
     metrics["backend"] = sim.description
-    context.shown, context.shown_by = episode, "baseline"
+    context.shown, context.shown_by = episode, "baseline world"
     thresholds = acceptance_thresholds(cfg) | {"waypoint_error_m": cfg.controller.ik_tolerance}
     summary = reason or f"xy_err {1e3 * metrics['xy_err_m']:.1f} mm, dz {1e3 * metrics['dz_m']:.1f} mm"
     return [GateResult(name="baseline", status=status, reason=summary, thresholds=thresholds, metrics=metrics)]

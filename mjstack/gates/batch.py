@@ -2,75 +2,211 @@
 
 from __future__ import annotations
 
+import logging
+import math
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from mjstack.errors import name_worlds
+from mjstack.gates.batch_record import FAILING, BatchRecord, write_failing
+from mjstack.gates.episode import Episode
 from mjstack.gates.gate import GateContext, acceptance_thresholds, failing_rules
+from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status, Value
-from mjstack.tasks.stack import RULE_TEXT
+from mjstack.sim import Simulation
+from mjstack.tasks.stack import RULE_TEXT, Rule
+
+log = logging.getLogger(__name__)
+
+_NAMED = 100  # worlds a rule in report.md; failing_worlds.csv has all
+
+
+@dataclass(eq=False, slots=True)
+class _Tally:
+    """Sums over the seeds: numbers, and the failing worlds by name. Nothing of the other worlds is kept.
+
+    Attributes:
+        several: Whether there are several seeds; then a world's name has its seed too.
+        low: Smallest of everything measured, by name.
+        high: Largest likewise.
+        ends: Hashes of the final states.
+    """
+
+    several: bool
+    seeds: int = 0
+    worlds: int = 0
+    failed: list[str] = field(default_factory=list)
+    broken: dict[Rule, list[str]] = field(default_factory=dict)
+    rows: list[str] = field(default_factory=list)
+    low: dict[str, float] = field(default_factory=dict)
+    high: dict[str, float] = field(default_factory=dict)
+    ends: set[int] = field(default_factory=set)
+    seconds: float = 0.0
+    steps: int = 0
+
+    def add(self, record: BatchRecord, episode: Episode, sim: Simulation) -> None:
+        """Takes in one seed."""
+        self.seeds += 1
+        self.worlds += sim.nworld
+        self.seconds += episode.seconds
+        self.steps += int(sim.step_count.sum())
+        self.failed += [self._name(record.seed, world) for world in np.flatnonzero(record.failed).tolist()]
+        for rule, worlds in failing_rules(record.failed).items():
+            self.broken.setdefault(rule, []).extend(self._name(record.seed, world) for world in worlds)
+        self.rows += record.failing_rows()
+        measured = record.values | {
+            "waypoint_error_m": episode.tape.waypoint_error,
+            "peak_contacts": sim.peak_contacts.cpu().numpy(),
+            "peak_constraint_rows": sim.peak_constraints.cpu().numpy(),
+        }
+        for name, values in measured.items():  # NaN, which a diverged world has, is handed on
+            self.low[name] = float(np.minimum(self.low.get(name, math.inf), values.min()))
+            self.high[name] = float(np.maximum(self.high.get(name, -math.inf), values.max()))
+        # Rounded: on CUDA even identical worlds differ in the last digits. Adding 0 makes -0 the same as 0.
+        self.ends.update(hash(row.tobytes()) for row in np.round(record.qpos, 4) + 0.0)
+
+    def _name(self, seed: int, world: int) -> str:
+        """As ``world=`` of job=replay takes it."""
+        return str(world) if not self.several else f"{seed}:{world}"
 
 
 def run_batch(context: GateContext) -> list[GateResult]:
-    """Plays the task in nworld worlds that start differently, and judges each."""
+    """Plays the task in nworld worlds that start differently, under every seed, and judges each."""
     cfg = context.cfg
+    t = cfg.gate.batch
+    tally = _Tally(t.seeds > 1)
+    problems: list[str] = []
+    details: list[str] = []
     sim = context.batch_simulation(cfg.nworld)
-    last = context.phase_start(cfg.gate.throughput.from_phase) - 1
-    episode = context.run(sim, cfg.reset, snapshots=frozenset([last]))
-    context.carry_start = episode.states.get(last)
-    verdict = episode.verdict
-    failed = verdict.failed.cpu().numpy()
-    final = sim.qpos.cpu().numpy()
-    bad = np.flatnonzero(failed).tolist()
-    # Rounded: on CUDA even identical worlds differ in the last digits.
-    distinct = len(np.unique(np.round(final, 4), axis=0))
-    steps = cfg.nworld * episode.tape.frames * cfg.timing.substeps
     sizes = getattr(sim, "sizes", None)
     metrics: dict[str, Value] = {
-        "backend": sim.description,
-        "worlds": cfg.nworld,
-        "accepted": cfg.nworld - len(bad),
-        "success_rate": 1.0 - len(bad) / cfg.nworld,
-        "distinct_final_states": distinct,
-        "xy_err_max_m": float(verdict.xy_err.max()),
-        "dz_min_m": float(verdict.dz.min()),
-        "dz_max_m": float(verdict.dz.max()),
-        "peak_speed_max_m_per_s": float(verdict.peak_speed.max()),
-        "rest_speed_max_m_per_s": float(verdict.rest_speed.max()),
-        "rest_position_max_m": float(verdict.rest_position.max()),
-        "rest_rotation_max_deg": float(np.degrees(float(verdict.rest_rotation.max()))),
-        "waypoint_error_max_m": float(episode.tape.waypoint_error.max()),
-        "peak_contacts_per_world": int(sim.peak_contacts.max()),
-        "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
-        "sizes": f"{sizes.as_overrides()} ({sizes.source})" if sizes else "native MuJoCo has no fixed buffers",
-        "episode_s": episode.seconds,
-        "world_steps_per_s": steps / episode.seconds,
+        "sizes": f"{sizes.as_overrides()} ({sizes.source})" if sizes else "native MuJoCo has no fixed buffers"
     }
-    problems: list[str] = []
-    broken = failing_rules(failed)
-    for rule, worlds in broken.items():
-        metrics[f"failed.{rule.name}"] = len(worlds)
-    details = [f"{RULE_TEXT[rule]}: {name_worlds(worlds, cfg.nworld, len(worlds))}" for rule, worlds in broken.items()]
-    counts = "; ".join(f"{RULE_TEXT[rule]} in {len(worlds)}" for rule, worlds in broken.items())
-    summary = f"{cfg.nworld - len(bad)} of {cfg.nworld} worlds accepted, {distinct} distinct"
-    if bad:
-        summary += f"; failed: {name_worlds(bad, cfg.nworld)}: {counts}"
-    if len(bad) > cfg.gate.batch.failed_worlds:
-        problems.append(f"{name_worlds(bad, cfg.nworld)} failed: {counts}")
-    if cfg.nworld > 1 and distinct < cfg.gate.batch.distinct_fraction * cfg.nworld:
-        problems.append(
-            f"only {distinct} distinct final states of {cfg.nworld} worlds: identical worlds prove nothing, use reset=jitter"
-        )
-    sim.close()
-    summary = "; ".join(problems) or summary
-    thresholds = acceptance_thresholds(cfg)
-    thresholds |= {"failed_worlds": cfg.gate.batch.failed_worlds, "distinct_fraction": cfg.gate.batch.distinct_fraction}
-    return [
-        GateResult(
-            name="batch",
-            status=Status.failed if problems else Status.passed,
-            reason=summary,
-            thresholds=thresholds,
-            metrics=metrics,
-            details=details,
-        )
+    try:
+        for seed in range(cfg.seed, cfg.seed + t.seeds):
+            try:
+                record = _play(context, sim, seed, tally)
+            except Exception as error:
+                if not tally.seeds:
+                    raise
+                log.exception("seed %d broke", seed)  # the seeds before it still count
+                what = (str(error) or type(error).__name__).splitlines()[0]
+                left = f"seed {seed}" if seed == cfg.seed + t.seeds - 1 else f"seeds {seed} to {cfg.seed + t.seeds - 1}"
+                problems.append(f"{left} not played: {what} (run.log has the traceback)")
+                break
+            details += _keep(context, record, tally)
+            accepted = int((record.failed == 0).sum())
+            if t.seeds > 1:
+                metrics[f"seed{seed}.accepted"] = accepted
+                so_far = f"{tally.worlds - len(tally.failed)} of {tally.worlds}"
+                context.say(f"batch, seed {seed}: {accepted} of {cfg.nworld} worlds accepted, {so_far} so far")
+        description = sim.description
+    finally:
+        sim.close()
+    return [_judge(context, description, tally, metrics, problems, details)]
+
+
+def _play(context: GateContext, sim: Simulation, seed: int, tally: _Tally) -> BatchRecord:
+    """One seed's episode in every world."""
+    cfg = context.cfg
+    last = context.phase_start(cfg.gate.throughput.from_phase) - 1
+    snapshots = frozenset([last] if seed == cfg.seed else [])  # throughput goes on from the first seed
+    episode = context.run(sim, cfg.reset, seed=seed, snapshots=snapshots)
+    context.carry_start = episode.states.get(last, context.carry_start)
+    record = BatchRecord.take(seed, sim, episode.verdict)
+    tally.add(record, episode, sim)
+    return record
+
+
+def _keep(context: GateContext, record: BatchRecord, tally: _Tally) -> list[str]:
+    """Writes the seed's record, before the next one can break or be stopped. A full disk takes no verdict back."""
+    if context.folder is None:
+        return []
+    try:
+        record.write(context.folder)
+        if tally.rows:
+            write_failing(context.folder, record.header(), tally.rows)
+    except OSError as error:
+        log.exception("the record of seed %d was not written", record.seed)
+        return [f"seed {record.seed}: no record of its worlds could be written ({error.strerror})"]
+    return []
+
+
+def _judge(
+    context: GateContext,
+    description: str,
+    tally: _Tally,
+    metrics: dict[str, Value],
+    problems: list[str],
+    details: list[str],
+) -> GateResult:
+    cfg = context.cfg
+    t = cfg.gate.batch
+    what = "worlds" if t.seeds == 1 else "world-episodes"
+    accepted, bad = tally.worlds - len(tally.failed), tally.failed
+    rate, (low, high) = accepted / tally.worlds, wilson_interval(accepted, tally.worlds)
+    metrics = {
+        "backend": description,
+        "worlds": cfg.nworld,
+        "seeds": tally.seeds,
+        "world_episodes": tally.worlds,
+        "accepted": accepted,
+        "success_rate": rate,
+        "success_rate_low95": low,
+        "success_rate_high95": high,
+        "distinct_final_states": len(tally.ends),
+        "xy_err_max_m": tally.high["xy_err_m"],
+        "dz_min_m": tally.low["dz_m"],
+        "dz_max_m": tally.high["dz_m"],
+        "peak_speed_max_m_per_s": tally.high["peak_speed_m_per_s"],
+        "rest_speed_max_m_per_s": tally.high["rest_speed_m_per_s"],
+        "rest_position_max_m": tally.high["rest_position_m"],
+        "rest_rotation_max_deg": tally.high["rest_rotation_deg"],
+        "waypoint_error_max_m": tally.high["waypoint_error_m"],
+        "peak_contacts_per_world": int(tally.high["peak_contacts"]),
+        "peak_constraint_rows_per_world": int(tally.high["peak_constraint_rows"]),
+        "episode_s": tally.seconds,
+        "world_steps_per_s": tally.steps / tally.seconds,
+        **metrics,
+        **{f"failed.{rule.name}": len(worlds) for rule, worlds in tally.broken.items()},
+    }
+    details = [
+        *(f"{RULE_TEXT[rule]}: {name_worlds(worlds, tally.worlds, _NAMED, what)}" for rule, worlds in tally.broken.items()),
+        *details,
     ]
+    counts = "; ".join(f"{RULE_TEXT[rule]} in {len(worlds)}" for rule, worlds in tally.broken.items())
+    interval = f"{_percent(rate)}, 95 % interval {_percent(low, '')} to {_percent(high)}"
+    summary = f"{accepted} of {tally.worlds} {what} accepted ({interval}), {len(tally.ends)} distinct"
+    failing = f"{name_worlds(bad, tally.worlds, what=what)} failed: {counts}"
+    if len(bad) > t.failed_worlds:
+        problems.insert(0, failing)
+    elif bad:
+        summary += f"; {failing}"
+    if tally.worlds > 1 and len(tally.ends) < t.distinct_fraction * tally.worlds:
+        problems.append(
+            f"only {len(tally.ends)} distinct final states of {tally.worlds} {what}: identical worlds prove nothing, "
+            "use reset=jitter"
+        )
+    reason = "; ".join([summary, *problems])
+    if bad and context.folder is not None:
+        details.append(f"{FAILING} has every failing world with what was measured")
+        reason += f". To look at one: job=replay run={context.folder} world={bad[0]}"
+    thresholds = acceptance_thresholds(cfg)
+    thresholds |= {"failed_worlds": t.failed_worlds, "distinct_fraction": t.distinct_fraction}
+    return GateResult(
+        name="batch",
+        status=Status.failed if problems else Status.passed,
+        reason=reason,
+        thresholds=thresholds,
+        metrics=metrics,
+        details=details,
+    )
+
+
+def _percent(rate: float, unit: str = " %") -> str:
+    """A rate with as many digits as tell it from 0 and 1, at least two."""
+    gap = min(rate, 1.0 - rate)
+    digits = 2 if gap <= 0.0 else max(2, math.ceil(-math.log10(100.0 * gap)))
+    text = f"{100.0 * rate:.{digits}f}"
+    return text.rstrip("0").rstrip(".") + unit

@@ -193,7 +193,7 @@ def _try_sizes(
 
 def _memory_metrics(context: GateContext, pairs: dict[str, tuple[BatchSizes, BatchSizes]]) -> dict[str, Value]:
     """What MJWarp's arrays take for the whole batch, with the sizes in force and with the recommended ones."""
-    from mjstack.sim.mjwarp import data_bytes  # loads Warp, which native runs do not need
+    from mjstack.sim.memory import data_bytes  # loads Warp, which native runs do not need
 
     out: dict[str, Value] = {}
     for name, (current, wanted) in pairs.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -61,13 +61,25 @@ def start_worlds(
     reset: Reset,
     planner: ScriptedPlanner,
     advance: Advance | None = None,
+    worlds: Sequence[int] | None = None,
 ) -> tuple[Env, CommandTape]:
     """Resets every world and plans its commands from where its cubes then stand.
+
+    Args:
+        sim: The worlds.
+        index: Addresses.
+        cfg: The configuration.
+        reset: How worlds differ at the start.
+        planner: Plans the commands.
+        advance: Told about progress.
+        worlds: Their numbers, which random numbers depend on: ``[17]`` starts one world as world 17 of any batch starts.
 
     Returns:
         The environment that the commands go through, and the commands, which are its actions.
     """
     env = Env(sim, index, scripted_config(cfg, reset=reset), check_faults=False)  # the acceptance names lost worlds
+    if worlds is not None:
+        env.world.copy_(torch.tensor(worlds))
     env.reset(seed=cfg.seed)
     sim.forward()
     cubes = torch.cat([sim.qpos[:, a : a + 2] for a in index.cube_qpos], dim=1)
@@ -87,6 +99,7 @@ def run_episode(
     snapshots: frozenset[int] = frozenset(),
     on_frame: FrameHook | None = None,
     advance: Advance | None = None,
+    worlds: Sequence[int] | None = None,
 ) -> Episode:
     """Plays the scripted task once in every world and judges it.
 
@@ -100,8 +113,9 @@ def run_episode(
         snapshots: Frames after which the state of all worlds is kept.
         on_frame: Called after each frame.
         advance: Told about progress.
+        worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start_worlds`.
     """
-    env, tape = start_worlds(sim, index, cfg, reset, planner, advance)
+    env, tape = start_worlds(sim, index, cfg, reset, planner, advance, worlds)
     evidence = StackEvidence(cfg, index, planner.phases, sim.nworld, sim.device)
     now = torch.zeros(1, dtype=torch.int64, device=sim.device)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ class GateContext:
         on_frame: Called after each frame of the one-world episode that is shown (viewer).
         results: Results so far, by gate.
         measured: Sizes that the scripted task needs, with a margin, once they have been measured.
+        shown: The one-world episode that pictures show, and ``shown_by``, what it is.
     """
 
     cfg: Config
@@ -88,9 +89,10 @@ class GateContext:
         episode = self.run(sim, NOMINAL, record=True, snapshots=frames, on_frame=hook)
         return sim, episode
 
-    def run(self, sim: Simulation, reset: Reset, **kwargs: Any) -> Episode:
-        """`run_episode` with this context's scene and planner."""
-        return run_episode(sim, self.index, self.cfg, self.planner, reset, advance=self.advance, **kwargs)
+    def run(self, sim: Simulation, reset: Reset, *, seed: int | None = None, **kwargs: Any) -> Episode:
+        """`run_episode` with this context's scene and planner, under the configured seed or another one."""
+        cfg = self.cfg if seed is None else replace(self.cfg, seed=seed)
+        return run_episode(sim, self.index, cfg, self.planner, reset, advance=self.advance, **kwargs)
 
     def batch_simulation(self, nworld: int) -> Simulation:
         """Worlds on the backend of the batch."""
@@ -128,16 +130,22 @@ class GateContext:
 def judge_one(verdict: Verdict) -> tuple[Status, str, dict]:
     """Status, reason and metrics of a one-world episode."""
     bits = int(verdict.failed[0])
-    metrics = {
-        "xy_err_m": float(verdict.xy_err[0]),
-        "dz_m": float(verdict.dz[0]),
-        "rest_speed_m_per_s": float(verdict.rest_speed[0]),
-        "peak_speed_m_per_s": float(verdict.peak_speed[0]),
-        "rest_position_m": float(verdict.rest_position[0]),
-        "rest_rotation_deg": float(np.degrees(float(verdict.rest_rotation[0]))),
-    }
+    metrics = {name: float(values[0]) for name, values in measured_values(verdict).items()}
     status = Status.failed if bits else Status.passed
     return status, f"failed: {describe_rules(bits)}" if bits else "", metrics
+
+
+def measured_values(verdict: Verdict) -> dict[str, np.ndarray]:
+    """What the acceptance measured, by name with unit, on the host; each of shape ``(nworld,)``."""
+    values = {
+        "xy_err_m": verdict.xy_err,
+        "dz_m": verdict.dz,
+        "rest_speed_m_per_s": verdict.rest_speed,
+        "peak_speed_m_per_s": verdict.peak_speed,
+        "rest_position_m": verdict.rest_position,
+        "rest_rotation_deg": verdict.rest_rotation.double().rad2deg(),
+    }
+    return {name: value.double().cpu().numpy() for name, value in values.items()}
 
 
 def acceptance_thresholds(cfg: Config) -> dict:

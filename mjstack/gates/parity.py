@@ -67,7 +67,7 @@ def run_parity(context: GateContext) -> list[GateResult]:
     thresholds["final.position_m"] = cfg.gate.parity.cube_position
     thresholds["final.rotation_deg"] = cfg.gate.parity.cube_rotation_deg
     context.say(f"stack check: xy_err={judged['xy_err_m']:.4f} dz={judged['dz_m']:.4f} ({mjwarp.description})")
-    context.shown, context.shown_by = episode, "parity"
+    context.shown, context.shown_by = episode, "parity world"
     mjwarp.close()
     summary = "; ".join(problems) or (
         f"xy_err {1e3 * judged['xy_err_m']:.1f} mm, dz {1e3 * judged['dz_m']:.1f} mm; red "

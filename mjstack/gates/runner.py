@@ -18,7 +18,9 @@ from mjstack.report.record import GateResult, Status
 
 log = logging.getLogger(__name__)
 
-GATES: dict[str, Callable[[GateContext], list[GateResult]]] = {
+Gate = Callable[[GateContext], list[GateResult]]
+
+GATES: dict[str, Gate] = {
     "baseline": run_baseline,
     "parity": run_parity,
     "capacity": run_capacity,
@@ -44,24 +46,30 @@ def run_gates(
     """
     out: list[GateResult] = []
     for name, run in GATES.items():
-        if name not in context.cfg.gates:
-            continue
-        on_start(name)
-        began = time.perf_counter()
-        try:
-            results = run(context)
-        except MjstackError as error:
-            results = [GateResult(name=name, status=Status.failed, reason=str(error))]
-        except Exception as error:
-            log.error("gate %s broke:\n%s", name, traceback.format_exc())
-            reason = f"internal error, {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-            results = [GateResult(name=name, status=Status.failed, reason=f"{reason} (run.log has the traceback)")]
-        seconds = time.perf_counter() - began
-        for result in results:
-            if result.status is not Status.skipped and not result.seconds:
-                result.seconds = seconds
-            context.results[result.name] = result
-            log.info("gate %s: %s %s", result.name, result.status.value, result.reason)
-            out.append(result)
-            on_result(result)
+        if name in context.cfg.gates:
+            on_start(name)
+            out += run_guarded(context, name, run, on_result)
     return out
+
+
+def run_guarded(
+    context: GateContext, name: str, run: Gate, on_result: Callable[[GateResult], None] = lambda _: None
+) -> list[GateResult]:
+    """Runs one gate, or whatever judges like one. If it raises it has failed, with the error as its reason."""
+    began = time.perf_counter()
+    try:
+        results = run(context)
+    except MjstackError as error:
+        results = [GateResult(name=name, status=Status.failed, reason=str(error))]
+    except Exception as error:
+        log.error("gate %s broke:\n%s", name, traceback.format_exc())
+        reason = f"internal error, {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+        results = [GateResult(name=name, status=Status.failed, reason=f"{reason} (run.log has the traceback)")]
+    seconds = time.perf_counter() - began
+    for result in results:
+        if result.status is not Status.skipped and not result.seconds:
+            result.seconds = seconds
+        context.results[result.name] = result
+        log.info("gate %s: %s %s", result.name, result.status.value, result.reason)
+        on_result(result)
+    return results

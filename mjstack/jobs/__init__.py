@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from mjstack.config.schema import Config
-from mjstack.jobs import gates, study
+from mjstack.errors import ConfigError
+from mjstack.jobs import gates, replay, study
 from mjstack.jobs.outcome import JobOutcome
 
 __all__ = ["JOBS", "JobOutcome", "check_job", "run_job"]
@@ -20,21 +22,35 @@ class Job:
     Attributes:
         check: Raises a `MjstackError` for what cannot be done here, before anything is written.
         run: Does it. Gets the configuration, the run's folder and the command line's overrides.
+        keys: Top-level keys and groups that its command line may set; None for all.
     """
 
     check: Callable[[Config], None]
     run: Callable[[Config, Path, list[str]], JobOutcome]
+    keys: tuple[str, ...] | None = None
 
 
 JOBS = {
     "gates": Job(gates.check_machine, gates.run_gates_job),
+    "replay": Job(replay.check_replay, replay.run_replay_job, replay.KEYS),
     "study": Job(study.check_study, study.run_study_job),
 }
 
 
-def check_job(cfg: Config) -> None:
-    """Raises for what this machine cannot do, before anything is written."""
-    JOBS[cfg.job.name].check(cfg)
+def check_job(cfg: Config, overrides: Sequence[str] = ()) -> None:
+    """Raises for what this machine cannot do, before anything is written.
+
+    Args:
+        cfg: The configuration.
+        overrides: Its command line, without Hydra's own keys.
+    """
+    job = JOBS[cfg.job.name]
+    for override in overrides:
+        key, _, value = override.lstrip("+~").partition("=")
+        if job.keys is not None and re.split(r"[.@/]", key)[0] not in job.keys:
+            expected = f"only {', '.join(job.keys[1:])} beside job={cfg.job.name}"
+            raise ConfigError(key, value, expected, "Leave it out")
+    job.check(cfg)
 
 
 def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:

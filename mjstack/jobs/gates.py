@@ -2,39 +2,32 @@
 
 from __future__ import annotations
 
-import logging
-import os
-import sys
-import time
 from pathlib import Path
-
-import mujoco
-import numpy as np
-from omegaconf import OmegaConf
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from mjstack.config.schema import Backend, Config
 from mjstack.control.scripted import ScriptedPlanner
 from mjstack.envs import build_env
-from mjstack.errors import ConfigError, MjstackError
-from mjstack.gates.episode import FrameHook
+from mjstack.errors import ConfigError
+from mjstack.gates.batch_record import clear_records
 from mjstack.gates.gate import GateContext
 from mjstack.gates.runner import run_gates
-from mjstack.jobs.outcome import STATUS_COLOR, JobOutcome
+from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
-from mjstack.report.markdown import headline
-from mjstack.report.picture import require_video, save_pictures, save_video
-from mjstack.report.provenance import collect_provenance
-from mjstack.report.record import GateResult, Report, Status
-from mjstack.sim import Simulation, cuda_driver, cuda_name, resolve_backend
-
-log = logging.getLogger(__name__)
+from mjstack.jobs.reported import Record, check_showing, run_reported
+from mjstack.sim import resolve_backend
 
 
 def check_machine(cfg: Config) -> None:
     """Raises for what this machine cannot do, before anything is written."""
+    check_task(cfg)
+    if (cfg.view or cfg.video) and not {"baseline", "parity"} & set(cfg.gates):
+        key = "view" if cfg.view else "video"
+        raise ConfigError(key, "true", "gates with baseline or parity, whose world is shown", "Add one of them to gates")
+    check_showing(cfg)
+
+
+def check_task(cfg: Config) -> None:
+    """Raises if the scripted task cannot be played as configured, on this machine."""
     resolve_backend(cfg)
     if cfg.task.name != "stack":
         raise ConfigError(
@@ -42,144 +35,15 @@ def check_machine(cfg: Config) -> None:
         )
     ScriptedPlanner(cfg)  # reads the robot, and reaches every nominal target
     build_env(cfg, nworld=1, backend=Backend.native, device="cpu").close()  # builds and checks every term
-    if (cfg.view or cfg.video) and not {"baseline", "parity"} & set(cfg.gates):
-        key = "view" if cfg.view else "video"
-        raise ConfigError(key, "true", "gates with baseline or parity, whose world is shown", "Add one of them to gates")
-    if cfg.view and sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ConfigError("view", "true", "a display, and DISPLAY is not set", "Use video=true instead")
-    if cfg.video:
-        try:
-            require_video()
-        except MjstackError as error:
-            error.exit_code = 2
-            raise
 
 
 def run_gates_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
-    """Runs the gates of one configuration and writes its report after each.
-
-    Args:
-        cfg: The configuration.
-        folder: Where report.json, report.md, pictures and logs go.
-        overrides: What was asked for on the command line.
-
-    Returns:
-        How it ended. Ctrl-C is an outcome, not an exception: the finished gates are in the report.
-    """
-    console = Console(highlight=False)
-    context = GateContext(cfg=cfg, folder=folder)
-    report: Report | None = None
-    outcome = JobOutcome(status=Status.interrupted, folder=folder, overrides=overrides)
-    try:
-        console.print(
-            f"[bold]{cfg.robot.title}[/], task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)} -> "
-            f"{escape(str(folder))}",
-            soft_wrap=True,
-        )
-        report = Report(provenance=_provenance(cfg, context))
-        report.write(folder)
-        with ProgressBar(console) as bar:
-            context.say, context.advance = bar.say, bar.advance
-            context.on_frame = _viewer(context) if cfg.view else None
-            run_gates(context, bar.start, lambda result: _record(report, result, folder, bar))
-        report.conclude()
-        outcome.status = report.status
-        report.write(folder)
-        _draw(context, report, folder, console)
-        report.write(folder)
-    except KeyboardInterrupt:
-        outcome.status = Status.interrupted
-        if report is not None:
-            report.status = Status.interrupted
-            report.write(folder)
-        console.print("interrupted; the finished gates are in the report")
-    except OSError as error:
-        outcome.status = Status.failed
-        Console(stderr=True).print(f"mjstack: {folder} cannot be written: {error.strerror}. Free space, or set hydra.run.dir.")
-    except MjstackError as error:
-        outcome.status = Status.failed
-        log.error("%s", error)
-        Console(stderr=True, soft_wrap=True).print(f"mjstack: {escape(str(error))}")
-    if report is not None:
-        outcome.gates = report.gates
-        _print_summary(console, report, folder)
-    return outcome
+    """Runs the gates of one configuration and writes its report after each; see `run_reported`."""
+    title = f"task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)}"
+    return run_reported(cfg, folder, overrides, title, _run)
 
 
-def _record(report: Report, result: GateResult, folder: Path, bar: ProgressBar) -> None:
-    report.gates.append(result)
-    report.write(folder)
-    bar.finish(result)
-
-
-def _provenance(cfg: Config, context: GateContext) -> dict:
-    backend, device = context.backend
-    driver = "no CUDA device"
-    name = f"native MuJoCo on {os.cpu_count()} cores" if backend.value == "native" else "Warp's CPU device"
-    if device.startswith("cuda"):
-        name, driver = cuda_name(device), cuda_driver()
-    model_text = _model_text(context.model)
-    config = OmegaConf.to_yaml(OmegaConf.structured(cfg))
-    return collect_provenance(config_yaml=config, model_text=model_text, device=f"{device}: {name}", driver=driver)
-
-
-def _model_text(model: mujoco.MjModel) -> str:
-    """The compiled model's numbers as text: what the physics sees, whatever file it came from."""
-    size = mujoco.mj_sizeModel(model)
-    buffer = np.empty(size, np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes().hex()
-
-
-def _draw(context: GateContext, report: Report, folder: Path, console: Console) -> None:
-    """Pictures and video of the one-world episode, if there was one. Their failure fails no gate."""
-    episode, cfg = context.shown, context.cfg
-    if episode is None or episode.qpos is None:
-        return
-    cubes = np.stack([episode.qpos[:, a : a + 3] for a in context.index.cube_qpos], axis=1)
-    title = f"{cfg.robot.title}, {cfg.task.name}: {context.shown_by} world"
-    try:
-        report.pictures = save_pictures(folder, context.visual_model, episode.qpos[-1], cubes, cfg.scene.cube_half, title)
-        if cfg.video:
-            save_video(folder / "episode.mp4", context.visual_model, episode.qpos, cfg.timing.frame_dt)
-            console.print(f"video: {folder}/episode.mp4", soft_wrap=True)
-    except Exception as error:  # drawing must not take back what the gates found
-        log.exception("drawing failed")
-        console.print(f"no picture: {escape(str(error) or type(error).__name__)}", soft_wrap=True)
-
-
-def _viewer(context: GateContext) -> FrameHook:
-    """Shows a one-world episode in MuJoCo's viewer, in real time; closing the window lets the run go on."""
-    import mujoco.viewer
-
-    model = context.visual_model
-    data = mujoco.MjData(model)
-    handle = mujoco.viewer.launch_passive(model, data)
-
-    def show(frame: int, sim: Simulation) -> None:
-        if not handle.is_running():
-            return
-        began = time.perf_counter()
-        data.qpos[:] = sim.qpos[0].cpu().numpy()
-        mujoco.mj_forward(model, data)
-        handle.sync()
-        time.sleep(max(0.0, context.cfg.timing.frame_dt - (time.perf_counter() - began)))
-
-    return show
-
-
-def _print_summary(console: Console, report: Report, folder: Path) -> None:
-    table = Table()
-    table.add_column("gate")
-    table.add_column("status")
-    table.add_column("s", justify="right")
-    table.add_column("what it says", overflow="fold")
-    for gate in report.gates:
-        color = STATUS_COLOR[gate.status]
-        table.add_row(gate.name, f"[{color}]{gate.status.value}[/]", f"{gate.seconds:.1f}", escape(headline(gate)))
-    console.print(table)
-    console.print(f"report: {escape(str(folder))}/report.md", soft_wrap=True)
-    for gate in report.gates:
-        if gate.status is Status.skipped:
-            console.print(f"skipped: {gate.name}: {escape(gate.reason)}", soft_wrap=True)
-    console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status.value}[/]")
+def _run(context: GateContext, bar: ProgressBar, record: Record) -> None:
+    if context.folder is not None:
+        clear_records(context.folder)
+    run_gates(context, bar.start, record)

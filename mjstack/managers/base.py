@@ -6,7 +6,8 @@ import importlib
 import inspect
 import io
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import UnionType
 from typing import Any, Protocol, Union, get_args, get_origin, get_type_hints
 
@@ -201,16 +202,42 @@ def _located(label: str, error: ParameterError) -> ConfigError:
 
 
 class Running:
-    """Which term was called last: the one to name if a capture fails.
+    """What terms are doing right now.
 
     Attributes:
-        label: Its dotted configuration key; empty outside the managers' terms.
+        label: Dotted configuration key of the term that was called last: the one to name if a capture fails.
+        values: What has been computed from the state that a pass looks at, by what and for whom; None outside a pass.
     """
 
     label = ""
+    values: dict[Any, torch.Tensor] | None = None
 
 
 running = Running()
+
+
+@contextmanager
+def one_pass() -> Iterator[None]:
+    """While nothing changes the state: what two terms have in common is computed once."""
+    outer, running.values = running.values, {}
+    try:
+        yield
+    finally:
+        running.values = outer
+
+
+def shared(key: Any, compute: Callable[[], torch.Tensor]) -> torch.Tensor:
+    """A value that others may want in the same pass too. Nobody may write into it.
+
+    Args:
+        key: What it is, the environment included.
+        compute: Computes it.
+    """
+    if running.values is None:
+        return compute()
+    if key not in running.values:
+        running.values[key] = compute()
+    return running.values[key]
 
 
 class Term:
@@ -241,6 +268,8 @@ class Term:
             self._reset = getattr(self._call, "reset", None)
         else:
             self._call, self.params_of_call = func, self.params
+        # Two groups may ask for the same: a function of the state gives both the same answer. Others may keep something.
+        self._shared_by = None if is_class or masked else (func, repr(sorted(self.params.items())))
 
     @property
     def has_memory(self) -> bool:
@@ -250,7 +279,9 @@ class Term:
     def __call__(self, *args: Any) -> Any:
         """Calls the term with the environment, and a mask if it takes one."""
         running.label = self.label
-        return self._call(*args, **self.params_of_call)
+        if self._shared_by is None:
+            return self._call(*args, **self.params_of_call)
+        return shared((id(args[0]), *self._shared_by), lambda: self._call(*args, **self.params_of_call))
 
     def reset(self, mask: torch.Tensor) -> None:
         """Lets a term with a memory forget the masked worlds."""

@@ -10,6 +10,7 @@ from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
 from mjstack.managers.base import EnvView
 from mjstack.mdp.geometry import named_pose, robot
+from mjstack.scene.index import Columns
 
 MODES = ("relative", "absolute", "delta")
 PARTS = ("arm", "gripper", "all")
@@ -57,7 +58,7 @@ class JointPosition(ActionTerm):
         tensors = robot(env)
         self._ctrl = env.sim.ctrl
         self._mode, self._scale = mode, scale
-        self._columns, self._pose = tensors.ctrl[chosen], named_pose(env, pose)[chosen]
+        self._columns, self._pose = Columns(env.index.ctrl[chosen], env.device), named_pose(env, pose)[chosen]
         self._low, self._high = tensors.ctrl_range[chosen].unbind(1)
         self.dim = len(chosen)
         self.actuators = tuple(env.index.ctrl[chosen].tolist())
@@ -71,8 +72,8 @@ class JointPosition(ActionTerm):
         elif self._mode == "relative":
             command = self._pose + self._scale * action.clamp(-1.0, 1.0)
         else:
-            command = self._ctrl.index_select(1, self._columns) + self._scale * action.clamp(-1.0, 1.0)
-        self._ctrl[:, self._columns] = torch.clamp(command, self._low, self._high)
+            command = self._columns.read(self._ctrl) + self._scale * action.clamp(-1.0, 1.0)
+        self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))
 
 
 class Gripper(ActionTerm):
@@ -81,7 +82,7 @@ class Gripper(ActionTerm):
     def __init__(self, env: EnvView) -> None:
         """Reads the profile."""
         tensors = robot(env)
-        self._ctrl, self._columns = env.sim.ctrl, tensors.ctrl[env.index.n_arm :]
+        self._ctrl, self._columns = env.sim.ctrl, Columns(env.index.ctrl[env.index.n_arm :], env.device)
         self._closed, self._opening = tensors.gripper_closed, tensors.gripper_open - tensors.gripper_closed
         self.dim = 1
         self.actuators = tuple(env.index.ctrl[env.index.n_arm :].tolist())
@@ -89,7 +90,7 @@ class Gripper(ActionTerm):
 
     def write_commands(self, action: torch.Tensor) -> None:
         """Writes the fingers' commands."""
-        self._ctrl[:, self._columns] = self._closed + 0.5 * (action.clamp(-1.0, 1.0) + 1.0) * self._opening
+        self._columns.write(self._ctrl, self._closed + 0.5 * (action.clamp(-1.0, 1.0) + 1.0) * self._opening)
 
 
 class EndEffectorDelta(ActionTerm):
@@ -118,6 +119,7 @@ class EndEffectorDelta(ActionTerm):
             raise ParameterError("iterations", iterations, "an integer of at least 1")
         tensors = robot(env)
         self._ctrl, self._columns, self._n_arm = env.sim.ctrl, tensors.ctrl, env.index.n_arm
+        self._arm = Columns(env.index.ctrl[: env.index.n_arm], env.device)
         self._low, self._high = tensors.ctrl_range.unbind(1)
         self._scale = scale
         self._ik = BatchedIk(env.sim.model, env.cfg.robot, env.nworld, env.device, iterations=iterations)
@@ -127,12 +129,11 @@ class EndEffectorDelta(ActionTerm):
 
     def write_commands(self, action: torch.Tensor) -> None:
         """Writes the arm's commands."""
-        last = self._ctrl.index_select(1, self._columns)
+        last = self._columns.read(self._ctrl)
         target = self._ik.aperture(last) + self._scale * action.clamp(-1.0, 1.0).float()
         command, _ = self._ik.solve(last, target)
-        arm = self._columns[: self._n_arm]
         command = command[:, : self._n_arm].to(self._ctrl.dtype)
-        self._ctrl[:, arm] = torch.clamp(command, self._low[: self._n_arm], self._high[: self._n_arm])
+        self._arm.write(self._ctrl, torch.clamp(command, self._low[: self._n_arm], self._high[: self._n_arm]))
 
 
 def _unit_bounds(dim: int, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

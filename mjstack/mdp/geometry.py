@@ -29,13 +29,13 @@ def named_pose(env: EnvView, pose: str) -> torch.Tensor:
 
 
 def joint_positions(env: EnvView) -> torch.Tensor:
-    """Arm joints [rad], then gripper joints [rad or m], shape ``(nworld, n)``."""
-    return env.sim.qpos.index_select(1, robot(env).qpos)
+    """Arm joints [rad], then gripper joints [rad or m], shape ``(nworld, n)``. Not to be written into."""
+    return robot(env).qpos.read(env.sim.qpos)
 
 
 def joint_velocities(env: EnvView) -> torch.Tensor:
     """Likewise [rad/s, m/s]."""
-    return env.sim.qvel.index_select(1, robot(env).qvel)
+    return robot(env).qvel.read(env.sim.qvel)
 
 
 def aperture_center(env: EnvView) -> torch.Tensor:
@@ -47,7 +47,7 @@ def aperture_center(env: EnvView) -> torch.Tensor:
 def gripper_opening(env: EnvView) -> torch.Tensor:
     """How far each gripper joint is open as measured, 0 closed to 1 open, shape ``(nworld, n_gripper)``."""
     tensors = robot(env)
-    q = env.sim.qpos.index_select(1, tensors.qpos[env.index.n_arm :])
+    q = tensors.gripper_qpos.read(env.sim.qpos)
     return (q - tensors.gripper_closed) / (tensors.gripper_open - tensors.gripper_closed)
 
 

@@ -53,13 +53,17 @@ class Placement:
         self._height = table_top(scene) + half
         nominal = torch.tensor([scene.red_xy, scene.blue_xy], dtype=torch.float64)
         center, room = torch.tensor(scene.table_center[:2]).double(), torch.tensor(scene.table_half[:2]).double() - self._radius
-        self._tensors = [
-            nominal,
-            torch.tensor(region).double(),
-            center,
-            room,
-            self._obstacles(cfg, model, index, region, gap, pose, noise),
-        ]
+        data = mujoco.MjData(model)
+        data.qpos[index.robot_qpos] = pose
+        mujoco.mj_kinematics(model, data)
+        centers, keep = _arm_spheres(cfg, data, index, noise)
+        keep += math.sqrt(3.0) * half + gap
+        near = np.zeros(len(keep), dtype=bool)
+        for xy in (scene.red_xy, scene.blue_xy):
+            offset = np.abs(centers - [*xy, self._height]) - [*region, 0.0]
+            near |= np.linalg.norm(np.maximum(offset, 0.0), axis=1) < keep
+        spheres = torch.from_numpy(np.column_stack((centers, keep))[near])
+        self._tensors = [nominal, torch.tensor(region).double(), center, room, spheres]
 
     def to(self, device: torch.device, dtype: torch.dtype) -> None:
         """Moves the constants to where worlds are placed."""
@@ -125,34 +129,15 @@ class Placement:
         chosen = torch.stack((offsets[rows, 0, red], offsets[rows, 1, blue]), dim=1)
         return torch.where(both[:, None, None], chosen, 0.0), both
 
-    def _obstacles(
-        self,
-        cfg: Config,
-        model: mujoco.MjModel,
-        index: SceneIndex,
-        region: tuple[float, float],
-        gap: float,
-        pose: Sequence[float],
-        noise: float,
-    ) -> torch.Tensor:
-        """Spheres (centre, distance to keep) around the arm's geoms that a cube could come near, shape ``(n, 4)``."""
-        data = mujoco.MjData(model)
-        data.qpos[index.robot_qpos] = pose
-        mujoco.mj_kinematics(model, data)
-        reach = math.sqrt(3.0) * cfg.scene.cube_half + gap
-        joints = [model.joint(name).id for name in cfg.robot.arm_joints]
-        spheres = []
-        for geom in range(model.ngeom):
-            body = model.geom_bodyid[geom]
-            collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
-            if body == 0 or body in index.bodies.values() or not collides:
-                continue
-            # A joint that is off moves the geom by at most its distance from the joint times the angle.
-            levers = np.linalg.norm(data.xanchor[joints] - data.geom_xpos[geom], axis=1)
-            keep = model.geom_rbound[geom] + reach + noise * levers.sum()
-            for xy in (cfg.scene.red_xy, cfg.scene.blue_xy):
-                offset = np.abs(data.geom_xpos[geom] - [*xy, self._height]) - [*region, 0.0]
-                if np.linalg.norm(np.maximum(offset, 0.0)) < keep:
-                    spheres.append([*data.geom_xpos[geom], keep])
-                    break
-        return torch.tensor(spheres, dtype=torch.float64).reshape(-1, 4)
+
+def _arm_spheres(cfg: Config, data: mujoco.MjData, index: SceneIndex, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Centres ``(n, 3)`` and radii ``(n,)`` of spheres that hold the arm's colliding geoms, wherever noise puts them."""
+    model = data.model
+    body = model.geom_bodyid
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    geoms = np.flatnonzero(collides & (body != 0) & ~np.isin(body, list(index.bodies.values())))
+    joints = [model.joint(name).id for name in cfg.robot.arm_joints]
+    centers = data.geom_xpos[geoms]
+    # A joint that is off moves a geom by at most its distance from the joint times the angle.
+    levers = np.linalg.norm(data.xanchor[joints][None] - centers[:, None], axis=2)
+    return centers, model.geom_rbound[geoms] + noise * levers.sum(1)

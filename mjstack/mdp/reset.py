@@ -12,6 +12,7 @@ from mjstack.managers.base import EnvView, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import named_pose, pose_w, robot
 from mjstack.mdp.placement import Placement
+from mjstack.scene.index import Columns
 
 
 def home(env: EnvView, mask: torch.Tensor, *, pose: str = "home") -> None:
@@ -44,7 +45,7 @@ class JointNoise:
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes qpos and ctrl."""
         noise = random_uniform(env, self.label, self._width.shape[0])
-        command = env.sim.ctrl.index_select(1, robot(env).ctrl) + self._width * noise
+        command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
         _write_robot(env, mask, torch.clamp(command, self._low, self._high))
 
 
@@ -191,16 +192,17 @@ class CubeFriction:
         jaws = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies]
         above = [g for g in jaws if model.geom_priority[g] > priority]
         level = [model.geom("table").id, *(g for g in jaws if g not in above)]
-        self._drawn = [torch.tensor(geoms, device=device) for geoms in (*cubes, above) if geoms]
-        self._lowered = torch.tensor(level, device=device)
+        self._drawn = [Columns(geoms, device) for geoms in (*cubes, above) if geoms]
+        self._lowered = Columns(level, device)
+        self._least = torch.tensor(self._low, dtype=env.sim.qpos.dtype, device=device)
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes geom_friction."""
         sliding = env.sim.fields["geom_friction"][..., 0]
         values = random_uniform(env, self.label, len(self._drawn), self._low, self._high).to(sliding.dtype)
         for number, geoms in enumerate(self._drawn):
-            sliding[:, geoms] = torch.where(mask[:, None], values[:, number, None], sliding.index_select(1, geoms))
-        sliding[:, self._lowered] = torch.where(mask[:, None], self._low, sliding.index_select(1, self._lowered))
+            geoms.write_masked(sliding, mask, values[:, number, None])
+        self._lowered.write_masked(sliding, mask, self._least)
 
 
 @uses_fields("actuator_gainprm", "actuator_biasprm")
@@ -228,7 +230,7 @@ class _Columns:
 
     def __init__(self, env: EnvView, name: str, elements: Sequence[int]) -> None:
         self._view = env.sim.fields[name]
-        self._elements = torch.tensor(elements, device=env.device)
+        self._elements = Columns(elements, env.device)
         nominal = torch.from_numpy(getattr(env.sim.model, name)[list(elements)].copy())
         self._nominal = nominal.to(env.device, self._view.dtype)
 
@@ -236,29 +238,25 @@ class _Columns:
         """Writes nominal times factor, ``(nworld, elements)``, into the masked worlds."""
         extra = [1] * (self._nominal.dim() - 1)
         value = self._nominal * factors.to(self._view.dtype).view(*factors.shape, *extra)
-        old = self._view.index_select(1, self._elements)
-        self._view[:, self._elements] = torch.where(mask.view(-1, 1, *extra), value, old)
+        self._elements.write_masked(self._view, mask, value)
 
 
 def _write(view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor) -> None:
     """Writes the masked rows of a ``(nworld, d)`` view."""
-    view.copy_(torch.where(mask[:, None], value.to(view.dtype), view))
+    torch.where(mask[:, None], value.to(view.dtype), view, out=view)
 
 
 def _write_robot(env: EnvView, mask: torch.Tensor, command: torch.Tensor) -> None:
-    tensors, rows = robot(env), mask[:, None]
-    for view, columns in ((env.sim.qpos, tensors.qpos), (env.sim.ctrl, tensors.ctrl)):
-        view[:, columns] = torch.where(rows, command.to(view.dtype), view.index_select(1, columns))
+    tensors = robot(env)
+    tensors.qpos.write_masked(env.sim.qpos, mask, command)
+    tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
 
 
 def _write_cube(env: EnvView, mask: torch.Tensor, name: str, dx: torch.Tensor, dy: torch.Tensor, yaw: torch.Tensor) -> None:
     """Moves the masked worlds' cube off the place where the simulation's reset has put it."""
     view = pose_w(env, name)
-    pose = view.clone()
-    pose[:, 0] += dx
-    pose[:, 1] += dy
-    pose[:, 3:] = quat_from_yaw(yaw)
-    _write(view, mask, pose)
+    place = view[:, :3] + torch.stack((dx, dy, torch.zeros_like(dx)), dim=1)
+    _write(view, mask, torch.cat((place, quat_from_yaw(yaw)), dim=1))
 
 
 def _not_negative(name: str, value: float) -> None:

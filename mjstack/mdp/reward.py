@@ -7,7 +7,7 @@ import math
 import torch
 
 from mjstack.errors import ParameterError
-from mjstack.managers.base import EnvView
+from mjstack.managers.base import EnvView, shared
 from mjstack.math import lowest_corner
 from mjstack.mdp.geometry import aperture_center, jaw_forces, joint_velocities, pose_w
 from mjstack.scene import table_top
@@ -69,5 +69,8 @@ def _require_positive(name: str, value: float) -> None:
 
 
 def _above_table(env: EnvView, name: str) -> torch.Tensor:
-    pose = pose_w(env, name)
-    return lowest_corner(pose[:, :3], pose[:, 3:], env.cfg.scene.cube_half) - table_top(env.cfg.scene)
+    def compute() -> torch.Tensor:
+        pose = pose_w(env, name)
+        return lowest_corner(pose[:, :3], pose[:, 3:], env.cfg.scene.cube_half) - table_top(env.cfg.scene)
+
+    return shared((id(env), _above_table, name), compute)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -15,14 +16,48 @@ from mjstack.scene.build import BLUE, RED, jaw_sensor
 CUBES = (RED, BLUE)
 
 
+class Columns:
+    """Some columns of a batched view. Where they lie side by side, reading them costs nothing and writing is one copy."""
+
+    def __init__(self, indices: Sequence[int] | np.ndarray, device: torch.device) -> None:
+        """Takes the columns, in the order in which values are given."""
+        self.indices = tuple(int(i) for i in indices)
+        first = self.indices[0] if self.indices else 0
+        together = self.indices == tuple(range(first, first + len(self.indices)))
+        self._together = slice(first, first + len(self.indices)) if together else None
+        self._scattered = torch.tensor(self.indices, dtype=torch.int64, device=device)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def read(self, view: torch.Tensor) -> torch.Tensor:
+        """The columns, shape ``(nworld, n, ...)``. It may be the view's own memory: do not write into it."""
+        return view.index_select(1, self._scattered) if self._together is None else view[:, self._together]
+
+    def write(self, view: torch.Tensor, value: torch.Tensor) -> None:
+        """Writes all worlds."""
+        view[:, self._scattered if self._together is None else self._together] = value
+
+    def write_masked(self, view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor) -> None:
+        """Writes the worlds of a ``(nworld,)`` bool mask."""
+        rows = mask.view(-1, *[1] * (view.dim() - 1))
+        value = value.to(view.dtype)
+        if self._together is None:
+            view[:, self._scattered] = torch.where(rows, value, self.read(view))
+        else:
+            part = view[:, self._together]
+            torch.where(rows, value, part, out=part)
+
+
 @dataclass(frozen=True, slots=True)
 class RobotTensors:
     """The robot's columns and limits as tensors, arm joints first, then the gripper's.
 
     Attributes:
-        qpos: Columns of qpos, shape ``(n,)``, int64.
-        qvel: Columns of qvel, shape ``(n,)``, int64.
-        ctrl: Columns of ctrl, shape ``(n,)``, int64.
+        qpos: Columns of qpos.
+        qvel: Columns of qvel.
+        ctrl: Columns of ctrl.
+        gripper_qpos: Columns of qpos, the gripper's alone.
         range: Joint limits [rad, m], shape ``(n, 2)``.
         ctrl_range: Limits of the commands, shape ``(n, 2)``.
         home: Home command, shape ``(n,)``.
@@ -31,9 +66,10 @@ class RobotTensors:
         gripper_closed: Likewise closed.
     """
 
-    qpos: torch.Tensor
-    qvel: torch.Tensor
-    ctrl: torch.Tensor
+    qpos: Columns
+    qvel: Columns
+    ctrl: Columns
+    gripper_qpos: Columns
     range: torch.Tensor
     ctrl_range: torch.Tensor
     home: torch.Tensor
@@ -88,9 +124,8 @@ class SceneIndex:
         """The robot's part on a device. Made once: a captured step may not copy from the host."""
         key = (device, dtype)
         if key not in self._tensors:
-            columns = [
-                torch.as_tensor(a, dtype=torch.int64, device=device) for a in (self.robot_qpos, self.robot_qvel, self.ctrl)
-            ]
+            addresses = self.robot_qpos, self.robot_qvel, self.ctrl, self.robot_qpos[self.n_arm :]
+            columns = [Columns(a, device) for a in addresses]
             values = (
                 self.robot_range,
                 self.ctrl_range,
@@ -100,7 +135,7 @@ class SceneIndex:
                 self._robot.gripper_closed,
             )
             numbers = [torch.as_tensor(np.asarray(v, dtype=float), dtype=dtype, device=device) for v in values]
-            self._tensors[key] = RobotTensors(*columns, *numbers)
+            self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]
 
     def object_address(self, name: str) -> tuple[int, int]:

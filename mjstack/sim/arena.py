@@ -11,7 +11,7 @@ _ALIGNMENT = 512  # bytes
 
 
 class Arena:
-    """An allocator for Warp on one CUDA device. Blocks that were given back serve the next request of their size.
+    """An allocator for Warp during one capture. Blocks that were given back serve the next request of their size.
 
     MJWarp allocates some thirty temporaries per step. Through CUDA's own pool each becomes two nodes of a captured graph,
     which run one after the other like kernels do; from here they are addresses. A block goes back to the stream that used
@@ -27,11 +27,6 @@ class Arena:
         self._free: dict[tuple[int, int], list[int]] = defaultdict(list)
         self._owner: dict[int, int] = {}
         self._blocks: list[torch.Tensor] = []
-
-    @property
-    def size(self) -> int:
-        """Memory held [bytes]."""
-        return sum(block.numel() for block in self._blocks)
 
     def allocate(self, size_in_bytes: int) -> int:
         """Address of a block on the current stream."""

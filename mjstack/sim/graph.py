@@ -6,7 +6,7 @@ import gc
 import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 
 import torch
 import warp as wp
@@ -19,8 +19,10 @@ from mjstack.sim.streams import torch_stream_scope
 log = logging.getLogger(__name__)
 
 _nesting = 0
-_arenas: dict[str, Arena] = {}
+# What a broken capture leaves: torch counts its memory as in use for ever, and aborts when it is destroyed.
+_abandoned: list[tuple[torch.cuda.CUDAGraph, torch.cuda.MemPool]] = []
 _capture_streams: dict[str, torch.cuda.Stream] = {}
+_side_streams: dict[str, list[torch.cuda.Stream]] = {}
 
 
 def inside_graph() -> bool:
@@ -60,6 +62,7 @@ class StepGraph:
         name: str,
         version: Callable[[], int] = lambda: 0,
         culprit: Callable[[], str] = lambda: "",
+        scratch: Callable[[], bool] = lambda: True,
     ) -> None:
         """Takes the work without running it.
 
@@ -71,11 +74,13 @@ class StepGraph:
             name: What it is called in messages.
             version: A number that changes when the graph has to be captured anew.
             culprit: Names what was running, for the message of a failed capture.
+            scratch: Whether Warp's temporaries come from an `Arena`.
         """
         self._work, self._mode, self._name = work, mode, name
-        self._version, self._culprit = version, culprit
+        self._version, self._culprit, self._scratch = version, culprit, scratch
         self._device = wp.get_device(str(device))
         self._replay: Callable[[], None] | None = None
+        self._memory: tuple[torch.cuda.MemPool, Arena | None] | None = None
         self._warm = self._failed = False
         self._seen = version()
         self.warm_up_seconds = self.capture_seconds = 0.0
@@ -103,12 +108,12 @@ class StepGraph:
 
     def drop(self) -> None:
         """Forgets the capture: the next call runs eagerly again, and the one after it captures."""
-        self._replay, self._warm, self._failed = None, False, False
+        self._replay, self._memory, self._warm, self._failed = None, None, False, False
         self._seen = self._version()
 
     def _warm_up(self) -> None:
         began = time.perf_counter()
-        with self._scope():
+        with _inside():
             self._work()
             wp.synchronize_device(self._device)  # Warp's temporaries are freed on a stream that torch's do not wait for
         self._warm = True
@@ -121,7 +126,7 @@ class StepGraph:
         collecting = gc.isenabled()
         gc.disable()
         try:
-            with self._scope():
+            with _inside():
                 self._replay = self._capture_cuda() if self._device.is_cuda else self._capture_cpu()
         except Exception as error:
             self._failed = True
@@ -145,10 +150,21 @@ class StepGraph:
         # second Warp object for it would unregister it when freed.
         stream = _capture_streams.setdefault(torch_device, torch.cuda.Stream(torch_device))
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-            scope = torch_stream_scope(self._device)
-            with scope, wp.ScopedCapture(stream=wp.get_stream(self._device), external=True):
-                self._work()
+        # A conditional node makes Warp interrupt the capture, and what goes on after it has another number. By that number
+        # torch knows what to allocate from the graph's own memory, which nobody else gets. So there is a second such pool.
+        memory = torch.cuda.MemPool()
+        arena = Arena(self._device) if self._scratch() else None
+        _abandoned.append((graph, memory))
+        with (
+            torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+            torch.cuda.use_mem_pool(memory),
+            wp.ScopedAllocator(self._device, arena),
+            torch_stream_scope(self._device),
+            wp.ScopedCapture(stream=wp.get_stream(self._device), external=True),
+        ):
+            self._work()
+        _abandoned.pop()
+        self._memory = memory, arena
         return graph.replay
 
     def _capture_cpu(self) -> Callable[[], None]:
@@ -157,15 +173,32 @@ class StepGraph:
         graph = capture.graph
         return lambda: wp.capture_launch(graph)
 
-    @contextmanager
-    def _scope(self) -> Iterator[None]:
-        """Marks the work as a graph's, its temporaries from the arena."""
-        memory: AbstractContextManager = nullcontext()
-        if self._device.is_cuda:
-            arena = _arenas.setdefault(str(self._device), Arena(self._device))
-            memory = wp.ScopedAllocator(self._device, arena)
-        with _inside(), memory:
-            yield
+
+def side_by_side(device: torch.device, *works: Callable[[], None], branches: bool = True) -> None:
+    """Does independent works: in a CUDA graph that is being captured as parallel branches, else one after the other.
+
+    Args:
+        device: Where they run.
+        works: No one may write what another reads or writes, nor keep a temporary that another one uses.
+        branches: False for one after the other in any case.
+    """
+    if not branches or device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
+        for work in works:
+            work()
+        return
+    main = torch.cuda.current_stream(device)
+    streams = _side_streams.setdefault(str(device), [])
+    while len(streams) < len(works) - 1:
+        streams.append(torch.cuda.Stream(device))
+    used = streams[: len(works) - 1]
+    for stream in used:
+        stream.wait_stream(main)
+    for stream, work in zip(used, works[1:], strict=True):
+        with torch.cuda.stream(stream), torch_stream_scope(wp.get_device(str(device))):
+            work()
+    works[0]()
+    for stream in used:
+        main.wait_stream(stream)
 
 
 def _recover(device: wp.Device) -> None:
@@ -174,9 +207,3 @@ def _recover(device: wp.Device) -> None:
         torch.cuda.synchronize(wp.device_to_torch(device))
     except RuntimeError:
         log.debug("the first synchronize after a failed capture reports it once more", exc_info=True)
-
-
-def arena_bytes(device: torch.device | str) -> int:
-    """Scratch memory that graphs on a device hold [bytes]."""
-    arena = _arenas.get(str(wp.get_device(str(device))))
-    return 0 if arena is None else arena.size

@@ -6,7 +6,11 @@ import dataclasses
 import re
 from collections.abc import Callable
 
+import mujoco
 import warp as wp
+
+from mjstack.sim.engine import mjw
+from mjstack.sim.sizes import BatchSizes
 
 _UNITS = {"B": 1, "KB": 1 << 10, "MB": 1 << 20, "GB": 1 << 30}
 
@@ -18,6 +22,28 @@ def array_bytes(node: object) -> int:
     if dataclasses.is_dataclass(node):
         return sum(array_bytes(getattr(node, field.name)) for field in dataclasses.fields(node))
     return 0
+
+
+def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
+    """What `MjwarpSimulation.memory_bytes` would be for these sizes, without allocating it.
+
+    Every array is as long as nworld, as the contact pool, or constant. So two small ones on the CPU tell the rest.
+
+    Args:
+        model: The compiled model.
+        nworld: Number of worlds.
+        sizes: Buffer sizes.
+    """
+    share = dataclasses.replace(sizes, naconmax=None, naccdmax=None)
+    with wp.ScopedDevice("cpu"):
+        one, two, longer = (
+            array_bytes(mjw.make_data(model, nworld=n, **dataclasses.replace(share, nconmax=c).as_kwargs(n)))
+            for n, c in ((1, sizes.nconmax), (2, sizes.nconmax), (1, sizes.nconmax + 1))
+        )
+    per_contact = longer - one
+    per_world = two - one - sizes.nconmax * per_contact
+    constant = one - per_world - sizes.nconmax * per_contact
+    return constant + nworld * per_world + sizes.contact_pool(nworld) * per_contact
 
 
 def borrowed_bytes(call: Callable[[], None], device: str) -> int | None:

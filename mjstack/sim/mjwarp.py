@@ -5,7 +5,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import fields as dataclass_fields
-from dataclasses import is_dataclass, replace
+from dataclasses import is_dataclass
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -15,17 +16,16 @@ import warp as wp
 from mjstack.config.schema import GraphMode
 from mjstack.errors import UnsupportedModel
 from mjstack.sim.counters import clear_counters, record_convex_contacts, record_usage
+from mjstack.sim.engine import mjw
 from mjstack.sim.fields import PLACING_FIELDS, check_fields
-from mjstack.sim.graph import StepGraph, inside_graph
+from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
 from mjstack.sim.memory import array_bytes, borrowed_bytes
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.sim.sizes import BatchSizes
 from mjstack.sim.static_geoms import place_static_geoms
 from mjstack.sim.streams import torch_stream_scope
+from mjstack.sim.substep import Arrangement, can_rearrange, rearranged_step
 from mjstack.sim.views import Fields, FixedViews, check_mask
-
-wp.config.log_level = wp.LOG_ERROR  # before mujoco_warp, which starts Warp on import
-import mujoco_warp as mjw  # noqa: E402
 
 
 class MjwarpSimulation(FixedViews):
@@ -39,6 +39,7 @@ class MjwarpSimulation(FixedViews):
         peak_pool: Most contacts, broad-phase pairs, and contacts of one kind of convex collision, of all worlds at once since
             the last full reset, shape ``(3,)``, int32. The third bounds what nccdmax must hold.
         version: Grows whenever something changes that a graph has baked in.
+        arrangement: How a captured step is arranged.
         solver_limits: Bits of `SolverLimit` for worlds whose solver stopped at a limit, shape ``(nworld,)``, int32.
     """
 
@@ -73,7 +74,7 @@ class MjwarpSimulation(FixedViews):
         self._device = wp.get_device(device)
         self._graph_mode = graph
         self._graphs: dict[tuple[int, bool], StepGraph] = {}
-        self.version = 0
+        self.version, self.arrangement = 0, Arrangement()
         names = check_fields(fields)
         self._placing = not PLACING_FIELDS.isdisjoint(names)
         name = self._device.name if self._device.is_cuda else "Warp's CPU device"
@@ -88,6 +89,7 @@ class MjwarpSimulation(FixedViews):
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
+            self._can_rearrange = can_rearrange(model, self._m)
             self._contacts = wp.zeros(nworld, dtype=int)
             self._peak_nefc = wp.zeros(nworld, dtype=int)
             self._peak_contacts = wp.zeros(nworld, dtype=int)
@@ -202,9 +204,14 @@ class MjwarpSimulation(FixedViews):
         }
 
     def bare_step(self) -> Callable[[], None]:
-        """One plain ``mujoco_warp.step``, replayed from a graph of its own: what everything else is measured against."""
+        """One plain ``mujoco_warp.step``, replayed as Warp captures it: what everything else is measured by."""
         graph = StepGraph(
-            lambda: mjw.step(self._m, self._d), self.device, self._graph_mode, name="a bare step", version=lambda: self.version
+            lambda: mjw.step(self._m, self._d),
+            self.device,
+            self._graph_mode,
+            name="a bare step",
+            version=lambda: self.version,
+            scratch=lambda: False,
         )
 
         def step() -> None:
@@ -225,6 +232,11 @@ class MjwarpSimulation(FixedViews):
             for count in (fresh.nacon, fresh.nefc, fresh.ncollision):
                 count.zero_()
         self._d, self.sizes = fresh, sizes
+        self.version += 1
+
+    def arrange(self, arrangement: Arrangement) -> None:
+        """Chooses how a captured step is arranged; for measurements, because the numbers stay the same."""
+        self.arrangement = arrangement
         self.version += 1
 
     def set_options(
@@ -272,11 +284,28 @@ class MjwarpSimulation(FixedViews):
 
     def _substeps(self, n: int, kinematics: bool) -> None:
         self._place()
-        for _ in range(n):
-            mjw.step(self._m, self._d)
-            self._count(steps=1)
-        if kinematics:
-            self._pose()
+        count = partial(self._count, steps=1)
+        arrangement = self.arrangement
+        if not (self._can_rearrange and arrangement.own_stages):
+            for _ in range(n):
+                mjw.step(self._m, self._d)
+                count()
+            if kinematics:
+                self._pose()
+            return
+        # What a step has used is counted while the next one begins, which touches neither contacts nor rows.
+        beside: tuple[Callable[[], None], ...] = ()
+        for i in range(n):
+            rearranged_step(
+                self._m,
+                self._d,
+                self.device,
+                sensors=i == n - 1 or not arrangement.sensors_once,
+                branches=arrangement.branches,
+                beside_kinematics=beside,
+            )
+            beside = (count,)
+        side_by_side(self.device, *((self._pose,) if kinematics else ()), *beside, branches=arrangement.branches)
 
     def _pose(self) -> None:
         """Poses of the current qpos, and nothing that a later step would start from: its forward computes them anew."""
@@ -344,6 +373,7 @@ class MjwarpSimulation(FixedViews):
                 self._graph_mode,
                 name=f"step({n})",
                 version=lambda: self.version,
+                scratch=lambda: self.arrangement.scratch,
             )
         return self._graphs[key]
 
@@ -377,25 +407,3 @@ def _keep_arrays(fresh: object, old: object) -> None:
             setattr(fresh, field.name, theirs)
         elif is_dataclass(ours):
             _keep_arrays(ours, theirs)
-
-
-def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
-    """What `MjwarpSimulation.memory_bytes` would be for these sizes, without allocating it.
-
-    Every array is as long as nworld, as the contact pool, or constant. So two small ones on the CPU tell the rest.
-
-    Args:
-        model: The compiled model.
-        nworld: Number of worlds.
-        sizes: Buffer sizes.
-    """
-    share = replace(sizes, naconmax=None, naccdmax=None)
-    with wp.ScopedDevice("cpu"):
-        one, two, longer = (
-            array_bytes(mjw.make_data(model, nworld=n, **replace(share, nconmax=c).as_kwargs(n)))
-            for n, c in ((1, sizes.nconmax), (2, sizes.nconmax), (1, sizes.nconmax + 1))
-        )
-    per_contact = longer - one
-    per_world = two - one - sizes.nconmax * per_contact
-    constant = one - per_world - sizes.nconmax * per_contact
-    return constant + nworld * per_world + sizes.contact_pool(nworld) * per_contact

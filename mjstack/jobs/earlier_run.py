@@ -1,0 +1,75 @@
+"""What an earlier run left in its folder: its configuration, its report, and its batch's worlds."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mjstack.config.schema import Config
+from mjstack.config.store import load_saved
+from mjstack.errors import MjstackError, RunError
+from mjstack.gates.batch_record import BatchRecord
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EarlierRun:
+    """A run of job=gates, finished or not.
+
+    Attributes:
+        folder: Where it is.
+        cfg: Its whole configuration.
+        provenance: Its report's: versions, device, hashes.
+    """
+
+    folder: Path
+    cfg: Config
+    provenance: dict[str, Any]
+
+    @classmethod
+    def read(cls, name: str) -> EarlierRun:
+        """Reads a run's folder.
+
+        Raises:
+            RunError: There is no such run; the message says what is missing.
+        """
+        folder = Path(name)
+        expected = "expected the folder of a run, such as outputs/2026-11-21/04-02-05 (of a sweep: one of its jobs')"
+        if not folder.is_dir():
+            raise RunError(f"run={name}: no such folder, {expected}. Name an existing one.")
+        saved, report = folder / ".hydra" / "config.yaml", folder / "report.json"
+        for path in (saved, report):
+            if not path.is_file():
+                raise RunError(f"run={name}: has no {path.relative_to(folder)}, {expected}. Name another folder.")
+        try:
+            cfg = load_saved(saved)
+        except MjstackError as error:
+            raise RunError(
+                f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error} Use the one that ran it."
+            ) from error
+        if cfg.job.name != "gates":
+            raise RunError(f"run={name}: is a run of job={cfg.job.name}, expected one of job=gates. Name that run's folder.")
+        try:
+            provenance = json.loads(report.read_text())["provenance"]
+            if not isinstance(provenance, dict):
+                raise TypeError(provenance)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise RunError(
+                f"run={name}: report.json cannot be read ({type(error).__name__}), expected mjstack's. Name another folder."
+            ) from error
+        return cls(folder=folder, cfg=cfg, provenance=provenance)
+
+    def batch_record(self, seed: int) -> BatchRecord | None:
+        """What its batch gate found under a seed, or None if it did not get there.
+
+        Raises:
+            RunError: The record cannot be read, or is not this run's.
+        """
+        record = BatchRecord.read(self.folder, seed)
+        if record is not None and (record.seed != seed or len(record.failed) != self.cfg.nworld):
+            raise RunError(
+                f"run={self.folder}: the record of seed {seed} has {len(record.failed)} worlds of seed {record.seed}, expected "
+                f"{self.cfg.nworld}, the run's nworld. Run the batch gate again."
+            )
+        return record

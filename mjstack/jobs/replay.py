@@ -1,0 +1,215 @@
+"""Job *replay*: one world of an earlier run's batch again, alone, with its trajectory kept and every rule explained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from omegaconf import OmegaConf
+from rich.markup import escape
+
+from mjstack.config.schema import Backend, Config, SimCfg
+from mjstack.errors import ConfigError, DeviceError
+from mjstack.gates.batch_record import BatchRecord
+from mjstack.gates.gate import GateContext, acceptance_thresholds, judge_one
+from mjstack.gates.replay import ReplayedWorld, replay_world
+from mjstack.gates.runner import run_guarded
+from mjstack.jobs.earlier_run import EarlierRun
+from mjstack.jobs.gates import check_task
+from mjstack.jobs.outcome import JobOutcome
+from mjstack.jobs.progress import ProgressBar
+from mjstack.jobs.reported import Record, check_showing, run_provenance, run_reported
+from mjstack.report.record import GateResult, Status, Value, write_atomic
+from mjstack.scene import SceneIndex
+from mjstack.sim import resolve_backend, resolve_device
+from mjstack.tasks.stack import Rule, describe_rules
+
+KEYS = ("job", "run", "world", "sim", "view", "video")
+"""What its command line may set. All else is the earlier run's."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReplayPlan:
+    """What is to be played.
+
+    Attributes:
+        run: The earlier run.
+        cfg: Its configuration, on the first backend here.
+        seed: The seed.
+        world: The world's number.
+        where: Backend and device, each played once; the first is the earlier run's unless ``sim`` says otherwise.
+        record: What the batch gate found there, or None.
+        note: What could not be as it was.
+    """
+
+    run: EarlierRun
+    cfg: Config
+    seed: int
+    world: int
+    where: list[tuple[Backend, str]]
+    record: BatchRecord | None
+    note: str
+
+
+def check_replay(cfg: Config) -> None:
+    """Raises for what cannot be replayed, before anything is written."""
+    plan = _plan(cfg)
+    check_task(plan.cfg)
+    check_showing(plan.cfg)
+
+
+def run_replay_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
+    """Plays the world on its run's backend and, where that was MJWarp, on native MuJoCo too; see `run_reported`."""
+    plan = _plan(cfg)
+    title = f"replay of world {plan.world} of {plan.cfg.nworld}, seed {plan.seed}, of {plan.run.folder}"
+    return run_reported(plan.cfg, folder, overrides, title, partial(_run, plan))
+
+
+def _plan(cfg: Config) -> ReplayPlan:
+    for key, expected in (("run", "the folder of an earlier run"), ("world", "one of its worlds")):
+        if getattr(cfg, key) is None:
+            fix = "Write job=replay run=outputs/<date>/<time> world=17"
+            raise ConfigError(key, "null", f"{expected}, because job=replay plays one again", fix)
+    resolve_backend(cfg)  # what this command line asks for must be there
+    run = EarlierRun.read(str(cfg.run))
+    head, _, tail = str(cfg.world).rpartition(":")
+    seed, world = int(head) if head else run.cfg.seed, int(tail)
+    last = run.cfg.seed + run.cfg.gate.batch.seeds - 1
+    if not run.cfg.seed <= seed <= last:
+        seeds = f"seed {last}" if last == run.cfg.seed else f"a seed from {run.cfg.seed} to {last}"
+        raise ConfigError("world", cfg.world, f"{seeds}, as that run has (seed:world)")
+    if not world < run.cfg.nworld:
+        raise ConfigError("world", cfg.world, f"a world from 0 to {run.cfg.nworld - 1}, as that run has")
+    record = run.batch_record(seed)
+    where, note = _choose(cfg.sim, run, record)
+    backend, device = where[0]
+    return ReplayPlan(
+        run=run,
+        cfg=replace(run.cfg, sim=SimCfg(backend=backend, device=device), view=cfg.view, video=cfg.video),
+        seed=seed,
+        world=world,
+        where=where,
+        record=record,
+        note=note,
+    )
+
+
+def _choose(asked: SimCfg, run: EarlierRun, record: BatchRecord | None) -> tuple[list[tuple[Backend, str]], str]:
+    """Backends and devices to play on, and what could not be as it was."""
+    ran = _ran_on(run, record)
+    backend = ran[0] if asked.backend is Backend.auto else asked.backend
+    if backend is Backend.native:
+        return [(Backend.native, "cpu")], ""
+    device, note = resolve_device(asked.device), ""
+    if asked.device == "auto" and ran[0] is Backend.mjwarp:
+        try:
+            device = resolve_device(ran[1])
+        except DeviceError:
+            note = f"that run was on {ran[1]}, which is not here: replayed on {device}"
+    where = [(Backend.mjwarp, device)]
+    return where + [(Backend.native, "cpu")] * (asked.backend is Backend.auto), note
+
+
+def _ran_on(run: EarlierRun, record: BatchRecord | None) -> tuple[Backend, str]:
+    """Backend and device of the earlier batch: as recorded, else what its configuration means on its machine."""
+    if record is not None:
+        return Backend(record.backend), record.device
+    device = str(run.provenance.get("device", "")).rpartition(": ")[0]
+    backend = run.cfg.sim.backend
+    if backend is Backend.auto:
+        backend = Backend.mjwarp if device.startswith("cuda") else Backend.native
+    return backend, device if device.startswith("cuda") else "cpu"
+
+
+def _run(plan: ReplayPlan, context: GateContext, bar: ProgressBar, record: Record) -> None:
+    assert context.folder is not None
+    played = replace(plan.cfg, seed=plan.seed)
+    write_atomic(context.folder / "replayed_config.yaml", OmegaConf.to_yaml(OmegaConf.structured(played)))
+    notes = [plan.note] if plan.note else []
+    notes += _changes(plan.run.provenance, run_provenance(plan.cfg, context))
+    for line in notes:
+        bar.say(escape(line))
+    for number, (backend, device) in enumerate(plan.where):
+        name = f"replay_{backend.value}"
+        bar.start(name)
+        run_guarded(context, name, partial(_replay, plan, number, backend, device, notes), record)
+
+
+def _changes(then: dict, now: dict) -> list[str]:
+    """What is not as it was in the earlier run and could change the physics."""
+    was, versions = then.get("versions"), now["versions"]
+    lines = [
+        f"{name} was {was[name]} in that run and is {version} now"
+        for name, version in versions.items()
+        if isinstance(was, dict) and name in was and was[name] != version
+    ]
+    if then.get("model_sha256") != now["model_sha256"]:
+        lines.append("the compiled model is not the same as in that run: this is another physics")
+    return lines
+
+
+def _replay(
+    plan: ReplayPlan, number: int, backend: Backend, device: str, notes: list[str], context: GateContext
+) -> list[GateResult]:
+    """Plays the world on one backend and says how it went, and whether that is what was recorded."""
+    first = number == 0
+    done = replay_world(
+        context,
+        seed=plan.seed,
+        world=plan.world,
+        backend=backend,
+        device=device,
+        on_frame=context.on_frame if first else None,
+    )
+    status, reason, metrics = judge_one(done.episode.verdict)
+    reason = reason or f"accepted, xy_err {1e3 * metrics['xy_err_m']:.1f} mm, dz {1e3 * metrics['dz_m']:.1f} mm"
+    reason += f"; {_compare(plan, done, backend, device, context.index)}"
+    if first:
+        context.shown, context.shown_by = done.episode, f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
+    for finding in done.findings:
+        context.say(escape(f"  {finding}"))
+    values: dict[str, Value] = {"backend": done.description, "seed": plan.seed, "world": plan.world, **metrics}
+    if plan.record is not None:
+        values["recorded"] = describe_rules(int(plan.record.failed[plan.world])) or "accepted"
+    name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
+    assert context.folder is not None
+    try:
+        done.write(context.folder / name, seed=plan.seed, world=plan.world)
+        values["trajectory"] = name
+    except OSError as error:
+        status, reason = Status.failed, f"{reason}; {name} cannot be written ({error.strerror})"
+    return [
+        GateResult(
+            name=f"replay_{backend.value}",
+            status=status,
+            reason=reason,
+            thresholds=acceptance_thresholds(plan.cfg),
+            metrics=values,
+            details=[*(str(finding) for finding in done.findings), *notes],
+        )
+    ]
+
+
+def _compare(plan: ReplayPlan, done: ReplayedWorld, backend: Backend, device: str, index: SceneIndex) -> str:
+    """What the batch gate recorded of this world, against what happened now."""
+    record = plan.record
+    if record is None:
+        return "that run recorded no verdict, because its batch gate did not get there"
+    bits = int(record.failed[plan.world])
+    told = describe_rules(bits) or "accepted"
+    same = bits == done.failed
+    if record.backend != backend.value:
+        return f"that run's {record.backend} world had {'the same verdict' if same else f'another verdict: {told}'}"
+    ours, theirs = done.qpos_end, record.qpos[plan.world]
+    if np.array_equal(ours, theirs, equal_nan=True):
+        return "as recorded, and it ends bit for bit where it did"
+    apart = max(float(np.linalg.norm(ours[a : a + 3] - theirs[a : a + 3])) for a in index.cube_qpos)
+    ends = f"its cubes end {1e3 * apart:.3g} mm from where they did"
+    cuda = device.startswith("cuda") or record.device.startswith("cuda")
+    why = ", and runs on CUDA agree to rounding only" if cuda else ""
+    if same:
+        return f"as recorded, but {ends}{why}"
+    pool = ", and a world alone shares no contact pool" if bits & Rule.OVERFLOW else ""
+    return f"NOT as recorded ({told}): {ends}{why}{pool}"

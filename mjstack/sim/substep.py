@@ -1,0 +1,94 @@
+"""One physics step out of MJWarp's own stages, arranged for a captured graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import torch
+
+from mjstack.sim.engine import mjw
+from mjstack.sim.graph import side_by_side
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Arrangement:
+    """What is done to make a captured step faster than MJWarp's own. All of it leaves the numbers as they are.
+
+    Attributes:
+        branches: Contacts beside smooth dynamics, and counting beside the next step's kinematics, as parallel branches.
+        sensors_once: Sensors in the last of several steps alone: nobody sees the others'.
+        own_stages: Only the stages that the model needs: no cameras, lights, tendons, flexes or energy.
+        scratch: Temporaries at fixed addresses (`Arena`), not allocated and freed by the graph.
+    """
+
+    branches: bool = True
+    sensors_once: bool = True
+    own_stages: bool = True
+    scratch: bool = True
+
+
+def can_rearrange(model: mujoco.MjModel, m: mjw.Model) -> bool:
+    """Whether `rearranged_step` does all that `mujoco_warp.step` does for this model.
+
+    It leaves out cameras, lights, tendons, flexes, sleeping, energy and callbacks, and it knows one integrator. Equalities
+    between bodies read velocities of the step before, and sensors of acceleration need a stage of their own.
+    """
+    equalities = {int(kind) for kind in model.eq_type}
+    return (
+        model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+        and model.ntendon == model.nflex == 0
+        and model.nhistory == 0
+        and not model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
+        and equalities <= {int(mujoco.mjtEq.mjEQ_JOINT)}
+        and not m.sensor_rne_postconstraint
+        and not m.opt.run_rne_postconstraint
+        and not any((m.callback.control, m.callback.contactfilter))
+    )
+
+
+def rearranged_step(
+    m: mjw.Model,
+    d: mjw.Data,
+    device: torch.device,
+    *,
+    sensors: bool,
+    branches: bool = True,
+    beside_kinematics: tuple[Callable[[], None], ...] = (),
+) -> None:
+    """`mujoco_warp.step`, with contacts and smooth dynamics as parallel branches: neither needs the other.
+
+    Args:
+        m: The uploaded model.
+        d: The worlds.
+        device: Where they are.
+        sensors: Whether sensordata is computed; of several steps only the last one's is seen.
+        branches: Whether a captured graph gets branches.
+        beside_kinematics: Work that may run while the poses are computed.
+    """
+
+    def kinematics() -> None:
+        mjw.kinematics(m, d)
+        mjw.com_pos(m, d)
+
+    def dynamics() -> None:
+        mjw.crb(m, d)
+        mjw.transmission(m, d)
+        mjw.fwd_velocity(m, d)
+        mjw.fwd_actuation(m, d)
+        mjw.fwd_acceleration(m, d, factorize=True)
+
+    def contacts() -> None:
+        mjw.collision(m, d)
+        mjw.make_constraint(m, d)
+
+    side_by_side(device, kinematics, *beside_kinematics, branches=branches)
+    side_by_side(device, contacts, dynamics, branches=branches)
+    mjw.solve(m, d)
+    if sensors:
+        d.sensordata.zero_()
+        mjw.sensor_pos(m, d)
+        mjw.sensor_vel(m, d)
+        mjw.sensor_acc(m, d)
+    mjw.implicit(m, d)

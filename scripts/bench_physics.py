@@ -1,0 +1,6 @@
+"""Measures what each change to the physics step is worth: ``python scripts/bench_physics.py robot=so101 nworld=2048``."""
+
+from mjstack.benchmark_physics import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,229 @@
+"""The batch gate: totals over seeds, the interval of its rate, what it keeps of every world, and what a failure leaves."""
+
+from __future__ import annotations
+
+import csv
+import os
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mjstack.control.scripted import CommandTape
+from mjstack.errors import RunError
+from mjstack.gates import gate as gate_module
+from mjstack.gates.batch import run_batch
+from mjstack.gates.batch_record import FAILING, BatchRecord, clear_records, write_failing
+from mjstack.gates.episode import Episode, run_episode
+from mjstack.gates.gate import GateContext
+from mjstack.math import wilson_interval
+from mjstack.report.record import GateResult, Status
+from mjstack.tasks.stack import Rule
+
+TIGHT = "gate.acceptance.xy_err=0.0015"  # some worlds end farther off than this
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [
+        (0, 10, 0.0, 0.27753),
+        (10, 10, 0.72247, 1.0),
+        (8, 10, 0.49016, 0.94332),
+        (50, 100, 0.40383, 0.59617),
+        (1, 1, 0.20654, 1.0),
+        (2047, 2048, 0.99724, 0.99991),
+    ],
+)
+def test_wilson_interval(successes: int, trials: int, low: float, high: float) -> None:
+    """The interval's ends p solve (k/n - p)^2 = z^2 p (1 - p) / n."""
+    found = wilson_interval(successes, trials)
+    assert found == pytest.approx((low, high), abs=1e-5)
+    for p in found:
+        assert (successes / trials - p) ** 2 == pytest.approx(1.959964**2 * p * (1.0 - p) / trials, rel=1e-4, abs=1e-12)
+    assert 0.0 <= found[0] <= successes / trials <= found[1] <= 1.0
+
+
+def play(context: GateContext, folder: Path | None) -> GateResult:
+    context.folder = folder
+    (result,) = run_batch(context)
+    return result
+
+
+@pytest.fixture(scope="module")
+def two_seeds(
+    new_context: Callable[..., GateContext], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, GateResult, list[str]]:
+    """A native batch of seven worlds under seeds 0 and 1, some of which fail, its folder, and what it said."""
+    folder = tmp_path_factory.mktemp("batch")
+    context = new_context("sim=native", "nworld=7", "gate.batch.seeds=2", TIGHT)
+    lines: list[str] = []
+    context.say = lines.append
+    return folder, play(context, folder), lines
+
+
+def test_seeds_add_up(two_seeds: tuple[Path, GateResult, list[str]]) -> None:
+    folder, result, lines = two_seeds
+    records = [BatchRecord.read(folder, seed) for seed in (0, 1)]
+    failing = [f"{seed}:{w}" for seed, r in enumerate(records) if r is not None for w in np.flatnonzero(r.failed)]
+    assert 0 < len(failing) < 14
+    assert {name[0] for name in failing} == {"0", "1"}  # the test would show less if one seed had none
+    accepted = 14 - len(failing)
+    low, high = wilson_interval(accepted, 14)
+    metrics = result.metrics
+    assert result.status is Status.failed
+    assert (metrics["world_episodes"], metrics["accepted"], metrics["seeds"]) == (14, accepted, 2)
+    assert metrics["seed0.accepted"] + metrics["seed1.accepted"] == accepted
+    assert metrics["failed.STACKED"] == len(failing)
+    assert metrics["distinct_final_states"] == 14
+    assert (metrics["success_rate_low95"], metrics["success_rate_high95"]) == (low, high)
+    assert f"{len(failing)} of 14 world-episodes ({', '.join(failing)}) failed: not stacked in {len(failing)}" in result.reason
+    assert f"{accepted} of 14 world-episodes accepted (" in result.reason
+    assert "95 % interval" in result.reason
+    assert f"job=replay run={folder} world={failing[0]}" in result.reason
+    assert [line.split(":")[0] for line in lines] == ["batch, seed 0", "batch, seed 1"]
+
+
+def test_failing_worlds_are_a_table(two_seeds: tuple[Path, GateResult, list[str]]) -> None:
+    folder, result, _ = two_seeds
+    rows = list(csv.DictReader((folder / FAILING).read_text().splitlines()))
+    assert len(rows) == result.metrics["failed.STACKED"]
+    for row in rows:
+        record = BatchRecord.read(folder, int(row["seed"]))
+        assert record is not None
+        assert record.failed[int(row["world"])] == Rule.STACKED
+        assert row["rules"] == "STACKED"
+        assert float(row["xy_err_m"]) > 0.0015
+        for name, values in record.values.items():
+            assert float(row[name]) == pytest.approx(values[int(row["world"])], rel=1e-5)
+
+
+def test_second_seed_is_what_it_is_alone(
+    two_seeds: tuple[Path, GateResult, list[str]], new_context: Callable[..., GateContext], tmp_path: Path
+) -> None:
+    """Worlds are started anew: nothing of seed 0 is left in them. Fewer of them, too, because nworld does not matter."""
+    result = play(new_context("sim=native", "nworld=3", "seed=1", TIGHT), tmp_path)
+    alone, after = BatchRecord.read(tmp_path, 1), BatchRecord.read(two_seeds[0], 1)
+    assert alone is not None
+    assert after is not None
+    assert np.array_equal(alone.qpos, after.qpos[:3])
+    assert np.array_equal(alone.failed, after.failed[:3])
+    first = BatchRecord.read(two_seeds[0], 0)
+    assert first is not None
+    assert not np.array_equal(first.qpos, after.qpos)
+    bad = np.flatnonzero(alone.failed).tolist()
+    assert f"({', '.join(map(str, bad))}) failed" in result.reason  # one seed: worlds have no seed in their names
+    assert result.metrics["worlds"] == 3
+
+
+@pytest.mark.parametrize("nu", [6, 8])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_commands_do_not_depend_on_nworld(nu: int, dtype: torch.dtype) -> None:
+    """Not even in their last bits, or a world would not do alone what it did among many."""
+    rng = np.random.default_rng(0)
+    knots, weights = rng.normal(size=(200, 12, nu)), rng.normal(size=(5, 6))
+    segments, error = np.array([0, 0, 6, 6, 6]), np.zeros(200)
+    many = CommandTape(knots, weights, segments, error).to(torch.device("cpu"), dtype)
+    for world in range(0, 200, 7):
+        alone = CommandTape(knots[world : world + 1], weights, segments, error[:1]).to(torch.device("cpu"), dtype)
+        for frame in range(5):
+            assert torch.equal(alone.command(frame)[0], many.command(frame)[world])
+
+
+class Stop(Exception):
+    """Something that nobody foresaw."""
+
+
+@pytest.mark.parametrize("error", [Stop("the second seed"), KeyboardInterrupt()])
+def test_what_stops_the_second_seed_keeps_the_first(
+    error: BaseException, new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def stops(*args: object, **kwargs: object) -> Episode:
+        if (tmp_path / "worlds_seed0.npz").exists():
+            raise error
+        return run_episode(*args, **kwargs)
+
+    monkeypatch.setattr(gate_module, "run_episode", stops)
+    context = new_context("sim=native", "nworld=2", "gate.batch.seeds=3", "gate.acceptance.xy_err=1e-6")
+    if isinstance(error, KeyboardInterrupt):
+        with pytest.raises(KeyboardInterrupt):
+            play(context, tmp_path)
+    else:
+        result = play(context, tmp_path)
+        assert result.status is Status.failed
+        assert "2 of 2 world-episodes (0:0, 0:1) failed" in result.reason
+        assert "seeds 1 to 2 not played: the second seed" in result.reason
+        assert result.metrics["seeds"] == 1
+    assert len((tmp_path / FAILING).read_text().splitlines()) == 3
+    record = BatchRecord.read(tmp_path, 0)
+    assert record is not None
+    assert (record.failed == Rule.STACKED).all()
+
+
+def test_full_disk_takes_no_verdict_back(
+    new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    result = play(new_context("sim=native", "nworld=2"), tmp_path)
+    assert result.status is Status.passed
+    assert "2 of 2 worlds accepted (100 %, 95 % interval 34.24 to 100 %), 2 distinct" in result.reason
+    assert any("No space left on device" in line for line in result.details)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_table_is_replaced_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_failing(tmp_path, "seed,world", ["0,1"])
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_failing(tmp_path, "seed,world", ["0,1", "1,2"])
+    assert (tmp_path / FAILING).read_text() == "seed,world\n0,1\n"
+    assert [path.name for path in tmp_path.iterdir()] == [FAILING]
+
+
+def test_records_of_an_earlier_run_go(tmp_path: Path) -> None:
+    for name in (FAILING, "worlds_seed0.npz", "worlds_seed11.npz", "report.json"):
+        (tmp_path / name).write_text("old")
+    clear_records(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_damaged_record_is_one_line(tmp_path: Path) -> None:
+    assert BatchRecord.read(tmp_path, 0) is None
+    (tmp_path / "worlds_seed0.npz").write_bytes(b"PK not a zip")
+    with pytest.raises(RunError, match=r"worlds_seed0\.npz: cannot be read") as caught:
+        BatchRecord.read(tmp_path, 0)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_few_failures_may_be_allowed(new_context: Callable[..., GateContext]) -> None:
+    """nworld=5 of seed 0 has world 4 off; allowed, it is still named."""
+    result = play(new_context("sim=native", "nworld=5", "gate.batch.failed_worlds=1", TIGHT), None)
+    assert result.status is Status.passed
+    assert "4 of 5 worlds accepted (80 %," in result.reason
+    assert "1 of 5 worlds (4) failed: not stacked in 1" in result.reason
+
+
+def test_no_trajectory_is_kept(new_context: Callable[..., GateContext], tmp_path: Path) -> None:
+    """A trajectory of qpos alone would take 96 kB a world on the host."""
+
+    def peak(nworld: int) -> int:
+        context = new_context("sim=native", f"nworld={nworld}")
+        assert context.model.nq * 8 * 600 == 96_000
+        tracemalloc.start()
+        play(context, tmp_path)
+        try:
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak(2)  # whatever is made once
+    assert (peak(12) - peak(2)) / 10 < 30_000

@@ -1,0 +1,141 @@
+"""What a captured step runs reads nothing back to the host and copies nothing from it: the source is checked."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import mjstack
+
+ROOT = Path(mjstack.__file__).parent
+READS = {"item", "tolist", "cpu", "numpy", "nonzero", "synchronize", "all_gather_object"}
+COPIES = {"tensor", "as_tensor", "from_numpy", "masked_select", "unique", "argwhere"}
+CASTS = {"bool", "int", "float"}
+# What runs within a step, by file: qualified names, or every function of a file.
+PATHS: dict[str, list[str] | None] = {
+    "envs/env.py": [
+        f"Env.{n}"
+        for n in (
+            "advance",
+            "_command",
+            "_move",
+            "_judge",
+            "_latch",
+            "_reset_ended",
+            "_write_start",
+            "_forget",
+            "_side_by_side",
+        )
+    ],
+    "envs/statistics.py": ["EpisodeStatistics.update"],
+    "envs/outputs.py": ["Outputs.copy", "Outputs._views"],
+    "managers/action.py": ["ActionManager.accept", "ActionManager.write_commands", "ActionManager.reset"],
+    "managers/observation.py": [
+        *(f"_Group.{n}" for n in ("compute", "append", "restart")),
+        "ObservationManager.compute",
+        "ObservationManager.refresh",
+    ],
+    "managers/reward.py": ["RewardManager.compute", "RewardManager.reset"],
+    "managers/termination.py": ["TerminationManager.compute", "TerminationManager.reset"],
+    "managers/reset.py": ["ResetManager.reset"],
+    "managers/base.py": ["random_uniform", "shared", "Term.__call__", "Term.reset"],
+    "mdp/observation.py": None,
+    "mdp/reward.py": None,
+    "mdp/geometry.py": None,
+    "mdp/termination.py": ["time_out", "success", "non_finite", "overflow", "CubeOffTable.__call__", "JointLimit.__call__"],
+    "mdp/action.py": ["JointPosition.write_commands", "Gripper.write_commands", "EndEffectorDelta.write_commands"],
+    "mdp/reset.py": [
+        *("home", "_write", "_write_robot", "_write_cube", "_Columns.write"),
+        *(
+            f"{name}.__call__"
+            for name in ("JointNoise", "JitterCubes", "RandomizeCubes", "CubeMass", "CubeFriction", "ActuatorGains")
+        ),
+    ],
+    "mdp/placement.py": ["Placement.choose", "Placement._choose"],
+    "tasks/stack.py": [
+        *(f"CubePair.{n}" for n in ("pose", "speed", "clearance", "offset", "stacked", "supported")),
+        "StackEvidence.update",
+        "StackSuccess.__call__",
+        "StackSuccess.reset",
+    ],
+    "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
+    "control/scripted.py": ["CommandTape.command"],
+    "kinematics/batched_ik.py": ["BatchedIk.solve", "BatchedIk.aperture"],
+    "scene/index.py": ["Columns.read", "Columns.write", "Columns.write_masked"],
+    "sim/mjwarp.py": [
+        f"MjwarpSimulation.{n}" for n in ("step", "reset", "kinematics", "_substeps", "_count", "_pose", "_place", "_graph")
+    ],
+    "sim/substep.py": ["rearranged_step"],
+    "sim/draws.py": ["draw_uniform"],
+    "math.py": None,
+}
+
+
+def functions(tree: ast.Module) -> dict[str, ast.FunctionDef]:
+    """Functions and methods by their qualified names."""
+    found = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    for cls in (node for node in tree.body if isinstance(node, ast.ClassDef)):
+        found |= {f"{cls.name}.{node.name}": node for node in cls.body if isinstance(node, ast.FunctionDef)}
+    return found
+
+
+def host_accesses(function: ast.FunctionDef) -> list[str]:
+    """Lines that read from the device or copy to it; what only the CPU gets to is left out."""
+    skipped: set[ast.AST] = set()
+    for node in ast.walk(function):
+        guard = None
+        if isinstance(node, ast.If):
+            guard, rest = ast.unparse(node.test), [*node.body]
+        elif isinstance(node, ast.BoolOp):
+            guard, rest = ast.unparse(node.values[0]), [*node.values[1:]]
+        elif isinstance(node, ast.IfExp):
+            guard, rest = ast.unparse(node.test), [node.body]
+        # `not x.is_cuda and bool(x.any())`, `on_cuda or bool(x.any())`: the second half is the CPU's.
+        if guard and ("is_cuda" in guard or "on_cuda" in guard):
+            skipped |= {inner for part in rest for inner in ast.walk(part)}
+        # A frame given as a number is the host's own.
+        if guard and guard.startswith("isinstance("):
+            skipped |= {inner for part in rest for inner in ast.walk(part)}
+    out = []
+    for node in ast.walk(function):
+        if not isinstance(node, ast.Call) or node in skipped:
+            continue
+        called = node.func
+        if isinstance(called, ast.Attribute):
+            base = ast.unparse(called.value)
+            if called.attr in READS or (base == "torch" and called.attr in COPIES):
+                out.append(f"{node.lineno}: {ast.unparse(node)}")
+        elif isinstance(called, ast.Name) and called.id in CASTS and not isinstance(node.args[0], ast.Constant):
+            out.append(f"{node.lineno}: {ast.unparse(node)}")
+    return out
+
+
+@pytest.mark.parametrize("path", sorted(PATHS))
+def test_a_captured_step_does_not_touch_the_host(path: str) -> None:
+    found = functions(ast.parse((ROOT / path).read_text()))
+    names = list(found) if PATHS[path] is None else PATHS[path]
+    assert names
+    for name in names:
+        assert name in found, f"{path} has no {name} any more"
+        assert host_accesses(found[name]) == [], f"{path}: {name}"
+
+
+@pytest.mark.parametrize(
+    ("body", "caught"),
+    [
+        ("x = d.sum().item()", True),
+        ("rows = mask.nonzero()", True),
+        ("if bool(done.any()):\n        pass", True),
+        ("k = torch.tensor([1.0], device=device)", True),
+        ("y = x.cpu()", True),
+        ("n = int(count)", True),
+        ("if not x.is_cuda and not bool(x.any()):\n        return", False),
+        ("x = torch.where(mask, a, b)", False),
+        ("if x.is_cuda or bool(x.any()):\n        return", False),
+    ],
+)
+def test_the_check_finds_what_it_should(body: str, caught: bool) -> None:
+    (function,) = functions(ast.parse(f"def step(x):\n    {body}\n")).values()
+    assert bool(host_accesses(function)) is caught

@@ -1,0 +1,314 @@
+"""Job replay: a world of an earlier run does alone what it did among others, and every rule is explained."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from mjstack.cli import run
+from mjstack.config import load_config
+from mjstack.config.store import load_saved
+from mjstack.gates.batch_record import BatchRecord
+from mjstack.gates.episode import snapshot, start_worlds
+from mjstack.gates.gate import GateContext
+from mjstack.gates.replay import _sizes_alone
+from mjstack.sim import BatchSizes
+from mjstack.tasks.stack import Rule
+
+FAILING, ACCEPTED = "0:4", "1:3"  # of the run below
+
+
+@pytest.fixture(scope="module")
+def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a native run of seven worlds under two seeds, with a threshold so tight that some fail."""
+    folder = tmp_path_factory.mktemp("earlier") / "run"
+    args = ["gates=[batch]", "sim=native", "nworld=7", "gate.batch.seeds=2", "gate.acceptance.xy_err=0.0015"]
+    assert run([*args, f"hydra.run.dir={folder}"]) == 1
+    return folder
+
+
+@pytest.fixture
+def replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, dict]]:
+    """Replays with some arguments into ``out``; returns the exit status and the report."""
+    monkeypatch.chdir(tmp_path)
+
+    def do(folder: Path, *args: str) -> tuple[int, dict]:
+        status = run(["job=replay", f"run={folder}", "hydra.run.dir=out", *args])
+        return status, json.loads((tmp_path / "out" / "report.json").read_text())
+
+    return do
+
+
+def record_of(folder: Path, seed: int) -> BatchRecord:
+    record = BatchRecord.read(folder, seed)
+    assert record is not None
+    return record
+
+
+def copy_of(folder: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
+
+
+def test_failing_world_fails_again_bit_for_bit(earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
+    record = record_of(earlier, 0)
+    assert record.failed[4] == Rule.STACKED
+    status, report = replay(earlier, f"world={FAILING}")
+    assert status == 1
+    assert report["status"] == "fail"
+    (gate,) = report["gates"]
+    assert (gate["name"], gate["status"]) == ("replay_native", "fail")
+    assert gate["reason"] == "failed: not stacked; as recorded, and it ends bit for bit where it did"
+    assert gate["metrics"]["xy_err_m"] == record.values["xy_err_m"][4]
+    assert gate["thresholds"]["xy_err_max_m"] == 0.0015
+    broken = [line for line in gate["details"] if "BROKEN" in line]
+    assert len(broken) == 1
+    assert broken[0].startswith(f"STACKED: BROKEN, not stacked: xy_err up to {1e3 * record.values['xy_err_m'][4]:.3g} mm")
+    assert "at most 1.5 mm" in broken[0]
+    assert len(gate["details"]) == len(Rule)
+    with np.load(tmp_path / "out" / "trajectory.npz") as held:
+        assert np.array_equal(held["qpos"][-1], record.qpos[4])
+        assert (int(held["seed"]), int(held["world"]), int(held["failed"])) == (0, 4, int(Rule.STACKED))
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        ".hydra",
+        "replayed_config.yaml",
+        "report.json",
+        "report.md",
+        "run.log",
+        "scene.png",
+        "trajectories.png",
+        "trajectory.npz",
+    ]
+
+
+def test_accepted_world_of_another_seed(earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
+    record = record_of(earlier, 1)
+    assert record.failed[3] == 0
+    status, report = replay(earlier, f"world={ACCEPTED}")
+    assert status == 0
+    (gate,) = report["gates"]
+    assert gate["status"] == "pass"
+    assert gate["reason"].endswith("; as recorded, and it ends bit for bit where it did")
+    assert not [line for line in gate["details"] if "BROKEN" in line]
+    with np.load(tmp_path / "out" / "trajectory.npz") as held:
+        assert np.array_equal(held["qpos"][-1], record.qpos[3])
+
+
+def test_trajectory_holds_the_episode(
+    earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path, new_context: Callable[..., GateContext]
+) -> None:
+    replay(earlier, "world=5")
+    context = new_context("sim=native", "gate.acceptance.xy_err=0.0015")
+    sim = context.batch_simulation(7)
+    _, tape = start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+    with np.load(tmp_path / "out" / "trajectory.npz") as held:
+        assert np.array_equal(held["start_qpos"], snapshot(sim).qpos[5])
+        assert not np.array_equal(held["start_qpos"], snapshot(sim).qpos[0])
+        assert (held["start_qvel"] == 0.0).all()
+        commands = np.stack([tape.command(frame)[5].numpy() for frame in range(tape.frames)])
+        assert np.allclose(held["ctrl"][:, context.index.ctrl], commands)
+        assert held["time_s"][[0, -1]] == pytest.approx([0.02, 12.0])
+        assert [str(held["phase"][i]) for i in (0, 59, 60, -1)] == ["above_red", "above_red", "descend_red", "done"]
+        red, blue = (held["qpos"][:, a : a + 3] for a in context.index.cube_qpos)
+        assert held["xy_err_m"] == pytest.approx(np.hypot(*(red - blue)[:, :2].T), abs=1e-6)
+        assert held["dz_m"] == pytest.approx((red - blue)[:, 2], abs=1e-6)
+        v = context.index.cube_qvel[0]
+        speed = np.linalg.norm(held["qvel"][:, v : v + 3], axis=1)
+        speed += np.sqrt(3.0) * 0.022 * np.linalg.norm(held["qvel"][:, v + 3 : v + 6], axis=1)
+        assert held["cube_speed_m_per_s"][:, 0] == pytest.approx(speed)
+        low = held["cube_height_m"]
+        assert abs(low[-1, 1]) < 0.001  # blue on the table,
+        assert low[-1, 0] == pytest.approx(0.044, abs=0.001)  # red one cube above it
+    sim.close()
+
+
+def test_saved_configuration_is_the_runs_own(earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
+    _, report = replay(earlier, "world=1:3")
+    then = json.loads((earlier / "report.json").read_text())["provenance"]
+    assert report["provenance"]["model_sha256"] == then["model_sha256"]
+    loaded = load_saved(earlier / ".hydra" / "config.yaml")
+    assert loaded == load_config(
+        ["gates=[batch]", "sim=native", "nworld=7", "gate.batch.seeds=2", "gate.acceptance.xy_err=0.0015"]
+    )
+    played = OmegaConf.load(tmp_path / "out" / "replayed_config.yaml")
+    assert (played.seed, played.gate.acceptance.xy_err) == (1, 0.0015)
+
+
+def test_another_verdict_is_said(earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
+    folder = copy_of(earlier, tmp_path)
+    record = record_of(folder, 0)
+    record.failed[3] = int(Rule.CARRY)
+    record.qpos[3, 14] += 0.002  # somewhere in blue's position
+    record.write(folder)
+    status, report = replay(folder, "world=3")
+    assert status == 0
+    (gate,) = report["gates"]
+    assert "NOT as recorded (red not carried): its cubes end 2 mm from where they did" in gate["reason"]
+    assert gate["metrics"]["recorded"] == "red not carried"
+
+
+def test_run_that_did_not_get_to_the_world(
+    earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing recorded, and made with another MuJoCo on another model: it is played, and all of that is said."""
+    folder = copy_of(earlier, tmp_path)
+    (folder / "worlds_seed1.npz").unlink()
+    report = json.loads((folder / "report.json").read_text())
+    report["provenance"]["versions"]["mujoco"] = "3.9.9"
+    report["provenance"]["model_sha256"] = "0" * 64
+    (folder / "report.json").write_text(json.dumps(report))
+    _, report = replay(folder, "world=1:0")
+    (gate,) = report["gates"]
+    assert "recorded no verdict" in gate["reason"]
+    printed = capsys.readouterr().out
+    for line in ("mujoco was 3.9.9 in that run", "not the same as in that run"):
+        assert line in printed
+        assert any(line in detail for detail in gate["details"])
+
+
+def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
+    replay: Callable[..., tuple[int, dict]], tmp_path: Path
+) -> None:
+    folder = tmp_path / "random"
+    run(["gates=[batch]", "sim=native", "nworld=3", "reset=randomized", "robot=rebot", f"hydra.run.dir={folder}"])
+    _, report = replay(folder, "world=2", "sim=native")
+    assert report["gates"][0]["reason"].endswith("as recorded, and it ends bit for bit where it did")
+    with np.load(tmp_path / "out" / "trajectory.npz") as held:
+        assert {"field.body_mass", "field.geom_friction"} <= set(held.files)
+        assert not np.isclose(held["field.body_mass"][-2:], 0.08).any()  # scaled
+
+
+def test_mjwarp_world_is_played_on_both_engines(replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
+    folder = tmp_path / "warp"
+    args = ["gates=[batch]", "sim=mjwarp", "sim.device=cpu", "nworld=2", "gate.acceptance.xy_err=1e-6"]
+    assert run([*args, f"hydra.run.dir={folder}"]) == 1
+    status, report = replay(folder, "world=1")
+    assert status == 1
+    warp, native = report["gates"]
+    assert (warp["name"], native["name"]) == ("replay_mjwarp", "replay_native")
+    assert warp["reason"] == "failed: not stacked; as recorded, and it ends bit for bit where it did"
+    assert native["reason"] == "failed: not stacked; that run's mjwarp world had the same verdict"
+    with np.load(tmp_path / "out" / "trajectory.npz") as ours, np.load(tmp_path / "out" / "trajectory_native.npz") as theirs:
+        assert "Warp" in str(ours["backend"])
+        assert np.abs(ours["start_qpos"] - theirs["start_qpos"]).max() < 1e-6
+        assert np.abs(ours["cube_pos_m"][-1] - theirs["cube_pos_m"][-1]).max() < 0.002
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+def test_cuda_world_ends_near_where_it_did(replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
+    folder = tmp_path / "cuda"
+    assert run(["gates=[batch]", "sim=mjwarp", "sim.device=cuda:0", "nworld=64", f"hydra.run.dir={folder}"]) == 0
+    record = record_of(folder, 0)
+    status, report = replay(folder, "world=41")
+    assert status == 0
+    warp, _ = report["gates"]
+    assert "as recorded" in warp["reason"]
+    assert "NOT" not in warp["reason"]
+    with np.load(tmp_path / "out" / "trajectory.npz") as held:
+        assert np.abs(held["qpos"][-1] - record.qpos[41]).max() < 0.01
+
+
+def test_a_world_alone_has_its_room() -> None:
+    """A world may have taken more than its share of the pool, but never more than the pool."""
+    small = BatchSizes(nconmax=20, njmax=100)
+    assert _sizes_alone(small, 64) == BatchSizes(nconmax=20, njmax=100, naconmax=80)
+    assert _sizes_alone(small, 2) == BatchSizes(nconmax=20, njmax=100, naconmax=40)
+    pooled = BatchSizes(nconmax=20, njmax=100, naconmax=30, nccdmax=4)
+    assert _sizes_alone(pooled, 64) == BatchSizes(nconmax=20, njmax=100, naconmax=30, naccdmax=16)
+    pooled = BatchSizes(nconmax=20, njmax=100, naconmax=30, naccdmax=50)
+    assert _sizes_alone(pooled, 64) == BatchSizes(nconmax=20, njmax=100, naconmax=30, naccdmax=30)
+
+
+BAD = [
+    (["world=1"], "run=null"),
+    (["run={run}"], "world=null"),
+    (["run=nowhere", "world=1"], "no such folder"),
+    (["run={run}/..", "world=1"], "has no .hydra/config.yaml"),
+    (["run={run}", "world=7"], "a world from 0 to 6"),
+    (["run={run}", "world=2:1"], "a seed from 0 to 1"),
+    (["run={run}", "world=-1"], "world=-1"),
+    (["run={run}", "world=1.5"], "world=1.5"),
+    (["run={run}", "world=1", "robot=rebot"], "robot=rebot: expected only run, world, sim, view, video"),
+    (["run={run}", "world=1", "nworld=3"], "nworld=3"),
+    (["run={run}", "world=1", "~reset.cubes"], "reset.cubes"),
+    (["run={run}", "world=1", "sim.device=cuda:77"], "cuda:77"),
+    (["run={run}", "world=1", "sim=native", "sim.device=cuda:0"], "cuda:0"),
+]
+
+
+@pytest.mark.parametrize(("args", "says"), BAD, ids=[" ".join(args) for args, _ in BAD])
+def test_bad_input_is_one_line_and_writes_nothing(
+    args: list[str],
+    says: str,
+    earlier: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["job=replay", *(arg.format(run=earlier) for arg in args)]) == 2
+    _refused(capsys, says)
+    assert list(tmp_path.iterdir()) == []
+
+
+def _refused(capsys: pytest.CaptureFixture[str], says: str) -> None:
+    out, err = capsys.readouterr()
+    assert err.startswith("mjstack: ")
+    assert len(err.strip().splitlines()) == 1
+    assert says in err
+    assert "Traceback" not in out + err
+
+
+DAMAGE = {
+    "no report": (lambda f: (f / "report.json").unlink(), "has no report.json"),
+    "no JSON": (lambda f: (f / "report.json").write_text("{"), "report.json cannot be read"),
+    "another report": (lambda f: (f / "report.json").write_text("[]"), "report.json cannot be read"),
+    "no YAML": (lambda f: (f / ".hydra" / "config.yaml").write_text("a: [1"), "no configuration of this mjstack"),
+    "empty": (lambda f: (f / ".hydra" / "config.yaml").write_text(""), "no configuration of this mjstack"),
+    "another tool's": (
+        lambda f: (f / ".hydra" / "config.yaml").write_text("model: resnet\n"),
+        "no configuration of this mjstack",
+    ),
+    "a key too many": (lambda f: _append(f / ".hydra" / "config.yaml", "colour: red\n"), "colour"),
+    "a value out of range": (lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 7", "nworld: 0"), "nworld=0"),
+    "a key too few": (lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 7\n", ""), "nworld is missing"),
+    "another nworld": (lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 7", "nworld: 6"), "has 7 worlds"),
+    "another job": (lambda f: _replace(f / ".hydra" / "config.yaml", "name: gates", "name: replay"), "job=replay"),
+    "record": (lambda f: (f / "worlds_seed0.npz").write_bytes(b"PK"), "worlds_seed0.npz: cannot be read"),
+}
+
+
+def _append(path: Path, text: str) -> None:
+    path.write_text(path.read_text() + text)
+
+
+def _replace(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new))
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damaged_folder_is_one_line_and_writes_nothing(
+    name: str, earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = copy_of(earlier, tmp_path)
+    damage, says = DAMAGE[name]
+    damage(folder)
+    monkeypatch.chdir(tmp_path)
+    assert run(["job=replay", f"run={folder}", "world=1"]) == 2
+    _refused(capsys, says)
+    assert [path.name for path in tmp_path.iterdir()] == ["copy"]
+
+
+@pytest.mark.parametrize("args", [["run=somewhere"], ["world=3"]])
+def test_keys_of_replay_belong_to_replay(args: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(args) == 2
+    _refused(capsys, "job=replay")

@@ -1,0 +1,98 @@
+"""The rearranged physics step is MJWarp's own."""
+
+from __future__ import annotations
+
+import mujoco
+import pytest
+import torch
+import warp as wp
+from environments import configure
+
+from mjstack.config.schema import Backend
+from mjstack.scene import SceneIndex, build_model
+from mjstack.sim import make_simulation
+from mjstack.sim.engine import mjw
+from mjstack.sim.mjwarp import MjwarpSimulation
+from mjstack.sim.sizes import resolve_env_sizes
+from mjstack.sim.substep import Arrangement, can_rearrange
+
+CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
+
+
+def worlds(robot: str, device: str, *overrides: str) -> MjwarpSimulation:
+    cfg = configure(*overrides, robot=robot)
+    sizes = resolve_env_sizes(cfg)
+    sim = make_simulation(build_model(cfg), cfg, 3, backend=Backend.mjwarp, device=device, sizes=sizes)
+    assert isinstance(sim, MjwarpSimulation)
+    return sim
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("robot", ["so101", "rebot"])
+def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
+    """Random commands, cubes thrown about: on the CPU device bit for bit, sensors included."""
+    ours, plain = worlds(robot, device), worlds(robot, device)
+    assert ours._can_rearrange
+    plain.arrange(Arrangement(own_stages=False))
+    low, high = torch.from_numpy(ours.model.actuator_ctrlrange).float().unbind(1)
+    generator = torch.Generator().manual_seed(0)
+    most, touched = 0, False
+    index = SceneIndex(ours.model, configure(robot=robot).robot)
+    red = index.cube_qpos[0]
+    for frame in range(40):
+        command = low + (high - low) * torch.rand((3, len(low)), generator=generator)
+        between = ours.site_xpos[:, index.aperture_sites].mean(1)
+        for sim in (ours, plain):
+            if device != "cpu":  # where runs differ by rounding, each frame starts from the same state
+                for name in ("qpos", "qvel"):
+                    getattr(sim, name)[:] = getattr(ours, name)
+            if frame == 20:  # a cube between the jaws, for the contact sensors
+                sim.qpos[:, red : red + 3] = between
+            sim.ctrl[:] = command.to(device)
+            sim.step(5, kinematics=frame % 2 == 0)
+            sim.synchronize()
+        for name in ("qpos", "qvel", "site_xpos", "sensordata", "qfrc_actuator", "contact_count", "constraint_count"):
+            a, b = getattr(ours, name), getattr(plain, name)
+            if device == "cpu":
+                assert torch.equal(a, b), (frame, name)
+            elif name in ("qpos", "site_xpos"):
+                torch.testing.assert_close(a, b, rtol=0.0, atol=2e-3)
+        assert torch.equal(ours.step_count, plain.step_count)
+        most = max(most, int(ours.contact_count.max()))
+        touched |= bool((ours.sensordata != 0.0).any())
+    assert most >= 8
+    assert touched
+    if device == "cpu":
+        assert torch.equal(ours.peak_contacts, plain.peak_contacts)
+        assert torch.equal(ours.peak_constraints, plain.peak_constraints)
+        assert torch.equal(ours.peak_pool, plain.peak_pool)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda spec: setattr(spec.option, "integrator", mujoco.mjtIntegrator.mjINT_EULER),
+        lambda spec: (
+            spec.worldbody.add_body(name="b").add_site(name="s")
+            and spec.add_sensor(
+                name="a", type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="s"
+            )
+        ),
+        lambda spec: spec.add_equality(
+            type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="box", name2="world"
+        ),
+    ],
+)
+def test_what_it_leaves_out_is_stepped_by_mjwarp(change) -> None:
+    spec = mujoco.MjSpec()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    body = spec.worldbody.add_body(name="box", pos=[0, 0, 1])
+    body.add_freejoint()
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 0.1])
+    plain = spec.copy().compile()
+    change(spec)
+    changed = spec.compile()
+    with wp.ScopedDevice("cpu"):
+        assert can_rearrange(plain, mjw.put_model(plain))
+        assert not can_rearrange(changed, mjw.put_model(changed))
