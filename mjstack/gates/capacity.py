@@ -33,15 +33,16 @@ def run_capacity(context: GateContext) -> list[GateResult]:
     """
     cfg, margin = context.cfg, context.cfg.gate.capacity.margin
     details: list[str] = []
-    task = measure_task(context, cfg.reset)
-    peaks, nworld = task.peaks, task.peaks.nworld
-    random = measure_random(context)
-    runs, env_peaks = {"": task, "random_actions.": random}, random.peaks
-    try:
-        runs["randomized."] = measure_task(context, cfg.gate.capacity.reset)
-        env_peaks = join_peaks(env_peaks, runs["randomized."].peaks)
-    except Unreachable as error:  # somebody's own layout; the other two stand
+    randomized: Workload | None = None
+    try:  # first, so that the plan of the task is the last one and kept for the runs and gates that follow
+        randomized = measure_task(context, cfg.gate.capacity.reset)
+    except Unreachable as error:  # somebody's own layout; the other two workloads stand
         details.append(f"randomised starts: not measured: {error}")
+    task, random = measure_task(context, cfg.reset), measure_random(context)
+    peaks, nworld = task.peaks, task.peaks.nworld
+    runs, env_peaks = {"": task, "random_actions.": random}, random.peaks
+    if randomized is not None:
+        runs["randomized."], env_peaks = randomized, join_peaks(env_peaks, randomized.peaks)
 
     how = f"batch=auto: gate capacity, {nworld} worlds, times {margin:g}" if cfg.batch.auto else "gate capacity"
     wanted = context.measured = recommend_sizes(peaks, margin, how)
