@@ -1,7 +1,6 @@
-"""What the managers cost: physics alone and a whole ``env.step``, alternating on one trajectory, on both backends.
+"""What the managers cost: a whole ``env.step``, its physics and its managers alone, alternating on one trajectory.
 
-A turn starts from the same state for every candidate and plays the same random actions. Physics alone is the action
-manager's commands and the physics steps. So the ratio is of one run, one trajectory and one machine's mood.
+On both backends; native MuJoCo beside ``mujoco.rollout``. `mjstack.gates.env_step` says what a turn is.
 """
 
 from __future__ import annotations
@@ -10,14 +9,12 @@ import argparse
 import json
 import statistics
 import sys
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 
 import mujoco
 import numpy as np
-import torch
 from mujoco import rollout
 from rich.console import Console
 from rich.table import Table
@@ -26,131 +23,16 @@ from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import Env, build_env
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.gates.episode import restore, snapshot
+from mjstack.gates.env_step import EnvStepTimes, measure_env_step
 from mjstack.report.provenance import collect_provenance
 from mjstack.sim import resolve_device
 from mjstack.sim.native import NativeSimulation
 
 
-@dataclass(kw_only=True, slots=True)
-class EnvStepResult:
-    """Times of one backend.
-
-    Attributes:
-        backend: Backend and hardware.
-        nworld: Number of worlds.
-        frames: Frames per turn.
-        substeps: Physics steps per frame.
-        physics_ms: Per frame and turn [ms], physics alone.
-        env_ms: Per frame and turn [ms], ``env.step``.
-        rollout_ms: Per frame and turn [ms], plain ``mujoco.rollout`` on as many threads; empty on MJWarp.
-        episodes: Episodes that ended, and were reset, within the measured turns.
-    """
-
-    backend: str
-    nworld: int
-    frames: int
-    substeps: int
-    physics_ms: list[float] = field(default_factory=list)
-    env_ms: list[float] = field(default_factory=list)
-    rollout_ms: list[float] = field(default_factory=list)
-    episodes: float = 0.0
-
-    @property
-    def overheads(self) -> list[float]:
-        """env.step's time over physics', less 1, of every turn."""
-        return [e / p - 1.0 for e, p in zip(self.env_ms, self.physics_ms, strict=True)]
-
-    @property
-    def overhead(self) -> float:
-        """Their median. On a busy machine it need not be the ratio of the medians."""
-        return statistics.median(self.overheads)
-
-    @property
-    def rollout_ratio(self) -> float | None:
-        """Median of rollout's time over physics': 1 is rollout's speed. None where it was not measured."""
-        if not self.rollout_ms:
-            return None
-        return statistics.median(r / p for r, p in zip(self.rollout_ms, self.physics_ms, strict=True))
-
-    def world_steps_per_s(self, milliseconds: list[float]) -> float:
-        """Physics steps of all worlds per second, median."""
-        return 1e3 * self.nworld * self.substeps / statistics.median(milliseconds)
-
-
-def measure_env_step(
-    env: Env, *, frames: int, turns: int, with_rollout: bool = False, progress: Callable[[int], None] | None = None
-) -> EnvStepResult:
-    """Plays random actions in turns.
-
-    Args:
-        env: The environment.
-        frames: Frames per turn.
-        turns: Measured turns; one before them warms up.
-        with_rollout: Also time ``mujoco.rollout``; the simulation must be native, without model fields.
-        progress: Told the turns done.
-    """
-    sim, substeps = env.sim, env.cfg.timing.substeps
-    env.reset(seed=env.cfg.seed)
-    result = EnvStepResult(backend=sim.description, nworld=env.nworld, frames=frames, substeps=substeps)
-    generator = torch.Generator().manual_seed(0)
-    manager = env.action_manager
-    low, high = manager.low.float().cpu(), manager.high.float().cpu()
-
-    def timed(work: Callable[[], None]) -> float:
-        sim.synchronize()
-        began = time.perf_counter()
-        work()
-        sim.synchronize()
-        return 1e3 * (time.perf_counter() - began) / frames
-
-    plain = _Rollout(env, frames) if with_rollout and isinstance(sim, NativeSimulation) else None
-    for turn in range(turns + 1):
-        actions = [
-            (low + (high - low) * torch.rand((env.nworld, manager.action_dim), generator=generator)).to(env.device)
-            for _ in range(frames)
-        ]
-        start = snapshot(sim)
-
-        def physics(actions: list[torch.Tensor] = actions, record: bool = False) -> None:
-            for action in actions:
-                manager.process(action)
-                manager.write_commands()
-                if record and plain is not None:
-                    plain.record()
-                sim.step(substeps)
-
-        def whole(actions: list[torch.Tensor] = actions) -> None:
-            for action in actions:
-                env.step(action)
-
-        times: list[float] = []
-        if plain is not None:
-            restore(sim, start)
-            plain.begin()
-            physics(record=True)
-            times.append(timed(plain.play))
-            if not np.array_equal(plain.qpos, sim.qpos.numpy()):
-                raise MjstackError("mujoco.rollout and the simulation ended in different states: the figure would be void.")
-        restore(sim, start)
-        times.append(timed(physics))
-        restore(sim, start)
-        env.read_statistics()
-        times.append(timed(whole))
-        if turn:  # the first one warms up
-            result.env_ms.append(times.pop())
-            result.physics_ms.append(times.pop())
-            result.rollout_ms.extend(times)
-            result.episodes += env.read_statistics()["episodes"]
-            if progress is not None:
-                progress(turn)
-    return result
-
-
-class _Rollout:
+class RolloutRival:
     """``mujoco.rollout`` over the frames of a turn, with the warm starts that it does not carry over by itself."""
 
-    def __init__(self, env: Env, frames: int) -> None:
+    def __init__(self, env: Env) -> None:
         assert isinstance(env.sim, NativeSimulation)
         self._sim: NativeSimulation = env.sim
         m = self._sim.model
@@ -163,10 +45,6 @@ class _Rollout:
         self._sensors = np.empty((n, self._nstep, m.nsensordata))
         self._ctrl: list[np.ndarray] = []
         self._warm: list[np.ndarray] = []
-
-    @property
-    def qpos(self) -> np.ndarray:
-        return self._out[:, -1, 1 : 1 + self._sim.model.nq]
 
     def begin(self) -> None:
         """Takes the simulation's state as the start."""
@@ -184,6 +62,7 @@ class _Rollout:
         self._warm.append(self._sim.qacc_warmstart.numpy().copy())
 
     def play(self) -> None:
+        """Plays the frames that were recorded."""
         states = self._states
         for ctrl, warm in zip(self._ctrl, self._warm, strict=True):
             self._pool.rollout(
@@ -197,6 +76,11 @@ class _Rollout:
                 sensordata=self._sensors,
             )
             states = self._out[:, -1].copy()
+
+    def check(self) -> None:
+        """Raises unless every world ended as the simulation's did, bit for bit."""
+        if not np.array_equal(self._out[:, -1, 1 : 1 + self._sim.model.nq], self._sim.qpos.numpy()):
+            raise MjstackError("mujoco.rollout and the simulation ended in different states: the figure would be void.")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -227,13 +111,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         versions = collect_provenance(config_yaml="", model_text="", device="", driver="")["versions"]
         rows = [
             asdict(r)
-            | {"overhead": r.overhead, "rollout_ratio": r.rollout_ratio, "world_steps_per_s": r.world_steps_per_s(r.env_ms)}
+            | {"overhead": r.overhead, "rival_ratio": r.rival_ratio, "world_steps_per_s": r.world_steps_per_s(r.env_ms)}
             for r in results
         ]
         args.out.write_text(json.dumps({"command": sys.argv, "versions": versions, "results": rows}, indent=2) + "\n")
 
 
-def _run(console: Console, cfg: Config, backend: Backend, args: argparse.Namespace) -> EnvStepResult:
+def _run(console: Console, cfg: Config, backend: Backend, args: argparse.Namespace) -> EnvStepTimes:
     device = "cpu" if backend is Backend.native else resolve_device(cfg.sim.device)
     slow = backend is Backend.mjwarp and device == "cpu"
     nworld = min(cfg.nworld, args.cpu_nworld) if slow else cfg.nworld
@@ -245,21 +129,24 @@ def _run(console: Console, cfg: Config, backend: Backend, args: argparse.Namespa
             env,
             frames=args.frames,
             turns=args.turns,
-            with_rollout=plain,
+            rival=RolloutRival(env) if plain else None,
             progress=lambda turn: status.update(f"{env.sim.description}, {nworld} worlds: turn {turn} of {args.turns}"),
         )
     env.close()
+    if result.problem:
+        raise MjstackError(f"{result.backend}: no figure: {result.problem}.")
     return result
 
 
-def _table(cfg: Config, results: list[EnvStepResult]) -> Table:
+def _table(cfg: Config, results: list[EnvStepTimes]) -> Table:
     table = Table(title=f"env.step against physics alone: {cfg.task.name}, {cfg.robot.title}, random actions, with resets")
     table.add_column("medians over the turns")
     for result in results:
         table.add_column(result.backend, justify="right", overflow="fold")
-    rows: list[tuple[str, Callable[[EnvStepResult], str]]] = [
+    rows: list[tuple[str, Callable[[EnvStepTimes], str]]] = [
         ("worlds", lambda r: f"{r.nworld:,}"),
         ("physics alone, ms per frame", lambda r: f"{statistics.median(r.physics_ms):.2f}"),
+        ("managers alone, ms per frame", lambda r: f"{statistics.median(r.managers_ms):.2f}"),
         ("env.step, ms per frame", lambda r: f"{statistics.median(r.env_ms):.2f}"),
         ("managers over physics, turn by turn", lambda r: f"{100.0 * r.overhead:+.1f} %"),
         ("the same, least and most", lambda r: f"{100.0 * min(r.overheads):+.1f} to {100.0 * max(r.overheads):+.1f} %"),
@@ -267,7 +154,7 @@ def _table(cfg: Config, results: list[EnvStepResult]) -> Table:
         ("env.step, world-steps/s", lambda r: f"{r.world_steps_per_s(r.env_ms):,.0f}"),
         (
             "physics in percent of mujoco.rollout",
-            lambda r: "-" if r.rollout_ratio is None else f"{100.0 * r.rollout_ratio:.0f} %",
+            lambda r: "-" if r.rival_ratio is None else f"{100.0 * r.rival_ratio:.0f} %",
         ),
         ("episodes that were reset meanwhile", lambda r: f"{r.episodes:.0f}"),
     ]

@@ -23,7 +23,7 @@ from rich.table import Table
 
 from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, own_hydra, to_config
 from mjstack.errors import MjstackError
-from mjstack.jobs import JobOutcome, check_job, run_job
+from mjstack.jobs import JobOutcome, check_job, job_folder, run_job
 from mjstack.report.markdown import escape_cell
 from mjstack.report.record import Status
 
@@ -51,6 +51,9 @@ def run(args: list[str]) -> int:
             config = to_config(compose_overrides(own))
             if not dry:
                 check_job(config, own)
+        folder = None if sweep or dry else job_folder(config)
+        if folder is not None and not any(o.startswith("hydra.run.dir=") for o in overrides):
+            args, overrides = [*args, f"hydra.run.dir={folder}"], [*overrides, f"hydra.run.dir={folder}"]
         if not dry:
             check_writable(_output_folder(overrides, sweep))
     except MjstackError as error:

@@ -402,6 +402,12 @@ def test_batch_uses_what_capacity_measured(new_context: NewContext) -> None:
     sim = context.batch_simulation(2)
     assert sim.sizes == BatchSizes(nconmax=48, njmax=184)  # type: ignore[attr-defined]
     assert context.parity_simulation().sizes == BatchSizes(nconmax=48, njmax=300)  # type: ignore[attr-defined]
+    assert context.env_sizes is None
+    context.measured_env = BatchSizes(nconmax=64, njmax=400)
+    assert context.env_sizes == BatchSizes(nconmax=48, njmax=400)
+    plain = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2")
+    plain.measured = plain.measured_env = BatchSizes(nconmax=8, njmax=8)
+    assert (plain.sizes, plain.env_sizes) == (BatchSizes(nconmax=128, njmax=300), None)
 
 
 def test_batch_measures_where_capacity_does_not_run(new_context: NewContext) -> None:

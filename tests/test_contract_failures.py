@@ -181,10 +181,17 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
     assert "no figure" in throughput.reason
     assert not [name for name in throughput.metrics if "per_s" in name or "ms_per" in name]
 
-    batch.status = Status.passed
+    batch.status = Status.passed  # and the episode it timed is not: that alone voids every figure
+    throughput, _ = run_throughput(context)
+    assert throughput.status is Status.failed
+    assert "1 of 4 worlds (2) failed the acceptance" in throughput.reason
+    assert throughput.reason.count("no figure") == 3
+    assert not [name for name in throughput.metrics if "per_s" in name or "ms_per" in name]
+
+    context.timed_episode.failed.clear()
     throughput, cuda = run_throughput(context)
     assert throughput.status is Status.passed
-    assert throughput.metrics["world_steps_per_s.median"] > 0
+    assert throughput.metrics["physics.world_steps_per_s.median"] > 0
     assert cuda.name == "throughput_cuda"
 
 

@@ -311,10 +311,15 @@ class BatchGateCfg:
 class ThroughputCfg:
     """How throughput is measured."""
 
+    sections: list[str] = MISSING
     repetitions: int = MISSING
     frames: int = MISSING
+    env_frames: int = MISSING
     max_seconds: float = MISSING
+    cpu_max_seconds: float = MISSING
     from_phase: str = MISSING
+    start_worlds: int = MISSING
+    native_baseline: bool = MISSING
 
 
 @dataclass(kw_only=True, slots=True)
@@ -333,6 +338,27 @@ class JobCfg:
     """What the command line runs."""
 
     name: str = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class ScalingJobCfg(JobCfg):
+    """Throughput over numbers of worlds, each in a process of its own.
+
+    ``backends`` null: native, and MJWarp where there is CUDA, as far as ``sim`` allows. Above ``large`` worlds a case makes
+    ``repetitions_large`` repetitions. ``case_minutes`` ends a case that hangs; ``max_minutes`` ends a call, and the next one
+    goes on. ``retry``: cases that failed run again.
+    """
+
+    nworlds: list[int] = MISSING
+    backends: list[str] | None = None
+    repetitions: int = MISSING
+    large: int = MISSING
+    repetitions_large: int = MISSING
+    native_frames: int = MISSING
+    native_env_frames: int = MISSING
+    case_minutes: float = MISSING
+    max_minutes: float | None = None
+    retry: bool = MISSING
 
 
 @dataclass(kw_only=True, slots=True)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import re
 
-from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
+from mjstack.config.schema import Config, ScalingJobCfg, SolverCfg, StudyJobCfg
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput")
-JOBS = ("gates", "replay", "study")
+JOBS = ("gates", "replay", "scaling", "study")
 CONDIMS = (1, 3, 4, 6)
+SCALING_BACKENDS = ("mjwarp", "native")
+SECTIONS = ("physics", "episode", "env_step")
 ANCHORS = ("red", "blue", "on_blue")
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
@@ -42,6 +44,8 @@ def validate(cfg: Config) -> None:
     _scene(cfg)
     _controller(cfg)
     _gates(cfg)
+    if isinstance(cfg.job, ScalingJobCfg):
+        _scaling(cfg.job)
     if isinstance(cfg.job, StudyJobCfg):
         _study(cfg.job)
 
@@ -197,9 +201,32 @@ def _gates(cfg: Config) -> None:
         _positive_int("gate.capacity.random_frames", gate.capacity.random_frames)
     if not (math.isfinite(gate.capacity.margin) and gate.capacity.margin >= 1.0):
         raise ConfigError("gate.capacity.margin", gate.capacity.margin, "a number of at least 1, such as 1.25")
-    _positive_int("gate.throughput.repetitions", gate.throughput.repetitions)
-    _positive_int("gate.throughput.frames", gate.throughput.frames)
-    _positive("gate.throughput.max_seconds", gate.throughput.max_seconds, "s")
+    for name in ("repetitions", "frames", "env_frames", "start_worlds"):
+        _positive_int(f"gate.throughput.{name}", getattr(gate.throughput, name))
+    for name in ("max_seconds", "cpu_max_seconds"):
+        _positive(f"gate.throughput.{name}", getattr(gate.throughput, name), "s")
+    if not gate.throughput.sections:
+        raise ConfigError("gate.throughput.sections", "[]", f"at least one of {', '.join(SECTIONS)}")
+    for name in gate.throughput.sections:
+        if name not in SECTIONS:
+            raise UnknownName("gate.throughput.sections: section", name, SECTIONS)
+
+
+def _scaling(job: ScalingJobCfg) -> None:
+    if not job.nworlds or len(set(job.nworlds)) < len(job.nworlds):
+        raise ConfigError("job.nworlds", job.nworlds, "at least one number of worlds, each once")
+    for nworld in job.nworlds:
+        _positive_int("job.nworlds", nworld)
+    for name in job.backends or ():
+        if name not in SCALING_BACKENDS:
+            raise UnknownName("job.backends: backend", name, SCALING_BACKENDS)
+    if job.backends is not None and not job.backends:
+        raise ConfigError("job.backends", "[]", f"null, or at least one of {', '.join(SCALING_BACKENDS)}")
+    for key in ("repetitions", "large", "repetitions_large", "native_frames", "native_env_frames"):
+        _positive_int(f"job.{key}", getattr(job, key))
+    _positive("job.case_minutes", job.case_minutes, "min")
+    if job.max_minutes is not None:
+        _positive("job.max_minutes", job.max_minutes, "min")
 
 
 def _positive_int(key: str, value: int) -> None:

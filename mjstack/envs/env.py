@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ import torch
 
 from mjstack.config.schema import Config
 from mjstack.envs.outputs import Outputs
+from mjstack.envs.parts import StepParts
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.errors import ArgumentError, FaultError, name_worlds
 from mjstack.managers.action import ActionManager
@@ -36,28 +36,6 @@ class Fault(Enum):
     STATE = "the state is not finite"
     REWARD = "the reward is not finite"
     OBSERVATION = "an observation is not finite"
-
-
-@dataclass(frozen=True, slots=True)
-class StepParts:
-    """A step taken apart, for measurements. Each part acts in place on the action that was last taken in.
-
-    On CUDA each is a graph of its own, captured at its second call, unless ``graph=off``; elsewhere the managers run eagerly.
-
-    Attributes:
-        physics: The substeps, and the poses after them.
-        managers: Everything else of a step: commands, success, terminations, rewards, observations, resets.
-        whole: Both, in the order of a step.
-    """
-
-    physics: Callable[[], None]
-    managers: Callable[[], None]
-    whole: Callable[[], None]
-
-    @property
-    def capture_seconds(self) -> float:
-        """What the captures took so far [s]."""
-        return sum(getattr(part, "capture_seconds", 0.0) for part in (self.physics, self.managers, self.whole))
 
 
 class Env:

@@ -11,7 +11,7 @@ import numpy as np
 from mjstack.errors import name_worlds
 from mjstack.gates.batch_record import FAILING, BatchRecord, write_failing
 from mjstack.gates.episode import Episode
-from mjstack.gates.gate import GateContext, acceptance_thresholds, failing_rules
+from mjstack.gates.gate import GateContext, TimedEpisode, acceptance_thresholds, failing_rules
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status, Value
 from mjstack.sim import Simulation
@@ -114,6 +114,8 @@ def _play(context: GateContext, sim: Simulation, seed: int, tally: _Tally) -> Ba
     snapshots = frozenset([last] if seed == cfg.seed else [])  # throughput goes on from the first seed
     episode = context.run(sim, cfg.reset, seed=seed, snapshots=snapshots)
     context.carry_start = episode.states.get(last, context.carry_start)
+    if seed == cfg.seed:
+        context.timed_episode = TimedEpisode.of(episode, sim)
     record = BatchRecord.take(seed, sim, episode.verdict)
     tally.add(record, episode, sim)
     return record

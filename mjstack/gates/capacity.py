@@ -46,7 +46,7 @@ def run_capacity(context: GateContext) -> list[GateResult]:
 
     how = f"batch=auto: gate capacity, {nworld} worlds, times {margin:g}" if cfg.batch.auto else "gate capacity"
     wanted = context.measured = recommend_sizes(peaks, margin, how)
-    env_wanted = recommend_sizes(env_peaks, margin, how)
+    env_wanted = context.measured_env = recommend_sizes(env_peaks, margin, how)
     sizes, env_sizes = resolve_sizes(cfg), resolve_env_sizes(cfg)
     if cfg.batch.auto:
         sizes, env_sizes = apply_configured(cfg, wanted), apply_configured(cfg, env_wanted)

@@ -29,6 +29,37 @@ def _silent(_: str) -> None:
     pass
 
 
+@dataclass(kw_only=True, slots=True)
+class TimedEpisode:
+    """How long an episode took, and where it failed.
+
+    Attributes:
+        description: Backend and hardware.
+        nworld: Number of worlds.
+        seconds: Wall time of the frames [s].
+        capture_seconds: Wall time of capturing graphs [s].
+        failed: Worlds that were not accepted.
+    """
+
+    description: str
+    nworld: int
+    seconds: float
+    capture_seconds: float
+    failed: list[int]
+
+    @classmethod
+    def of(cls, episode: Episode, sim: Simulation) -> TimedEpisode:
+        """What is kept of an episode once its simulation is gone."""
+        failed = np.flatnonzero(episode.verdict.failed.cpu().numpy()).tolist()
+        return cls(
+            description=sim.description,
+            nworld=sim.nworld,
+            seconds=episode.seconds,
+            capture_seconds=episode.capture_seconds,
+            failed=failed,
+        )
+
+
 @dataclass(eq=False)
 class GateContext:
     """Everything gates need, and what one leaves for the next.
@@ -41,6 +72,7 @@ class GateContext:
         on_frame: Called after each frame of the one-world episode that is shown (viewer).
         results: Results so far, by gate.
         measured: Sizes that the scripted task needs, with a margin, once they have been measured.
+        measured_env: Sizes that environments need likewise.
         shown: The one-world episode that pictures show, and ``shown_by``, what it is.
     """
 
@@ -51,7 +83,9 @@ class GateContext:
     on_frame: FrameHook | None = None
     results: dict[str, GateResult] = field(default_factory=dict)
     measured: BatchSizes | None = None
+    measured_env: BatchSizes | None = None
     carry_start: State | None = None
+    timed_episode: TimedEpisode | None = None
     shown: Episode | None = None
     shown_by: str = ""
 
@@ -89,6 +123,11 @@ class GateContext:
         episode = self.run(sim, NOMINAL, record=True, snapshots=frames, on_frame=hook)
         return sim, episode
 
+    def tell(self, what: str, done: int, total: int) -> None:
+        """Reports progress, if anyone listens."""
+        if self.advance is not None:
+            self.advance(what, done, total)
+
     def run(self, sim: Simulation, reset: Reset, *, seed: int | None = None, **kwargs: Any) -> Episode:
         """`run_episode` with this context's scene and planner, under the configured seed or another one."""
         cfg = self.cfg if seed is None else replace(self.cfg, seed=seed)
@@ -113,6 +152,11 @@ class GateContext:
             self.measured = size_batch(self)
             self.say(f"{apply_configured(self.cfg, self.measured).as_overrides()} ({self.measured.source})")
         return apply_configured(self.cfg, self.measured)
+
+    @property
+    def env_sizes(self) -> BatchSizes | None:
+        """Buffer sizes of environments with ``batch=auto``, if *capacity* has measured them; None leaves it to `build_env`."""
+        return apply_configured(self.cfg, self.measured_env) if self.cfg.batch.auto and self.measured_env else None
 
     def parity_simulation(self) -> Simulation:
         """One MJWarp world."""

@@ -1,21 +1,24 @@
-"""Gate *throughput*: how fast the worlds step, cube in hand, warm-up and compilation apart."""
+"""Gate *throughput*: how fast physics, the validated episode and ``env.step`` are. Void where the task or physics failed."""
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
-import statistics
+import sys
 import time
 from collections.abc import Callable
 
 import torch
 
 from mjstack.config.schema import Backend
+from mjstack.envs import build_env
 from mjstack.errors import MjstackError
-from mjstack.gates.episode import State, restore, snapshot, start_worlds
 from mjstack.gates.gate import GateContext
+from mjstack.gates.power import EnergyMeter
+from mjstack.gates.sections import Section, Stopwatch, measure_env_steps, measure_episode, measure_physics
 from mjstack.report.record import GateResult, Status, Value
-from mjstack.sim import LOST_PHYSICS, Simulation, resolve_sizes
+from mjstack.sim import BatchSizes
 
 log = logging.getLogger(__name__)
 
@@ -29,115 +32,137 @@ def run_throughput(context: GateContext) -> list[GateResult]:
     """
     backend, device = context.backend
     if device.startswith("cuda"):
-        native = _guarded(context, "throughput", Backend.native, "cpu")
-        return [native, _guarded(context, CUDA, Backend.mjwarp, device)]
+        if context.cfg.gate.throughput.native_baseline:
+            native = _measure(context, "throughput", Backend.native, "cpu")
+        else:
+            native = GateResult(name="throughput", status=Status.skipped, reason="gate.throughput.native_baseline=false")
+        return [native, _measure(context, CUDA, Backend.mjwarp, device)]
     reason = "no CUDA device was used: " + (
         "this machine has none" if not torch.cuda.is_available() else f"sim={backend.value} sim.device={device}"
     )
     return [
-        _guarded(context, "throughput", backend, device),
+        _measure(context, "throughput", backend, device),
         GateResult(name=CUDA, status=Status.skipped, reason=reason),
     ]
 
 
-def _guarded(context: GateContext, name: str, backend: Backend, device: str) -> GateResult:
-    """One measurement; if it breaks, out of memory say, the other one is kept."""
-    began = time.perf_counter()
-    try:
-        result = _measure(context, name, backend, device)
-    except MjstackError as error:
-        result = GateResult(name=name, status=Status.failed, reason=str(error))
-    except Exception as error:
-        log.exception("%s broke", name)
-        reason = f"{type(error).__name__}: {(str(error) or 'no message').splitlines()[0]} (run.log has the traceback)"
-        result = GateResult(name=name, status=Status.failed, reason=reason)
-    result.seconds = time.perf_counter() - began
-    return result
-
-
 def _measure(context: GateContext, name: str, backend: Backend, device: str) -> GateResult:
+    """All sections on one backend. One that breaks, out of memory say, leaves the others their figures."""
     cfg, t = context.cfg, context.cfg.gate.throughput
-    began = time.perf_counter()
-    sim = context.simulation(cfg.nworld, backend, device)
-    build_seconds = time.perf_counter() - began
-    env, tape = start_worlds(sim, context.index, cfg, cfg.reset, context.planner, context.advance)
-    first = context.phase_start(t.from_phase)
-
-    def play(start: int, frames: int) -> float:
-        """Seconds that some frames take, the device idle at both ends."""
-        sim.synchronize()
-        began = time.perf_counter()
-        for frame in range(start, start + frames):
-            env.action_manager.process(tape.command(frame))
-            env.action_manager.write_commands()
-            sim.step(cfg.timing.substeps)
-        sim.synchronize()
-        return time.perf_counter() - began
-
-    state = context.carry_start
-    if state is None or state.qpos.shape[0] != cfg.nworld:
-        state = _play_up_to(context, sim, first, play)
-        context.carry_start = state
-    restore(sim, state)
-    warm_seconds = play(first, 1)
-    frame_seconds = play(first + 1, 1)
-    frames = max(1, min(t.frames, int(t.max_seconds / frame_seconds), tape.frames - first))
-    times: list[float] = []
-    bad = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
-    for repetition in range(t.repetitions):
-        restore(sim, state)
-        times.append(play(first, frames))
-        bad |= (sim.overflow & LOST_PHYSICS) != 0
-        bad |= ~(torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1))
-        bad |= sim.step_count != frames * cfg.timing.substeps
-        if context.advance is not None:
-            context.advance("repetitions", repetition + 1, t.repetitions)
-    lost = int(bad.sum())
-    steps = frames * cfg.timing.substeps
-    ms = [1e3 * seconds / steps for seconds in times]
-    rate = [cfg.nworld * steps / seconds for seconds in times]
-    sizes = getattr(sim, "sizes", None) or resolve_sizes(cfg)
-    metrics: dict[str, Value] = {
-        "backend": sim.description,
-        "cpu_count": os.cpu_count(),
-        "worlds": cfg.nworld,
-        "frames_per_repetition": frames,
-        "repetitions": len(times),
-        "ms_per_batched_step.median": statistics.median(ms),
-        "ms_per_batched_step.min": min(ms),
-        "ms_per_batched_step.max": max(ms),
-        "world_steps_per_s.median": statistics.median(rate),
-        "world_steps_per_s.min": min(rate),
-        "world_steps_per_s.max": max(rate),
-        "build_and_compile_s": build_seconds,
-        "warm_up_s": warm_seconds,
-        "nconmax": sizes.nconmax,
-        "naconmax": sizes.contact_pool(cfg.nworld),
-        "njmax": sizes.njmax,
-        "sizes_from": sizes.source,
-    }
-    sim.close()
     batch = context.results.get("batch")
-    status = Status.passed
-    reason = f"{statistics.median(rate):,.0f} world-steps/s, {statistics.median(ms):.3g} ms per step of {cfg.nworld} worlds"
-    if lost or (batch is not None and batch.status is Status.failed):
-        why = f"{lost} worlds overflowed, diverged or were not stepped" if lost else "the batch gate failed"
-        metrics = {key: value for key, value in metrics.items() if "_per_" not in key or key == "frames_per_repetition"}
-        status, reason = Status.failed, f"no figure: {why}, and a figure counts only where the task was verified"
-    elif batch is None:
+    if batch is not None and batch.status is Status.failed:
+        reason = "no figure: the batch gate failed, and a figure counts only where the task was verified"
+        return GateResult(name=name, status=Status.failed, reason=reason)
+    began = time.perf_counter()
+    on_cuda = device.startswith("cuda")
+    watch = Stopwatch(t.max_seconds if on_cuda else t.cpu_max_seconds, t.repetitions)
+    meter = EnergyMeter(device)
+    facts: dict[str, Value] = {"worlds": cfg.nworld, "cpu_count": os.cpu_count()}
+    sections: list[Section] = []
+    if {"physics", "episode"} & set(t.sections):
+        sections += _on_scripted_worlds(context, backend, device, watch, meter, facts)
+    if "env_step" in t.sections:
+        sections.append(_guarded("env_step", lambda: _on_environment(context, backend, device, watch, meter, facts)))
+    if not on_cuda:
+        facts |= {"gpu_power_and_memory": "not measured: no GPU"} | _peak_memory()
+
+    episode = next((section for section in sections if section.name == "episode"), None)
+    if episode is not None and episode.rejected:
+        for section in sections:
+            section.problem = section.problem or "the episode failed, and a figure counts only where the task was verified"
+    verified = batch is not None or (episode is not None and not episode.missing)
+    parts = []
+    for section in sections:
+        facts |= section.metrics()
+        text = section.headline
+        if section.problem:
+            text = f"no figure: {section.problem}"
+        elif section.missing:
+            text = f"not measured: {section.missing}"
+        parts.append(f"{section.name}: {text}")
+    reason = "; ".join(parts)
+    if not verified:
         reason += " (the task was not verified in this run: add batch to gates)"
+    failed = any(section.problem for section in sections)
+    measured = any(section.figures and not section.problem for section in sections)
+    if not failed and not measured:
+        return GateResult(name=name, status=Status.skipped, reason=reason, metrics=facts)
     return GateResult(
         name=name,
-        status=status,
+        status=Status.failed if failed else Status.passed,
         reason=reason,
-        thresholds={"repetitions": t.repetitions, "max_seconds_per_repetition": t.max_seconds},
-        metrics=metrics,
+        seconds=time.perf_counter() - began,
+        thresholds={"repetitions": t.repetitions, "max_seconds_per_section": watch.seconds},
+        metrics=facts,
     )
 
 
-def _play_up_to(context: GateContext, sim: Simulation, first: int, play: Callable[[int, int], float]) -> State:
-    for frame in range(first):
-        play(frame, 1)
-        if context.advance is not None:
-            context.advance("frames to the start", frame + 1, first)
-    return snapshot(sim)
+def _on_scripted_worlds(
+    context: GateContext, backend: Backend, device: str, watch: Stopwatch, meter: EnergyMeter, facts: dict[str, Value]
+) -> list[Section]:
+    """Sections *physics* and *episode*, on the same worlds."""
+    cfg, wanted = context.cfg, context.cfg.gate.throughput.sections
+    gc.collect()  # environments hold on to their worlds in cycles, and a GPU has not room for all
+    began = time.perf_counter()
+    try:
+        sim = context.simulation(cfg.nworld, backend, device)
+    except Exception as error:
+        return [Section(name=name, problem=_explain(name, error)) for name in ("physics", "episode") if name in wanted]
+    facts |= {"backend": sim.description, "build_and_compile_s": time.perf_counter() - began}
+    sizes: BatchSizes | None = getattr(sim, "sizes", None)
+    if sizes is not None:
+        facts |= {"nconmax": sizes.nconmax, "naconmax": sizes.contact_pool(cfg.nworld), "njmax": sizes.njmax}
+        facts["sizes_from"] = sizes.source
+    sections: list[Section] = []
+    frame_seconds: float | None = None
+    if "physics" in wanted:
+        sections.append(_guarded("physics", lambda: measure_physics(context, sim, watch, meter)))
+        frame_seconds = sections[0].frame_seconds
+    if "episode" in wanted:
+        sections.append(_guarded("episode", lambda: measure_episode(context, sim, watch, meter, frame_seconds)))
+    sim.close()
+    return sections
+
+
+def _on_environment(
+    context: GateContext, backend: Backend, device: str, watch: Stopwatch, meter: EnergyMeter, facts: dict[str, Value]
+) -> Section:
+    """Section *env_step*, on an environment with room for random actions."""
+    cfg = context.cfg
+    gc.collect()
+    began = time.perf_counter()
+    env = build_env(cfg, model=context.model, backend=backend, device=device, sizes=context.env_sizes)
+    facts.setdefault("backend", env.sim.description)
+    build_seconds = time.perf_counter() - began
+    try:
+        section = measure_env_steps(context, env, watch, meter)
+    finally:
+        env.close()
+    section.facts["build_and_compile_s"] = build_seconds
+    return section
+
+
+def _guarded(name: str, measure: Callable[[], Section]) -> Section:
+    """A section, or the error that broke it as its problem."""
+    try:
+        return measure()
+    except Exception as error:
+        return Section(name=name, problem=_explain(name, error))
+
+
+def _explain(name: str, error: Exception) -> str:
+    """One line about an error; run.log gets the traceback of one that is nobody's input."""
+    if isinstance(error, MjstackError):
+        return str(error).rstrip(".")
+    log.error("%s broke", name, exc_info=error)
+    return f"{type(error).__name__}: {(str(error) or 'no message').splitlines()[0]} (run.log has the traceback)"
+
+
+def _peak_memory() -> dict[str, Value]:
+    """The most memory that this process has held so far."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return {}
+    unit = 1 if sys.platform == "darwin" else 1024
+    return {"process_peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20}

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
-from mjstack.jobs import gates, replay, study
+from mjstack.jobs import gates, replay, scaling, study
 from mjstack.jobs.outcome import JobOutcome
 
-__all__ = ["JOBS", "JobOutcome", "check_job", "run_job"]
+__all__ = ["JOBS", "JobOutcome", "check_job", "job_folder", "run_job"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,16 +23,19 @@ class Job:
         check: Raises a `MjstackError` for what cannot be done here, before anything is written.
         run: Does it. Gets the configuration, the run's folder and the command line's overrides.
         keys: Top-level keys and groups that its command line may set; None for all.
+        folder: Where it goes if nobody says otherwise, for a job that resumes; None for a folder of the hour.
     """
 
     check: Callable[[Config], None]
     run: Callable[[Config, Path, list[str]], JobOutcome]
     keys: tuple[str, ...] | None = None
+    folder: Callable[[Config], Path] | None = None
 
 
 JOBS = {
     "gates": Job(gates.check_machine, gates.run_gates_job),
-    "replay": Job(replay.check_replay, replay.run_replay_job, replay.KEYS),
+    "replay": Job(replay.check_replay, replay.run_replay_job, keys=replay.KEYS),
+    "scaling": Job(scaling.check_scaling, scaling.run_scaling_job, folder=scaling.scaling_folder),
     "study": Job(study.check_study, study.run_study_job),
 }
 
@@ -51,6 +54,12 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> None:
             expected = f"only {', '.join(job.keys[1:])} beside job={cfg.job.name}"
             raise ConfigError(key, value, expected, "Leave it out")
     job.check(cfg)
+
+
+def job_folder(cfg: Config) -> Path | None:
+    """The folder of a job that resumes, None for others."""
+    find = JOBS[cfg.job.name].folder
+    return None if find is None else find(cfg)
 
 
 def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:

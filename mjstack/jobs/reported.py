@@ -108,12 +108,12 @@ def run_provenance(cfg: Config, context: GateContext) -> dict:
     name = f"native MuJoCo on {os.cpu_count()} cores" if backend.value == "native" else "Warp's CPU device"
     if device.startswith("cuda"):
         name, driver = cuda_name(device), cuda_driver()
-    model_text = _model_text(context.model)
+    text = model_text(context.model)
     config = OmegaConf.to_yaml(OmegaConf.structured(cfg))
-    return collect_provenance(config_yaml=config, model_text=model_text, device=f"{device}: {name}", driver=driver)
+    return collect_provenance(config_yaml=config, model_text=text, device=f"{device}: {name}", driver=driver)
 
 
-def _model_text(model: mujoco.MjModel) -> str:
+def model_text(model: mujoco.MjModel) -> str:
     """The compiled model's numbers as text: what the physics sees, whatever file it came from."""
     size = mujoco.mj_sizeModel(model)
     buffer = np.empty(size, np.uint8)

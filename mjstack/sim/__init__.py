@@ -1,6 +1,14 @@
 """Physics backends behind one protocol."""
 
-from mjstack.sim.build import cuda_driver, cuda_name, make_simulation, resolve_backend, resolve_device
+from mjstack.sim.build import (
+    cuda_driver,
+    cuda_name,
+    cuda_uuid,
+    device_memory,
+    make_simulation,
+    resolve_backend,
+    resolve_device,
+)
 from mjstack.sim.simulation import LOST_PHYSICS, Overflow, Simulation, SolverLimit, describe_overflow
 from mjstack.sim.sizes import BatchSizes, resolve_sizes
 from mjstack.sim.views import Fields
@@ -14,7 +22,9 @@ __all__ = [
     "SolverLimit",
     "cuda_driver",
     "cuda_name",
+    "cuda_uuid",
     "describe_overflow",
+    "device_memory",
     "make_simulation",
     "resolve_backend",
     "resolve_device",

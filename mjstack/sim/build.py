@@ -81,6 +81,27 @@ def cuda_name(device: str) -> str:
     return torch.cuda.get_device_name(device)
 
 
+def cuda_uuid(device: str) -> str:
+    """The GPU's identity, by which other tools know it."""
+    return f"GPU-{torch.cuda.get_device_properties(device).uuid}"
+
+
+def device_memory(device: str) -> tuple[int, int] | None:
+    """GPU memory in bytes: what torch's and Warp's arrays of this process hold, and what is taken on the whole GPU.
+
+    The second has the captured graphs, CUDA's own share, freed memory that a pool keeps, and other processes in it too.
+    None on a CPU.
+    """
+    if device == "cpu":
+        return None
+    import warp as wp  # native runs do not need it
+
+    free, total = torch.cuda.mem_get_info(device)
+    where = wp.get_device(device)
+    pooled = wp.get_mempool_used_mem_current(where) if where.is_mempool_enabled else 0
+    return torch.cuda.memory_allocated(device) + pooled, total - free
+
+
 def cuda_driver() -> str:
     """Version of the NVIDIA driver, from the kernel module or NVML; ``unknown`` where neither tells."""
     try:

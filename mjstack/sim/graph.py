@@ -6,7 +6,7 @@ import gc
 import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import torch
 import warp as wp
@@ -19,7 +19,7 @@ from mjstack.sim.streams import torch_stream_scope
 log = logging.getLogger(__name__)
 
 _nesting = 0
-# What a broken capture leaves: torch counts its memory as in use for ever, and aborts when it is destroyed.
+# What a broken capture leaves is kept: torch counts its memory as in use for ever.
 _abandoned: list[tuple[torch.cuda.CUDAGraph, torch.cuda.MemPool]] = []
 _capture_streams: dict[str, torch.cuda.Stream] = {}
 _side_streams: dict[str, list[torch.cuda.Stream]] = {}
@@ -152,17 +152,23 @@ class StepGraph:
         graph = torch.cuda.CUDAGraph()
         # A conditional node makes Warp interrupt the capture, and what goes on after it has another number. By that number
         # torch knows what to allocate from the graph's own memory, which nobody else gets. So there is a second such pool.
-        memory = torch.cuda.MemPool()
+        memory, pool = torch.cuda.MemPool(), torch.cuda.graph_pool_handle()
         arena = Arena(self._device) if self._scratch() else None
         _abandoned.append((graph, memory))
-        with (
-            torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
-            torch.cuda.use_mem_pool(memory),
-            wp.ScopedAllocator(self._device, arena),
-            torch_stream_scope(self._device),
-            wp.ScopedCapture(stream=wp.get_stream(self._device), external=True),
-        ):
-            self._work()
+        try:
+            with (
+                torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
+                torch.cuda.use_mem_pool(memory),
+                wp.ScopedAllocator(self._device, arena),
+                torch_stream_scope(self._device),
+                wp.ScopedCapture(stream=wp.get_stream(self._device), external=True),
+            ):
+                self._work()
+        except Exception:
+            # Torch leaves it open where the end of the capture fails, and then aborts the process when any pool is destroyed.
+            with suppress(AttributeError, RuntimeError):
+                torch._C._cuda_endAllocateToPool(stream.device_index, pool)
+            raise
         _abandoned.pop()
         self._memory = memory, arena
         return graph.replay

@@ -1,0 +1,215 @@
+"""What a whole ``env.step`` costs, and its physics and its managers alone: in turns, on one trajectory.
+
+A turn plays random actions from one state three times: the whole step, then from the same state the physics under the same
+commands, then the managers without any physics. The next turn goes on where the whole step ended. So each ratio is of one
+turn, one trajectory and one machine's mood. Worlds start at ages spread over an episode, so that in every frame some of
+them time out and are reset.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Protocol
+
+import torch
+
+from mjstack.envs import Env
+from mjstack.gates.episode import restore, snapshot
+from mjstack.gates.timing import frames_that_fit, timed
+from mjstack.sim import LOST_PHYSICS
+
+WARM_UP = 3  # steps: eager, captured, replayed
+_COST = 4.0  # of a turn over that of its whole steps from the start, when fewer things touch
+_LOSSES = ("mjstack.mdp.termination.overflow", "mjstack.mdp.termination.non_finite")
+
+
+class Rival(Protocol):
+    """Something else that plays a turn's physics, to be timed beside it."""
+
+    def begin(self) -> None:
+        """Takes the simulation's state as the start."""
+
+    def record(self) -> None:
+        """Takes the commands and the state before a frame."""
+
+    def play(self) -> None:
+        """Plays the frames; this is what is timed."""
+
+    def check(self) -> None:
+        """Raises unless it ended where the simulation did."""
+
+
+@dataclass(kw_only=True, slots=True)
+class EnvStepTimes:
+    """Times of one backend.
+
+    Attributes:
+        backend: Backend and hardware.
+        nworld: Number of worlds.
+        frames: Frames per turn.
+        substeps: Physics steps per frame.
+        physics_ms: Per frame and turn [ms], the physics steps and the poses after them.
+        managers_ms: Likewise, everything else of a step, on worlds that stand still.
+        env_ms: Likewise, ``env.step``.
+        rival_ms: Likewise, the rival; empty without one.
+        episodes: Episodes that ended, and were reset, within the measured turns.
+        warm_up_s: The first steps together [s].
+        capture_s: Capturing the step and its parts [s].
+        problem: Why the times are void; empty where they count.
+    """
+
+    backend: str
+    nworld: int
+    frames: int
+    substeps: int
+    physics_ms: list[float] = field(default_factory=list)
+    managers_ms: list[float] = field(default_factory=list)
+    env_ms: list[float] = field(default_factory=list)
+    rival_ms: list[float] = field(default_factory=list)
+    episodes: float = 0.0
+    warm_up_s: float = 0.0
+    capture_s: float = 0.0
+    problem: str = ""
+
+    @property
+    def overheads(self) -> list[float]:
+        """env.step's time over physics', less 1, of every turn."""
+        return [e / p - 1.0 for e, p in zip(self.env_ms, self.physics_ms, strict=True)]
+
+    @property
+    def overhead(self) -> float:
+        """Their median. On a busy machine it need not be the ratio of the medians."""
+        return statistics.median(self.overheads)
+
+    @property
+    def rival_ratio(self) -> float | None:
+        """Median of the rival's time over physics': 1 is as fast. None where there was no rival."""
+        if not self.rival_ms:
+            return None
+        return statistics.median(r / p for r, p in zip(self.rival_ms, self.physics_ms, strict=True))
+
+    def world_steps_per_s(self, milliseconds: list[float]) -> float:
+        """Physics steps of all worlds per second, median."""
+        return 1e3 * self.nworld * self.substeps / statistics.median(milliseconds)
+
+
+def measure_env_step(
+    env: Env,
+    *,
+    frames: int,
+    turns: int,
+    max_seconds: float | None = None,
+    rival: Rival | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> EnvStepTimes:
+    """Plays random actions, uniform over their whole range, in turns.
+
+    Args:
+        env: The environment.
+        frames: Frames per turn.
+        turns: Measured turns; one before them warms up.
+        max_seconds: Shortens the turns so that all of them take about this long [s].
+        rival: Timed beside the physics.
+        progress: Told the turns done.
+
+    Raises:
+        FaultError: Physics was lost.
+    """
+    sim, manager, substeps = env.sim, env.action_manager, env.cfg.timing.substeps
+    generator = torch.Generator().manual_seed(0)
+    low, high = manager.low.float().cpu(), manager.high.float().cpu()
+
+    def random_actions(count: int) -> list[torch.Tensor]:
+        span = (high - low) * torch.rand((count, env.nworld, manager.action_dim), generator=generator)
+        return list((low + span).to(env.device).unbind())
+
+    env.reset(seed=env.cfg.seed)
+    env.frame.copy_(torch.randint(env.max_episode_frames, (env.nworld,), generator=generator))
+    seconds: list[float] = []
+    for action in random_actions(WARM_UP):
+        seconds.append(timed(sim, partial(env.step, action)))
+    parts = env.parts()
+    if max_seconds is not None:
+        frames = frames_that_fit(frames, max_seconds, _COST * (turns + 1) * seconds[-1])
+    result = EnvStepTimes(backend=sim.description, nworld=env.nworld, frames=frames, substeps=substeps)
+    result.warm_up_s = sum(seconds)
+    commands = [torch.empty_like(sim.ctrl) for _ in range(frames)]
+    bad = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
+
+    def whole() -> None:
+        for action, command in zip(actions, commands, strict=True):
+            env.step(action)
+            command.copy_(sim.ctrl)  # one small copy; where a world was reset it is the new episode's
+
+    def physics() -> None:
+        for command in commands:
+            sim.ctrl.copy_(command)
+            parts.physics()
+
+    def managers() -> None:
+        for action in actions:
+            manager.process(action)
+            parts.managers()
+
+    def set_ages(frame: torch.Tensor, episode: torch.Tensor) -> None:
+        env.frame.copy_(frame)
+        env.episode.copy_(episode)
+
+    def per_frame(work: Callable[[], None]) -> float:
+        return 1e3 * timed(sim, work) / frames
+
+    start = snapshot(sim)
+    for turn in range(turns + 1):
+        actions = random_actions(frames)
+        ages = env.frame.clone(), env.episode.clone()
+        restore(sim, start)
+        env.read_statistics()
+        env_ms = per_frame(whole)
+        counted = env.read_statistics()
+        losses = [name for name, cfg in env.cfg.termination.items() if cfg.func in _LOSSES]
+        lost = [name for name in losses if counted.get(f"termination/{name}", 0.0) > 0.0]
+        if lost:
+            result.problem = f"worlds ended by {', '.join(lost)}: raise batch.nconmax or batch.njmax, or act more gently"
+        end, later_ages = snapshot(sim), (env.frame.clone(), env.episode.clone())
+        restore(sim, start)
+        rival_ms = [] if rival is None else [_play_rival(env, rival, commands, per_frame)]
+        restore(sim, start)
+        physics_ms = per_frame(physics)
+        bad |= (sim.overflow & LOST_PHYSICS) != 0
+        bad |= ~(torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1))
+        bad |= sim.step_count != frames * substeps
+        restore(sim, start)
+        set_ages(*ages)
+        managers_ms = per_frame(managers)
+        env.raise_faults()
+        set_ages(*later_ages)
+        start = end
+        if turn:  # the first one warms up
+            result.env_ms.append(env_ms)
+            result.physics_ms.append(physics_ms)
+            result.managers_ms.append(managers_ms)
+            result.rival_ms.extend(rival_ms)
+            result.episodes += counted["episodes"]
+            if progress is not None:
+                progress(turn)
+    result.capture_s = parts.capture_seconds + (0.0 if env.graph is None else env.graph.capture_seconds)
+    if bool(bad.any()):
+        result.problem = f"{int(bad.sum())} of {env.nworld} worlds overflowed, diverged or were not stepped"
+    return result
+
+
+def _play_rival(
+    env: Env, rival: Rival, commands: list[torch.Tensor], per_frame: Callable[[Callable[[], None]], float]
+) -> float:
+    """The rival's time [ms per frame], on the commands of this turn."""
+    rival.begin()
+    for command in commands:
+        env.sim.ctrl.copy_(command)
+        rival.record()
+        env.sim.step(env.cfg.timing.substeps)
+    milliseconds = per_frame(rival.play)
+    rival.check()
+    return milliseconds

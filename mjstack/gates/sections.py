@@ -1,0 +1,280 @@
+"""The three things that the throughput gate measures: physics steps, the validated episode, and ``env.step``."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import torch
+
+from mjstack.config.schema import Backend
+from mjstack.envs import Env
+from mjstack.errors import name_worlds
+from mjstack.gates.env_step import measure_env_step
+from mjstack.gates.episode import State, restore, run_episode, snapshot, start_worlds
+from mjstack.gates.gate import GateContext, TimedEpisode
+from mjstack.gates.power import EnergyMeter
+from mjstack.gates.timing import Timing, frames_that_fit, spread, timed
+from mjstack.report.record import Value
+from mjstack.sim import LOST_PHYSICS, BatchSizes, Simulation, device_memory
+
+if TYPE_CHECKING:
+    from mjstack.sim.mjwarp import MjwarpSimulation
+
+
+@dataclass(kw_only=True, slots=True)
+class Section:
+    """A part of the measurement.
+
+    Attributes:
+        name: physics, episode or env_step.
+        figures: Speeds: void where there is a problem.
+        facts: What else is worth knowing, with or without figures.
+        problem: Why the figures do not count; empty where they do.
+        headline: The section in a few words.
+        missing: Why there are no figures, which is no failure; empty where there are.
+        rejected: Whether worlds failed the task, so that no figure of these worlds counts.
+        frame_seconds: How long a frame took [s], for what comes next.
+    """
+
+    name: str
+    figures: dict[str, Value] = field(default_factory=dict)
+    facts: dict[str, Value] = field(default_factory=dict)
+    problem: str = ""
+    headline: str = ""
+    missing: str = ""
+    rejected: bool = False
+    frame_seconds: float | None = None
+
+    def metrics(self) -> dict[str, Value]:
+        """Everything that may be shown, under the section's name."""
+        shown = self.facts if self.problem else self.figures | self.facts
+        if self.missing:
+            shown = shown | {"status": f"not measured: {self.missing}"}
+        return {f"{self.name}.{key}": value for key, value in shown.items()}
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """How long a section may take, and how many repetitions it is to make.
+
+    Attributes:
+        seconds: Time for the whole section [s].
+        repetitions: Wanted repetitions.
+    """
+
+    seconds: float
+    repetitions: int
+
+
+def measure_physics(context: GateContext, sim: Simulation, watch: Stopwatch, meter: EnergyMeter) -> Section:
+    """Physics steps under a held command: every repetition starts from the same states, the cube in hand.
+
+    Whatever else is in a step of the simulation (counting contacts, latching overflow) is in the figure.
+    """
+    t, substeps = context.cfg.gate.throughput, context.cfg.timing.substeps
+
+    def play(frames: int) -> None:
+        for _ in range(frames):
+            sim.step(substeps)
+
+    state = _carry_start(context, sim)
+    restore(sim, state)
+    first = timed(sim, lambda: play(1))
+    second = timed(sim, lambda: play(1))
+    frames = frames_that_fit(t.frames, watch.seconds, watch.repetitions * second)
+    timing = Timing(nworld=sim.nworld, frames=frames, substeps=substeps)
+    bad = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
+    with meter:
+        for repetition in range(watch.repetitions):
+            restore(sim, state)
+            timing.seconds.append(timed(sim, lambda: play(frames)))
+            bad |= _lost(sim) | (sim.step_count != frames * substeps)
+            context.tell("physics, repetitions", repetition + 1, watch.repetitions)
+    section = Section(name="physics", frame_seconds=timing.median / frames)
+    section.figures = timing.step_metrics() | meter.metrics()
+    section.facts = {
+        "frames_per_repetition": frames,
+        "repetitions": watch.repetitions,
+        "warm_up_and_capture_s": first,
+        "peak_contacts_per_world": int(sim.peak_contacts.max()),
+        "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
+    }
+    section.facts |= _memory(sim)
+    if bad.any():
+        section.problem = f"{int(bad.sum())} worlds overflowed, diverged or were not stepped"
+    step_ms = 1e3 * timing.median / (frames * substeps)
+    section.headline = f"{timing.world_steps_per_s:,.0f} world-steps/s, {step_ms:.3g} ms per step of {sim.nworld} worlds"
+    return section
+
+
+def measure_episode(
+    context: GateContext, sim: Simulation, watch: Stopwatch, meter: EnergyMeter, frame_seconds: float | None
+) -> Section:
+    """The whole scripted episode with its acceptance; on MJWarp alternating with bare steps of the same commands.
+
+    Native MuJoCo takes the batch gate's episode as its first repetition. There an episode of thousands of worlds lasts
+    minutes, so it is played only as often as the time allows, and not at all where even one would not fit.
+
+    Args:
+        context: Scene and planner.
+        sim: The worlds.
+        watch: Time and repetitions.
+        meter: Measures the energy.
+        frame_seconds: About how long a frame takes [s], if it is known.
+    """
+    cfg, section = context.cfg, Section(name="episode")
+    mjwarp = sim.backend == "mjwarp"
+    before = context.timed_episode
+    if before is not None and (before.description, before.nworld) != (sim.description, sim.nworld):
+        before = None
+    frames = context.planner.phases[-1].stop
+    timing = Timing(nworld=sim.nworld, frames=frames, substeps=cfg.timing.substeps)
+    played: list[TimedEpisode] = [before] if before is not None and not mjwarp else []
+    bare: list[float] = []
+    ratios: list[float] = []
+    estimate = 0.0 if frame_seconds is None else frame_seconds * frames
+    if before is not None:
+        estimate = max(estimate, before.seconds)
+    if mjwarp:
+        estimate *= 2
+    began = time.perf_counter()
+    with meter:
+        while len(played) < watch.repetitions and time.perf_counter() - began + estimate <= watch.seconds:
+            turn_began = time.perf_counter()
+            episode = run_episode(sim, context.index, cfg, context.planner, cfg.reset)
+            played.append(TimedEpisode.of(episode, sim))
+            if mjwarp:
+                seconds, problem = _play_bare(context, cast("MjwarpSimulation", sim))
+                section.problem = section.problem or problem
+                bare.append(seconds)
+                ratios.append(episode.seconds / seconds)
+            estimate = time.perf_counter() - turn_began
+            context.tell("episode, repetitions", len(played), watch.repetitions)
+    if not played and before is not None:
+        played = [before]
+    if not played:
+        section.missing = (
+            f"an episode would take about {estimate:.0f} s, and a section has {watch.seconds:g} s "
+            f"(gate.throughput.{'max_seconds' if sim.device.type == 'cuda' else 'cpu_max_seconds'})"
+        )
+        return section
+    timing.seconds = [p.seconds for p in played]
+    failed = sorted({w for p in played for w in p.failed})
+    section.facts = {
+        "repetitions": len(played),
+        "of_the_batch_gate": sum(p is before for p in played),
+        "frames": frames,
+        "accepted": sim.nworld - len(failed),
+        "capture_s": statistics.median(p.capture_seconds for p in played),
+    }
+    section.figures = spread("seconds", timing.seconds) | timing.step_metrics() | timing.frame_metrics()
+    section.headline = f"{timing.median:.3g} s"
+    if ratios:
+        section.figures |= spread("bare_seconds", bare) | spread("bare_ratio", ratios)
+        section.headline += f" ({statistics.median(ratios):.3f} x bare steps)"
+    elif mjwarp:
+        section.facts["bare_ratio"] = "not measured: no time for an episode and as many bare steps"
+    if len(played) > sum(p is before for p in played):
+        section.figures |= meter.metrics()
+        section.facts |= _memory(sim)
+    if failed:
+        section.rejected = True
+        section.problem = f"{name_worlds(failed, sim.nworld)} failed the acceptance"
+    return section
+
+
+def measure_env_steps(context: GateContext, env: Env, watch: Stopwatch, meter: EnergyMeter) -> Section:
+    """``env.step`` with the configured managers, random actions, and resets as they come."""
+    t, section = context.cfg.gate.throughput, Section(name="env_step")
+    with meter:
+        times = measure_env_step(
+            env,
+            frames=t.env_frames,
+            turns=watch.repetitions,
+            max_seconds=watch.seconds,
+            progress=lambda turn: context.tell("env.step, turns", turn, watch.repetitions),
+        )
+    sim = env.sim
+    timing = Timing(nworld=env.nworld, frames=times.frames, substeps=times.substeps)
+    timing.seconds = [1e-3 * times.frames * ms for ms in times.env_ms]
+    section.figures = timing.frame_metrics() | timing.step_metrics()
+    section.figures |= spread("physics_ms_per_frame", times.physics_ms) | spread("managers_ms_per_frame", times.managers_ms)
+    section.figures |= spread("managers_over_physics", times.overheads)
+    section.facts = {
+        "frames_per_turn": times.frames,
+        "turns": watch.repetitions,
+        "episodes_ended": int(times.episodes),
+        "warm_up_s": times.warm_up_s,
+        "capture_s": times.capture_s,
+    }
+    sizes: BatchSizes | None = getattr(sim, "sizes", None)
+    if sizes is not None:
+        section.facts |= {"naconmax": sizes.contact_pool(sim.nworld), "njmax": sizes.njmax}
+    section.figures |= meter.metrics()
+    section.facts |= _memory(sim)
+    section.problem = times.problem
+    rate = env.nworld * times.frames / timing.median
+    section.headline = f"{rate:,.0f} env-steps/s, managers {100.0 * times.overhead:+.1f} %"
+    return section
+
+
+def _carry_start(context: GateContext, sim: Simulation) -> State:
+    """States at the start of the measured phase: the batch gate's, or those of some native worlds over and over."""
+    state = context.carry_start
+    if state is not None and state.qpos.shape[0] == sim.nworld:
+        return state
+    cfg, t = context.cfg, context.cfg.gate.throughput
+    count = min(sim.nworld, t.start_worlds)
+    some = context.simulation(count, Backend.native, "cpu")
+    env, tape = start_worlds(some, context.index, cfg, cfg.reset, context.planner)
+    first = context.phase_start(t.from_phase)
+    for frame in range(first):
+        env.step(tape.command(frame))
+        context.tell("frames to the start", frame + 1, first)
+    state = snapshot(some)
+    env.close()
+    worlds = np.arange(sim.nworld) % count
+    return State(state.qpos[worlds], state.qvel[worlds], state.ctrl[worlds])
+
+
+def _play_bare(context: GateContext, sim: MjwarpSimulation) -> tuple[float, str]:
+    """The same commands from the same start on bare steps: seconds, and why they would not count.
+
+    The tape is evaluated in the loop, as it is in the episode. What the steps lost shows in where the cubes end.
+    """
+    cfg, substeps = context.cfg, context.cfg.timing.substeps
+    step = sim.bare_step()
+    for _ in range(3):  # eager, captured, replayed: none of it is timed
+        step()
+    _, tape = start_worlds(sim, context.index, cfg, cfg.reset, context.planner)
+
+    def play() -> None:
+        for frame in range(tape.frames):
+            sim.ctrl.copy_(tape.command(frame))
+            for _ in range(substeps):
+                step()
+
+    seconds = timed(sim, play)
+    red, blue = (sim.qpos[:, a : a + 3] for a in context.index.cube_qpos)
+    apart, rules = red - blue, cfg.gate.acceptance
+    stacked = (apart[:, :2].norm(dim=1) <= rules.xy_err) & (apart[:, 2] >= rules.dz_min) & (apart[:, 2] <= rules.dz_max)
+    lost = int((~stacked).sum())  # a comparison with NaN is false
+    return seconds, f"{lost} worlds did not stack with bare steps" if lost else ""
+
+
+def _lost(sim: Simulation) -> torch.Tensor:
+    """Worlds that overflowed or diverged, shape ``(nworld,)``, bool."""
+    finite = torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1)
+    return ((sim.overflow & LOST_PHYSICS) != 0) | ~finite
+
+
+def _memory(sim: Simulation) -> dict[str, Value]:
+    """What the worlds take on the GPU."""
+    used = device_memory(str(sim.device))
+    if used is None:
+        return {}
+    return {"gpu_memory_arrays_mib": used[0] / 2**20, "gpu_memory_whole_gpu_mib": used[1] / 2**20}

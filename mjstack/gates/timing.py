@@ -1,0 +1,70 @@
+"""Wall time of work on a simulation, and what repetitions of it say."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from mjstack.report.record import Value
+from mjstack.sim import Simulation
+
+
+def timed(sim: Simulation, work: Callable[[], object]) -> float:
+    """Seconds that some work takes, the device idle at both ends."""
+    sim.synchronize()
+    began = time.perf_counter()
+    work()
+    sim.synchronize()
+    return time.perf_counter() - began
+
+
+def spread(name: str, values: Sequence[float]) -> dict[str, Value]:
+    """Median, least and largest of some values as three metrics."""
+    return {f"{name}.median": statistics.median(values), f"{name}.min": min(values), f"{name}.max": max(values)}
+
+
+@dataclass(kw_only=True, slots=True)
+class Timing:
+    """Repetitions of the same work.
+
+    Attributes:
+        nworld: Number of worlds.
+        frames: Control intervals in one repetition.
+        substeps: Physics steps in one of them.
+        seconds: Wall time of each repetition [s].
+    """
+
+    nworld: int
+    frames: int
+    substeps: int
+    seconds: list[float] = field(default_factory=list)
+
+    @property
+    def median(self) -> float:
+        """Median repetition [s]."""
+        return statistics.median(self.seconds)
+
+    @property
+    def world_steps_per_s(self) -> float:
+        """Physics steps of all worlds together per second, median."""
+        return self.nworld * self.frames * self.substeps / self.median
+
+    def step_metrics(self) -> dict[str, Value]:
+        """Per physics step: what a batched one costs, and how many world-steps are made in a second."""
+        steps = self.frames * self.substeps
+        return spread("ms_per_batched_step", [1e3 * s / steps for s in self.seconds]) | spread(
+            "world_steps_per_s", [self.nworld * steps / s for s in self.seconds]
+        )
+
+    def frame_metrics(self) -> dict[str, Value]:
+        """Likewise per control interval."""
+        return spread("ms_per_env_step", [1e3 * s / self.frames for s in self.seconds]) | spread(
+            "env_steps_per_s", [self.nworld * self.frames / s for s in self.seconds]
+        )
+
+
+def frames_that_fit(most: int, budget: float, seconds_per_frame: float) -> int:
+    """As many frames as a time budget [s] allows, from 1 to most."""
+    return max(1, min(most, int(budget / max(seconds_per_frame, 1e-9))))

@@ -1,0 +1,143 @@
+"""The scaling table: one row per backend and number of worlds, as CSV and as text."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+
+from mjstack.report.markdown import escape_cell
+from mjstack.report.record import Value
+
+PASS = "pass"
+NOT_RUN = "not run"
+
+
+@dataclass(kw_only=True, slots=True)
+class ScalingRow:
+    """What one case found. A figure that was not measured, or that is void, is None.
+
+    Attributes:
+        nworld: Number of worlds.
+        backend: ``mjwarp`` or ``native``.
+        status: pass, fail, out of memory, timeout, crashed, or not run.
+        reason: Why, in one line; empty for a pass.
+        accepted: Worlds whose episode was accepted.
+        ms_per_step: One batched physics step under a held command [ms], median; ``_min`` and ``_max`` as well.
+        world_steps_per_s: The same as physics steps of all worlds per second.
+        ms_per_env_step: ``env.step`` with all managers [ms], median.
+        env_steps_per_s: The same as control intervals of all worlds per second.
+        managers_over_physics: What the managers add to physics in ``env.step``, as a fraction of it.
+        episode_s: The validated episode [s], median.
+        bare_ratio: That over bare steps of the same commands.
+        gpu_memory_arrays_mib: GPU memory that arrays hold [MiB], most of all sections.
+        gpu_memory_whole_gpu_mib: GPU memory that is taken on the whole GPU [MiB], likewise.
+        gpu_power_mean_w: Mean power during the episodes and the bare steps [W].
+        process_peak_mib: Host memory [MiB]; of native cases.
+        build_s: Building the worlds, compilation included [s].
+        capture_s: Capturing an episode's graphs [s].
+        seconds: The whole case, start of its process included [s].
+        hardware: Backend and hardware.
+        git_commit: Which mjstack.
+    """
+
+    nworld: int
+    backend: str
+    status: str = NOT_RUN
+    reason: str = ""
+    accepted: Value = None
+    ms_per_step: Value = None
+    ms_per_step_min: Value = None
+    ms_per_step_max: Value = None
+    world_steps_per_s: Value = None
+    world_steps_per_s_min: Value = None
+    world_steps_per_s_max: Value = None
+    ms_per_env_step: Value = None
+    env_steps_per_s: Value = None
+    env_steps_per_s_min: Value = None
+    env_steps_per_s_max: Value = None
+    managers_over_physics: Value = None
+    episode_s: Value = None
+    bare_ratio: Value = None
+    gpu_memory_arrays_mib: Value = None
+    gpu_memory_whole_gpu_mib: Value = None
+    gpu_power_mean_w: Value = None
+    process_peak_mib: Value = None
+    build_s: Value = None
+    capture_s: Value = None
+    seconds: Value = None
+    hardware: str = ""
+    git_commit: str = ""
+
+
+def to_csv(rows: Sequence[ScalingRow]) -> str:
+    """All columns of all rows."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, [field.name for field in fields(ScalingRow)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    return out.getvalue()
+
+
+def to_markdown(rows: Sequence[ScalingRow], title: str, notes: Sequence[str], picture: str = "") -> str:
+    """The table for people, what it says about the crossover, and where its rows come from."""
+    lines = [f"# {title}", ""]
+    lines += [
+        "| " + " | ".join(name for name, _ in _COLUMNS) + " |",
+        "| ---: | --- " + "| ---: " * (len(_COLUMNS) - 3) + "| --- |",
+    ]
+    for row in rows:
+        lines.append("| " + " | ".join(escape_cell(show(row)) for _, show in _COLUMNS) + " |")
+    if picture:
+        lines += ["", f"![{title}]({picture})"]
+    lines += ["", describe_crossover(rows), ""]
+    lines += [f"- {note}" for note in notes]
+    for name, values in (("hardware", {row.hardware for row in rows}), ("commit", {row.git_commit for row in rows})):
+        lines += [f"- {name}: {value}" for value in sorted(values - {""})]
+    return "\n".join(lines) + "\n"
+
+
+def crossover(rows: Sequence[ScalingRow]) -> float | None:
+    """Number of worlds from which MJWarp makes more world-steps/s than native MuJoCo; None where the rows do not show it.
+
+    Interpolated between the two numbers of worlds that bracket it, straight in logarithms.
+    """
+    rates = {
+        (row.backend, row.nworld): float(row.world_steps_per_s) for row in rows if isinstance(row.world_steps_per_s, float)
+    }
+    both = sorted({n for _, n in rates if ("mjwarp", n) in rates and ("native", n) in rates})
+    gap = [math.log(rates["mjwarp", n] / rates["native", n]) for n in both]
+    for (n0, g0), (n1, g1) in zip(zip(both, gap, strict=True), list(zip(both, gap, strict=True))[1:], strict=False):
+        if g0 <= 0.0 < g1:
+            return math.exp(math.log(n0) + (math.log(n1) - math.log(n0)) * -g0 / (g1 - g0))
+    return None
+
+
+def describe_crossover(rows: Sequence[ScalingRow]) -> str:
+    """The crossover in a sentence."""
+    at = crossover(rows)
+    if at is None:
+        return "Crossover: the finished rows do not show MJWarp passing native MuJoCo."
+    return f"Crossover: from about {at:,.0f} worlds on MJWarp makes more physics steps than native MuJoCo on all cores."
+
+
+def _number(value: Value, form: str = ",.0f") -> str:
+    return format(value, form) if isinstance(value, float | int) else "-"
+
+
+_COLUMNS = (
+    ("worlds", lambda r: f"{r.nworld:,}"),
+    ("backend", lambda r: r.backend),
+    ("accepted", lambda r: _number(r.accepted)),
+    ("ms per step", lambda r: _number(r.ms_per_step, ".4g")),
+    ("world-steps/s", lambda r: _number(r.world_steps_per_s)),
+    ("env-steps/s", lambda r: _number(r.env_steps_per_s)),
+    ("managers", lambda r: _number(r.managers_over_physics, "+.1%")),
+    ("episode, s", lambda r: _number(r.episode_s, ".3g")),
+    ("over bare steps", lambda r: _number(r.bare_ratio, ".3f")),
+    ("GPU memory, MiB", lambda r: _number(r.gpu_memory_whole_gpu_mib)),
+    ("capture, s", lambda r: _number(r.capture_s, ".2f")),
+    ("status", lambda r: f"{r.status}: {r.reason}" if r.reason else r.status),
+)

@@ -1,0 +1,355 @@
+"""The scaling job: cases in processes of their own, resumed, with gaps where one fails."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mjstack.cli import run
+from mjstack.config import load_config
+from mjstack.jobs import scaling
+from mjstack.jobs.case import OutOfTime, _row, read_case
+from mjstack.jobs.scaling import case_overrides, scaling_folder
+from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow, crossover, describe_crossover, to_csv, to_markdown
+
+SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
+TINY = ["job=scaling", "job.repetitions=1", "job.native_frames=2", "job.native_env_frames=1", "gate.throughput.start_worlds=2"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def home(folder: Path) -> Path:
+    (path,) = (folder / "outputs" / "scaling").iterdir()
+    return path
+
+
+def table(folder: Path) -> dict[tuple[str, int], dict[str, str]]:
+    with (home(folder) / "scaling.csv").open() as file:
+        return {(row["backend"], int(row["nworld"])): row for row in csv.DictReader(file)}
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    return {path.parent.name: path.stat().st_mtime_ns for path in home(folder).rglob("case.json")}
+
+
+def test_cases_resume_and_leave_table_and_plot(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run([*TINY, "sim=native", "job.nworlds=[1,2]"]) == 0
+    first, before = table(folder), stamps(folder)
+    assert set(first) == {("native", 1), ("native", 2)}
+    for (_, nworld), row in first.items():
+        assert row["status"] == "pass"
+        assert float(row["world_steps_per_s"]) == pytest.approx(1e3 * nworld / float(row["ms_per_step"]))
+        assert float(row["env_steps_per_s"]) == pytest.approx(1e3 * nworld / float(row["ms_per_env_step"]))
+        assert row["bare_ratio"] == row["accepted"] == ""  # native cases play no episode
+    for name in ("scaling.csv", "scaling.md", "scaling.png", "report.json", "report.md", "run.log", ".hydra/config.yaml"):
+        assert (home(folder) / name).stat().st_size > 0, name
+    report = json.loads((home(folder) / "report.json").read_text())
+    assert report["status"] == "pass"
+    assert [gate["name"] for gate in report["gates"]] == ["native-1", "native-2"]
+    assert [path.name for path in folder.iterdir()] == ["outputs"]
+
+    capsys.readouterr()
+    assert run([*TINY, "sim=native", "job.nworlds=[1,2,3]", "nworld=7"]) == 0
+    out = capsys.readouterr().out
+    after = stamps(folder)
+    assert {name: after[name] for name in before} == before
+    assert set(after) - set(before) == {"native-3"}
+    assert out.count("(done before)") == 2
+    assert "nworld=7 is not used" in out
+    assert {key: row for key, row in table(folder).items() if key in first} == first
+
+
+def test_failing_case_is_a_gap_and_runs_again_if_asked(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = [*TINY, "sim.device=cpu", "job.nworlds=[1]", "job.backends=[mjwarp,native]", "batch.njmax=40"]
+    assert run(args) == 1
+    rows = table(folder)
+    assert rows["mjwarp", 1]["status"] == "fail"
+    assert "buffer overflow" in rows["mjwarp", 1]["reason"]
+    assert rows["mjwarp", 1]["accepted"] == "0"
+    assert not any(rows["mjwarp", 1][name] for name in ("ms_per_step", "world_steps_per_s", "env_steps_per_s", "episode_s"))
+    assert rows["native", 1]["status"] == "pass"
+    assert float(rows["native", 1]["world_steps_per_s"]) > 0
+    report = json.loads((home(folder) / "report.json").read_text())
+    assert report["status"] == "fail"
+    assert (home(folder) / "scaling.png").stat().st_size > 0
+
+    before = stamps(folder)
+    assert run(args) == 1
+    assert stamps(folder) == before
+    assert "job.retry=true" in capsys.readouterr().out
+    assert run([*args, "job.retry=true"]) == 1
+    after = stamps(folder)
+    assert after["mjwarp-1"] > before["mjwarp-1"]
+    assert after["native-1"] == before["native-1"]
+
+
+def test_out_of_memory_is_said_as_that(folder: Path) -> None:
+    """More worlds than any address space holds."""
+    assert run([*TINY, "sim=native", "job.nworlds=[1,1000000000000]"]) == 1
+    rows = table(folder)
+    assert rows["native", 1]["status"] == "pass"
+    assert rows["native", 1000000000000]["status"] == "out of memory"
+    assert rows["native", 1000000000000]["world_steps_per_s"] == ""
+
+
+@pytest.mark.parametrize(
+    ("code", "reason", "output", "status", "says"),
+    [
+        (1, "RuntimeError: Failed to allocate 99 bytes on device 'cuda:0'", "", "out of memory", "99 bytes"),
+        (1, "internal error, OutOfMemoryError: CUDA out of memory.", "", "out of memory", "CUDA out of memory"),
+        (1, "internal error, RuntimeError: bad", "Warp CUDA error 2: out of memory (in function x)", "out of memory", "bad"),
+        (1, "3 of 8 worlds failed", "", "fail", "batch: 3 of 8 worlds failed"),
+        (2, "", "mjstack: nworld=0: expected", "fail", "nworld=0"),
+        (-9, "", "", "out of memory", "killed by signal 9"),
+        (-11, "", "", "crashed", "killed by signal 11"),
+    ],
+)
+def test_how_a_case_ended(tmp_path: Path, code: int, reason: str, output: str, status: str, says: str) -> None:
+    gates = [{"name": "batch", "status": "fail", "reason": reason, "metrics": {}}] if reason else []
+    (tmp_path / "report.json").write_text(json.dumps({"gates": gates, "provenance": {"git_commit": "abc"}}))
+    (tmp_path / "output.log").write_text(output)
+    row = _row(tmp_path, 8, "mjwarp", code)
+    assert (row.status, row.git_commit) == (status, "abc")
+    assert says in row.reason
+    assert row.world_steps_per_s is None
+
+
+def test_case_without_a_report_says_its_last_line(tmp_path: Path) -> None:
+    (tmp_path / "output.log").write_text("something\nImportError: no such thing\n")
+    row = _row(tmp_path, 8, "native", 1)
+    assert (row.status, row.reason) == ("fail", "ImportError: no such thing")
+
+
+@pytest.mark.parametrize("text", [None, "", "{", '{"nworld": 1}', '{"other": 1}'])
+def test_unreadable_case_counts_as_not_run(tmp_path: Path, text: str | None) -> None:
+    if text is not None:
+        (tmp_path / "case.json").write_text(text)
+    row = read_case(tmp_path, 4, "native")
+    assert (row.nworld, row.backend, row.status) == (4, "native", NOT_RUN)
+
+
+@pytest.fixture
+def pretended(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, str]]:
+    """Cases that take 40 s each on a clock of their own."""
+    ran: list[tuple[int, str]] = []
+    clock = [0.0]
+
+    def pretend(_: Path, nworld: int, backend: str, __: list[str], *, case_seconds: float, call_seconds: float) -> ScalingRow:
+        clock[0] += min(40.0, call_seconds)
+        if call_seconds < 40.0:
+            raise OutOfTime("stopped")
+        ran.append((nworld, backend))
+        return ScalingRow(nworld=nworld, backend=backend, status=PASS, seconds=40.0, world_steps_per_s=1.0 * nworld)
+
+    monkeypatch.setattr(scaling, "run_case", pretend)
+    monkeypatch.setattr(scaling.time, "monotonic", lambda: clock[0])
+    return ran
+
+
+def test_no_case_starts_that_would_not_fit(
+    folder: Path, pretended: list[tuple[int, str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    # 150 s: 40, 40 (two of them tell: no growth), 40; 30 s are too few for the fourth.
+    args = [*TINY, "sim=native", "job.nworlds=[1,2,4,8]", "job.max_minutes=2.5"]
+    assert run(args) == 1
+    assert [nworld for nworld, _ in pretended] == [1, 2, 4]
+    out = capsys.readouterr().out
+    assert "incomplete: 1 of 4 cases have not run (4/4 native, 8 worlds needs more than the 30 s that are left)" in out
+    assert json.loads((home(folder) / "report.json").read_text())["status"] == "interrupted"
+    assert "| 8 | native | - | - |" in (home(folder) / "scaling.md").read_text()
+
+
+def test_a_call_that_is_too_short_still_tries_its_first_case(
+    folder: Path, pretended: list[tuple[int, str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([*TINY, "sim=native", "job.nworlds=[1,2]", "job.max_minutes=0.5"]) == 1
+    assert pretended == []
+    assert "incomplete: 2 of 2 cases have not run (stopped)" in capsys.readouterr().out
+
+
+def test_failed_plot_takes_nothing_back(
+    folder: Path, pretended: list[tuple[int, str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("no fonts")
+
+    monkeypatch.setattr(scaling, "save_scaling_curves", fail)
+    assert run([*TINY, "sim=native", "job.nworlds=[1]"]) == 0
+    assert "no picture: no fonts" in capsys.readouterr().out
+    assert ("native", 1) in table(folder)
+
+
+def test_full_disk_is_one_line(
+    folder: Path, pretended: list[tuple[int, str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(scaling, "write_atomic", full)
+    assert run([*TINY, "sim=native", "job.nworlds=[1]"]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("mjstack: ")
+    assert "No space left on device" in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def alive(marker: str) -> list[str]:
+    """Processes whose environment has a marker."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        try:
+            if marker.encode() in path.read_bytes() and (path.parent / "cmdline").read_bytes():
+                found.append(path.parent.name)
+        except OSError:
+            continue
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="no /proc here")
+def test_ctrl_c_leaves_the_finished_cases_and_no_process(folder: Path) -> None:
+    marker = f"MJSTACK_TEST={folder.name}"
+    process = subprocess.Popen(
+        [sys.executable, SCRIPT, *TINY, "sim=native", "job.nworlds=[1,3000]", "job.native_frames=2000"],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"MJSTACK_TEST": folder.name},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        until = time.monotonic() + 120
+        while not list(folder.glob("outputs/scaling/*/cases/native-3000/report.json")):
+            assert process.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        assert len(alive(marker)) == 2
+        os.kill(process.pid, signal.SIGINT)  # this process alone: a terminal would tell its child too
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert "incomplete: 1 of 2 cases have not run (interrupted)" in out
+    rows = table(folder)
+    assert (rows["native", 1]["status"], rows["native", 3000]["status"]) == ("pass", "not run")
+    assert json.loads((home(folder) / "report.json").read_text())["status"] == "interrupted"
+    assert alive(marker) == []
+
+
+def test_folder_depends_on_what_a_case_depends_on() -> None:
+    def name(*overrides: str) -> str:
+        return str(scaling_folder(load_config(["job=scaling", *overrides])))
+
+    same = name()
+    assert same.startswith("outputs/scaling/")
+    for override in (
+        "job.nworlds=[5]",
+        "job.max_minutes=3",
+        "job.retry=true",
+        "nworld=3",
+        "job.backends=[native]",
+        "sim=native",
+    ):
+        assert name(override) == same, override
+    for override in ("robot=rebot", "job.repetitions=2", "batch.njmax=99", "seed=1", "sim.device=cpu", "~reward.grasp"):
+        assert name(override) != same, override
+
+
+def test_cases_get_the_command_line() -> None:
+    cfg = load_config(["job=scaling", "robot=rebot"])
+    given = ["job=scaling", "robot=rebot", "nworld=3", "job.nworlds=[4]", "sim=mjwarp", "sim.device=cpu", "+reward.x={func: f}"]
+    warp, native = (case_overrides(cfg, given, 4096, backend) for backend in ("mjwarp", "native"))
+    assert warp[:3] == ["robot=rebot", "sim.device=cpu", "+reward.x={func: f}"]
+    assert {"job=gates", "sim=mjwarp", "nworld=4096", "gate.throughput.repetitions=1", "gates=[batch,throughput]"} <= set(warp)
+    assert {"sim=native", "sim.device=cpu", "gates=[throughput]", "gate.throughput.frames=60"} <= set(native)
+    assert "gate.throughput.repetitions=5" in case_overrides(cfg, given, 2048, "mjwarp")
+    for overrides in (warp, native):
+        keys = [override.lstrip("+").partition("=")[0] for override in overrides]
+        assert len(keys) == len(set(keys))
+
+
+BAD = [
+    ["job.nworlds=[]"],
+    ["job.nworlds=[0]"],
+    ["job.nworlds=[2,2]"],
+    ["job.nworlds=many"],
+    ["job.nworld=[2]"],
+    ["job.backends=[cuda]"],
+    ["job.backends=[]"],
+    ["job.repetitions=0"],
+    ["job.case_minutes=0"],
+    ["job.max_minutes=-1"],
+    ["job.retry=perhaps"],
+    ["view=true"],
+    ["video=true"],
+    ["task=reach"],
+    ["gate.throughput.sections=[physic]"],
+    ["gate.throughput.sections=[]"],
+    ["job.backends=[mjwarp]", "sim.device=cuda:77"],
+    ["hydra.run.dir=afile/below"],
+]
+
+
+@pytest.mark.parametrize("args", BAD, ids=[" ".join(args) for args in BAD])
+def test_bad_input_is_one_line_and_writes_nothing(args: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "afile").write_text("")
+    assert run(["job=scaling", *args]) == 2
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    assert err.startswith("mjstack: ")
+    assert len(err.strip().splitlines()) == 1
+    assert [path.name for path in folder.rglob("*")] == ["afile"]
+
+
+def rows(rates: dict[str, dict[int, float | None]]) -> list[ScalingRow]:
+    return [
+        ScalingRow(nworld=n, backend=backend, status="fail" if rate is None else PASS, world_steps_per_s=rate)
+        for backend, some in rates.items()
+        for n, rate in some.items()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("mjwarp", "native", "at"),
+    [
+        ({1: 1.0, 100: 100.0}, {1: 10.0, 100: 10.0}, 10.0),
+        ({1: 1.0, 10: None, 100: 100.0}, {1: 10.0, 10: 10.0, 100: 10.0}, 10.0),
+        ({1: 1.0, 100: 5.0}, {1: 10.0, 100: 10.0}, None),
+        ({1: 20.0, 100: 50.0}, {1: 10.0, 100: 10.0}, None),
+        ({1: 1.0}, {100: 10.0}, None),
+        ({1: None}, {1: None}, None),
+    ],
+)
+def test_crossover(mjwarp: dict[int, float | None], native: dict[int, float | None], at: float | None) -> None:
+    both = rows({"mjwarp": mjwarp, "native": native})
+    found = crossover(both)
+    assert found == (None if at is None else pytest.approx(at))
+    assert (f"about {at:,.0f} worlds" if at else "do not show") in describe_crossover(both)
+
+
+def test_table_shows_gaps_and_where_rows_come_from() -> None:
+    good = ScalingRow(
+        nworld=2048, backend="mjwarp", status=PASS, ms_per_step=1.376, bare_ratio=1.02, git_commit="a", hardware="x"
+    )
+    bad = ScalingRow(nworld=4096, backend="mjwarp", status="out of memory", reason="a | b", git_commit="b", hardware="x")
+    text = to_markdown([good, bad], "T", ["n"], "p.png")
+    lines = text.splitlines()
+    assert lines[4].startswith("| 2,048 | mjwarp | - | 1.376 |")
+    assert "| 1.020 |" in lines[4]
+    assert lines[5].endswith("| out of memory: a \\| b |")
+    assert "- commit: a\n- commit: b\n" in text
+    assert text.count("- hardware") == 1
+    assert [row["ms_per_step"] for row in csv.DictReader(to_csv([good, bad]).splitlines())] == ["1.376", ""]

@@ -1,0 +1,321 @@
+"""The throughput gate: what its sections measure, and what voids their figures."""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mjstack.config import load_config
+from mjstack.envs import build_env
+from mjstack.gates import env_step, power, sections
+from mjstack.gates.env_step import measure_env_step
+from mjstack.gates.episode import State, run_episode
+from mjstack.gates.gate import GateContext
+from mjstack.gates.power import EnergyMeter
+from mjstack.gates.throughput import run_throughput
+from mjstack.gates.timing import Timing, frames_that_fit, timed
+from mjstack.report.record import GateResult, Status
+from mjstack.sim import Simulation
+from mjstack.sim.native import NativeSimulation
+
+SHORT = (
+    "gates=[throughput]",
+    "gate.throughput.repetitions=3",
+    "gate.throughput.frames=3",
+    "gate.throughput.env_frames=2",
+    "gate.throughput.cpu_max_seconds=120",
+)
+SPEEDS = ("per_s", "ms_per", "seconds", "ratio", "over_physics", "power")
+
+
+def speeds(result: GateResult, section: str = "") -> list[str]:
+    """Metrics that say how fast something was."""
+    named = [name for name in result.metrics if name.startswith(section) and any(word in name for word in SPEEDS)]
+    return [name for name in named if name != "gpu_power_and_memory"]
+
+
+def test_timing_is_arithmetic() -> None:
+    timing = Timing(nworld=4, frames=5, substeps=10, seconds=[2.0, 0.5, 1.0])
+    assert timing.median == 1.0
+    assert timing.world_steps_per_s == 200.0
+    step, frame = timing.step_metrics(), timing.frame_metrics()
+    assert [step[f"ms_per_batched_step.{k}"] for k in ("median", "min", "max")] == [20.0, 10.0, 40.0]
+    assert [step[f"world_steps_per_s.{k}"] for k in ("median", "min", "max")] == [200.0, 100.0, 400.0]
+    assert [frame[f"ms_per_env_step.{k}"] for k in ("median", "min", "max")] == [200.0, 100.0, 400.0]
+    assert [frame[f"env_steps_per_s.{k}"] for k in ("median", "min", "max")] == [20.0, 10.0, 40.0]
+
+
+@pytest.mark.parametrize(("budget", "frame", "fit"), [(10.0, 1.0, 10), (10.0, 0.1, 25), (0.5, 1.0, 1), (2.5, 1.0, 2)])
+def test_frames_fit_into_the_time(budget: float, frame: float, fit: int) -> None:
+    assert frames_that_fit(25, budget, frame) == fit
+
+
+def test_timed_waits_for_the_device_at_both_ends() -> None:
+    seen: list[str] = []
+    sim: Any = SimpleNamespace(synchronize=lambda: seen.append("wait"))
+    assert timed(sim, lambda: (seen.append("work"), time.sleep(0.01))) >= 0.01
+    assert seen == ["wait", "work", "wait"]
+
+
+def test_native_sections(new_context: Callable[..., GateContext]) -> None:
+    result, cuda = run_throughput(new_context("sim=native", "nworld=2", *SHORT))
+    assert result.status is Status.passed, result.reason
+    assert cuda.status is Status.skipped or torch.cuda.is_available()
+    m = result.metrics
+    assert (m["worlds"], m["physics.repetitions"], m["physics.frames_per_repetition"]) == (2, 3, 3)
+    assert (m["episode.accepted"], m["episode.repetitions"], m["episode.frames"]) == (2, 3, 600)
+    assert (m["env_step.turns"], m["env_step.frames_per_turn"]) == (3, 2)
+    for section in ("physics", "episode", "env_step"):
+        # With three repetitions the median of the rates is the rate of the median.
+        ms, rate = m[f"{section}.ms_per_batched_step.median"], m[f"{section}.world_steps_per_s.median"]
+        assert rate == pytest.approx(2 * 1e3 / ms)
+        assert m[f"{section}.ms_per_batched_step.min"] <= ms <= m[f"{section}.ms_per_batched_step.max"]
+    assert m["episode.seconds.median"] == pytest.approx(6.0 * m["episode.ms_per_batched_step.median"])
+    assert m["env_step.managers_over_physics.median"] > 0.0
+    assert m["env_step.managers_ms_per_frame.median"] < m["env_step.ms_per_env_step.max"]
+    assert m["gpu_power_and_memory"] == "not measured: no GPU"
+    assert not any("bare" in name for name in m)
+
+
+def test_episode_alternates_with_bare_steps_on_mjwarp(new_context: Callable[..., GateContext]) -> None:
+    context = new_context(
+        "sim=mjwarp",
+        "sim.device=cpu",
+        "nworld=1",
+        *SHORT,
+        "gate.throughput.sections=[episode]",
+        "gate.throughput.repetitions=1",
+    )
+    result, _ = run_throughput(context)
+    assert result.status is Status.passed, result.reason
+    m = result.metrics
+    assert m["episode.accepted"] == 1
+    assert m["episode.bare_ratio.median"] == pytest.approx(m["episode.seconds.median"] / m["episode.bare_seconds.median"])
+    assert "x bare steps" in result.reason
+
+
+def test_bare_steps_play_the_same_trajectory(
+    new_context: Callable[..., GateContext], make_sim: Callable[..., Simulation], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Warp's CPU device is bit-reproducible: whatever else a step does, the physics of both is the same."""
+    context, sim = new_context("nworld=1"), make_sim("mjwarp", 1)
+    run_episode(sim, context.index, context.cfg, context.planner, context.cfg.reset)
+    final = sim.qpos.clone()
+    seconds, problem = sections._play_bare(context, sim)  # type: ignore[arg-type]
+    assert seconds > 0.0
+    assert problem == ""
+    assert torch.equal(sim.qpos, final)
+    monkeypatch.setattr(type(sim), "bare_step", lambda _: lambda: None)
+    assert sections._play_bare(context, sim)[1] == "1 worlds did not stack with bare steps"  # type: ignore[arg-type]
+
+
+def test_rejected_episode_voids_every_section(new_context: Callable[..., GateContext]) -> None:
+    result, _ = run_throughput(
+        new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.repetitions=1", "gate.acceptance.xy_err=1e-7")
+    )
+    assert result.status is Status.failed
+    assert result.reason.count("no figure") == 3
+    assert "2 of 2 worlds (0, 1) failed the acceptance" in result.reason
+    assert speeds(result) == []
+    assert result.metrics["episode.accepted"] == 0
+
+
+@pytest.mark.parametrize("section", ["physics", "env_step"])
+def test_overflow_voids_the_figure(new_context: Callable[..., GateContext], section: str) -> None:
+    """40 rows hold a start above the table, and neither a grasped cube nor thrashing."""
+    result, _ = run_throughput(
+        new_context(
+            "sim=mjwarp",
+            "sim.device=cpu",
+            "nworld=2",
+            *SHORT,
+            f"gate.throughput.sections=[{section}]",
+            "gate.throughput.env_frames=20",
+            "batch.njmax=40",
+        )
+    )
+    assert result.status is Status.failed
+    assert f"{section}: no figure: " in result.reason
+    assert speeds(result) == []
+
+
+def test_steps_not_made_void_the_figure(new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch) -> None:
+    step = NativeSimulation.step
+
+    def lazy(self: NativeSimulation, n: int = 1, *, kinematics: bool = False) -> None:
+        step(self, max(1, n - 1), kinematics=kinematics)
+
+    monkeypatch.setattr(NativeSimulation, "step", lazy)
+    result, _ = run_throughput(new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.sections=[physics]"))
+    assert result.status is Status.failed
+    assert "physics: no figure: 2 worlds overflowed, diverged or were not stepped" in result.reason
+    assert speeds(result) == []
+
+
+def test_broken_section_leaves_the_others(new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch) -> None:
+    def out_of_memory(*_: object, **__: object) -> None:
+        raise MemoryError("Unable to allocate 9 GiB")
+
+    monkeypatch.setattr(sections, "measure_env_step", out_of_memory)
+    result, _ = run_throughput(new_context("sim=native", "nworld=1", *SHORT, "gate.throughput.sections=[physics,env_step]"))
+    assert result.status is Status.failed
+    assert "env_step: no figure: MemoryError: Unable to allocate 9 GiB (run.log has the traceback)" in result.reason
+    assert speeds(result, "env_step") == []
+    assert speeds(result, "physics") != []
+
+
+def test_no_time_for_an_episode_is_said(new_context: Callable[..., GateContext]) -> None:
+    result, _ = run_throughput(new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.cpu_max_seconds=1e-4"))
+    assert result.status is Status.passed
+    assert "episode: not measured: an episode would take about" in result.reason
+    assert "the task was not verified in this run" in result.reason
+    assert result.metrics["physics.frames_per_repetition"] == 1
+    assert result.metrics["env_step.frames_per_turn"] == 1
+    assert speeds(result, "episode") == []
+
+
+def test_start_states_repeat_without_the_batch_gate(new_context: Callable[..., GateContext]) -> None:
+    context = new_context("sim=native", "nworld=5", *SHORT, "gate.throughput.start_worlds=2")
+    sim = context.batch_simulation(5)
+    state = sections._carry_start(context, sim)
+    assert state.qpos.shape[0] == 5
+    assert np.array_equal(state.qpos[[0, 1, 0]], state.qpos[2:])
+    assert not np.array_equal(state.qpos[0], state.qpos[1])
+    red = context.index.cube_qpos[0]
+    gripper = context.index.robot_qpos[-1]
+    assert np.abs(state.qpos[:, red] - context.cfg.scene.red_xy[0]).max() < 0.03
+    assert state.qpos[:, gripper].max() < context.cfg.robot.gripper_open[0] - 0.1  # closed on the cube
+    kept = State(state.qpos.copy(), state.qvel, state.ctrl)
+    context.carry_start = kept
+    assert sections._carry_start(context, sim) is kept
+
+
+class Witness:
+    """A rival that only looks: where the physics under the recorded commands ends."""
+
+    def __init__(self, sim: Simulation) -> None:
+        self.sim, self.ends, self.frames = sim, [], 0
+
+    def begin(self) -> None:
+        self.frames = 0
+
+    def record(self) -> None:
+        self.frames += 1
+
+    def play(self) -> None:
+        pass
+
+    def check(self) -> None:
+        self.ends.append((self.frames, self.sim.qpos.clone()))
+
+
+def test_the_parts_play_one_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Physics alone ends where the whole step ended, except in worlds that were reset meanwhile, of which there are some."""
+    cfg = load_config(["task=stack", "sim=native", "task.episode_frames=9"])
+    env = build_env(cfg, nworld=12)
+    wholes, take = [], env_step.snapshot
+
+    def keep(sim: Simulation) -> State:
+        wholes.append((take(sim), env.episode.clone()))
+        return wholes[-1][0]
+
+    monkeypatch.setattr(env_step, "snapshot", keep)
+    witness = Witness(env.sim)
+    times = measure_env_step(env, frames=4, turns=3, rival=witness)
+    assert len(times.physics_ms) == len(times.managers_ms) == len(times.env_ms) == len(times.rival_ms) == 3
+    assert times.overhead == pytest.approx(
+        statistics.median(e / p - 1.0 for e, p in zip(times.env_ms, times.physics_ms, strict=True))
+    )
+    assert times.problem == ""
+    ended = 0
+    for (_, before), (whole, after), (frames, alone) in zip(wholes[:-1], wholes[1:], witness.ends, strict=True):
+        same = (before == after).numpy()
+        ended += int((after - before).sum())
+        assert frames == 4
+        assert same.any()
+        assert np.array_equal(whole.qpos[same], alone.numpy()[same])
+        assert not np.array_equal(whole.qpos[~same], alone.numpy()[~same])
+    assert ended > 12  # 16 frames of episodes of 9: every world once at least
+    assert 0 < times.episodes < ended  # the first turn warms up
+
+
+class FakeNvml:
+    """NVML whose counter goes by 100 J from one reading to the next."""
+
+    class NVMLError(Exception):
+        pass
+
+    def __init__(self, refuses: str = "") -> None:
+        self.refuses, self.millijoules = refuses, 0.0
+
+    def nvmlInit(self) -> None:
+        pass
+
+    def nvmlDeviceGetHandleByUUID(self, uuid: str) -> str:
+        if self.refuses:
+            raise self.NVMLError(self.refuses)
+        assert uuid == "GPU-1"
+        return uuid
+
+    def nvmlDeviceGetTotalEnergyConsumption(self, _: str) -> float:
+        self.millijoules += 1e5
+        return self.millijoules
+
+
+def meter(monkeypatch: pytest.MonkeyPatch, nvml: FakeNvml | None) -> EnergyMeter:
+    monkeypatch.setitem(sys.modules, "pynvml", nvml)  # None: an import error
+    monkeypatch.setattr(power, "cuda_uuid", lambda _: "GPU-1")
+    return EnergyMeter("cuda:0")
+
+
+def test_energy_is_the_counters_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([10.0, 14.0])
+    monkeypatch.setattr(power.time, "perf_counter", lambda: next(clock))
+    energy = meter(monkeypatch, FakeNvml())
+    with energy:
+        pass
+    assert energy.metrics() == {"gpu_power_mean_w": pytest.approx(25.0), "gpu_energy_j": pytest.approx(100.0)}
+
+
+@pytest.mark.parametrize(
+    ("nvml", "why"),
+    [(None, "nvidia-ml-py is not installed"), (FakeNvml("Not Supported"), "Not Supported"), (FakeNvml(), "too short")],
+)
+def test_missing_power_says_why(monkeypatch: pytest.MonkeyPatch, nvml: FakeNvml | None, why: str) -> None:
+    energy = meter(monkeypatch, nvml)
+    with energy:
+        pass
+    (value,) = energy.metrics().values()
+    assert str(value).startswith("not measured: ")
+    assert why in str(value)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+def test_episode_costs_hardly_more_than_bare_steps(new_context: Callable[..., GateContext]) -> None:
+    context = new_context(
+        "sim=mjwarp",
+        "nworld=2048",
+        "gates=[throughput]",
+        "gate.throughput.repetitions=3",
+        "gate.throughput.native_baseline=false",
+    )
+    baseline, result = run_throughput(context)
+    assert baseline.status is Status.skipped
+    assert result.status is Status.passed, result.reason
+    m = result.metrics
+    assert m["episode.accepted"] == 2048
+    assert m["episode.bare_ratio.median"] <= 1.04
+    for section in ("physics", "episode", "env_step"):
+        assert 0.0 < m[f"{section}.gpu_memory_arrays_mib"] <= m[f"{section}.gpu_memory_whole_gpu_mib"]
+        watts = m[f"{section}.gpu_power_mean_w"]
+        assert str(watts).startswith("not measured: ") or 50.0 < float(watts) < 2000.0
+    assert m["env_step.managers_over_physics.median"] < 1.0
