@@ -36,6 +36,13 @@ class GraphMode(Enum):
     off = "off"
 
 
+class Cone(Enum):
+    """Shape of the friction cone."""
+
+    elliptic = "elliptic"
+    pyramidal = "pyramidal"
+
+
 @dataclass(kw_only=True, slots=True)
 class LayoutCfg:
     """Where a scene's objects stand for one robot, and the buffer sizes its contacts need.
@@ -119,18 +126,27 @@ class TimingCfg:
 
 @dataclass(kw_only=True, slots=True)
 class SolverCfg:
-    """Constraint solver. ``null`` keeps the model file's own value."""
+    """Constraint solver. ``null`` keeps the model file's own value.
+
+    ``gripper_condim`` is the contact dimension of the geoms of ``robot.jaw_bodies``.
+    """
 
     iterations: int | None = None
     ls_iterations: int | None = None
     impratio: float | None = None
     tolerance: float | None = None
+    cone: Cone = Cone.elliptic
+    gripper_condim: int | None = None
 
 
 @dataclass(kw_only=True, slots=True)
 class BatchCfg:
-    """MJWarp's buffer sizes. ``null`` takes the default of this robot and scene (nconmax, njmax) or of MJWarp."""
+    """MJWarp's buffer sizes. ``null`` takes the default of this robot and scene (nconmax, njmax) or of MJWarp.
 
+    With ``auto``, what is null is measured first, as `CapacityCfg` says.
+    """
+
+    auto: bool = False
     nconmax: int | None = None
     naconmax: int | None = None
     njmax: int | None = None
@@ -266,9 +282,20 @@ class ParityCfg:
 
 @dataclass(kw_only=True, slots=True)
 class CapacityCfg:
-    """How many worlds size the buffers where worlds are slow (any CPU backend); on CUDA all nworld do."""
+    """How buffers are sized.
+
+    ``cpu_nworld`` worlds do where worlds are slow (any CPU backend); on CUDA all nworld do. Recommended sizes are ``margin``
+    times the peaks. Random actions last ``random_frames``, one whole episode if null. ``reset`` is how worlds start in the
+    workload of randomised starts. An environment with ``batch=auto`` is sized by ``probe_frames`` of random actions, on
+    CUDA in at most ``probe_nworld`` worlds.
+    """
 
     cpu_nworld: int = MISSING
+    margin: float = MISSING
+    random_frames: int | None = None
+    probe_nworld: int = MISSING
+    probe_frames: int = MISSING
+    reset: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(kw_only=True, slots=True)
@@ -332,6 +359,21 @@ class ScalingJobCfg(JobCfg):
     case_minutes: float = MISSING
     max_minutes: float | None = None
     retry: bool = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class StudyJobCfg(JobCfg):
+    """What settings of the solver cost, and whether every world is still accepted.
+
+    ``variants`` maps a name to what it changes in `SolverCfg`; typed, each is a whole one. ``repetitions`` of ``frames`` frames
+    are timed, or of as many as fit into ``max_seconds``.
+    """
+
+    repetitions: int = MISSING
+    frames: int = MISSING
+    max_seconds: float = MISSING
+    # Variants by name, untyped until `type_terms`, so that the command line may add one.
+    variants: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(kw_only=True, slots=True)

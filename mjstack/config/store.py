@@ -17,7 +17,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
-from mjstack.config.schema import Config, ScalingJobCfg
+from mjstack.config.schema import Config, ScalingJobCfg, StudyJobCfg
 from mjstack.config.terms import type_terms
 from mjstack.config.validate import validate
 from mjstack.errors import MjstackError, UnknownName, suggest
@@ -28,6 +28,7 @@ _TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 _KINDS = {"Integer": "an integer", "Float": "a number", "Boolean": "true or false"}
 
 ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
+ConfigStore.instance().store(group="job", name="study_schema", node=StudyJobCfg, provider="mjstack")
 ConfigStore.instance().store(group="job", name="scaling_schema", node=ScalingJobCfg, provider="mjstack")
 
 

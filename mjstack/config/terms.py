@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import Any, cast
+from dataclasses import asdict, fields
+from enum import EnumMeta
+from typing import Any, cast, get_type_hints
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -14,6 +15,8 @@ from mjstack.config.schema import (
     ObservationGroupCfg,
     ObservationTermCfg,
     RewardTermCfg,
+    SolverCfg,
+    StudyJobCfg,
     TermCfg,
     TerminationTermCfg,
 )
@@ -21,7 +24,7 @@ from mjstack.errors import ConfigError, TermError, UnknownName
 
 
 def type_terms(cfg: Config) -> None:
-    """Gives every term its type, in place. A term that is null is left out.
+    """Gives every term and every variant of the solver its type, in place. A term that is null is left out.
 
     Raises:
         MjstackError: A term has an unknown key, lacks one, or a value has the wrong type.
@@ -29,11 +32,17 @@ def type_terms(cfg: Config) -> None:
     cfg.action = _terms("action", cfg.action, ActionTermCfg)
     cfg.controller.action = _terms("controller.action", cfg.controller.action, ActionTermCfg)
     cfg.reset = _terms("reset", cfg.reset, TermCfg)
+    cfg.gate.capacity.reset = _terms("gate.capacity.reset", cfg.gate.capacity.reset, TermCfg)
     cfg.termination = _terms("termination", cfg.termination, TerminationTermCfg)
     cfg.reward = _terms("reward", cfg.reward, RewardTermCfg)
     cfg.observation = _terms("observation", cfg.observation, ObservationGroupCfg)
     for name, group in cfg.observation.items():
         group.terms = _terms(f"observation.{name}.terms", group.terms, ObservationTermCfg)
+    if isinstance(cfg.job, StudyJobCfg):
+        cfg.job.variants = {
+            name: _typed(f"job.variants.{name}", asdict(cfg.solver) | node if isinstance(node, dict) else node, SolverCfg)
+            for name, node in cfg.job.variants.items()
+        }
 
 
 def _terms(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
@@ -43,7 +52,7 @@ def _terms(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
 def _typed(key: str, node: Any, kind: type) -> Any:
     names = [field.name for field in fields(kind)]
     if not isinstance(node, dict):
-        raise ConfigError(key, node, f"a term: {', '.join(names)}")
+        raise ConfigError(key, node, f"a mapping with some of {', '.join(names)}")
     for name in node:
         if name not in names:
             raise UnknownName(f"{key}: key", str(name), names)
@@ -51,7 +60,8 @@ def _typed(key: str, node: Any, kind: type) -> Any:
         try:
             OmegaConf.merge(OmegaConf.structured(kind), {name: value})
         except OmegaConfBaseException as error:
-            wanted = next(field.type for field in fields(kind) if field.name == name)
+            hint = get_type_hints(kind)[name]
+            wanted = " or ".join(hint.__members__) if isinstance(hint, EnumMeta) else fields(kind)[names.index(name)].type
             raise ConfigError(f"{key}.{name}", value, str(wanted)) from error
     merged = OmegaConf.merge(OmegaConf.structured(kind), node)
     missing = sorted(OmegaConf.missing_keys(merged))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import re
 
-from mjstack.config.schema import Config, ScalingJobCfg
+from mjstack.config.schema import Config, ScalingJobCfg, SolverCfg, StudyJobCfg
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput")
-JOBS = ("gates", "replay", "scaling")
+JOBS = ("gates", "replay", "scaling", "study")
+CONDIMS = (1, 3, 4, 6)
 SCALING_BACKENDS = ("mjwarp", "native")
 SECTIONS = ("physics", "episode", "env_step")
 ANCHORS = ("red", "blue", "on_blue")
@@ -45,6 +46,8 @@ def validate(cfg: Config) -> None:
     _gates(cfg)
     if isinstance(cfg.job, ScalingJobCfg):
         _scaling(cfg.job)
+    if isinstance(cfg.job, StudyJobCfg):
+        _study(cfg.job)
 
 
 def _timing(cfg: Config) -> None:
@@ -67,14 +70,30 @@ def _solver_and_batch(cfg: Config) -> None:
         value = getattr(cfg.batch, name)
         if value is not None:
             _positive_int(f"batch.{name}", value)
+    _solver("solver", cfg.solver)
+
+
+def _solver(key: str, solver: SolverCfg) -> None:
     for name in ("iterations", "ls_iterations"):
-        value = getattr(cfg.solver, name)
+        value = getattr(solver, name)
         if value is not None:
-            _positive_int(f"solver.{name}", value)
+            _positive_int(f"{key}.{name}", value)
     for name in ("impratio", "tolerance"):
-        value = getattr(cfg.solver, name)
+        value = getattr(solver, name)
         if value is not None:
-            _positive(f"solver.{name}", value)
+            _positive(f"{key}.{name}", value)
+    if solver.gripper_condim is not None and solver.gripper_condim not in CONDIMS:
+        raise ConfigError(f"{key}.gripper_condim", solver.gripper_condim, "1, 3, 4, 6, or null for the model's own")
+
+
+def _study(job: StudyJobCfg) -> None:
+    _positive_int("job.repetitions", job.repetitions)
+    _positive_int("job.frames", job.frames)
+    _positive("job.max_seconds", job.max_seconds, "s")
+    if not job.variants:
+        raise ConfigError("job.variants", "{}", "at least one variant of the solver")
+    for name, variant in job.variants.items():
+        _solver(f"job.variants.{name}", variant)
 
 
 def _robot(cfg: Config) -> None:
@@ -176,7 +195,12 @@ def _gates(cfg: Config) -> None:
         for field in PARITY_FIELDS:
             if not (field in limits and math.isfinite(limits[field]) and limits[field] >= 0.0):
                 raise ConfigError(f"gate.parity.{name}.{field}", limits.get(field), "a number that is not negative")
-    _positive_int("gate.capacity.cpu_nworld", gate.capacity.cpu_nworld)
+    for name in ("cpu_nworld", "probe_nworld", "probe_frames"):
+        _positive_int(f"gate.capacity.{name}", getattr(gate.capacity, name))
+    if gate.capacity.random_frames is not None:
+        _positive_int("gate.capacity.random_frames", gate.capacity.random_frames)
+    if not (math.isfinite(gate.capacity.margin) and gate.capacity.margin >= 1.0):
+        raise ConfigError("gate.capacity.margin", gate.capacity.margin, "a number of at least 1, such as 1.25")
     for name in ("repetitions", "frames", "env_frames", "start_worlds"):
         _positive_int(f"gate.throughput.{name}", getattr(gate.throughput, name))
     for name in ("max_seconds", "cpu_max_seconds"):

@@ -11,11 +11,12 @@ import torch
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.envs.env import Env
+from mjstack.envs.probe import probe_env_sizes
 from mjstack.errors import ArgumentError
 from mjstack.managers.reset import required_fields
 from mjstack.scene import SceneIndex, build_model
-from mjstack.sim import make_simulation
-from mjstack.sim.sizes import BatchSizes, resolve_env_sizes
+from mjstack.sim import BatchSizes, make_simulation, resolve_backend, resolve_device
+from mjstack.sim.sizes import resolve_env_sizes
 
 
 def make_env(
@@ -59,18 +60,18 @@ def build_env(
         model: The scene, if it has been compiled before.
         backend: Overrides the configured backend.
         device: Overrides the configured device.
-        sizes: Overrides MJWarp's buffer sizes, which by default have room for random actions.
+        sizes: Overrides MJWarp's buffer sizes, which by default have room for random actions. With ``batch=auto`` they are
+            measured first, in worlds that are gone again before these are made.
     """
     model = build_model(cfg) if model is None else model
-    sim = make_simulation(
-        model,
-        cfg,
-        cfg.nworld if nworld is None else nworld,
-        backend=backend,
-        device=device,
-        fields=required_fields(cfg.reset),
-        sizes=resolve_env_sizes(cfg) if sizes is None else sizes,
-    )
+    nworld = cfg.nworld if nworld is None else nworld
+    if backend is None:
+        backend, device = resolve_backend(cfg)
+    elif device is None:
+        device = resolve_device(cfg.sim.device)
+    if sizes is None:
+        sizes = probe_env_sizes(cfg, model, nworld, backend, device) if cfg.batch.auto else resolve_env_sizes(cfg)
+    sim = make_simulation(model, cfg, nworld, backend=backend, device=device, fields=required_fields(cfg.reset), sizes=sizes)
     return Env(sim, SceneIndex(model, cfg.robot), cfg)
 
 

@@ -78,8 +78,11 @@ def run_batch(context: GateContext) -> list[GateResult]:
     tally = _Tally(t.seeds > 1)
     problems: list[str] = []
     details: list[str] = []
-    metrics: dict[str, Value] = {}
     sim = context.batch_simulation(cfg.nworld)
+    sizes = getattr(sim, "sizes", None)
+    metrics: dict[str, Value] = {
+        "sizes": f"{sizes.as_overrides()} ({sizes.source})" if sizes else "native MuJoCo has no fixed buffers"
+    }
     try:
         for seed in range(cfg.seed, cfg.seed + t.seeds):
             try:

@@ -14,10 +14,12 @@ import numpy as np
 from mjstack.config.schema import Backend, Config
 from mjstack.control.scripted import ScriptedPlanner
 from mjstack.gates.episode import NOMINAL, Advance, Episode, FrameHook, Reset, State, run_episode
+from mjstack.gates.sizing import size_batch
 from mjstack.managers.reset import required_fields
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import SceneIndex, build_model
-from mjstack.sim import Simulation, make_simulation, resolve_backend, resolve_device
+from mjstack.sim import BatchSizes, Simulation, make_simulation, resolve_backend, resolve_device, resolve_sizes
+from mjstack.sim.sizes import apply_configured
 from mjstack.tasks.stack import Rule, Verdict, describe_rules
 
 Say = Callable[[str], None]
@@ -69,6 +71,8 @@ class GateContext:
         advance: Told about progress.
         on_frame: Called after each frame of the one-world episode that is shown (viewer).
         results: Results so far, by gate.
+        measured: Sizes that the scripted task needs, with a margin, once they have been measured.
+        measured_env: Sizes that environments need likewise.
         shown: The one-world episode that pictures show, and ``shown_by``, what it is.
     """
 
@@ -78,6 +82,8 @@ class GateContext:
     advance: Advance | None = None
     on_frame: FrameHook | None = None
     results: dict[str, GateResult] = field(default_factory=dict)
+    measured: BatchSizes | None = None
+    measured_env: BatchSizes | None = None
     carry_start: State | None = None
     timed_episode: TimedEpisode | None = None
     shown: Episode | None = None
@@ -134,7 +140,23 @@ class GateContext:
     def simulation(self, nworld: int, backend: Backend, device: str) -> Simulation:
         """Worlds that can start as the configuration says."""
         fields = required_fields(self.cfg.reset)
-        return make_simulation(self.model, self.cfg, nworld, backend=backend, device=device, fields=fields)
+        sizes = self.sizes if backend is Backend.mjwarp else None
+        return make_simulation(self.model, self.cfg, nworld, backend=backend, device=device, fields=fields, sizes=sizes)
+
+    @property
+    def sizes(self) -> BatchSizes:
+        """Buffer sizes of the batch; with ``batch=auto`` they are measured first, unless *capacity* has done so."""
+        if not self.cfg.batch.auto or self.backend[0] is Backend.native:  # native MuJoCo has no fixed buffers
+            return resolve_sizes(self.cfg)
+        if self.measured is None:
+            self.measured = size_batch(self)
+            self.say(f"{apply_configured(self.cfg, self.measured).as_overrides()} ({self.measured.source})")
+        return apply_configured(self.cfg, self.measured)
+
+    @property
+    def env_sizes(self) -> BatchSizes | None:
+        """Buffer sizes of environments with ``batch=auto``, if *capacity* has measured them; None leaves it to `build_env`."""
+        return apply_configured(self.cfg, self.measured_env) if self.cfg.batch.auto and self.measured_env else None
 
     def parity_simulation(self) -> Simulation:
         """One MJWarp world."""

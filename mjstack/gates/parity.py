@@ -110,7 +110,7 @@ def compare_options(cfg: Config, native: Simulation, mjwarp: Simulation) -> dict
     requested: dict[str, float | int | str | None] = {
         "timestep": cfg.timing.physics_dt,
         "integrator": "mjINT_IMPLICITFAST",
-        "cone": "mjCONE_ELLIPTIC",
+        "cone": f"mjCONE_{solver.cone.value.upper()}",
         "box_box": "primitive",
         "iterations": solver.iterations,
         "ls_iterations": solver.ls_iterations,

@@ -112,6 +112,7 @@ def _on_scripted_worlds(
     sizes: BatchSizes | None = getattr(sim, "sizes", None)
     if sizes is not None:
         facts |= {"nconmax": sizes.nconmax, "naconmax": sizes.contact_pool(cfg.nworld), "njmax": sizes.njmax}
+        facts["sizes_from"] = sizes.source
     sections: list[Section] = []
     frame_seconds: float | None = None
     if "physics" in wanted:
@@ -130,7 +131,7 @@ def _on_environment(
     cfg = context.cfg
     gc.collect()
     began = time.perf_counter()
-    env = build_env(cfg, model=context.model, backend=backend, device=device)
+    env = build_env(cfg, model=context.model, backend=backend, device=device, sizes=context.env_sizes)
     facts.setdefault("backend", env.sim.description)
     build_seconds = time.perf_counter() - began
     try:

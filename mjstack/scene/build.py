@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import mujoco
 
-from mjstack.config.schema import Config, SceneCfg, SolverCfg, TimingCfg
+from mjstack.config.schema import Cone, Config, SceneCfg, SolverCfg, TimingCfg
 from mjstack.robots import robot_spec
 
 RED, BLUE = "red_cube", "blue_cube"
+_CONES = {Cone.elliptic: mujoco.mjtCone.mjCONE_ELLIPTIC, Cone.pyramidal: mujoco.mjtCone.mjCONE_PYRAMIDAL}
 _NETFORCE = 3  # the contact sensor's reduction to one force and torque, in the world frame
 
 
@@ -40,7 +41,7 @@ def build_scene(
         scene: Table and cubes.
         timing: Physics timestep.
         solver: Solver settings; ``None`` keeps the robot file's own.
-        jaw_bodies: Bodies whose contact force on each cube a sensor measures.
+        jaw_bodies: Bodies of the gripper, whose contact force on each cube a sensor measures.
         visuals: Keep geoms that only pictures need.
 
     Returns:
@@ -49,7 +50,7 @@ def build_scene(
     option = spec.option
     option.timestep = timing.physics_dt
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.cone = _CONES[solver.cone]
     if solver.iterations is not None:
         option.iterations = solver.iterations
     if solver.ls_iterations is not None:
@@ -58,6 +59,10 @@ def build_scene(
         option.impratio = solver.impratio
     if solver.tolerance is not None:
         option.tolerance = solver.tolerance
+    if solver.gripper_condim is not None:
+        for jaw in jaw_bodies:
+            for geom in spec.body(jaw).geoms:
+                geom.condim = solver.gripper_condim
     world = spec.worldbody
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], rgba=[0.32, 0.36, 0.42, 1], condim=3)
     world.add_geom(

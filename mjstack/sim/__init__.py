@@ -9,7 +9,7 @@ from mjstack.sim.build import (
     resolve_backend,
     resolve_device,
 )
-from mjstack.sim.simulation import LOST_PHYSICS, Overflow, Simulation, describe_overflow
+from mjstack.sim.simulation import LOST_PHYSICS, Overflow, Simulation, SolverLimit, describe_overflow
 from mjstack.sim.sizes import BatchSizes, resolve_sizes
 from mjstack.sim.views import Fields
 
@@ -19,6 +19,7 @@ __all__ = [
     "Fields",
     "Overflow",
     "Simulation",
+    "SolverLimit",
     "cuda_driver",
     "cuda_name",
     "cuda_uuid",

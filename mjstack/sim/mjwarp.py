@@ -19,6 +19,7 @@ from mjstack.sim.counters import clear_counters, record_convex_contacts, record_
 from mjstack.sim.engine import mjw
 from mjstack.sim.fields import PLACING_FIELDS, check_fields
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
+from mjstack.sim.memory import array_bytes, borrowed_bytes
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.sim.sizes import BatchSizes
 from mjstack.sim.static_geoms import place_static_geoms
@@ -39,7 +40,7 @@ class MjwarpSimulation(FixedViews):
             the last full reset, shape ``(3,)``, int32. The third bounds what nccdmax must hold.
         version: Grows whenever something changes that a graph has baked in.
         arrangement: How a captured step is arranged.
-        solver_limits: MJWarp's bits for worlds whose solver stopped at an iteration limit, shape ``(nworld,)``, int32.
+        solver_limits: Bits of `SolverLimit` for worlds whose solver stopped at a limit, shape ``(nworld,)``, int32.
     """
 
     backend = "mjwarp"
@@ -87,7 +88,7 @@ class MjwarpSimulation(FixedViews):
                 raise UnsupportedModel((str(error) or repr(error)).splitlines()[0].rstrip(".")) from error
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
-            self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
+            self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
             self._can_rearrange = can_rearrange(model, self._m)
             self._contacts = wp.zeros(nworld, dtype=int)
             self._peak_nefc = wp.zeros(nworld, dtype=int)
@@ -118,6 +119,9 @@ class MjwarpSimulation(FixedViews):
         self.solver_limits = wp.to_torch(self._limits)
         self.step_count = wp.to_torch(self._steps)
         self._torch_mask = wp.to_torch(self._mask)
+        # What masked resets would erase. It is taken in there, just before, and not in every substep: nothing else lowers a
+        # counter, so the two together never miss one, and it costs a captured step three small operations.
+        self._most_contacts, self._most_constraints, self._overflow_ever = (torch.zeros_like(self.overflow) for _ in range(3))
         self._warm_up()
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
@@ -150,6 +154,7 @@ class MjwarpSimulation(FixedViews):
         else:
             check_mask(mask, self.nworld, self.device)
             self._torch_mask.copy_(mask)
+        self._keep_peaks(clear=mask is None)
         with torch_stream_scope(self._device):
             mjw.reset_data(self._m, self._d, reset=self._mask)
             wp.launch(
@@ -158,6 +163,29 @@ class MjwarpSimulation(FixedViews):
                 inputs=[self._mask],
                 outputs=[self._peak_contacts, self._peak_nefc, self._contacts, self._lost, self._limits, self._steps],
             )
+
+    @property
+    def most_contacts(self) -> torch.Tensor:
+        """Largest contact_count since the last full reset."""
+        return torch.maximum(self._most_contacts, self.peak_contacts)
+
+    @property
+    def most_constraints(self) -> torch.Tensor:
+        """Largest constraint_count since the last full reset."""
+        return torch.maximum(self._most_constraints, self.peak_constraints)
+
+    @property
+    def overflow_ever(self) -> torch.Tensor:
+        """Overflow bits since the last full reset."""
+        return self._overflow_ever | self.overflow
+
+    def memory_bytes(self) -> int:
+        """Bytes of MJWarp's data: all that grows with nworld, but for per-world fields and what a step borrows."""
+        return array_bytes(self._d)
+
+    def borrowed_bytes(self) -> int | None:
+        """The most that a step borrows at once beside it, or None if Warp does not tell. Convex pairs are most of it."""
+        return borrowed_bytes(self.forward, self._device.alias)
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as uploaded."""
@@ -199,7 +227,7 @@ class MjwarpSimulation(FixedViews):
             sizes: The new sizes.
         """
         with wp.ScopedDevice(self._device):
-            fresh = mjw.make_data(self.model, nworld=self.nworld, **sizes.as_kwargs())
+            fresh = mjw.make_data(self.model, nworld=self.nworld, **sizes.as_kwargs(self.nworld))
             _keep_arrays(fresh, self._d)
             for count in (fresh.nacon, fresh.nefc, fresh.ncollision):
                 count.zero_()
@@ -243,6 +271,16 @@ class MjwarpSimulation(FixedViews):
     def close(self) -> None:
         """Drops the graphs; buffers go with the object."""
         self._graphs.clear()
+
+    def _keep_peaks(self, *, clear: bool) -> None:
+        """Takes in the counters that a reset is about to erase, or forgets all of them."""
+        if clear:
+            for buffer in (self._most_contacts, self._most_constraints, self._overflow_ever):
+                buffer.zero_()
+            return
+        torch.maximum(self._most_contacts, self.peak_contacts, out=self._most_contacts)
+        torch.maximum(self._most_constraints, self.peak_constraints, out=self._most_constraints)
+        self._overflow_ever |= self.overflow
 
     def _substeps(self, n: int, kinematics: bool) -> None:
         self._place()

@@ -104,6 +104,8 @@ class NativeSimulation(FixedViews):
         self.contact_count, self.constraint_count, self.peak_contacts, self.peak_constraints, self.overflow = torch.from_numpy(
             self._counts
         ).unbind(1)
+        # What masked resets would erase, in the columns of the last three.
+        self._most = np.zeros((nworld, 3), dtype=np.int32)
         self._steps = np.zeros(nworld, dtype=np.int64)
         self.step_count = torch.from_numpy(self._steps)
         self._fields = {
@@ -141,8 +143,24 @@ class NativeSimulation(FixedViews):
         if "qpos0" in self._fields:
             self._qpos[rows] = self._fields["qpos0"][rows]
         self._others["sensordata"][rows] = 0
+        self._most = np.zeros_like(self._most) if mask is None else self._all_peaks()
         self._counts[rows] = 0
         self._steps[rows] = 0
+
+    @property
+    def most_contacts(self) -> torch.Tensor:
+        """Largest contact_count since the last full reset."""
+        return torch.from_numpy(self._all_peaks()[:, 0])
+
+    @property
+    def most_constraints(self) -> torch.Tensor:
+        """Largest constraint_count since the last full reset."""
+        return torch.from_numpy(self._all_peaks()[:, 1])
+
+    @property
+    def overflow_ever(self) -> torch.Tensor:
+        """Overflow bits since the last full reset."""
+        return torch.from_numpy(self._all_peaks()[:, 2])
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options of the model."""
@@ -198,6 +216,11 @@ class NativeSimulation(FixedViews):
         if self._simple is not None:
             fields.append((self._simple.dof_M0, model.dof_M0))
         return _Worker(model, data, fields, pairs(data, self._poses), pairs(data, self._others))
+
+    def _all_peaks(self) -> np.ndarray:
+        """Peak contacts, peak rows and overflow bits since the last full reset, shape ``(nworld, 3)``."""
+        peaks, bits = np.maximum(self._most[:, :2], self._counts[:, 2:4]), self._most[:, 2] | self._counts[:, 4]
+        return np.column_stack((peaks, bits))
 
     def _rows(self, mask: torch.Tensor | None) -> np.ndarray:
         """The mask as numpy sees it; every world for None."""

@@ -29,6 +29,13 @@ class Overflow(IntFlag):
     TACTILE = 1 << 11
 
 
+class SolverLimit(IntFlag):
+    """Where a world's solver stopped short of its tolerance. The values are those of MJWarp's ``OverflowType`` again."""
+
+    ITERATIONS = 1 << 9
+    LS_ITERATIONS = 1 << 10
+
+
 def describe_overflow(bits: int) -> str:
     """The names of the bits, such as ``NEFC, CCD``."""
     return ", ".join(flag.name or "" for flag in Overflow if bits & flag)
@@ -81,6 +88,10 @@ class Simulation(Protocol):
             alone raises none on MJWarp.
         peak_contacts: Largest contact_count over all substeps since the world's last reset, shape ``(nworld,)``, int32.
         peak_constraints: Largest constraint_count likewise, shape ``(nworld,)``, int32.
+        most_contacts: Largest contact_count since the last full reset (one without a mask), shape ``(nworld,)``, int32. Masked
+            resets leave it alone, so it is the peak of a run in which worlds end and start anew. Computed when it is read.
+        most_constraints: Largest constraint_count likewise, shape ``(nworld,)``, int32.
+        overflow_ever: Bits of `Overflow` raised since the last full reset likewise, shape ``(nworld,)``, int32.
         version: Grows when something changes that a captured graph has baked in.
     """
 
@@ -107,6 +118,18 @@ class Simulation(Protocol):
     peak_contacts: torch.Tensor
     peak_constraints: torch.Tensor
     version: int
+
+    @property
+    def most_contacts(self) -> torch.Tensor:
+        """See above."""
+
+    @property
+    def most_constraints(self) -> torch.Tensor:
+        """See above."""
+
+    @property
+    def overflow_ever(self) -> torch.Tensor:
+        """See above."""
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
         """Advances every world by n physics steps under the current ctrl.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from mjstack.config.schema import Config
+
+KEYS = ("nconmax", "njmax", "naconmax", "nccdmax", "naccdmax")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -17,6 +19,7 @@ class BatchSizes:
         njmax: Constraint rows per world, a hard limit.
         nccdmax: Convex collisions per world, pooled, or None for MJWarp's default.
         naccdmax: Convex collisions of all worlds together, or None.
+        source: Where they come from, for reports.
     """
 
     nconmax: int
@@ -24,34 +27,61 @@ class BatchSizes:
     naconmax: int | None = None
     nccdmax: int | None = None
     naccdmax: int | None = None
+    source: str = field(default="the configuration", compare=False)
 
-    def as_kwargs(self) -> dict[str, int]:
-        """Arguments for ``mujoco_warp.make_data``."""
-        names = ("nconmax", "njmax", "naconmax", "nccdmax", "naccdmax")
-        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+    def as_kwargs(self, nworld: int) -> dict[str, int]:
+        """Arguments for ``mujoco_warp.make_data``.
+
+        Convex pairs are some of the pairs in the contact pool. MJWarp refuses more room for them than that pool has, so what
+        could never be used is cut off.
+
+        Args:
+            nworld: Number of worlds.
+        """
+        kwargs = {name: value for name in KEYS if (value := getattr(self, name)) is not None}
+        if "nccdmax" in kwargs:
+            kwargs["nccdmax"] = min(kwargs["nccdmax"], self.nconmax, self.contact_pool(nworld) // nworld)
+        if "naccdmax" in kwargs:
+            kwargs["naccdmax"] = min(kwargs["naccdmax"], self.contact_pool(nworld))
+        return kwargs
 
     def contact_pool(self, nworld: int) -> int:
         """Contacts that fit into the pool of nworld worlds."""
         return self.naconmax if self.naconmax is not None else self.nconmax * nworld
 
+    def convex_pool(self, nworld: int) -> int:
+        """Convex pairs of one kind that fit into the pool of nworld worlds."""
+        kwargs = self.as_kwargs(nworld)
+        return kwargs.get("naccdmax", kwargs["nccdmax"] * nworld if "nccdmax" in kwargs else self.contact_pool(nworld))
+
+    def as_overrides(self) -> str:
+        """The same on the command line: ``batch.nconmax=40 batch.njmax=184``."""
+        return " ".join(f"batch.{name}={value}" for name in KEYS if (value := getattr(self, name)) is not None)
+
 
 def resolve_sizes(cfg: Config) -> BatchSizes:
     """The configured sizes, with the defaults of this robot and scene where they are null."""
     layout = cfg.robot.layouts[cfg.scene.name]
-    return _sizes(cfg, layout.nconmax, layout.njmax)
+    return apply_configured(cfg, BatchSizes(nconmax=layout.nconmax, njmax=layout.njmax))
 
 
 def resolve_env_sizes(cfg: Config) -> BatchSizes:
     """Likewise with room for random actions, the worst case for contacts."""
     layout = cfg.robot.layouts[cfg.scene.name]
-    return _sizes(cfg, layout.env_nconmax, layout.env_njmax)
+    return apply_configured(cfg, BatchSizes(nconmax=layout.env_nconmax, njmax=layout.env_njmax))
 
 
-def _sizes(cfg: Config, nconmax: int, njmax: int) -> BatchSizes:
+def resolve_measuring_sizes(cfg: Config) -> BatchSizes:
+    """Room to measure in: the robot's sizes for random actions, or the configured ones where those are larger."""
+    layout = cfg.robot.layouts[cfg.scene.name]
     return BatchSizes(
-        nconmax=cfg.batch.nconmax if cfg.batch.nconmax is not None else nconmax,
-        njmax=cfg.batch.njmax if cfg.batch.njmax is not None else njmax,
-        naconmax=cfg.batch.naconmax,
-        nccdmax=cfg.batch.nccdmax,
-        naccdmax=cfg.batch.naccdmax,
+        nconmax=max(layout.env_nconmax, cfg.batch.nconmax or 0),
+        njmax=max(layout.env_njmax, cfg.batch.njmax or 0),
+        source="room to measure in",
     )
+
+
+def apply_configured(cfg: Config, sizes: BatchSizes) -> BatchSizes:
+    """The sizes, with what the configuration sets in their place."""
+    given = {name: value for name in KEYS if (value := getattr(cfg.batch, name)) is not None}
+    return replace(sizes, **given)

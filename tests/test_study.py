@@ -1,0 +1,222 @@
+"""The solver study: what it measures, that a broken variant stops no other, and that its settings reach the physics."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from mjstack.cli import run
+from mjstack.config import load_config
+from mjstack.config.schema import Backend, Config, StudyJobCfg
+from mjstack.errors import MjstackError
+from mjstack.gates.gate import GateContext
+from mjstack.gates.parity import compare_options
+from mjstack.jobs import check_job, study
+from mjstack.jobs.study import run_study_job
+from mjstack.report.record import Status
+from mjstack.scene import build_model
+from mjstack.sim import LOST_PHYSICS, Simulation, SolverLimit, make_simulation
+
+QUICK = ("job=study", "sim=native", "nworld=2", "job.repetitions=2", "job.frames=1")
+
+
+def configure(*overrides: str, keep: tuple[str, ...]) -> Config:
+    """A study of some of its variants."""
+    cfg = load_config([*QUICK, *overrides])
+    assert isinstance(cfg.job, StudyJobCfg)
+    cfg.job.variants = {name: cfg.job.variants[name] for name in keep}
+    return cfg
+
+
+def table(folder: Path) -> dict[str, dict[str, str]]:
+    with (folder / "study.csv").open() as file:
+        return {row["variant"]: row for row in csv.DictReader(file)}
+
+
+def report(folder: Path) -> dict:
+    return json.loads((folder / "report.json").read_text())
+
+
+def test_native_study(tmp_path: Path) -> None:
+    cfg = configure(keep=("base", "iterations_5", "iterations_100", "condim_3", "cone_pyramidal"))
+    outcome = run_study_job(cfg, tmp_path, [])
+    assert outcome.exit_code == 0
+    rows = table(tmp_path)
+    assert list(rows) == ["base", "iterations_5", "iterations_100", "condim_3", "cone_pyramidal"]
+    assert rows["base"]["accepted"] == rows["condim_3"]["accepted"] == "2"
+    # With five iterations the grip is lost. A study says so, and passes: it measured.
+    assert int(rows["iterations_5"]["accepted"]) < 2
+    assert "not stacked" in rows["iterations_5"]["broken_rules"]
+    assert rows["iterations_5"]["status"] == "pass"
+    assert (rows["iterations_100"]["status"], rows["iterations_100"]["reason"]) == ("skip", "the same as base")
+    assert rows["condim_3"]["changes"] == "gripper_condim=3"
+    # A contact of the gripper has 6 rows as modelled, 3 with condim 3, and 10 with a pyramidal cone.
+    peak = {name: int(row["peak_rows"]) for name, row in rows.items() if row["peak_rows"]}
+    assert peak["condim_3"] < peak["base"] < peak["cone_pyramidal"]
+    for name in ("base", "iterations_5", "condim_3", "cone_pyramidal"):
+        row = rows[name]
+        low, middle, high = (float(row[key]) for key in ("ratio_min", "ratio", "ratio_max"))
+        assert 0.0 < low <= middle <= high
+        assert float(row["ms_min"]) <= float(row["ms_per_batched_step"]) <= float(row["ms_max"])
+        assert row["iteration_limit_worlds"] == row["line_search_limit_worlds"] == ""
+    found = report(tmp_path)
+    assert found["status"] == "pass"
+    assert {gate["name"]: gate["status"] for gate in found["gates"]}["iterations_100"] == "skip"
+    text = (tmp_path / "study.md").read_text()
+    assert "| iterations_5 | iterations=5 |" in text
+    assert "0 of 2" in text
+    assert "does not tell which worlds stopped" in text
+    assert (tmp_path / "study.png").stat().st_size > 10_000
+    assert "![study.png](study.png)" in text
+
+
+def test_a_broken_variant_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make = study._simulation
+
+    def fragile(context: GateContext) -> Simulation:
+        if context.cfg.solver.iterations == 20:
+            raise RuntimeError("out of memory\nat length")
+        if context.cfg.solver.iterations == 10:
+            raise MjstackError("this one cannot be.")
+        return make(context)
+
+    monkeypatch.setattr(study, "_simulation", fragile)
+    cfg = configure(keep=("iterations_20", "iterations_10", "base"))
+    outcome = run_study_job(cfg, tmp_path, [])
+    assert outcome.exit_code == 1
+    rows = table(tmp_path)
+    assert [row["status"] for row in rows.values()] == ["fail", "fail", "pass"]
+    assert rows["iterations_20"]["reason"] == "RuntimeError: out of memory (run.log has the traceback)"
+    assert rows["iterations_10"]["reason"] == "this one cannot be."
+    assert rows["iterations_20"]["ratio"] == ""
+    assert report(tmp_path)["status"] == "fail"
+
+
+def test_without_a_base_there_is_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(_: GateContext) -> Simulation:
+        raise RuntimeError("no room")
+
+    monkeypatch.setattr(study, "_simulation", broken)
+    assert run_study_job(configure(keep=("base",)), tmp_path, []).exit_code == 1
+    (only,) = report(tmp_path)["gates"]
+    assert only["reason"] == "the configured solver cannot be timed: no room"
+
+
+def test_ctrl_c_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    measure = study._measure
+    calls = []
+
+    def interrupted(*args: object) -> None:
+        calls.append(args)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        measure(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(study, "_measure", interrupted)
+    outcome = run_study_job(configure(keep=("base", "condim_3", "condim_4")), tmp_path, [])
+    assert outcome.exit_code == 130
+    assert list(table(tmp_path)) == ["base"]
+    found = report(tmp_path)
+    assert found["status"] == "interrupted"
+    assert [gate["name"] for gate in found["gates"]] == ["base"]
+
+
+def test_mjwarp_tells_who_stopped_at_a_limit(tmp_path: Path) -> None:
+    cfg = configure("sim=mjwarp", "sim.device=cpu", "nworld=1", keep=("base", "ls_iterations_5"))
+    assert run_study_job(cfg, tmp_path, []).status is Status.passed
+    rows = table(tmp_path)
+    assert rows["base"]["iteration_limit_worlds"] == rows["base"]["line_search_limit_worlds"] == "0"
+    assert rows["ls_iterations_5"]["line_search_limit_worlds"] == "1"
+    assert rows["ls_iterations_5"]["iteration_limit_worlds"] == "0"
+
+
+def test_limits_are_no_lost_physics() -> None:
+    assert LOST_PHYSICS & int(SolverLimit.ITERATIONS | SolverLimit.LS_ITERATIONS) == 0
+
+
+def test_no_time_for_worlds_that_diverged(make_sim: Callable[..., Simulation], backend: str) -> None:
+    sim = make_sim(backend, 2)
+    sim.step(10)
+    study._require_sound(sim, 10)
+    with pytest.raises(MjstackError, match="2 of 2 worlds"):
+        study._require_sound(sim, 20)
+    sim.qvel[1, 0] = torch.nan
+    with pytest.raises(MjstackError, match="no time: 1 of 2 worlds"):
+        study._require_sound(sim, 10)
+
+
+# The two settings that came with it
+
+
+def gripper_geoms(model: mujoco.MjModel, cfg: Config) -> np.ndarray:
+    bodies = [model.body(name).id for name in cfg.robot.jaw_bodies]
+    return np.isin(model.geom_bodyid, bodies)
+
+
+@pytest.mark.parametrize("condim", [3, 4, 6])
+def test_gripper_condim_reaches_the_gripper_alone(robot: str, condim: int) -> None:
+    plain_cfg = load_config([f"robot={robot}"])
+    plain = build_model(plain_cfg)
+    model = build_model(load_config([f"robot={robot}", f"solver.gripper_condim={condim}"]))
+    gripper = gripper_geoms(model, plain_cfg)
+    assert gripper.sum() >= 2
+    assert (model.geom_condim[gripper] == condim).all()
+    assert np.array_equal(model.geom_condim[~gripper], plain.geom_condim[~gripper])
+    assert set(plain.geom_condim[gripper]) <= {3, 4, 6}
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_cone_reaches_both_backends(cone: str) -> None:
+    cfg = load_config([f"solver.cone={cone}"])
+    model = build_model(cfg)
+    native, mjwarp = (make_simulation(model, cfg, 1, backend=kind, device="cpu") for kind in (Backend.native, Backend.mjwarp))
+    asked, held, uploaded, equal = compare_options(cfg, native, mjwarp)["cone"]
+    assert asked == held == uploaded == f"mjCONE_{cone.upper()}"
+    assert equal
+
+
+BAD = [
+    (["solver.cone=round"], "elliptic, pyramidal"),
+    (["solver.gripper_condim=2"], "1, 3, 4, 6"),
+    (["job=studies"], "Did you mean 'study'?"),
+    (["job=stud_schema"], "Available: gates"),
+    (["job.repetitions=3"], "job.repetitions"),
+    (["job=study", "job.repetitions=0"], "job.repetitions=0"),
+    (["job=study", "job.max_seconds=0"], "job.max_seconds"),
+    (["job=study", "+job.variants.mine=3"], "job.variants.mine=3: expected a mapping"),
+    (["job=study", "+job.variants.mine={iteration: 3}"], "Did you mean 'iterations'?"),
+    (["job=study", "+job.variants.mine={iterations: 0}"], "job.variants.mine.iterations=0"),
+    (["job=study", "+job.variants.mine={iterations: few}"], "job.variants.mine.iterations=few"),
+    (["job=study", "+job.variants.mine={cone: round}"], "elliptic or pyramidal"),
+    (["job=study", "job.variants.condim_3.gripper_condim=5"], "job.variants.condim_3.gripper_condim=5"),
+    (["job=study", "job.variants=null"], "job.variants"),
+    (["job=study", "video=true"], "video=true"),
+    (["job=study", "task=reach"], "task=reach"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
+def test_bad_input_is_one_line_and_nothing_is_written(
+    overrides: list[str], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run([*overrides, "nworld=2", "sim=native"]) == 2
+    message = capsys.readouterr().err.strip()
+    assert says in message
+    assert "\n" not in message
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_own_variant_takes_the_rest_from_the_configured_solver() -> None:
+    cfg = load_config(["job=study", "solver=asset", "+job.variants.mine={iterations: 7, cone: pyramidal}"])
+    assert isinstance(cfg.job, StudyJobCfg)
+    mine = cfg.job.variants["mine"]
+    assert (mine.iterations, mine.cone.value, mine.impratio) == (7, "pyramidal", None)
+    check_job(cfg)
