@@ -64,7 +64,6 @@ def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
         spread = max(spread, float((a["reward"] - b["reward"]).abs().median()))
     assert eager.read_statistics()["episodes"] == replayed.read_statistics()["episodes"] == 15 * nworld
     if backend == "mjwarp-cuda":
-        assert replayed.graph is not None
         assert replayed.graph.captured
         assert spread < 1e-4
         # Random numbers advance at every replay.

@@ -5,13 +5,13 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from mjstack.config.schema import Config
 from mjstack.envs.outputs import Outputs
-from mjstack.envs.parts import StepParts
+from mjstack.envs.parts import Eager, Repeated, StepParts
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.errors import ArgumentError, FaultError, name_worlds
 from mjstack.managers.action import ActionManager
@@ -22,9 +22,6 @@ from mjstack.managers.reward import RewardManager
 from mjstack.managers.termination import TerminationManager
 from mjstack.scene import SceneIndex
 from mjstack.sim import LOST_PHYSICS, Overflow, Simulation, describe_overflow
-
-if TYPE_CHECKING:
-    from mjstack.sim.graph import StepGraph
 
 FAULT_WINDOW = 200  # steps between two looks at the faults on CUDA; on the CPU looking costs nothing
 
@@ -74,6 +71,7 @@ class Env:
         reset_manager: How episodes start.
         termination_manager: How they end.
         reward_manager: What they are worth.
+        graph: What `step` repeats, captured or not.
     """
 
     def __init__(self, sim: Simulation, index: SceneIndex, cfg: Config, *, check_faults: bool = True) -> None:
@@ -121,7 +119,7 @@ class Env:
         self._forget(self._everyone)
         self.episode.fill_(-1)
         self._bind_outputs()
-        self._frame: Callable[[], None] = self.captured(self.advance, "env.step")
+        self.graph = self.captured(self.advance, "env.step")
 
     @property
     def seed(self) -> int:
@@ -213,7 +211,7 @@ class Env:
         if not self._started:
             raise ArgumentError("env", "step() before reset(), or after close()", "reset() first", "Call env.reset()")
         self.action_manager.take(action)
-        self._frame()
+        self.graph()
         self._steps += 1
         if self._check_faults and self._everyone.is_cuda and self._steps % FAULT_WINDOW == 0:
             self.raise_faults()
@@ -231,7 +229,7 @@ class Env:
         self._move()
         self._judge()
 
-    def captured(self, work: Callable[[], None], name: str) -> Callable[[], None]:
+    def captured(self, work: Callable[[], None], name: str) -> Repeated:
         """Work of this environment as a graph on CUDA; elsewhere as it is.
 
         Args:
@@ -239,8 +237,8 @@ class Env:
             name: What it is called in messages.
         """
         if self.device.type != "cuda":
-            return work
-        from mjstack.sim.graph import StepGraph
+            return Eager(work)
+        from mjstack.sim.graph import StepGraph  # loads Warp, which native runs do not need
 
         return StepGraph(
             work,
@@ -267,11 +265,6 @@ class Env:
             self.captured(managers, "the managers"),
             self.captured(self.advance, "env.step"),
         )
-
-    @property
-    def graph(self) -> StepGraph | None:
-        """The graph that `step` replays; None where there is none."""
-        return None if self.device.type != "cuda" else self._frame  # type: ignore[return-value]
 
     def read_statistics(self) -> dict[str, float]:
         """Means over the episodes that ended since the last call; see `EpisodeStatistics.read`. Waits for the device."""
@@ -305,6 +298,8 @@ class Env:
         """Gives the simulation's threads and buffers back. Nothing can be stepped afterwards."""
         self._started = False
         self._closed = True
+        self.sim.synchronize()
+        self.graph.drop()
         self.sim.close()
 
     def __str__(self) -> str:

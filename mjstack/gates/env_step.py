@@ -195,7 +195,7 @@ def measure_env_step(
             result.episodes += counted["episodes"]
             if progress is not None:
                 progress(turn)
-    result.capture_s = parts.capture_seconds + (0.0 if env.graph is None else env.graph.capture_seconds)
+    result.capture_s = parts.capture_seconds + env.graph.capture_seconds
     if bool(bad.any()):
         result.problem = f"{int(bad.sum())} of {env.nworld} worlds overflowed, diverged or were not stepped"
     return result

@@ -144,7 +144,8 @@ def run_episode(
             advance("frames", frame + 1, tape.frames)
     sim.synchronize()
     seconds = time.perf_counter() - began
-    capture_seconds = getattr(play, "warm_up_seconds", 0.0) + getattr(play, "capture_seconds", 0.0)
+    capture_seconds = play.warm_up_seconds + play.capture_seconds
+    play.drop()  # its memory, which only the collector would find otherwise
     if capture_seconds:  # the first frame was the warm-up
         seconds = (seconds - capture_seconds) * tape.frames / (tape.frames - 1)
     return Episode(evidence.verdict(sim), tape, seconds, trajectory, states, capture_seconds)
