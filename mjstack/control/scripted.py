@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from mjstack.config.schema import Config
+from mjstack.control.planning_pool import PARALLEL_FROM, WORLDS_PER_PROCESS, Plan, plan_in_parallel
 from mjstack.errors import Unreachable
 from mjstack.kinematics.mink_ik import ApertureIk
 from mjstack.scene import table_top
+from mjstack.sim.native import available_cores
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,13 +86,19 @@ class CommandTape:
 class ScriptedPlanner:
     """Plans command tapes for cubes at given places, with mink."""
 
-    def __init__(self, cfg: Config) -> None:
+    def __init__(self, cfg: Config, *, parallel_from: int = PARALLEL_FROM, processes: int | None = None) -> None:
         """Plans the nominal layout, from which every other plan starts.
+
+        Args:
+            cfg: The configuration.
+            parallel_from: Number of distinct worlds from which on other processes help with them.
+            processes: How many plan then, this one among them; by default as many as there are cores and work for.
 
         Raises:
             Unreachable: A nominal target is out of reach.
         """
         self._cfg = cfg
+        self._parallel_from, self._processes = parallel_from, processes
         self.phases = build_phases(cfg)
         self.ik = ApertureIk(
             cfg.robot, cfg.model, tolerance=cfg.controller.ik_tolerance, iterations=cfg.controller.ik_iterations
@@ -99,7 +108,7 @@ class ScriptedPlanner:
         self._seed: np.ndarray | None = None
         self._last: tuple[np.ndarray, CommandTape] | None = None
         nominal = np.array([[*cfg.scene.red_xy, *cfg.scene.blue_xy]])
-        self._seed = self._plan_world(0, nominal[0])[0]
+        self._seed = self.plan_world(0, nominal[0])[0]
 
     def plan(self, cubes_xy: np.ndarray, progress: Callable[[int], None] | None = None) -> CommandTape:
         """Plans one tape per world; worlds whose cubes stand alike share the work.
@@ -109,22 +118,26 @@ class ScriptedPlanner:
             progress: Called with the number of worlds done.
 
         Raises:
-            Unreachable: A target is out of reach; names the world, the phase and the distance.
+            Unreachable: A target is out of reach; names the world (the first one), the phase and the distance.
+            WorkerLost: A process that helps has ended.
         """
         if self._last is not None and np.array_equal(self._last[0], cubes_xy):
             return self._last[1]  # the gates of one run play the same batch
         nworld = cubes_xy.shape[0]
         knots = np.full((nworld, len(self.phases) * len(self._nodes), len(self._cfg.robot.home)), np.nan)
         error = np.full(nworld, np.nan)
-        done: dict[bytes, int] = {}
-        for world in range(nworld):
-            twin = done.setdefault(cubes_xy[world].tobytes(), world)
-            if twin == world:
-                knots[world], error[world] = self._plan_world(world, cubes_xy[world])
-            else:
-                knots[world], error[world] = knots[twin], error[twin]
-            if progress is not None:
-                progress(world + 1)
+        first: dict[bytes, int] = {}
+        twin = np.array([first.setdefault(xy.tobytes(), world) for world, xy in enumerate(cubes_xy)], dtype=np.intp)
+        alike = np.bincount(twin, minlength=nworld)
+        done = 0
+        with closing(self._plans(list(first.values()), cubes_xy)) as plans:
+            for world, *plan in plans:
+                knots[world], error[world] = plan
+                done += int(alike[world])
+                if progress is not None:
+                    progress(done)
+        if len(first) < nworld:
+            knots, error = knots[twin], error[twin]
         tape = CommandTape(knots, self._weights, self._segments, error)
         if nworld > 1:
             self._last = (cubes_xy.copy(), tape)
@@ -141,7 +154,19 @@ class ScriptedPlanner:
                 worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start)))))
         return worst
 
-    def _plan_world(self, world: int, xy: np.ndarray) -> tuple[np.ndarray, float]:
+    def plan_world(self, world: int, xy: np.ndarray) -> tuple[np.ndarray, float]:
+        """Plans one world, starting from the nominal plan, so that its neighbours do not matter.
+
+        Args:
+            world: Its number, for the error.
+            xy: Red x, y and blue x, y at the start [m], shape ``(4,)``.
+
+        Returns:
+            Commands at the knots, shape ``(n, nu)``, and the largest distance [m] from a target at any.
+
+        Raises:
+            Unreachable: A target is out of reach.
+        """
         n = len(self._nodes)
         knots = np.empty((len(self.phases) * n, len(self._cfg.robot.home)))
         worst, command = 0.0, self.ik.home
@@ -159,6 +184,16 @@ class ScriptedPlanner:
                     worst = max(worst, distance)
                 knots[k] = command
         return knots, worst
+
+    def _plans(self, worlds: list[int], cubes_xy: np.ndarray) -> Generator[Plan]:
+        """The plans of some worlds, one after the other here, or shared out where there are many; then in any order."""
+        if len(worlds) >= self._parallel_from:
+            processes = self._processes or min(available_cores(), len(worlds) // WORLDS_PER_PROCESS)
+            if processes > 1:
+                yield from plan_in_parallel(self._cfg, self.plan_world, worlds, cubes_xy, processes)
+                return
+        for world in worlds:
+            yield world, *self.plan_world(world, cubes_xy[world])
 
     def _targets(self, xy: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
         """Start and end of the aperture centre and of the gripper command, per phase."""
