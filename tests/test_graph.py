@@ -61,7 +61,8 @@ def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
             # The new episodes' starts come from random numbers alone.
             assert torch.equal(eager.sim.qpos, replayed.sim.qpos)
             starts.append(replayed.sim.qpos.clone())
-        spread = max(spread, float((a["reward"] - b["reward"]).abs().median()))
+        if t % frames < 5:  # later, contacts have drawn two runs of the same apart
+            spread = max(spread, float((a["reward"] - b["reward"]).abs().quantile(0.95)))
     assert eager.read_statistics()["episodes"] == replayed.read_statistics()["episodes"] == 15 * nworld
     if backend == "mjwarp-cuda":
         assert replayed.graph.captured
@@ -231,3 +232,45 @@ def test_an_episode_of_the_gate_is_captured_and_accepted() -> None:
 def _add_one(values: wp.array[float]):
     i = wp.tid()
     values[i] = values[i] + 1.0
+
+
+def test_what_failed_is_captured_anew_after_a_change() -> None:
+    version = 0
+    calls = 0
+
+    def work() -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise RuntimeError("this cannot be captured")
+
+    graph = StepGraph(work, "cpu", GraphMode.auto, name="failing once", version=lambda: version)
+    for _ in range(4):
+        graph()
+    assert not graph.captured
+    version = 1
+    for _ in range(3):
+        graph()
+    assert graph.captured
+
+
+def test_what_a_step_returns_is_the_callers_own() -> None:
+    """One block of memory; but to autograd each tensor is one of its own."""
+    env = mjstack.make_env(["task=reach", "sim=native"], nworld=2)
+    env.reset(seed=0)
+    zero = torch.zeros((2, env.action_manager.action_dim))
+    obs, reward, terminated, truncated, extras = env.step(zero)
+    weight = torch.ones(obs["policy"].shape[1], requires_grad=True)
+    loss = (obs["policy"] * weight).sum()
+    reward.add_(1.0)
+    terminated.fill_(True)
+    loss.backward()
+    assert torch.equal(weight.grad, obs["policy"].sum(0))
+    kept = {name: value.clone() for name, value in obs.items()}
+    again = env.step(zero + 1.0)
+    assert all(torch.equal(kept[name], obs[name]) for name in obs)
+    assert not torch.equal(again[0]["policy"], obs["policy"])
+    assert terminated.all()
+    assert not truncated.any()
+    assert not again[2].any()
+    assert extras["success"].dtype is torch.bool

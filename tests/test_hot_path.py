@@ -31,7 +31,7 @@ PATHS: dict[str, list[str] | None] = {
     ],
     "envs/statistics.py": ["EpisodeStatistics.update"],
     "envs/outputs.py": ["Outputs.copy", "Outputs._views"],
-    "managers/action.py": ["ActionManager.accept", "ActionManager.write_commands", "ActionManager.reset"],
+    "managers/action.py": [f"ActionManager.{n}" for n in ("take", "accept", "write_commands", "reset")],
     "managers/observation.py": [
         *(f"_Group.{n}" for n in ("compute", "append", "restart")),
         "ObservationManager.compute",
@@ -65,9 +65,11 @@ PATHS: dict[str, list[str] | None] = {
     "kinematics/batched_ik.py": ["BatchedIk.solve", "BatchedIk.aperture"],
     "scene/index.py": ["Columns.read", "Columns.write", "Columns.write_masked"],
     "sim/mjwarp.py": [
-        f"MjwarpSimulation.{n}" for n in ("step", "reset", "kinematics", "_substeps", "_count", "_pose", "_place", "_graph")
+        f"MjwarpSimulation.{n}"
+        for n in ("step", "reset", "kinematics", "_substeps", "_keep_peaks", "_count", "_pose", "_place")
     ],
     "sim/substep.py": ["rearranged_step"],
+    "sim/graph.py": ["side_by_side"],
     "sim/draws.py": ["draw_uniform"],
     "math.py": None,
 }
@@ -81,33 +83,52 @@ def functions(tree: ast.Module) -> dict[str, ast.FunctionDef]:
     return found
 
 
-def host_accesses(function: ast.FunctionDef) -> list[str]:
-    """Lines that read from the device or copy to it; what only the CPU gets to is left out."""
+def cpu_only(function: ast.FunctionDef) -> set[ast.AST]:
+    """What only the CPU gets to: after `not x.is_cuda and`, after `x.is_cuda or`, and in `if not x.is_cuda:`."""
     skipped: set[ast.AST] = set()
+
+    def asks(node: ast.expr) -> bool:
+        return isinstance(node, ast.Name | ast.Attribute) and ast.unparse(node).endswith(("is_cuda", "on_cuda"))
+
+    def denies(node: ast.expr) -> bool:
+        return isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not) and asks(node.operand)
+
     for node in ast.walk(function):
-        guard = None
-        if isinstance(node, ast.If):
-            guard, rest = ast.unparse(node.test), [*node.body]
-        elif isinstance(node, ast.BoolOp):
-            guard, rest = ast.unparse(node.values[0]), [*node.values[1:]]
-        elif isinstance(node, ast.IfExp):
-            guard, rest = ast.unparse(node.test), [node.body]
-        # `not x.is_cuda and bool(x.any())`, `on_cuda or bool(x.any())`: the second half is the CPU's.
-        if guard and ("is_cuda" in guard or "on_cuda" in guard):
-            skipped |= {inner for part in rest for inner in ast.walk(part)}
-        # A frame given as a number is the host's own.
-        if guard and guard.startswith("isinstance("):
-            skipped |= {inner for part in rest for inner in ast.walk(part)}
+        parts: list[ast.AST] = []
+        if isinstance(node, ast.BoolOp):
+            first = node.values[0]
+            guarded = denies(first) if isinstance(node.op, ast.And) else asks(first)
+            parts = [*node.values[1:]] if guarded else []
+        elif isinstance(node, ast.If):
+            test = node.test.values if isinstance(node.test, ast.BoolOp) and isinstance(node.test.op, ast.And) else [node.test]
+            # A frame that is given as a number is the host's own.
+            ours = any(denies(part) or ast.unparse(part).startswith("isinstance(") for part in test)
+            parts = [*node.body] if ours else []
+        skipped |= {inner for part in parts for inner in ast.walk(part)}
+    return skipped
+
+
+def host_accesses(function: ast.FunctionDef) -> list[str]:
+    """Lines that read from the device, copy to it, or have a shape that depends on data."""
+    skipped = cpu_only(function)
     out = []
     for node in ast.walk(function):
-        if not isinstance(node, ast.Call) or node in skipped:
+        if node in skipped:
             continue
-        called = node.func
-        if isinstance(called, ast.Attribute):
-            base = ast.unparse(called.value)
-            if called.attr in READS or (base == "torch" and called.attr in COPIES):
-                out.append(f"{node.lineno}: {ast.unparse(node)}")
-        elif isinstance(called, ast.Name) and called.id in CASTS and not isinstance(node.args[0], ast.Constant):
+        bad = False
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            base = ast.unparse(node.func.value)
+            bad = node.func.attr in READS or (base == "torch" and node.func.attr in COPIES)
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            bad = node.func.id in CASTS and not isinstance(node.args[0], ast.Constant)
+        elif isinstance(node, ast.If | ast.While | ast.IfExp):
+            # A tensor's own truth: `if mask.any():`.
+            test = node.test
+            called = isinstance(test, ast.Call) and isinstance(test.func, ast.Attribute) and test.func.attr in {"any", "all"}
+            bad = called and test not in skipped
+        elif isinstance(node, ast.Subscript):
+            bad = isinstance(node.slice, ast.Name) and node.slice.id in {"mask", "done", "broken"}
+        if bad:
             out.append(f"{node.lineno}: {ast.unparse(node)}")
     return out
 
@@ -134,6 +155,13 @@ def test_a_captured_step_does_not_touch_the_host(path: str) -> None:
         ("if not x.is_cuda and not bool(x.any()):\n        return", False),
         ("x = torch.where(mask, a, b)", False),
         ("if x.is_cuda or bool(x.any()):\n        return", False),
+        ("if not x.is_cuda:\n        y = x.item()", False),
+        ("if x.is_cuda:\n        y = x.item()", True),
+        ("if x.is_cuda and bool(x.any()):\n        return", True),
+        ("if not x.is_cuda or bool(x.any()):\n        return", True),
+        ("if x.any():\n        return", True),
+        ("while flag.all():\n        pass", True),
+        ("y = x[mask]", True),
     ],
 )
 def test_the_check_finds_what_it_should(body: str, caught: bool) -> None:

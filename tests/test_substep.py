@@ -68,6 +68,37 @@ def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
         assert torch.equal(ours.peak_pool, plain.peak_pool)
 
 
+@pytest.mark.gpu
+@CUDA
+@pytest.mark.parametrize("robot", ["so101", "rebot"])
+def test_branches_count_and_sense_what_one_after_the_other_does(robot: str) -> None:
+    """Cubes at rest, red between the jaws: a few substeps from one state, where rounding has no time to grow."""
+    ours, plain = worlds(robot, "cuda:0"), worlds(robot, "cuda:0")
+    plain.arrange(Arrangement(own_stages=False))
+    index = SceneIndex(ours.model, configure(robot=robot).robot)
+    home = torch.tensor(configure(robot=robot).robot.start, device="cuda:0")
+    for sim in (ours, plain):
+        sim.qpos[:, torch.as_tensor(index.robot_qpos, device="cuda:0")] = home
+        sim.ctrl[:, torch.as_tensor(index.ctrl, device="cuda:0")] = home
+        sim.step(50, kinematics=True)
+    between = plain.site_xpos[:, index.aperture_sites].mean(1)
+    red = index.cube_qpos[0]
+    plain.qpos[:, red : red + 3] = between
+    for n in (1, 1, 2, 3, 1, 2):
+        ours.qpos[:], ours.qvel[:] = plain.qpos, plain.qvel
+        for sim in (ours, plain):
+            sim.step(n, kinematics=True)
+        for name in ("contact_count", "constraint_count"):
+            assert torch.equal(getattr(ours, name), getattr(plain, name)), name
+        for name, size in (("qpos", 1e-4), ("qvel", 2e-2), ("site_xpos", 1e-4)):
+            torch.testing.assert_close(getattr(ours, name), getattr(plain, name), rtol=0.0, atol=size)
+        scale = float(plain.sensordata.abs().max()) + 1.0
+        torch.testing.assert_close(ours.sensordata, plain.sensordata, rtol=0.0, atol=0.05 * scale)
+    assert torch.equal(ours.peak_contacts, plain.peak_contacts)
+    assert torch.equal(ours.peak_constraints, plain.peak_constraints)
+    assert torch.equal(ours.overflow, plain.overflow)
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -77,6 +108,11 @@ def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
             and spec.add_sensor(
                 name="a", type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="s"
             )
+        ),
+        lambda spec: spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_BODY, target="box"),
+        lambda spec: (
+            spec.worldbody.add_camera(name="c")
+            and spec.add_sensor(type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_CAMERA, objname="c")
         ),
         lambda spec: spec.add_equality(
             type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="box", name2="world"

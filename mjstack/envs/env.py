@@ -228,6 +228,7 @@ class Env:
         self._command()
         self._move()
         self._judge()
+        running.label = ""
 
     def captured(self, work: Callable[[], None], name: str) -> Repeated:
         """Work of this environment as a graph on CUDA; elsewhere as it is.
@@ -260,11 +261,7 @@ class Env:
             self._command()
             self._judge()
 
-        return StepParts(
-            self.captured(self._move, "the physics"),
-            self.captured(managers, "the managers"),
-            self.captured(self.advance, "env.step"),
-        )
+        return StepParts(self.captured(self._move, "the physics"), self.captured(managers, "the managers"))
 
     def read_statistics(self) -> dict[str, float]:
         """Means over the episodes that ended since the last call; see `EpisodeStatistics.read`. Waits for the device."""

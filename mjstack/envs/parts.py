@@ -57,14 +57,12 @@ class StepParts:
     Attributes:
         physics: The substeps, and the poses after them.
         managers: Everything else of a step: commands, success, terminations, rewards, observations, resets.
-        whole: Both, in the order of a step.
     """
 
     physics: Repeated
     managers: Repeated
-    whole: Repeated
 
     @property
     def capture_seconds(self) -> float:
         """What the captures took so far [s]."""
-        return self.physics.capture_seconds + self.managers.capture_seconds + self.whole.capture_seconds
+        return self.physics.capture_seconds + self.managers.capture_seconds

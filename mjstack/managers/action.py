@@ -99,7 +99,7 @@ class ActionManager:
         self.accept()
 
     def take(self, action: torch.Tensor) -> None:
-        """Checks an action and copies it to where `accept` finds it; this part of a step is never captured."""
+        """Checks an action and copies it to where `accept` finds it."""
         self.check(action)
         action = action.detach()  # physics has no gradient, and a buffer must not acquire one
         if not action.is_cuda and not bool(torch.isfinite(action).all()):

@@ -92,11 +92,11 @@ class StepGraph:
 
     def __call__(self) -> None:
         """Does the work, in one way or another."""
+        if self._version() != self._seen:
+            self.drop()
         if self._mode is GraphMode.off or self._failed:
             self._work()
             return
-        if self._version() != self._seen:
-            self.drop()
         if self._replay is not None:
             self._replay()
         elif not self._warm:
@@ -148,7 +148,9 @@ class StepGraph:
         torch_device = wp.device_to_torch(self._device)
         # A stream of torch's own making: newer torch refuses to capture on a blocking one. The same for ever, because a
         # second Warp object for it would unregister it when freed.
-        stream = _capture_streams.setdefault(torch_device, torch.cuda.Stream(torch_device))
+        if torch_device not in _capture_streams:
+            _capture_streams[torch_device] = torch.cuda.Stream(torch_device)
+        stream = _capture_streams[torch_device]
         graph = torch.cuda.CUDAGraph()
         # A conditional node makes Warp interrupt the capture, and what goes on after it has another number. By that number
         # torch knows what to allocate from the graph's own memory, which nobody else gets. So there is a second such pool.

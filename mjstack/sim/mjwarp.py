@@ -204,7 +204,7 @@ class MjwarpSimulation(FixedViews):
         }
 
     def bare_step(self) -> Callable[[], None]:
-        """One plain ``mujoco_warp.step``, replayed as Warp captures it: what everything else is measured by."""
+        """One plain ``mujoco_warp.step``, captured and replayed with nothing else: what the rest is measured by."""
         graph = StepGraph(
             lambda: mjw.step(self._m, self._d),
             self.device,
@@ -220,12 +220,23 @@ class MjwarpSimulation(FixedViews):
 
         return step
 
+    def graph_of(self, n: int = 1, *, kinematics: bool = False) -> StepGraph:
+        """The graph that `step(n)` replays."""
+        return self._graph(n, kinematics)
+
+    def latch(self) -> None:
+        """Takes in what the worlds use and have lost by now; `step` does it by itself."""
+        with torch_stream_scope(self._device):
+            self._count(steps=0)
+
     def resize(self, sizes: BatchSizes) -> None:
         """Gives the worlds other buffer sizes. Their state and every view stay; contacts and rows are empty until a step.
 
         Args:
             sizes: The new sizes.
         """
+        self.synchronize()  # a graph may still write into what goes now
+        self._graphs.clear()
         with wp.ScopedDevice(self._device):
             fresh = mjw.make_data(self.model, nworld=self.nworld, **sizes.as_kwargs(self.nworld))
             _keep_arrays(fresh, self._d)

@@ -33,12 +33,18 @@ class Arrangement:
 def can_rearrange(model: mujoco.MjModel, m: mjw.Model) -> bool:
     """Whether `rearranged_step` does all that `mujoco_warp.step` does for this model.
 
-    It leaves out cameras, lights, tendons, flexes, sleeping, energy and callbacks, and it knows one integrator. Equalities
-    between bodies read velocities of the step before, and sensors of acceleration need a stage of their own.
+    It leaves out cameras and lights, which nothing in the physics reads, tendons, flexes, sleeping, energy and callbacks, and
+    it knows one integrator. Equalities between bodies read velocities of the step before, adhesion reads contacts among the
+    smooth forces, and sensors of acceleration or of a camera need stages of their own.
     """
     equalities = {int(kind) for kind in model.eq_type}
+    seen_by = {int(kind) for kind in (*model.sensor_objtype, *model.sensor_reftype)}
     return (
-        model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+        m.opt.run_collision_detection
+        and not m.nacttrnbody
+        and not m.flg_adhesion
+        and int(mujoco.mjtObj.mjOBJ_CAMERA) not in seen_by
+        and model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
         and model.ntendon == model.nflex == 0
         and model.nhistory == 0
         and not model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
