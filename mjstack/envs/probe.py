@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import math
 from collections.abc import Callable
@@ -13,10 +14,11 @@ import torch
 
 from mjstack.config.schema import Backend, Config
 from mjstack.envs.env import Env
+from mjstack.errors import FaultError, name_worlds
 from mjstack.managers.base import random_uniform
 from mjstack.managers.reset import required_fields
 from mjstack.scene import SceneIndex
-from mjstack.sim import LOST_PHYSICS, BatchSizes, Overflow, Simulation, make_simulation
+from mjstack.sim import LOST_PHYSICS, BatchSizes, Overflow, Simulation, describe_overflow, make_simulation
 from mjstack.sim.sizes import apply_configured, resolve_env_sizes, resolve_measuring_sizes
 
 log = logging.getLogger(__name__)
@@ -110,14 +112,18 @@ def recommend_sizes(peaks: Peaks, margin: float, source: str) -> BatchSizes:
     )
 
 
-def measure_peaks(cfg: Config, run: Callable[[BatchSizes], Peaks]) -> Peaks:
+def measure_peaks(cfg: Config, run: Callable[[BatchSizes], Peaks]) -> tuple[Peaks, BatchSizes]:
     """Runs something with room to spare, and with twice the room wherever even that was too little.
 
-    Peaks of a run that lost physics are those of another motion, so they are not used.
+    Peaks of a run that lost physics are those of another motion. Where the last run has lost some too, its ``overflow`` tells:
+    nothing may be sized from it (`require_physics`).
 
     Args:
         cfg: The configuration.
         run: Plays it in worlds of some sizes.
+
+    Returns:
+        Peaks of the last run, and the room that it had.
     """
     sizes = resolve_measuring_sizes(cfg)
     peaks = run(sizes)
@@ -133,7 +139,40 @@ def measure_peaks(cfg: Config, run: Callable[[BatchSizes], Peaks]) -> Peaks:
         )
         log.info("%s overflowed while sizes were measured: again with %s", Overflow(bits), sizes.as_overrides())
         peaks = run(sizes)
-    return peaks
+    return peaks, sizes
+
+
+def describe_loss(overflow: np.ndarray, sizes: BatchSizes | None) -> tuple[str, str]:
+    """What was lost although there was room to spare, and what to do; both empty if nothing was.
+
+    Args:
+        overflow: Bits of `Overflow` raised in each world, shape ``(nworld,)``.
+        sizes: The room there was, or None on native MuJoCo.
+    """
+    bits, worlds = int(np.bitwise_or.reduce(overflow)), np.flatnonzero(overflow).tolist()
+    if not bits:
+        return "", ""
+    # In the room to measure in convex pairs have as much as contacts: the same key gives more of both.
+    keys = [f"batch.{key}" for key, flags in (("njmax", ROWS), ("nconmax", SIZED & ~ROWS)) if bits & flags]
+    fix = f"Set {' and '.join(keys)} higher still" if keys else "Simplify the model, or run sim=native"
+    room = "" if sizes is None else f" even with {sizes.as_overrides()}"
+    return f"{describe_overflow(bits)} overflow in {name_worlds(worlds, len(overflow))}{room}", fix
+
+
+def require_physics(what: str, peaks: Peaks, sizes: BatchSizes | None) -> None:
+    """Refuses to size anything from motion that lost physics.
+
+    Args:
+        what: What was run, such as ``the scripted task``.
+        peaks: What it used and lost.
+        sizes: The room it had.
+
+    Raises:
+        FaultError: A world lost physics; names the worlds and what to do.
+    """
+    loss, fix = describe_loss(peaks.overflow, sizes)
+    if loss:
+        raise FaultError(f"batch=auto: what {what} needs cannot be measured: {loss}", fix)
 
 
 def play_random_actions(env: Env, frames: int, advance: Callable[[int], None] | None = None) -> None:
@@ -161,24 +200,35 @@ def probe_env_sizes(cfg: Config, model: mujoco.MjModel, nworld: int, backend: Ba
         nworld: Worlds of the environment.
         backend: Its backend. Native MuJoCo has no buffers: nothing is measured there.
         device: Its device.
+
+    Raises:
+        FaultError: Physics was lost in all the room that the probe tried.
     """
     if backend is Backend.native:
         return resolve_env_sizes(cfg)
     c = cfg.gate.capacity
     worlds = min(nworld, c.probe_nworld if device.startswith("cuda") else c.cpu_nworld)
 
-    def run(sizes: BatchSizes) -> Peaks:
+    def play(sizes: BatchSizes) -> Peaks:
         fields = required_fields(cfg.reset)
         sim = make_simulation(model, cfg, worlds, backend=backend, device=device, fields=fields, sizes=sizes)
         env = Env(sim, SceneIndex(model, cfg.robot), cfg, check_faults=False)  # a lack of room is what it looks for
-        env.reset(seed=cfg.seed)
-        play_random_actions(env, c.probe_frames)
-        peaks = read_peaks(sim)
-        env.close()
-        return peaks
+        try:
+            env.reset(seed=cfg.seed)
+            play_random_actions(env, c.probe_frames)
+            return read_peaks(sim)
+        finally:
+            env.close()
+
+    def run(sizes: BatchSizes) -> Peaks:
+        try:
+            return play(sizes)
+        finally:
+            gc.collect()  # the environment and its managers refer to each other, and hold the worlds
 
     with torch.no_grad():
-        peaks = measure_peaks(cfg, run)
+        peaks, room = measure_peaks(cfg, run)
+    require_physics(f"an environment of {worlds} worlds", peaks, room)
     source = f"batch=auto: {c.probe_frames} frames of random actions in {worlds} worlds, times {c.margin:g}"
     sizes = apply_configured(cfg, recommend_sizes(peaks, c.margin, source))
     log.info("%s (%s)", sizes.as_overrides(), source)

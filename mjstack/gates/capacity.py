@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
 from mjstack.config.schema import Config
-from mjstack.envs.probe import POOL, ROWS, SIZED, Peaks, join_peaks, recommend_sizes
+from mjstack.envs.probe import Peaks, describe_loss, join_peaks, recommend_sizes
 from mjstack.errors import Unreachable, name_worlds
 from mjstack.gates.gate import GateContext
-from mjstack.gates.sizing import Workload, measure_random, measure_task, play_random, play_task
+from mjstack.gates.sizing import Workload, measure_random, measure_task, measuring_worlds, play_random, play_task
 from mjstack.report.record import GateResult, Status, Value
-from mjstack.sim import BatchSizes, Overflow, describe_overflow, resolve_sizes
+from mjstack.sim import BatchSizes, resolve_sizes
 from mjstack.sim.sizes import apply_configured, resolve_env_sizes
 
 _NATIVE = "native MuJoCo has no fixed buffers"
+_NO_ORDER = "on CUDA sums have no fixed order"
 
 
 @dataclass(slots=True)
@@ -26,55 +28,91 @@ class _Shortage:
     text: str
 
 
+@dataclass(slots=True)
+class _Trial:
+    """What came of a second run, at exactly the recommended sizes: figures, and what was wrong or is to be known."""
+
+    metrics: dict[str, Value]
+    problem: str = ""
+    remark: str = ""
+
+
 def run_capacity(context: GateContext) -> list[GateResult]:
     """Finds what the scripted task, randomised starts and random actions need, and tries the sizes that it recommends.
 
     Peaks are over all substeps and all worlds, in worlds with room to spare: one that has lost physics moves differently.
     """
     cfg, margin = context.cfg, context.cfg.gate.capacity.margin
+    exact = not context.backend[1].startswith("cuda")
+    nworld = measuring_worlds(context)
+    how = f"batch=auto: gate capacity, {nworld} worlds, times {margin:g}" if cfg.batch.auto else "gate capacity"
     details: list[str] = []
-    randomized: Workload | None = None
-    try:  # first, so that the plan of the task is the last one and kept for the runs and gates that follow
+    trials: list[_Trial] = []
+
+    # Each start is planned once, for both of its runs, and the task last: its plan is kept for the gates that follow.
+    random, randomized = measure_random(context), None
+    try:
         randomized = measure_task(context, cfg.gate.capacity.reset)
     except Unreachable as error:  # somebody's own layout; the other two workloads stand
         details.append(f"randomised starts: not measured: {error}")
-    task, random = measure_task(context, cfg.reset), measure_random(context)
-    peaks, nworld = task.peaks, task.peaks.nworld
-    runs, env_peaks = {"": task, "random_actions.": random}, random.peaks
-    if randomized is not None:
-        runs["randomized."], env_peaks = randomized, join_peaks(env_peaks, randomized.peaks)
+    env_runs = [random] if randomized is None else [random, randomized]
+    env_peaks = reduce(join_peaks, (run.peaks for run in env_runs))
+    env_wanted, env_lost = recommend_sizes(env_peaks, margin, how), _lost(*env_runs)
+    if random.sizes is not None and not env_lost:
+        if randomized is not None:
+            again = play_task(context, cfg.gate.capacity.reset, env_wanted)
+            trials.append(_compare("randomized", randomized, again, judged=True, exact=exact))
+        again = play_random(context, env_wanted)
+        trials.append(_compare("random_actions", random, again, judged=False, exact=exact))
 
-    how = f"batch=auto: gate capacity, {nworld} worlds, times {margin:g}" if cfg.batch.auto else "gate capacity"
-    wanted = context.measured = recommend_sizes(peaks, margin, how)
-    env_wanted = context.measured_env = recommend_sizes(env_peaks, margin, how)
+    task = measure_task(context, cfg.reset)
+    peaks = task.peaks
+    wanted, task_lost = recommend_sizes(peaks, margin, how), _lost(task)
+    if task.sizes is not None and not task_lost:
+        trials.append(_compare("task", task, play_task(context, cfg.reset, wanted), judged=True, exact=exact))
+    runs = {"": task, "random_actions.": random} | ({} if randomized is None else {"randomized.": randomized})
+
+    # Motion that lost physics sizes nothing that follows.
+    context.measured, context.measured_env = None if task_lost else wanted, None if env_lost else env_wanted
     sizes, env_sizes = resolve_sizes(cfg), resolve_env_sizes(cfg)
     if cfg.batch.auto:
         sizes, env_sizes = apply_configured(cfg, wanted), apply_configured(cfg, env_wanted)
 
-    problems = [shortage.text for shortage in _shortages(cfg, peaks, sizes, wanted)]
-    for shortage in _shortages(cfg, env_peaks, env_sizes, env_wanted):
+    problems = [task_lost] if task_lost else [shortage.text for shortage in _shortages(cfg, peaks, sizes, wanted)]
+    if env_lost:
+        problems.append(f"environments: {env_lost}")
+    for shortage in [] if env_lost else _shortages(cfg, env_peaks, env_sizes, env_wanted):
         # Sizes that were set may be meant for the batch alone; those of the robot's profile should do for both.
         chosen = any(getattr(cfg.batch, key) is not None for key in shortage.keys)
         (details if chosen else problems).append(f"environments: {shortage.text}")
+    problems += [trial.problem for trial in trials if trial.problem]
+    details += [trial.remark for trial in trials if trial.remark]
 
     metrics: dict[str, Value] = {"backend": task.description, "worlds": nworld, "sizes_from": sizes.source}
     for prefix, run in runs.items():
         metrics |= _peak_metrics(prefix, run)
-    for prefix, found in (("recommended", wanted), ("recommended_env", env_wanted)):
+    known = {
+        name: (current, found)
+        for name, current, found, lost in (("task", sizes, wanted, task_lost), ("env", env_sizes, env_wanted, env_lost))
+        if not lost
+    }
+    for name, (_, found) in known.items():
+        prefix = "recommended" if name == "task" else f"recommended_{name}"
         metrics |= {f"{prefix}.nconmax": found.nconmax, f"{prefix}.naconmax": found.contact_pool(cfg.nworld)}
         metrics |= {f"{prefix}.njmax": found.njmax, f"{prefix}.nccdmax": found.nccdmax or "not counted: MJWarp's default"}
-    paste, env_paste = _overrides(cfg, wanted), _overrides(cfg, env_wanted)
-    lines = [f"scripted task: {paste}", f"environments (random actions, randomised starts): {env_paste}"]
+    lines = []
+    for name, title in (("task", "scripted task"), ("env", "environments (random actions, randomised starts)")):
+        lines.append(f"{title}: {_overrides(cfg, known[name][1]) if name in known else 'not known, physics was lost'}")
     if task.sizes is None:
         lines[0] += " (contacts alone: native MuJoCo does not count the collision pairs that share their pool)"
         metrics["rerun"] = f"sizes were not tried: {_NATIVE}"
         metrics["memory"] = f"not reported: {_NATIVE}"
-    elif lost := _lost(*runs.values()):
-        metrics["rerun"] = "sizes were not tried: peaks are not known"
-        problems.append(lost)
     else:
-        problems += _try_sizes(context, metrics, task, random, wanted, env_wanted)
-        metrics |= _memory_metrics(context, {"task": (sizes, wanted), "env": (env_sizes, env_wanted)})
+        if len(known) < 2:
+            metrics["rerun"] = "sizes were not tried where peaks are not known"
+        for trial in trials:
+            metrics |= trial.metrics
+        metrics |= _memory_metrics(context, known)
     for line in lines:
         context.say(line)
     if nworld < cfg.nworld:
@@ -137,59 +175,55 @@ def _shortages(cfg: Config, peaks: Peaks, sizes: BatchSizes, wanted: BatchSizes)
 
 
 def _lost(*runs: Workload) -> str:
-    """Physics that was lost although there was room to spare."""
-    bits = np.bitwise_or.reduce([run.peaks.overflow for run in runs])
-    worlds = np.flatnonzero(bits).tolist()
-    if not worlds:
+    """Physics that was lost although there was room to spare. Native MuJoCo has no such room."""
+    if runs[0].sizes is None:
         return ""
-    all_bits, sizes = int(np.bitwise_or.reduce(bits)), runs[0].sizes
-    keys = (("njmax", ROWS), ("nconmax", POOL), ("nccdmax", int(Overflow.CCD)))
-    raised = " and ".join(f"batch.{key}" for key, flags in keys if all_bits & flags)
-    fix = f"Set {raised} higher still" if all_bits & SIZED else "Simplify the model, or run sim=native"
-    room = "" if sizes is None else f" even with {sizes.as_overrides()}"
-    return f"{describe_overflow(all_bits)} overflow in {name_worlds(worlds, len(bits))}{room}. {fix}"
+    losses = [describe_loss(run.peaks.overflow, run.sizes) for run in runs]
+    return "; ".join(f"{loss}. {fix}" for loss, fix in losses if loss)
 
 
-def _try_sizes(
-    context: GateContext,
-    metrics: dict[str, Value],
-    task: Workload,
-    random: Workload,
-    wanted: BatchSizes,
-    env_wanted: BatchSizes,
-) -> list[str]:
-    """Plays both again at exactly the recommended sizes: nothing may be lost, and the outcome is to be the same."""
-    exact = not context.backend[1].startswith("cuda")
-    runs = (
-        ("task", task, wanted, lambda: play_task(context, context.cfg.reset, wanted)),
-        ("random_actions", random, env_wanted, lambda: play_random(context, env_wanted)),
+def _compare(name: str, first: Workload, again: Workload, *, judged: bool, exact: bool) -> _Trial:
+    """Holds a run at exactly the recommended sizes against the first one.
+
+    Nothing may be lost. Where runs repeat bit for bit, the outcome is to be the same too; where they do not, a world near a
+    threshold may fall on its other side, which is reported.
+
+    Args:
+        name: The workload.
+        first: The run with room to spare.
+        again: The second one.
+        judged: Whether the acceptance judges it.
+        exact: Whether runs repeat bit for bit, as they do on any CPU.
+    """
+    assert again.sizes is not None, "native MuJoCo has no sizes to try"
+    at, count, key = f"{name} at {again.sizes.as_overrides()}", len(first.failed), f"rerun.{name}"
+    lost = np.flatnonzero(again.peaks.overflow).tolist()
+    flipped = np.flatnonzero((first.failed == 0) != (again.failed == 0)).tolist()
+    moved = np.flatnonzero(~np.isclose(first.final, again.final, rtol=0.0, atol=0.0, equal_nan=True).all(1)).tolist()
+    trial = _Trial(
+        {
+            f"{key}.sizes": again.sizes.as_overrides(),
+            f"{key}.overflow_worlds": len(lost),
+            f"{key}.peak_constraint_rows_per_world": int(again.peaks.rows.max()),
+        }
     )
-    problems: list[str] = []
-    for name, first, wanted_here, play in runs:
-        again = play()
-        judged, count = name == "task", len(first.failed)
-        lost = np.flatnonzero(again.peaks.overflow).tolist()
-        flipped = np.flatnonzero((first.failed == 0) != (again.failed == 0)).tolist()
-        moved = np.flatnonzero(~np.isclose(first.final, again.final, rtol=0.0, atol=0.0, equal_nan=True).all(1)).tolist()
-        key = f"rerun.{name}"
-        metrics[f"{key}.sizes"] = wanted_here.as_overrides()
-        metrics[f"{key}.overflow_worlds"] = len(lost)
-        metrics[f"{key}.peak_constraint_rows_per_world"] = int(again.peaks.rows.max())
-        if judged:
-            metrics[f"{key}.accepted"] = again.accepted
-            metrics[f"{key}.same_worlds_accepted"] = not flipped
-        metrics[f"{key}.same_final_state"] = not moved if exact else "not compared: on CUDA sums have no fixed order"
-        if lost:
-            problems.append(f"{name} at {wanted_here.as_overrides()}: overflow in {name_worlds(lost, count)}")
-        elif judged and flipped:
-            problems.append(f"{name} at {wanted_here.as_overrides()}: another verdict in {name_worlds(flipped, count)}")
-        elif exact and moved:
-            problems.append(f"{name} at {wanted_here.as_overrides()}: another final state in {name_worlds(moved, count)}")
-        for part, run in (("measuring", first), ("rerun", again)):
-            cost = {"data": run.data_bytes, "borrowed_in_a_step": run.borrowed_bytes, "device": run.device_bytes}
-            for what, size in cost.items():
-                metrics[f"memory.{name}.{part}.{what}_mb"] = "not known here" if size is None else size / 1e6
-    return problems
+    if judged:
+        trial.metrics |= {f"{key}.accepted": again.accepted, f"{key}.flipped_worlds": len(flipped)}
+    trial.metrics[f"{key}.same_final_state"] = not moved if exact else f"not compared: {_NO_ORDER}"
+    flip = f"{at}: another verdict in {name_worlds(flipped, count)}" if judged and flipped else ""
+    if lost:
+        trial.problem = f"{at}: overflow in {name_worlds(lost, count)}"
+    elif exact and flip:
+        trial.problem = flip
+    elif exact and moved:
+        trial.problem = f"{at}: another final state in {name_worlds(moved, count)}"
+    if flip and not exact:
+        trial.remark = f"{flip}: {_NO_ORDER}"
+    for part, run in (("measuring", first), ("rerun", again)):
+        cost = {"data": run.data_bytes, "borrowed_in_a_step": run.borrowed_bytes, "device": run.device_bytes}
+        for what, size in cost.items():
+            trial.metrics[f"memory.{name}.{part}.{what}_mb"] = "not known here" if size is None else size / 1e6
+    return trial
 
 
 def _memory_metrics(context: GateContext, pairs: dict[str, tuple[BatchSizes, BatchSizes]]) -> dict[str, Value]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from mjstack.config.schema import Backend
 from mjstack.envs import Env
-from mjstack.envs.probe import Peaks, measure_peaks, play_random_actions, read_peaks, recommend_sizes
+from mjstack.envs.probe import Peaks, measure_peaks, play_random_actions, read_peaks, recommend_sizes, require_physics
 from mjstack.gates.episode import Reset
 from mjstack.managers.reset import required_fields
 from mjstack.sim import BatchSizes, Simulation, make_simulation
@@ -93,10 +93,15 @@ def play_random(context: GateContext, sizes: BatchSizes | None) -> Workload:
 
 
 def size_batch(context: GateContext) -> BatchSizes:
-    """Sizes for ``batch=auto`` where the capacity gate does not run before."""
+    """Sizes for ``batch=auto`` where the capacity gate does not run before.
+
+    Raises:
+        FaultError: Physics was lost in all the room that was tried.
+    """
     worlds, margin = measuring_worlds(context), context.cfg.gate.capacity.margin
-    peaks = measure_task(context, context.cfg.reset).peaks
-    return recommend_sizes(peaks, margin, f"batch=auto: the scripted task in {worlds} worlds, times {margin:g}")
+    task = measure_task(context, context.cfg.reset)
+    require_physics("the scripted task", task.peaks, task.sizes)
+    return recommend_sizes(task.peaks, margin, f"batch=auto: the scripted task in {worlds} worlds, times {margin:g}")
 
 
 def _measure(context: GateContext, play: Callable[[BatchSizes | None], Workload]) -> Workload:
