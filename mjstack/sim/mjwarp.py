@@ -220,6 +220,15 @@ class MjwarpSimulation(FixedViews):
 
         return step
 
+    def graph_of(self, n: int = 1, *, kinematics: bool = False) -> StepGraph:
+        """The graph that `step(n)` replays."""
+        return self._graph(n, kinematics)
+
+    def latch(self) -> None:
+        """Takes in what the worlds use and have lost by now; `step` does it by itself."""
+        with torch_stream_scope(self._device):
+            self._count(steps=0)
+
     def resize(self, sizes: BatchSizes) -> None:
         """Gives the worlds other buffer sizes. Their state and every view stay; contacts and rows are empty until a step.
 
