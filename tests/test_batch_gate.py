@@ -83,6 +83,7 @@ def test_seeds_add_up(two_seeds: tuple[Path, GateResult, list[str]]) -> None:
     assert f"{accepted} of 14 world-episodes accepted (" in result.reason
     assert "95 % interval" in result.reason
     assert f"job=replay run={folder} world={failing[0]}" in result.reason
+    assert not {"episode_s", "world_steps_per_s"} & set(metrics)  # void where worlds failed
     assert [line.split(":")[0] for line in lines] == ["batch, seed 0", "batch, seed 1"]
 
 
@@ -172,6 +173,7 @@ def test_full_disk_takes_no_verdict_back(
     result = play(new_context("sim=native", "nworld=2"), tmp_path)
     assert result.status is Status.passed
     assert "2 of 2 worlds accepted (100 %, 95 % interval 34.24 to 100 %), 2 distinct" in result.reason
+    assert result.metrics["world_steps_per_s"] == pytest.approx(2 * 6000 / result.metrics["episode_s"])
     assert any("No space left on device" in line for line in result.details)
     assert list(tmp_path.iterdir()) == []
 
@@ -210,6 +212,7 @@ def test_a_few_failures_may_be_allowed(new_context: Callable[..., GateContext]) 
     assert result.status is Status.passed
     assert "4 of 5 worlds accepted (80 %," in result.reason
     assert "1 of 5 worlds (4) failed: not stacked in 1" in result.reason
+    assert not {"episode_s", "world_steps_per_s"} & set(result.metrics)  # allowed, and void nonetheless
 
 
 def test_no_trajectory_is_kept(new_context: Callable[..., GateContext], tmp_path: Path) -> None:

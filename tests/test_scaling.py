@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
+from matplotlib.axes import Axes
 
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.jobs import scaling
 from mjstack.jobs.case import OutOfTime, _row, read_case
 from mjstack.jobs.scaling import case_overrides, scaling_folder
+from mjstack.report.curves import save_scaling_curves
 from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow, crossover, describe_crossover, to_csv, to_markdown
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
@@ -205,6 +209,24 @@ def test_full_disk_is_one_line(
     assert len(err.strip().splitlines()) == 1
 
 
+def test_full_disk_at_ctrl_c_is_one_line_too(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(scaling, "run_case", stopped)
+    monkeypatch.setattr(scaling, "write_atomic", full)
+    assert run([*TINY, "sim=native", "job.nworlds=[1]"]) == 130
+    err = capsys.readouterr().err
+    assert err.startswith("mjstack: ")
+    assert "No space left on device" in err
+    assert len(err.strip().splitlines()) == 1
+
+
 def alive(marker: str) -> list[str]:
     """Processes whose environment has a marker."""
     found = []
@@ -338,6 +360,25 @@ def test_crossover(mjwarp: dict[int, float | None], native: dict[int, float | No
     found = crossover(both)
     assert found == (None if at is None else pytest.approx(at))
     assert (f"about {at:,.0f} worlds" if at else "do not show") in describe_crossover(both)
+
+
+def test_failed_case_is_a_gap_even_with_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three cases the middle one measured physics and then failed; its figure would move the crossover."""
+    both = rows({"mjwarp": {1: 1.0, 10: 99.0, 100: 100.0}, "native": {1: 10.0, 10: 10.0, 100: 10.0}})
+    both[1].status = "fail"
+    assert crossover(both) == pytest.approx(10.0)
+    drawn: list[tuple[str, list[float]]] = []
+    plot = Axes.plot
+
+    def spy(self: Axes, x: Any, y: Any, *args: Any, **kwargs: Any) -> Any:
+        drawn.append((str(kwargs.get("label", "x")), [float(value) for value in y]))
+        return plot(self, x, y, *args, **kwargs)
+
+    monkeypatch.setattr(Axes, "plot", spy)
+    save_scaling_curves(tmp_path / "p.png", both, 10, "T")
+    curves = [y for label, y in drawn if label == "MJWarp, physics"]
+    assert [[math.isnan(value) for value in y] for y in curves] == [[False, True, False]] * 2
+    assert [len(y) for label, y in drawn if label == "x"] == [1, 1, 0, 0]
 
 
 def test_table_shows_gaps_and_where_rows_come_from() -> None:

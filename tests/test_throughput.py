@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from mjstack.config import load_config
+from mjstack.config.schema import GraphMode
 from mjstack.envs import build_env
 from mjstack.gates import env_step, power, sections
 from mjstack.gates.env_step import measure_env_step
@@ -21,7 +22,7 @@ from mjstack.gates.episode import State, run_episode
 from mjstack.gates.gate import GateContext
 from mjstack.gates.power import EnergyMeter
 from mjstack.gates.throughput import run_throughput
-from mjstack.gates.timing import Timing, frames_that_fit, timed
+from mjstack.gates.timing import Timing, capture_problem, frames_that_fit, timed
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation
 from mjstack.sim.native import NativeSimulation
@@ -82,6 +83,12 @@ def test_native_sections(new_context: Callable[..., GateContext]) -> None:
     assert m["env_step.managers_over_physics.median"] > 0.0
     assert m["env_step.managers_ms_per_frame.median"] < m["env_step.ms_per_env_step.max"]
     assert m["gpu_power_and_memory"] == "not measured: no GPU"
+    for section in ("physics", "episode", "env_step"):
+        assert m[f"{section}.captured"] is False  # native MuJoCo has nothing to capture
+        assert m[f"{section}.warm_up_s"] == m[f"{section}.capture_s"] == 0.0
+    alone, over = m["env_step.managers_alone_over_physics.median"], m["env_step.managers_over_physics.median"]
+    assert f"managers {100.0 * over:+.1f} % (alone {100.0 * alone:.1f} %)" in result.reason
+    assert "(eager)" not in result.reason
     assert not any("bare" in name for name in m)
 
 
@@ -100,6 +107,39 @@ def test_episode_alternates_with_bare_steps_on_mjwarp(new_context: Callable[...,
     assert m["episode.accepted"] == 1
     assert m["episode.bare_ratio.median"] == pytest.approx(m["episode.seconds.median"] / m["episode.bare_seconds.median"])
     assert "x bare steps" in result.reason
+    # Warp's CPU device: physics is captured, the frame around it is not.
+    assert (m["episode.captured"], m["episode.physics_captured"]) == (False, True)
+    assert m["episode.warm_up_s"] > 0.0
+    assert m["episode.capture_s"] > 0.0
+
+
+def test_warm_up_and_capture_are_apart_on_mjwarp(new_context: Callable[..., GateContext]) -> None:
+    sections_ = "gate.throughput.sections=[physics,env_step]"
+    result, _ = run_throughput(new_context("sim=mjwarp", "sim.device=cpu", "nworld=1", *SHORT, sections_))
+    assert result.status is Status.passed, result.reason
+    m = result.metrics
+    for section in ("physics", "env_step"):
+        assert m[f"{section}.warm_up_s"] > 0.0
+        assert m[f"{section}.capture_s"] > 0.0
+    assert m["physics.captured"] is True
+    assert (m["env_step.captured"], m["env_step.physics_captured"]) == (False, True)
+    # The first call of a frame was neither timed nor the estimate: eager it takes some 0.15 s.
+    assert 1e-3 * m["physics.ms_per_batched_step.max"] * 10 < m["physics.warm_up_s"]
+
+
+@pytest.mark.parametrize(
+    ("device", "mode", "captured", "void"),
+    [
+        ("cuda", GraphMode.auto, False, True),
+        ("cuda", GraphMode.require, False, True),
+        ("cuda", GraphMode.off, False, False),
+        ("cuda", GraphMode.auto, True, False),
+        ("cpu", GraphMode.auto, False, False),
+    ],
+)
+def test_eager_work_is_void_where_it_should_be_captured(device: str, mode: GraphMode, captured: bool, void: bool) -> None:
+    sim: Any = SimpleNamespace(device=torch.device(device))
+    assert bool(capture_problem(sim, mode, captured)) is void
 
 
 def test_bare_steps_play_the_same_trajectory(
@@ -115,6 +155,21 @@ def test_bare_steps_play_the_same_trajectory(
     assert torch.equal(sim.qpos, final)
     monkeypatch.setattr(type(sim), "bare_step", lambda _: lambda: None)
     assert sections._play_bare(context, sim)[1] == "1 worlds did not stack with bare steps"  # type: ignore[arg-type]
+
+
+def test_bare_steps_that_lose_worlds_do_not_count(
+    new_context: Callable[..., GateContext], make_sim: Callable[..., Simulation], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """8 rows do not hold two cubes on a table. What bare steps lose is counted once, after them."""
+    context, sim = new_context("nworld=1"), make_sim("mjwarp", 1, "batch.njmax=8")
+    start = sections.start_worlds
+
+    def short(*args: Any) -> Any:
+        env, tape = start(*args)
+        return env, SimpleNamespace(frames=2, command=tape.command)
+
+    monkeypatch.setattr(sections, "start_worlds", short)
+    assert sections._play_bare(context, sim)[1] == "1 worlds overflowed or diverged with bare steps"  # type: ignore[arg-type]
 
 
 def test_rejected_episode_voids_every_section(new_context: Callable[..., GateContext]) -> None:
@@ -170,6 +225,24 @@ def test_broken_section_leaves_the_others(new_context: Callable[..., GateContext
     assert "env_step: no figure: MemoryError: Unable to allocate 9 GiB (run.log has the traceback)" in result.reason
     assert speeds(result, "env_step") == []
     assert speeds(result, "physics") != []
+
+
+def test_broken_episode_does_not_verify_the_task(
+    new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("bad")
+
+    monkeypatch.setattr(sections, "run_episode", broken)
+    context = new_context("sim=native", "nworld=1", *SHORT, "gate.throughput.sections=[physics,episode]")
+    result, _ = run_throughput(context)
+    assert result.status is Status.failed
+    assert "episode: no figure: RuntimeError: bad" in result.reason
+    assert "the task was not verified in this run" in result.reason
+    for status, verified in ((Status.passed, True), (Status.skipped, False)):
+        context.results["batch"] = GateResult(name="batch", status=status, reason="")
+        result, _ = run_throughput(context)
+        assert ("the task was not verified" not in result.reason) is verified
 
 
 def test_no_time_for_an_episode_is_said(new_context: Callable[..., GateContext]) -> None:
@@ -234,6 +307,11 @@ def test_the_parts_play_one_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
     assert times.overhead == pytest.approx(
         statistics.median(e / p - 1.0 for e, p in zip(times.env_ms, times.physics_ms, strict=True))
     )
+    assert times.managers_alone == [m / p for m, p in zip(times.managers_ms, times.physics_ms, strict=True)]
+    for residual, whole_ms, physics_ms, managers_ms in zip(
+        times.residual_ms, times.env_ms, times.physics_ms, times.managers_ms, strict=True
+    ):
+        assert residual + physics_ms + managers_ms == pytest.approx(whole_ms)
     assert times.problem == ""
     ended = 0
     for (_, before), (whole, after), (frames, alone) in zip(wholes[:-1], wholes[1:], witness.ends, strict=True):
@@ -276,13 +354,37 @@ def meter(monkeypatch: pytest.MonkeyPatch, nvml: FakeNvml | None) -> EnergyMeter
     return EnergyMeter("cuda:0")
 
 
-def test_energy_is_the_counters_difference(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter([10.0, 14.0])
+def test_energy_is_that_of_the_stretches_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What passes between them, 500 J and a minute, does not count."""
+    clock = iter([10.0, 14.0, 74.0, 80.0])
     monkeypatch.setattr(power.time, "perf_counter", lambda: next(clock))
-    energy = meter(monkeypatch, FakeNvml())
-    with energy:
-        pass
-    assert energy.metrics() == {"gpu_power_mean_w": pytest.approx(25.0), "gpu_energy_j": pytest.approx(100.0)}
+    nvml = FakeNvml()
+    energy = meter(monkeypatch, nvml)
+    for _ in range(2):
+        energy.start()
+        energy.stop()
+        nvml.millijoules += 5e5
+    assert energy.metrics() == {"gpu_power_mean_w": pytest.approx(20.0), "gpu_energy_j": pytest.approx(200.0)}
+    energy.clear()
+    assert "too short" in str(energy.metrics()["gpu_power_mean_w"])
+
+
+def test_the_meter_runs_while_the_work_does() -> None:
+    seen: list[str] = []
+    sim: Any = SimpleNamespace(synchronize=lambda: seen.append("wait"))
+    energy: Any = SimpleNamespace(start=lambda: seen.append("start"), stop=lambda: seen.append("stop"))
+    timed(sim, lambda: seen.append("work"), energy)
+    assert seen == ["wait", "start", "work", "wait", "stop"]
+
+
+def test_the_meter_sees_an_episodes_replayed_frames(new_context: Callable[..., GateContext]) -> None:
+    context, seen = new_context("sim=native", "nworld=1"), []
+    sim = context.batch_simulation(1)
+    energy: Any = SimpleNamespace(
+        start=lambda: seen.append(int(sim.step_count[0])), stop=lambda: seen.append(int(sim.step_count[0]))
+    )
+    context.run(sim, context.cfg.reset, meter=energy)
+    assert seen == [20, 6000]  # not the two frames that warm up and are captured
 
 
 @pytest.mark.parametrize(
@@ -291,8 +393,8 @@ def test_energy_is_the_counters_difference(monkeypatch: pytest.MonkeyPatch) -> N
 )
 def test_missing_power_says_why(monkeypatch: pytest.MonkeyPatch, nvml: FakeNvml | None, why: str) -> None:
     energy = meter(monkeypatch, nvml)
-    with energy:
-        pass
+    energy.start()
+    energy.stop()
     (value,) = energy.metrics().values()
     assert str(value).startswith("not measured: ")
     assert why in str(value)
@@ -318,4 +420,7 @@ def test_episode_costs_hardly_more_than_bare_steps(new_context: Callable[..., Ga
         assert 0.0 < m[f"{section}.gpu_memory_arrays_mib"] <= m[f"{section}.gpu_memory_whole_gpu_mib"]
         watts = m[f"{section}.gpu_power_mean_w"]
         assert str(watts).startswith("not measured: ") or 50.0 < float(watts) < 2000.0
+        assert m[f"{section}.captured"] is True
+        assert m[f"{section}.warm_up_s"] > 0.0
+        assert m[f"{section}.capture_s"] > 0.0
     assert m["env_step.managers_over_physics.median"] < 1.0

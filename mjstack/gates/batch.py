@@ -168,11 +168,11 @@ def _judge(
         "waypoint_error_max_m": tally.high["waypoint_error_m"],
         "peak_contacts_per_world": int(tally.high["peak_contacts"]),
         "peak_constraint_rows_per_world": int(tally.high["peak_constraint_rows"]),
-        "episode_s": tally.seconds,
-        "world_steps_per_s": tally.steps / tally.seconds,
         **metrics,
         **{f"failed.{rule.name}": len(worlds) for rule, worlds in tally.broken.items()},
     }
+    if not bad:  # how fast worlds are that do not do the task is no figure
+        metrics |= {"episode_s": tally.seconds, "world_steps_per_s": tally.steps / tally.seconds}
     details = [
         *(f"{RULE_TEXT[rule]}: {name_worlds(worlds, tally.worlds, _NAMED, what)}" for rule, worlds in tally.broken.items()),
         *details,

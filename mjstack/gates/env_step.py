@@ -2,8 +2,14 @@
 
 A turn plays random actions from one state three times: the whole step, then from the same state the physics under the same
 commands, then the managers without any physics. The next turn goes on where the whole step ended. So each ratio is of one
-turn, one trajectory and one machine's mood. Worlds start at ages spread over an episode, so that in every frame some of
-them time out and are reset.
+turn and one machine's mood. Worlds start at ages spread over an episode, so that in every frame some of them time out and
+are reset.
+
+The three do not do quite the same work. Physics alone has no resets: a world that ended goes on from where it was, under the
+next episode's commands, and may touch more, and so cost more, than the reset one in the whole step. Then env.step's time over
+that of physics flatters the managers. The managers alone work on worlds that stand still, which end for other reasons, and
+they launch what in the whole step may run beside something else. Hence both ratios, and what is left when both parts are
+taken from the whole: where it is far from 0, the turns differed by more than the managers.
 """
 
 from __future__ import annotations
@@ -18,10 +24,10 @@ import torch
 
 from mjstack.envs import Env
 from mjstack.gates.episode import restore, snapshot
-from mjstack.gates.timing import frames_that_fit, timed
+from mjstack.gates.power import EnergyMeter
+from mjstack.gates.timing import WARM_UP, capture_problem, frames_that_fit, step_graph, timed
 from mjstack.sim import LOST_PHYSICS
 
-WARM_UP = 3  # steps: eager, captured, replayed
 _COST = 4.0  # of a turn over that of its whole steps from the start, when fewer things touch
 _LOSSES = ("mjstack.mdp.termination.overflow", "mjstack.mdp.termination.non_finite")
 
@@ -56,8 +62,9 @@ class EnvStepTimes:
         env_ms: Likewise, ``env.step``.
         rival_ms: Likewise, the rival; empty without one.
         episodes: Episodes that ended, and were reset, within the measured turns.
-        warm_up_s: The first steps together [s].
-        capture_s: Capturing the step and its parts [s].
+        warm_up_s: The first step, which runs eagerly [s]; on Warp's CPU device its physics, 0 on native MuJoCo.
+        capture_s: Capturing it [s], likewise.
+        captured: Whether the step and both parts were replayed.
         problem: Why the times are void; empty where they count.
     """
 
@@ -72,6 +79,7 @@ class EnvStepTimes:
     episodes: float = 0.0
     warm_up_s: float = 0.0
     capture_s: float = 0.0
+    captured: bool = False
     problem: str = ""
 
     @property
@@ -83,6 +91,16 @@ class EnvStepTimes:
     def overhead(self) -> float:
         """Their median. On a busy machine it need not be the ratio of the medians."""
         return statistics.median(self.overheads)
+
+    @property
+    def managers_alone(self) -> list[float]:
+        """The managers' own time over physics', of every turn."""
+        return [m / p for m, p in zip(self.managers_ms, self.physics_ms, strict=True)]
+
+    @property
+    def residual_ms(self) -> list[float]:
+        """What of env.step neither part explains [ms per frame], of every turn; negative where they run side by side."""
+        return [e - p - m for e, p, m in zip(self.env_ms, self.physics_ms, self.managers_ms, strict=True)]
 
     @property
     def rival_ratio(self) -> float | None:
@@ -103,6 +121,7 @@ def measure_env_step(
     turns: int,
     max_seconds: float | None = None,
     rival: Rival | None = None,
+    meter: EnergyMeter | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> EnvStepTimes:
     """Plays random actions, uniform over their whole range, in turns.
@@ -113,6 +132,7 @@ def measure_env_step(
         turns: Measured turns; one before them warms up.
         max_seconds: Shortens the turns so that all of them take about this long [s].
         rival: Timed beside the physics.
+        meter: Takes in the energy of the whole steps.
         progress: Told the turns done.
 
     Raises:
@@ -128,14 +148,19 @@ def measure_env_step(
 
     env.reset(seed=env.cfg.seed)
     env.frame.copy_(torch.randint(env.max_episode_frames, (env.nworld,), generator=generator))
-    seconds: list[float] = []
-    for action in random_actions(WARM_UP):
-        seconds.append(timed(sim, partial(env.step, action)))
+    seconds = [timed(sim, partial(env.step, action)) for action in random_actions(WARM_UP)]
     parts = env.parts()
+    on_cuda = env.device.type == "cuda"
+    if on_cuda:  # a turn may be too short to warm them up
+        for part in (parts.physics, parts.managers):
+            for _ in range(WARM_UP):
+                part()
     if max_seconds is not None:
         frames = frames_that_fit(frames, max_seconds, _COST * (turns + 1) * seconds[-1])
     result = EnvStepTimes(backend=sim.description, nworld=env.nworld, frames=frames, substeps=substeps)
-    result.warm_up_s = sum(seconds)
+    graph = env.graph if on_cuda else step_graph(sim, substeps, kinematics=True)
+    if graph is not None:
+        result.warm_up_s, result.capture_s = graph.warm_up_seconds, graph.capture_seconds
     commands = [torch.empty_like(sim.ctrl) for _ in range(frames)]
     bad = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
 
@@ -158,16 +183,18 @@ def measure_env_step(
         env.frame.copy_(frame)
         env.episode.copy_(episode)
 
-    def per_frame(work: Callable[[], None]) -> float:
-        return 1e3 * timed(sim, work) / frames
+    def per_frame(work: Callable[[], None], meter: EnergyMeter | None = None) -> float:
+        return 1e3 * timed(sim, work, meter) / frames
 
+    if meter is not None:
+        meter.clear()
     start = snapshot(sim)
     for turn in range(turns + 1):
         actions = random_actions(frames)
         ages = env.frame.clone(), env.episode.clone()
         restore(sim, start)
         env.read_statistics()
-        env_ms = per_frame(whole)
+        env_ms = per_frame(whole, meter if turn else None)
         counted = env.read_statistics()
         losses = [name for name, cfg in env.cfg.termination.items() if cfg.func in _LOSSES]
         lost = [name for name in losses if counted.get(f"termination/{name}", 0.0) > 0.0]
@@ -195,7 +222,8 @@ def measure_env_step(
             result.episodes += counted["episodes"]
             if progress is not None:
                 progress(turn)
-    result.capture_s = parts.capture_seconds + env.graph.capture_seconds
+    result.captured = env.graph.captured and parts.physics.captured and parts.managers.captured
+    result.problem = result.problem or capture_problem(sim, env.cfg.graph, result.captured)
     if bool(bad.any()):
         result.problem = f"{int(bad.sum())} of {env.nworld} worlds overflowed, diverged or were not stepped"
     return result

@@ -12,9 +12,13 @@ import torch
 from mjstack.config.schema import Config, TermCfg
 from mjstack.control.scripted import CommandTape, ScriptedPlanner
 from mjstack.envs import Env, scripted_config
+from mjstack.gates.power import EnergyMeter
+from mjstack.gates.timing import step_graph
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
 from mjstack.tasks.stack import StackEvidence, Verdict
+
+_EAGER = 2  # frames: the warm-up, and the one that is captured
 
 FrameHook = Callable[[int, Simulation], None]
 Advance = Callable[[str, int, int], None]
@@ -43,7 +47,9 @@ class Episode:
         seconds: Wall time of the frames alone [s]; where they are captured, of as many replayed ones.
         qpos: World 0 at every frame end, shape ``(frames, nq)``, if it was recorded.
         states: Snapshots of all worlds after the frames that were asked for.
-        capture_seconds: Warm-up and capture [s]; 0 where nothing is captured.
+        warm_up_seconds: The eager first call of what is captured [s]; 0 if it was captured before, or never is.
+        capture_seconds: The capture alone [s], likewise.
+        captured: Whether whole frames were replayed; on Warp's CPU device, where physics alone is, they are not.
     """
 
     verdict: Verdict
@@ -51,7 +57,9 @@ class Episode:
     seconds: float
     qpos: np.ndarray | None = None
     states: dict[int, State] = field(default_factory=dict)
+    warm_up_seconds: float = 0.0
     capture_seconds: float = 0.0
+    captured: bool = False
 
 
 def start_worlds(
@@ -100,6 +108,7 @@ def run_episode(
     on_frame: FrameHook | None = None,
     advance: Advance | None = None,
     worlds: Sequence[int] | None = None,
+    meter: EnergyMeter | None = None,
 ) -> Episode:
     """Plays the scripted task once in every world and judges it.
 
@@ -114,6 +123,7 @@ def run_episode(
         on_frame: Called after each frame.
         advance: Told about progress.
         worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start_worlds`.
+        meter: Takes in the energy of the frames from the third on, when all are replayed.
     """
     env, tape = start_worlds(sim, index, cfg, reset, planner, advance, worlds)
     evidence = StackEvidence(cfg, index, planner.phases, sim.nworld, sim.device)
@@ -126,11 +136,20 @@ def run_episode(
         now.add_(1)
 
     play = env.captured(work, "a frame of the episode")
+    # On Warp's CPU device physics alone is captured, once for all episodes.
+    graph = play if sim.device.type == "cuda" else step_graph(sim, cfg.timing.substeps, kinematics=True)
+    before = (0.0, 0.0) if graph is None else (graph.warm_up_seconds, graph.capture_seconds)
     trajectory = np.full((tape.frames, sim.qpos.shape[1]), np.nan) if record else None
     states: dict[int, State] = {}
     sim.synchronize()
     began = time.perf_counter()
+    aside = 0.0  # what reading the counter takes
     for frame in range(tape.frames):
+        if meter is not None and frame == _EAGER:
+            sim.synchronize()
+            reading = time.perf_counter()
+            meter.start()
+            aside = time.perf_counter() - reading
         play()
         if on_frame is not None:
             on_frame(frame, sim)
@@ -143,12 +162,17 @@ def run_episode(
                 sim.synchronize()  # so that the bar shows work done, not work queued
             advance("frames", frame + 1, tape.frames)
     sim.synchronize()
-    seconds = time.perf_counter() - began
-    capture_seconds = play.warm_up_seconds + play.capture_seconds
+    seconds = time.perf_counter() - began - aside
+    if meter is not None:
+        meter.stop()
+    after = before if graph is None else (graph.warm_up_seconds, graph.capture_seconds)
+    warm_up, capture = (now if now != then else 0.0 for now, then in zip(after, before, strict=True))
+    captured = play.captured
     play.drop()  # its memory, which only the collector would find otherwise
-    if capture_seconds:  # the first frame was the warm-up
-        seconds = (seconds - capture_seconds) * tape.frames / (tape.frames - 1)
-    return Episode(evidence.verdict(sim), tape, seconds, trajectory, states, capture_seconds)
+    seconds -= warm_up + capture
+    if warm_up:  # the first frame was it
+        seconds *= tape.frames / (tape.frames - 1)
+    return Episode(evidence.verdict(sim), tape, seconds, trajectory, states, warm_up, capture, captured)
 
 
 def snapshot(sim: Simulation) -> State:

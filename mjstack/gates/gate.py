@@ -37,14 +37,18 @@ class TimedEpisode:
         description: Backend and hardware.
         nworld: Number of worlds.
         seconds: Wall time of the frames [s].
-        capture_seconds: Wall time of capturing graphs [s].
+        warm_up_seconds: The eager first call of what is captured [s].
+        capture_seconds: The capture alone [s].
+        captured: Whether whole frames were replayed.
         failed: Worlds that were not accepted.
     """
 
     description: str
     nworld: int
     seconds: float
+    warm_up_seconds: float
     capture_seconds: float
+    captured: bool
     failed: list[int]
 
     @classmethod
@@ -55,7 +59,9 @@ class TimedEpisode:
             description=sim.description,
             nworld=sim.nworld,
             seconds=episode.seconds,
+            warm_up_seconds=episode.warm_up_seconds,
             capture_seconds=episode.capture_seconds,
+            captured=episode.captured,
             failed=failed,
         )
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import time
-from types import TracebackType
 from typing import Any
 
 from mjstack.report.record import Value
 from mjstack.sim import cuda_uuid
 
-SHORTEST = 0.5  # s: the counter moves some ten times a second
+SHORTEST = 0.5  # s, of a stretch of work on average: the counter moves some ten times a second
 
 
 class EnergyMeter:
-    """Reads the GPU's energy counter at both ends of a ``with`` block. It counts the whole GPU, whoever uses it.
+    """Adds up what the GPU's energy counter moves from `start` to `stop`. It counts the whole GPU, whoever uses it.
 
     Attributes:
         reason: Why there is no figure; empty where there is one.
@@ -27,7 +26,8 @@ class EnergyMeter:
         """
         self._nvml: Any = None
         self._handle: Any = None
-        self._began = self._joules = self._seconds = 0.0
+        self._began = self._read_first = 0.0
+        self.clear()
         self.reason, self._cpu = "", device == "cpu"
         if self._cpu:
             return
@@ -45,21 +45,29 @@ class EnergyMeter:
             return
         self._nvml = pynvml
 
-    def __enter__(self) -> EnergyMeter:
-        self._began, self._joules = time.perf_counter(), -self._read()
-        return self
+    def clear(self) -> None:
+        """Forgets what was added up."""
+        self._joules = self._seconds = 0.0
+        self._stretches = 0
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._joules += self._read()
-        self._seconds = time.perf_counter() - self._began
+    def start(self) -> None:
+        """Begins a stretch of work, the device idle."""
+        self._read_first, self._began = self._read(), time.perf_counter()
+
+    def stop(self) -> None:
+        """Ends it, the device idle again, and adds it."""
+        self._seconds += time.perf_counter() - self._began
+        self._joules += self._read() - self._read_first
+        self._stretches += 1
 
     def metrics(self) -> dict[str, Value]:
-        """Energy and mean power of the last block, or why they are missing; nothing on a CPU."""
+        """Energy and mean power of the stretches, or why they are missing; nothing on a CPU."""
         if self._cpu:
             return {}
         reason = self.reason
-        if not reason and self._seconds < SHORTEST:
-            reason = f"{self._seconds:.1f} s are too short for NVML's counter"
+        each = self._seconds / max(self._stretches, 1)
+        if not reason and each < SHORTEST:
+            reason = f"stretches of {each:.2g} s are too short for NVML's counter"
         if reason:
             return {"gpu_power_mean_w": f"not measured: {reason}"}
         return {"gpu_power_mean_w": self._joules / self._seconds, "gpu_energy_j": self._joules}

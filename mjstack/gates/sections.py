@@ -17,7 +17,7 @@ from mjstack.gates.env_step import measure_env_step
 from mjstack.gates.episode import State, restore, run_episode, snapshot, start_worlds
 from mjstack.gates.gate import GateContext, TimedEpisode
 from mjstack.gates.power import EnergyMeter
-from mjstack.gates.timing import Timing, frames_that_fit, spread, timed
+from mjstack.gates.timing import WARM_UP, Timing, capture_problem, frames_that_fit, spread, step_graph, timed
 from mjstack.report.record import Value
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Simulation, device_memory
 
@@ -83,27 +83,31 @@ def measure_physics(context: GateContext, sim: Simulation, watch: Stopwatch, met
 
     state = _carry_start(context, sim)
     restore(sim, state)
-    first = timed(sim, lambda: play(1))
-    second = timed(sim, lambda: play(1))
-    frames = frames_that_fit(t.frames, watch.seconds, watch.repetitions * second)
+    graph = step_graph(sim, substeps)
+    first = [timed(sim, lambda: play(1)) for _ in range(2 if graph is None else WARM_UP)]
+    frames = frames_that_fit(t.frames, watch.seconds, watch.repetitions * first[-1])
     timing = Timing(nworld=sim.nworld, frames=frames, substeps=substeps)
     bad = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
-    with meter:
-        for repetition in range(watch.repetitions):
-            restore(sim, state)
-            timing.seconds.append(timed(sim, lambda: play(frames)))
-            bad |= _lost(sim) | (sim.step_count != frames * substeps)
-            context.tell("physics, repetitions", repetition + 1, watch.repetitions)
+    meter.clear()
+    for repetition in range(watch.repetitions):
+        restore(sim, state)
+        timing.seconds.append(timed(sim, lambda: play(frames), meter))
+        bad |= _lost(sim) | (sim.step_count != frames * substeps)
+        context.tell("physics, repetitions", repetition + 1, watch.repetitions)
+    captured = graph is not None and graph.captured
     section = Section(name="physics", frame_seconds=timing.median / frames)
     section.figures = timing.step_metrics() | meter.metrics()
     section.facts = {
         "frames_per_repetition": frames,
         "repetitions": watch.repetitions,
-        "warm_up_and_capture_s": first,
+        "warm_up_s": 0.0 if graph is None else graph.warm_up_seconds,
+        "capture_s": 0.0 if graph is None else graph.capture_seconds,
+        "captured": captured,
         "peak_contacts_per_world": int(sim.peak_contacts.max()),
         "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
     }
     section.facts |= _memory(sim)
+    section.problem = capture_problem(sim, context.cfg.graph, captured)
     if bad.any():
         section.problem = f"{int(bad.sum())} worlds overflowed, diverged or were not stepped"
     step_ms = 1e3 * timing.median / (frames * substeps)
@@ -142,18 +146,18 @@ def measure_episode(
     if mjwarp:
         estimate *= 2
     began = time.perf_counter()
-    with meter:
-        while len(played) < watch.repetitions and time.perf_counter() - began + estimate <= watch.seconds:
-            turn_began = time.perf_counter()
-            episode = run_episode(sim, context.index, cfg, context.planner, cfg.reset)
-            played.append(TimedEpisode.of(episode, sim))
-            if mjwarp:
-                seconds, problem = _play_bare(context, cast("MjwarpSimulation", sim))
-                section.problem = section.problem or problem
-                bare.append(seconds)
-                ratios.append(episode.seconds / seconds)
-            estimate = time.perf_counter() - turn_began
-            context.tell("episode, repetitions", len(played), watch.repetitions)
+    meter.clear()
+    while len(played) < watch.repetitions and time.perf_counter() - began + estimate <= watch.seconds:
+        turn_began = time.perf_counter()
+        episode = run_episode(sim, context.index, cfg, context.planner, cfg.reset, meter=meter)
+        played.append(TimedEpisode.of(episode, sim))
+        if mjwarp:
+            seconds, problem = _play_bare(context, cast("MjwarpSimulation", sim))
+            section.problem = section.problem or problem
+            bare.append(seconds)
+            ratios.append(episode.seconds / seconds)
+        estimate = time.perf_counter() - turn_began
+        context.tell("episode, repetitions", len(played), watch.repetitions)
     if not played and before is not None:
         played = [before]
     if not played:
@@ -163,14 +167,20 @@ def measure_episode(
         )
         return section
     timing.seconds = [p.seconds for p in played]
+    captured = all(p.captured for p in played)
     failed = sorted({w for p in played for w in p.failed})
     section.facts = {
         "repetitions": len(played),
         "of_the_batch_gate": sum(p is before for p in played),
         "frames": frames,
         "accepted": sim.nworld - len(failed),
-        "capture_s": statistics.median(p.capture_seconds for p in played),
+        # The most of all: where physics alone is captured, on Warp's CPU device, one episode does it for all.
+        "warm_up_s": max(p.warm_up_seconds for p in played),
+        "capture_s": max(p.capture_seconds for p in played),
+        "captured": captured,
     }
+    section.facts |= _physics_captured(sim, cfg.timing.substeps)
+    section.problem = section.problem or capture_problem(sim, cfg.graph, captured)
     section.figures = spread("seconds", timing.seconds) | timing.step_metrics() | timing.frame_metrics()
     section.headline = f"{timing.median:.3g} s"
     if ratios:
@@ -190,27 +200,31 @@ def measure_episode(
 def measure_env_steps(context: GateContext, env: Env, watch: Stopwatch, meter: EnergyMeter) -> Section:
     """``env.step`` with the configured managers, random actions, and resets as they come."""
     t, section = context.cfg.gate.throughput, Section(name="env_step")
-    with meter:
-        times = measure_env_step(
-            env,
-            frames=t.env_frames,
-            turns=watch.repetitions,
-            max_seconds=watch.seconds,
-            progress=lambda turn: context.tell("env.step, turns", turn, watch.repetitions),
-        )
+    times = measure_env_step(
+        env,
+        frames=t.env_frames,
+        turns=watch.repetitions,
+        max_seconds=watch.seconds,
+        meter=meter,
+        progress=lambda turn: context.tell("env.step, turns", turn, watch.repetitions),
+    )
     sim = env.sim
     timing = Timing(nworld=env.nworld, frames=times.frames, substeps=times.substeps)
     timing.seconds = [1e-3 * times.frames * ms for ms in times.env_ms]
     section.figures = timing.frame_metrics() | timing.step_metrics()
     section.figures |= spread("physics_ms_per_frame", times.physics_ms) | spread("managers_ms_per_frame", times.managers_ms)
     section.figures |= spread("managers_over_physics", times.overheads)
+    section.figures |= spread("managers_alone_over_physics", times.managers_alone)
+    section.figures |= spread("residual_ms_per_frame", times.residual_ms)
     section.facts = {
         "frames_per_turn": times.frames,
         "turns": watch.repetitions,
         "episodes_ended": int(times.episodes),
         "warm_up_s": times.warm_up_s,
         "capture_s": times.capture_s,
+        "captured": times.captured,
     }
+    section.facts |= _physics_captured(sim, times.substeps)
     sizes: BatchSizes | None = getattr(sim, "sizes", None)
     if sizes is not None:
         section.facts |= {"naconmax": sizes.contact_pool(sim.nworld), "njmax": sizes.njmax}
@@ -218,7 +232,8 @@ def measure_env_steps(context: GateContext, env: Env, watch: Stopwatch, meter: E
     section.facts |= _memory(sim)
     section.problem = times.problem
     rate = env.nworld * times.frames / timing.median
-    section.headline = f"{rate:,.0f} env-steps/s, managers {100.0 * times.overhead:+.1f} %"
+    alone = statistics.median(times.managers_alone)
+    section.headline = f"{rate:,.0f} env-steps/s, managers {100.0 * times.overhead:+.1f} % (alone {100.0 * alone:.1f} %)"
     return section
 
 
@@ -244,11 +259,11 @@ def _carry_start(context: GateContext, sim: Simulation) -> State:
 def _play_bare(context: GateContext, sim: MjwarpSimulation) -> tuple[float, str]:
     """The same commands from the same start on bare steps: seconds, and why they would not count.
 
-    The tape is evaluated in the loop, as it is in the episode. What the steps lost shows in where the cubes end.
+    The tape is evaluated in the loop, as it is in the episode. Overflow bits stay until a reset: one look at the end has all.
     """
     cfg, substeps = context.cfg, context.cfg.timing.substeps
     step = sim.bare_step()
-    for _ in range(3):  # eager, captured, replayed: none of it is timed
+    for _ in range(WARM_UP):  # none of it is timed
         step()
     _, tape = start_worlds(sim, context.index, cfg, cfg.reset, context.planner)
 
@@ -259,17 +274,27 @@ def _play_bare(context: GateContext, sim: MjwarpSimulation) -> tuple[float, str]
                 step()
 
     seconds = timed(sim, play)
+    sim.latch()
+    bad = int(_lost(sim).sum())
+    if bad:
+        return seconds, f"{bad} worlds overflowed or diverged with bare steps"
     red, blue = (sim.qpos[:, a : a + 3] for a in context.index.cube_qpos)
     apart, rules = red - blue, cfg.gate.acceptance
     stacked = (apart[:, :2].norm(dim=1) <= rules.xy_err) & (apart[:, 2] >= rules.dz_min) & (apart[:, 2] <= rules.dz_max)
-    lost = int((~stacked).sum())  # a comparison with NaN is false
-    return seconds, f"{lost} worlds did not stack with bare steps" if lost else ""
+    fallen = int((~stacked).sum())
+    return seconds, f"{fallen} worlds did not stack with bare steps" if fallen else ""
 
 
 def _lost(sim: Simulation) -> torch.Tensor:
     """Worlds that overflowed or diverged, shape ``(nworld,)``, bool."""
     finite = torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1)
     return ((sim.overflow & LOST_PHYSICS) != 0) | ~finite
+
+
+def _physics_captured(sim: Simulation, substeps: int) -> dict[str, Value]:
+    """On Warp's CPU device, where whole frames never are captured: whether their physics was."""
+    graph = None if sim.device.type == "cuda" else step_graph(sim, substeps, kinematics=True)
+    return {} if graph is None else {"physics_captured": graph.captured}
 
 
 def _memory(sim: Simulation) -> dict[str, Value]:

@@ -70,7 +70,8 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
     if episode is not None and episode.rejected:
         for section in sections:
             section.problem = section.problem or "the episode failed, and a figure counts only where the task was verified"
-    verified = batch is not None or (episode is not None and not episode.missing)
+    verified = batch is not None and batch.status is Status.passed
+    verified |= episode is not None and bool(episode.figures) and not episode.problem
     parts = []
     for section in sections:
         facts |= section.metrics()
@@ -79,6 +80,8 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
             text = f"no figure: {section.problem}"
         elif section.missing:
             text = f"not measured: {section.missing}"
+        elif on_cuda and not section.facts["captured"]:
+            text += " (eager)"
         parts.append(f"{section.name}: {text}")
     reason = "; ".join(parts)
     if not verified:

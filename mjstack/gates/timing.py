@@ -7,17 +7,40 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from mjstack.config.schema import GraphMode
+from mjstack.envs.parts import Repeated
+from mjstack.gates.power import EnergyMeter
 from mjstack.report.record import Value
 from mjstack.sim import Simulation
 
+WARM_UP = 3  # calls: eager, captured, replayed
 
-def timed(sim: Simulation, work: Callable[[], object]) -> float:
-    """Seconds that some work takes, the device idle at both ends."""
+
+def timed(sim: Simulation, work: Callable[[], object], meter: EnergyMeter | None = None) -> float:
+    """Seconds that some work takes, the device idle at both ends; a meter takes in its energy."""
     sim.synchronize()
+    if meter is not None:
+        meter.start()
     began = time.perf_counter()
     work()
     sim.synchronize()
-    return time.perf_counter() - began
+    seconds = time.perf_counter() - began
+    if meter is not None:
+        meter.stop()
+    return seconds
+
+
+def step_graph(sim: Simulation, n: int, *, kinematics: bool = False) -> Repeated | None:
+    """The graph that ``sim.step(n)`` replays; None on native MuJoCo, which has none."""
+    graph_of = getattr(sim, "graph_of", None)
+    return None if graph_of is None else graph_of(n, kinematics=kinematics)
+
+
+def capture_problem(sim: Simulation, mode: GraphMode, captured: bool) -> str:
+    """Why work that ran eagerly has no figure: on CUDA it should have been captured. Empty where it has one."""
+    if captured or sim.device.type != "cuda" or mode is GraphMode.off:
+        return ""
+    return "it was not captured and ran eagerly (run.log says why); graph=off measures it like that"
 
 
 def spread(name: str, values: Sequence[float]) -> dict[str, Value]:

@@ -152,10 +152,12 @@ def _fill(row: ScalingRow, metrics: dict[str, Any]) -> None:
         setattr(row, f"{column}_max", get(f"{name}.max"))
     row.ms_per_env_step = get("env_step.ms_per_env_step.median")
     row.managers_over_physics = get("env_step.managers_over_physics.median")
+    row.managers_alone_over_physics = get("env_step.managers_alone_over_physics.median")
     row.episode_s, row.bare_ratio = get("episode.seconds.median"), get("episode.bare_ratio.median")
     row.gpu_memory_arrays_mib, row.gpu_memory_whole_gpu_mib = most("gpu_memory_arrays_mib"), most("gpu_memory_whole_gpu_mib")
     row.gpu_power_mean_w, row.process_peak_mib = get("episode.gpu_power_mean_w"), get("process_peak_mib")
-    row.build_s, row.capture_s = get("build_and_compile_s"), get("episode.capture_s")
+    row.build_s = get("build_and_compile_s")
+    row.warm_up_s, row.capture_s = get("episode.warm_up_s"), get("episode.capture_s")
 
 
 def is_done(row: ScalingRow, retry: bool) -> bool:

@@ -118,12 +118,13 @@ def run_scaling_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutco
         outcome.gates = _conclude(cfg, folder, rows, incomplete, console)
     except KeyboardInterrupt:
         outcome.status = Status.interrupted
-        outcome.gates = _conclude(cfg, folder, rows, "interrupted", console)
+        try:
+            outcome.gates = _conclude(cfg, folder, rows, "interrupted", console)
+        except OSError as error:
+            _say_unwritten(folder, error)
     except OSError as error:
         outcome.status = Status.failed
-        Console(stderr=True, soft_wrap=True).print(
-            f"mjstack: {escape(str(folder))} cannot be written: {error.strerror}. Free space, and run the same command again."
-        )
+        _say_unwritten(folder, error)
     return outcome
 
 
@@ -146,6 +147,12 @@ def case_overrides(cfg: Config, overrides: Sequence[str], nworld: int, backend: 
         f"gate.throughput.env_frames={job.native_env_frames}",
         f"gate.throughput.cpu_max_seconds={60.0 * job.case_minutes}",
     ]
+
+
+def _say_unwritten(folder: Path, error: OSError) -> None:
+    Console(stderr=True, soft_wrap=True).print(
+        f"mjstack: {escape(str(folder))} cannot be written: {error.strerror}. Free space, and run the same command again."
+    )
 
 
 def _job(cfg: Config) -> ScalingJobCfg:
@@ -201,9 +208,11 @@ def _notes(cfg: Config) -> list[str]:
         f"ms per step and world-steps/s: physics under a held command from {t.from_phase} on, cube in hand; medians of "
         f"{job.repetitions} repetitions up to {job.large:,} worlds, of {job.repetitions_large} above.",
         f"env-steps/s: env.step with all managers, random actions and resets, {cfg.timing.substeps} physics steps each; "
-        "managers: what they add to its physics.",
+        "managers: what they add to its physics, in which worlds that would have ended go on; managers alone: their own time "
+        "over that of physics.",
         "MJWarp: accepted worlds of the whole episode; its seconds include the acceptance's evidence; over bare steps: "
-        "against replayed mujoco_warp.step alone on the same commands.",
+        "against replayed mujoco_warp.step alone on the same commands; capture: that of the episode's graph, without its "
+        "warm-up; power, in scaling.csv: during the episodes' replayed frames alone.",
         f"native: {job.native_frames} frames of physics per repetition on all cores; no episode, so these worlds are not "
         f"judged; beyond {t.start_worlds} worlds the start states repeat.",
     ]

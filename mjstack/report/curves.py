@@ -27,7 +27,7 @@ def save_scaling_curves(path: Path, rows: Sequence[ScalingRow], substeps: int, t
 
     Args:
         path: The picture.
-        rows: The table. A case without figures interrupts its curve, and a cross at the bottom marks it.
+        rows: The table. A case that did not pass interrupts its curves, whatever it has measured, and a cross marks it.
         substeps: Physics steps in an environment step: both are drawn as world-steps/s.
         title: What is shown.
     """
@@ -39,14 +39,14 @@ def save_scaling_curves(path: Path, rows: Sequence[ScalingRow], substeps: int, t
         worlds = [row.nworld for row in mine]
         for name, line, marker, what in _SERIES:
             factor = substeps if name == "env_steps_per_s" else 1
-            values = [factor * _number(getattr(row, name)) for row in mine]
+            values = [factor * _number(getattr(row, name)) if row.status == PASS else math.nan for row in mine]
             if all(math.isnan(value) for value in values):
                 continue
             label = f"{LABELS[backend]}, {what}"
             rate.plot(worlds, values, line, marker=marker, markersize=4, color=color, label=label)
             steps = [1e3 * n / value for n, value in zip(worlds, values, strict=True)]
             cost.plot(worlds, steps, line, marker=marker, markersize=4, color=color, label=label)
-        failed = [row.nworld for row in mine if row.status != PASS and math.isnan(_number(row.world_steps_per_s))]
+        failed = [row.nworld for row in mine if row.status != PASS]
         for axes in (rate, cost):
             bottom = [0.02 if backend == "mjwarp" else 0.06] * len(failed)
             axes.plot(failed, bottom, "x", color=color, transform=axes.get_xaxis_transform())

@@ -30,14 +30,16 @@ class ScalingRow:
         ms_per_env_step: ``env.step`` with all managers [ms], median.
         env_steps_per_s: The same as control intervals of all worlds per second.
         managers_over_physics: What the managers add to physics in ``env.step``, as a fraction of it.
+        managers_alone_over_physics: The time of the managers alone, likewise.
         episode_s: The validated episode [s], median.
         bare_ratio: That over bare steps of the same commands.
         gpu_memory_arrays_mib: GPU memory that arrays hold [MiB], most of all sections.
         gpu_memory_whole_gpu_mib: GPU memory that is taken on the whole GPU [MiB], likewise.
-        gpu_power_mean_w: Mean power during the episodes and the bare steps [W].
+        gpu_power_mean_w: Mean power during the episodes' frames alone [W].
         process_peak_mib: Host memory [MiB]; of native cases.
         build_s: Building the worlds, compilation included [s].
-        capture_s: Capturing an episode's graphs [s].
+        warm_up_s: An episode's first frame, which runs eagerly [s].
+        capture_s: Capturing an episode's graph, its warm-up not included [s].
         seconds: The whole case, start of its process included [s].
         hardware: Backend and hardware.
         git_commit: Which mjstack.
@@ -59,6 +61,7 @@ class ScalingRow:
     env_steps_per_s_min: Value = None
     env_steps_per_s_max: Value = None
     managers_over_physics: Value = None
+    managers_alone_over_physics: Value = None
     episode_s: Value = None
     bare_ratio: Value = None
     gpu_memory_arrays_mib: Value = None
@@ -66,6 +69,7 @@ class ScalingRow:
     gpu_power_mean_w: Value = None
     process_peak_mib: Value = None
     build_s: Value = None
+    warm_up_s: Value = None
     capture_s: Value = None
     seconds: Value = None
     hardware: str = ""
@@ -102,10 +106,12 @@ def to_markdown(rows: Sequence[ScalingRow], title: str, notes: Sequence[str], pi
 def crossover(rows: Sequence[ScalingRow]) -> float | None:
     """Number of worlds from which MJWarp makes more world-steps/s than native MuJoCo; None where the rows do not show it.
 
-    Interpolated between the two numbers of worlds that bracket it, straight in logarithms.
+    Interpolated between the two numbers of worlds that bracket it, straight in logarithms. Cases that failed do not count.
     """
     rates = {
-        (row.backend, row.nworld): float(row.world_steps_per_s) for row in rows if isinstance(row.world_steps_per_s, float)
+        (row.backend, row.nworld): float(row.world_steps_per_s)
+        for row in rows
+        if row.status == PASS and isinstance(row.world_steps_per_s, float)
     }
     both = sorted({n for _, n in rates if ("mjwarp", n) in rates and ("native", n) in rates})
     gap = [math.log(rates["mjwarp", n] / rates["native", n]) for n in both]
@@ -119,7 +125,7 @@ def describe_crossover(rows: Sequence[ScalingRow]) -> str:
     """The crossover in a sentence."""
     at = crossover(rows)
     if at is None:
-        return "Crossover: the finished rows do not show MJWarp passing native MuJoCo."
+        return "Crossover: the cases that passed do not show MJWarp passing native MuJoCo."
     return f"Crossover: from about {at:,.0f} worlds on MJWarp makes more physics steps than native MuJoCo on all cores."
 
 
@@ -135,6 +141,7 @@ _COLUMNS = (
     ("world-steps/s", lambda r: _number(r.world_steps_per_s)),
     ("env-steps/s", lambda r: _number(r.env_steps_per_s)),
     ("managers", lambda r: _number(r.managers_over_physics, "+.1%")),
+    ("managers alone", lambda r: _number(r.managers_alone_over_physics, ".1%")),
     ("episode, s", lambda r: _number(r.episode_s, ".3g")),
     ("over bare steps", lambda r: _number(r.bare_ratio, ".3f")),
     ("GPU memory, MiB", lambda r: _number(r.gpu_memory_whole_gpu_mib)),
