@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from dataclasses import dataclass, field
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import torch
 
-from mjstack.config.schema import Backend
+from mjstack.config.schema import Backend, GraphMode
 from mjstack.envs import Env
 from mjstack.errors import name_worlds
 from mjstack.gates.env_step import measure_env_step
@@ -265,6 +266,8 @@ def _play_bare(context: GateContext, sim: MjwarpSimulation) -> tuple[float, str]
     step = sim.bare_step()
     for _ in range(WARM_UP):  # none of it is timed
         step()
+    if sim.device.type == "cuda" and cfg.graph is not GraphMode.off and not step.captured:
+        return math.nan, "the bare steps could not be captured"
     _, tape = start_worlds(sim, context.index, cfg, cfg.reset, context.planner)
 
     def play() -> None:

@@ -203,22 +203,16 @@ class MjwarpSimulation(FixedViews):
             "box_box": "primitive" if primitive else "convex",
         }
 
-    def bare_step(self) -> Callable[[], None]:
+    def bare_step(self) -> StepGraph:
         """One plain ``mujoco_warp.step``, captured and replayed with nothing else: what the rest is measured by."""
-        graph = StepGraph(
-            lambda: mjw.step(self._m, self._d),
-            self.device,
-            self._graph_mode,
-            name="a bare step",
-            version=lambda: self.version,
-            scratch=lambda: False,
-        )
 
-        def step() -> None:
+        def work() -> None:
             with torch_stream_scope(self._device):
-                graph()
+                mjw.step(self._m, self._d)
 
-        return step
+        return StepGraph(
+            work, self.device, self._graph_mode, name="a bare step", version=lambda: self.version, scratch=lambda: False
+        )
 
     def graph_of(self, n: int = 1, *, kinematics: bool = False) -> StepGraph:
         """The graph that `step(n)` replays."""
