@@ -60,7 +60,7 @@ class ProgressBar:
             self._task = self._progress.add_task(f"{self._gate}: {unit}", total=total, unit="", rate="")
         rate = f"{done / (now - self._began):.1f}/s" if now > self._began and done > 1 else ""
         self._progress.update(self._task, completed=done, rate=rate)
-        if self._progress.disable and now - self._spoke > 15.0:
+        if self._progress.disable and done > 1 and now - self._spoke > 15.0:
             self._spoke = now
             left = (total - done) * (now - self._began) / max(done, 1)
             self.say(f"{self._gate}: {unit} {done}/{total}, {rate}, {left:.0f} s left")
