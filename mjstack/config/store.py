@@ -167,6 +167,10 @@ def _unknown_key(error: Exception, key: str) -> MjstackError:
         nearest = max(same_leaf, key=lambda k: difflib.SequenceMatcher(None, key, k).ratio())
         return CompositionError(f"configuration key '{key}' does not exist. Did you mean '{nearest}'?")
     siblings = [k for k in keys if k.rpartition(".")[0] == key.rpartition(".")[0]]
+    near = difflib.get_close_matches(leaf, [k.rpartition(".")[2] for k in siblings], n=1, cutoff=0.6)
+    if near:
+        nearest = key.removesuffix(leaf) + near[0]
+        return CompositionError(f"configuration key '{key}' does not exist. Did you mean '{nearest}'?")
     pool = sorted({*siblings, *(k for k in keys if "." not in k)})
     return CompositionError(f"configuration key '{key}' does not exist. {suggest(key, _nearest_first(leaf, pool))}")
 
