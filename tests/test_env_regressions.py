@@ -69,7 +69,7 @@ def test_an_overflow_names_the_size_that_is_in_force() -> None:
     env = mjstack.make_env(["sim=mjwarp", "sim.device=cpu", "batch.naconmax=40", "reset=randomized"], nworld=2)
     env.reset(seed=0)
     env.sim.overflow.fill_(8)  # NARROWPHASE; latched as if a step had raised it
-    env._overflow |= 8
+    env._faults._overflow |= 8
     env.sim.peak_pool.fill_(77)
     with pytest.raises(FaultError, match=r"Raise batch\.naconmax \(naconmax=40; all worlds together needed 77"):
         env.raise_faults()

@@ -22,7 +22,8 @@ from mjstack.jobs import scaling
 from mjstack.jobs.case import OutOfTime, _row, read_case
 from mjstack.jobs.scaling import case_overrides, scaling_folder
 from mjstack.report.curves import save_scaling_curves
-from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow, crossover, describe_crossover, to_csv, to_markdown
+from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow, crossover, describe_crossover, to_markdown
+from mjstack.report.table import to_csv
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
 TINY = ["job=scaling", "job.repetitions=1", "job.native_frames=2", "job.native_env_frames=1", "gate.throughput.start_worlds=2"]
@@ -393,4 +394,4 @@ def test_table_shows_gaps_and_where_rows_come_from() -> None:
     assert lines[5].endswith("| out of memory: a \\| b |")
     assert "- commit: a\n- commit: b\n" in text
     assert text.count("- hardware") == 1
-    assert [row["ms_per_step"] for row in csv.DictReader(to_csv([good, bad]).splitlines())] == ["1.376", ""]
+    assert [row["ms_per_step"] for row in csv.DictReader(to_csv(ScalingRow, [good, bad]).splitlines())] == ["1.376", ""]

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from enum import Enum
 from typing import Any
 
 import torch
 
 from mjstack.config.schema import Config
+from mjstack.envs.faults import FaultLatch, count_start
 from mjstack.envs.outputs import Outputs
 from mjstack.envs.parts import Eager, Repeated, StepParts
 from mjstack.envs.statistics import EpisodeStatistics
-from mjstack.errors import ArgumentError, FaultError, name_worlds
+from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
 from mjstack.managers.base import Term, first_value, one_pass, running
 from mjstack.managers.observation import ObservationManager
@@ -21,18 +21,9 @@ from mjstack.managers.reset import ResetManager
 from mjstack.managers.reward import RewardManager
 from mjstack.managers.termination import TerminationManager
 from mjstack.scene import SceneIndex
-from mjstack.sim import LOST_PHYSICS, Overflow, Simulation, describe_overflow
+from mjstack.sim import Simulation
 
 FAULT_WINDOW = 200  # steps between two looks at the faults on CUDA; on the CPU looking costs nothing
-
-
-class Fault(Enum):
-    """What went wrong in a world, latched on the device until the host looks; in the order of `Env._latch`."""
-
-    ACTION = "actions were not finite"
-    STATE = "the state is not finite"
-    REWARD = "the reward is not finite"
-    OBSERVATION = "an observation is not finite"
 
 
 class Env:
@@ -95,10 +86,6 @@ class Env:
         self.frame = torch.zeros_like(self.world)
         self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
         self._everyone = torch.ones_like(self.success)
-        self._nobody = torch.zeros_like(self.success)
-        self._faults = torch.zeros((sim.nworld, len(Fault)), dtype=torch.bool, device=sim.device)
-        self._overflow = torch.zeros(sim.nworld, dtype=torch.int32, device=sim.device)
-        self._ends_on_overflow, self._ends_on_non_finite = self._ends_on("overflow"), self._ends_on("non_finite")
         self._steps = self._version = 0
         self._check_faults = check_faults
         self._started = self._closed = False
@@ -119,6 +106,7 @@ class Env:
         self._forget(self._everyone)
         self.episode.fill_(-1)
         self._bind_outputs()
+        self._faults = FaultLatch(self)
         self.graph = self.captured(self.advance, "env.step")
 
     @property
@@ -179,9 +167,9 @@ class Env:
         self.frame.masked_fill_(mask, 0)
         self._write_start(mask)
         if mask is self._everyone:
-            self._require_capacity()
-            for latch in (self._faults, self._overflow):
-                latch.zero_()
+            if count_start(self.sim):
+                self._write_start(self._everyone)  # as if nobody had looked
+            self._faults.clear()
             self._started = True
         self._forget(mask)
         return _copies(self.observation_manager.refresh(mask)), {}
@@ -274,22 +262,7 @@ class Env:
         Raises:
             FaultError: Something did; names the worlds and what to do.
         """
-        if not bool(self._faults.any() | (self._overflow != 0).any()):
-            return
-        overflow = self._overflow.tolist()
-        lost = [w for w, bits in enumerate(overflow) if bits]
-        if lost:
-            bits = 0
-            for w in lost:
-                bits |= overflow[w]
-            raise FaultError(
-                f"{describe_overflow(bits)} overflow in {name_worlds(lost, self.nworld)}", self._capacity_hint(bits)
-            )
-        for column, fault in enumerate(Fault):
-            worlds = self._faults[:, column].nonzero()[:, 0].tolist()
-            if worlds:
-                where = f"{name_worlds(worlds, self.nworld)}{self._culprits(fault, worlds[0])}"
-                raise FaultError(f"{fault.value} in {where}", _FIXES[fault])
+        self._faults.raise_any()
 
     def close(self) -> None:
         """Gives the simulation's threads and buffers back. Nothing can be stepped afterwards."""
@@ -351,25 +324,9 @@ class Env:
         self._side_by_side(reward, observe)
         running.label = ""
         if self._check_faults and not broken.is_cuda:
-            self._latch(broken)
-            self.raise_faults()
+            self._faults.latch(broken)
+            self._faults.raise_any()
         self._reset_ended(broken)
-
-    def _latch(self, broken: torch.Tensor) -> None:
-        """Keeps what went wrong, before a reset can erase it."""
-        # A world's own overflow may end its episode; that of the shared pool voids the whole batch.
-        self._overflow |= self.sim.overflow & (_POOL if self._ends_on_overflow else LOST_PHYSICS)
-        bad_action, reward = self.action_manager.not_finite, self.reward_manager.reward
-        seen = torch.zeros_like(reward)
-        for group in self.observation_manager.groups.values():
-            seen = seen + (group * 0.0).sum(1)
-        state = self._nobody if self._ends_on_non_finite else broken
-        self._faults |= torch.stack((bad_action, state, reward * 0.0 != 0.0, (seen != 0.0) & ~broken), dim=1)
-        bad_action.zero_()
-
-    def _ends_on(self, term: str) -> bool:
-        """Whether one of mjstack's own terminations is in use, under whatever name."""
-        return any(cfg.func == f"mjstack.mdp.termination.{term}" for cfg in self.cfg.termination.values())
 
     def _reset_ended(self, broken: torch.Tensor) -> None:
         """The terminal observation, the statistics, the reset of the worlds that ended, and the observation to go on with."""
@@ -391,7 +348,7 @@ class Env:
 
         def latch() -> None:
             if on_cuda and self._check_faults:
-                self._latch(broken)
+                self._faults.latch(broken)
 
         self._side_by_side(hand_out, count, latch)
         if ending:
@@ -438,63 +395,6 @@ class Env:
         if not self._started:
             raise ArgumentError("mask", "a part of the worlds", "none at the first reset", "Call env.reset()")
         return mask
-
-    def _require_capacity(self) -> None:
-        """Counts the contacts of a full start, which MJWarp's pool must hold before the first step."""
-        sizes, pool = getattr(self.sim, "sizes", None), getattr(self.sim, "peak_pool", None)
-        if sizes is None or pool is None:
-            return
-        pool.zero_()  # it has the peak of everything before
-        self.sim.forward()
-        used = max(pool.tolist())
-        room = sizes.contact_pool(self.nworld)
-        if used > room:
-            key, value = ("naconmax", sizes.naconmax) if sizes.naconmax is not None else ("nconmax", sizes.nconmax)
-            per_world = -(-used // self.nworld)
-            need = used if sizes.naconmax is not None else per_world
-            raise FaultError(
-                f"batch.{key}={value}: the start of {self.nworld} worlds needs at least {used} contacts and "
-                f"collision pairs ({per_world} per world), and there is room for {room}",
-                f"Raise it to more than batch.{key}={need}, or choose a reset with fewer contacts",
-            )
-        self._write_start(self._everyone)  # as if nobody had looked
-
-    def _capacity_hint(self, bits: int) -> str:
-        sizes = getattr(self.sim, "sizes", None)
-        # The pools' own sizes take precedence where they are set.
-        contacts = "nconmax" if getattr(sizes, "naconmax", None) is None else "naconmax"
-        convex = "nccdmax" if getattr(sizes, "naccdmax", None) is None else "naccdmax"
-        by_key = {"njmax": Overflow.NEFC | Overflow.NJMAX_NNZ, contacts: _POOL, convex: Overflow.CCD}
-        keys = [key for key, flags in by_key.items() if bits & flags]
-        if not keys:
-            return "Simplify the model, or use sim=native"
-        held = ", ".join(f"{key}={getattr(sizes, key, None)}" for key in keys)
-        peak = f"; up to {int(self.sim.peak_constraints.max())} rows were needed" if "njmax" in keys else ""
-        pool = getattr(self.sim, "peak_pool", None)
-        if contacts in keys and pool is not None:
-            most = max(pool.tolist())
-            peak += f"; all worlds together needed {most}, {-(-most // self.nworld)} per world"
-        return f"Raise {' and '.join(f'batch.{key}' for key in keys)} ({held}{peak})"
-
-    def _culprits(self, fault: Fault, world: int) -> str:
-        """Names the terms behind a number that is not finite, as far as their last values tell."""
-        if fault is Fault.REWARD:
-            bad = ~torch.isfinite(self.reward_manager.values[world])
-            names = [n for n, is_bad in zip(self.reward_manager.names, bad.tolist(), strict=True) if is_bad]
-            return f", from reward.{', reward.'.join(names)}" if names else ""
-        if fault is Fault.OBSERVATION:
-            terms = self.observation_manager.not_finite_terms(world)
-            return f", from {', '.join(terms)}" if terms else ""
-        return ""
-
-
-_POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
-_FIXES = {
-    Fault.ACTION: "Check what the policy returns",
-    Fault.STATE: "Lower the gains or the timestep, or add the termination non_finite",
-    Fault.REWARD: "Correct the term",
-    Fault.OBSERVATION: "Correct the term",
-}
 
 
 def _copies(groups: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

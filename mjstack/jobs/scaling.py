@@ -25,7 +25,8 @@ from mjstack.jobs.reported import model_text
 from mjstack.report.curves import save_scaling_curves
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Report, Status, write_atomic
-from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow, describe_crossover, to_csv, to_markdown
+from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow, describe_crossover, to_markdown
+from mjstack.report.table import to_csv
 from mjstack.scene import build_model
 from mjstack.sim import cuda_driver, resolve_device
 
@@ -194,7 +195,7 @@ def _describe(row: ScalingRow) -> str:
 
 
 def _write_tables(cfg: Config, folder: Path, rows: list[ScalingRow], picture: str = "") -> None:
-    write_atomic(folder / "scaling.csv", to_csv(rows))
+    write_atomic(folder / "scaling.csv", to_csv(ScalingRow, rows))
     write_atomic(folder / "scaling.md", to_markdown(rows, _title(cfg), _notes(cfg), picture))
 
 

@@ -24,7 +24,8 @@ from mjstack.jobs.reported import Record, run_reported
 from mjstack.managers.reset import required_fields
 from mjstack.report.picture import save_study
 from mjstack.report.record import GateResult, Status, write_atomic
-from mjstack.report.study import StudyRow, to_csv, to_markdown
+from mjstack.report.study import StudyRow, to_markdown
+from mjstack.report.table import to_csv
 from mjstack.sim import LOST_PHYSICS, Simulation, SolverLimit, make_simulation
 from mjstack.sim.sizes import resolve_measuring_sizes
 from mjstack.tasks.stack import RULE_TEXT
@@ -247,7 +248,7 @@ def _notes(context: GateContext) -> list[str]:
 
 
 def _write_tables(context: GateContext, folder: Path, rows: list[StudyRow], picture: str = "") -> None:
-    write_atomic(folder / "study.csv", to_csv(rows))
+    write_atomic(folder / "study.csv", to_csv(StudyRow, rows))
     write_atomic(folder / "study.md", to_markdown(rows, _title(context), _notes(context), picture))
 
 

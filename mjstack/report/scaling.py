@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 
 from mjstack.report.markdown import escape_cell
 from mjstack.report.record import Value
@@ -74,15 +72,6 @@ class ScalingRow:
     seconds: Value = None
     hardware: str = ""
     git_commit: str = ""
-
-
-def to_csv(rows: Sequence[ScalingRow]) -> str:
-    """All columns of all rows."""
-    out = io.StringIO()
-    writer = csv.DictWriter(out, [field.name for field in fields(ScalingRow)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    return out.getvalue()
 
 
 def to_markdown(rows: Sequence[ScalingRow], title: str, notes: Sequence[str], picture: str = "") -> str:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 
 from mjstack.report.markdown import escape_cell
 
@@ -53,15 +51,6 @@ class StudyRow:
     line_search_limit_worlds: int | None = None
     peak_rows: int | None = None
     xy_err_max_m: float | None = None
-
-
-def to_csv(rows: Sequence[StudyRow]) -> str:
-    """All columns, for programs; what is not known is empty."""
-    out = io.StringIO()
-    writer = csv.DictWriter(out, [field.name for field in fields(StudyRow)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    return out.getvalue()
 
 
 def to_markdown(rows: Sequence[StudyRow], title: str, notes: Sequence[str], picture: str = "") -> str:

@@ -9,12 +9,12 @@ from dataclasses import is_dataclass
 from functools import partial
 
 import mujoco
-import numpy as np
 import torch
 import warp as wp
 
 from mjstack.config.schema import GraphMode
 from mjstack.errors import UnsupportedModel
+from mjstack.sim.convex import convex_kinds
 from mjstack.sim.counters import clear_counters, record_convex_contacts, record_usage
 from mjstack.sim.engine import mjw
 from mjstack.sim.fields import PLACING_FIELDS, check_fields
@@ -94,7 +94,7 @@ class MjwarpSimulation(FixedViews):
             self._peak_nefc = wp.zeros(nworld, dtype=int)
             self._peak_contacts = wp.zeros(nworld, dtype=int)
             self._peak_pool = wp.zeros(3, dtype=int)
-            kinds = _convex_kinds(model)
+            kinds = convex_kinds(model)
             self._kinds = None if kinds is None else wp.array(kinds, dtype=int)
             self._kind_counts = wp.zeros(0 if kinds is None else int(kinds.max()) + 1, dtype=int)
             self._lost = wp.zeros(nworld, dtype=int)
@@ -381,27 +381,6 @@ class MjwarpSimulation(FixedViews):
                 scratch=lambda: self.arrangement.scratch,
             )
         return self._graphs[key]
-
-
-def _convex_kinds(model: mujoco.MjModel) -> np.ndarray | None:
-    """Numbers the combinations of geom types that collide by the convex algorithm, else -1; None if the model has none.
-
-    Planes are always primitive, and so is everything among spheres, capsules and boxes, and a sphere with a cylinder.
-    """
-    g = mujoco.mjtGeom
-    present = {int(t) for t in model.geom_type}
-    shapes = [int(t) for t in (g.mjGEOM_HFIELD, g.mjGEOM_SPHERE, g.mjGEOM_CAPSULE, g.mjGEOM_ELLIPSOID, g.mjGEOM_CYLINDER)]
-    shapes += [int(t) for t in (g.mjGEOM_BOX, g.mjGEOM_MESH)]
-    simple = {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CAPSULE), int(g.mjGEOM_BOX)}
-    kinds = np.full(2 * (max(present) + 1,), -1, dtype=np.int32)
-    number = 0
-    for i, a in enumerate(shapes):
-        for b in shapes[i:]:
-            primitive = {a, b} <= simple or {a, b} == {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CYLINDER)}
-            if not primitive and {a, b} <= present:
-                kinds[a, b] = kinds[b, a] = number
-                number += 1
-    return kinds if number else None
 
 
 def _keep_arrays(fresh: object, old: object) -> None:
