@@ -47,13 +47,15 @@ class Cone(Enum):
 class LayoutCfg:
     """Where a scene's objects stand for one robot, and the buffer sizes its contacts need.
 
-    ``nconmax`` and ``njmax`` are for the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions.
+    ``random_xy`` is how far ``reset=randomized`` moves each cube off its place in x and y. ``nconmax`` and ``njmax`` are for the
+    scripted task, ``env_nconmax`` and ``env_njmax`` for random actions.
     """
 
     table_center: list[float] = MISSING
     table_half: list[float] = MISSING
     red_xy: list[float] = MISSING
     blue_xy: list[float] = MISSING
+    random_xy: list[float] = MISSING
     nconmax: int = MISSING
     njmax: int = MISSING
     env_nconmax: int = MISSING
@@ -64,7 +66,8 @@ class LayoutCfg:
 class RobotCfg:
     """An arm: names of its parts and the commands of the task.
 
-    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments.
+    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments. ``finger_room`` is what the open
+    jaws need around a cube.
     """
 
     name: str = MISSING
@@ -86,6 +89,7 @@ class RobotCfg:
     jaw_bodies: list[str] = MISSING
     replace_collision: bool = False
     approach_height: float = MISSING
+    finger_room: float = MISSING
     layouts: dict[str, LayoutCfg] = MISSING
 
 
@@ -106,6 +110,7 @@ class SceneCfg:
     table_friction: list[float] = MISSING
     red_xy: list[float] = MISSING
     blue_xy: list[float] = MISSING
+    random_xy: list[float] = MISSING
     cube_half: float = MISSING
     cube_mass: float = MISSING
     cube_friction: list[float] = MISSING
@@ -377,6 +382,14 @@ class StudyJobCfg(JobCfg):
 
 
 @dataclass(kw_only=True, slots=True)
+class ReachabilityJobCfg(JobCfg):
+    """What the arm reaches on the table, every ``step``, and how far cubes may stand from their places, ``margin`` inside that."""
+
+    step: float = MISSING
+    margin: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
 class Config:
     """Everything a run needs."""
 
@@ -404,5 +417,6 @@ class Config:
     graph: GraphMode = MISSING
     view: bool = MISSING
     video: bool = MISSING
+    layout: str | None = None
     run: str | None = None
     world: str | None = None
