@@ -47,8 +47,8 @@ class Cone(Enum):
 class LayoutCfg:
     """Where a scene's objects stand for one robot, and the buffer sizes its contacts need.
 
-    ``random_xy`` is how far ``reset=randomized`` moves each cube off its place in x and y. ``nconmax`` and ``njmax`` are for the
-    scripted task, ``env_nconmax`` and ``env_njmax`` for random actions.
+    ``random_xy`` is how far ``reset=randomized`` moves each cube off its place in x and y. ``nconmax`` and ``njmax`` are for
+    the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions.
     """
 
     table_center: list[float] = MISSING
@@ -66,8 +66,8 @@ class LayoutCfg:
 class RobotCfg:
     """An arm: names of its parts and the commands of the task.
 
-    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments. ``finger_room`` is what the open
-    jaws need around a cube.
+    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments. ``finger_room`` is what the
+    open jaws need around a cube.
     """
 
     name: str = MISSING
@@ -383,7 +383,10 @@ class StudyJobCfg(JobCfg):
 
 @dataclass(kw_only=True, slots=True)
 class ReachabilityJobCfg(JobCfg):
-    """What the arm reaches on the table, every ``step``, and how far cubes may stand from their places, ``margin`` inside that."""
+    """What the arm reaches on the table, and how far cubes may stand from their places.
+
+    ``step`` is the distance of the map's points. A region counts as reached if it is still ``margin`` wider all round.
+    """
 
     step: float = MISSING
     margin: float = MISSING

@@ -42,7 +42,7 @@ class Reached:
 class PointReach:
     """Brings the aperture centre to points, for one opening of the gripper; collisions are not looked at.
 
-    The other joints stay at the robot's home, or where they are locked. The gripper points along the axis of the last arm joint.
+    The other joints stay at the robot's home, or where they are locked. The gripper points along the last arm joint's axis.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg, gripper: Sequence[float]) -> None:
