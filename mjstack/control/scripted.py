@@ -5,36 +5,16 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Generator
 from contextlib import closing
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from mjstack.config.schema import Config
+from mjstack.control.phases import FIXED, anchor_of, build_phases
 from mjstack.control.planning_pool import PARALLEL_FROM, WORLDS_PER_PROCESS, Plan, plan_in_parallel
 from mjstack.errors import Unreachable
 from mjstack.kinematics.mink_ik import ApertureIk
-from mjstack.scene import table_top
 from mjstack.sim.native import available_cores
-
-
-@dataclass(frozen=True, slots=True)
-class Phase:
-    """A phase as frames ``start`` to ``stop`` (exclusive) of the episode."""
-
-    name: str
-    start: int
-    stop: int
-
-
-def build_phases(cfg: Config) -> list[Phase]:
-    """The controller's phases laid out over the episode's frames."""
-    phases, start = [], 0
-    for name, phase in cfg.controller.phases.items():
-        stop = start + round(phase.seconds / cfg.timing.frame_dt)
-        phases.append(Phase(name, start, stop))
-        start = stop
-    return phases
 
 
 class CommandTape:
@@ -197,21 +177,16 @@ class ScriptedPlanner:
 
     def _targets(self, xy: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
         """Start and end of the aperture centre and of the gripper command, per phase."""
-        robot, scene = self._cfg.robot, self._cfg.scene
-        half, top = scene.cube_half, table_top(scene)
-        anchors = {
-            "red": np.array([xy[0], xy[1], top + half]),
-            "blue": np.array([xy[2], xy[3], top + half]),
-            "on_blue": np.array([xy[2], xy[3], top + 3.0 * half]),
-        }
+        robot, sources = self._cfg.robot, (xy[:2], xy[2:])
         grips = {"open": np.array(robot.gripper_open), "closed": np.array(robot.gripper_closed)}
         out: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-        for cfg in self._cfg.controller.phases.values():
+        for name, cfg in self._cfg.controller.phases.items():
             grip = grips[cfg.gripper]
-            if cfg.anchor is None:
+            anchor = anchor_of(self._cfg, name)
+            if anchor is None:
                 end = out[-1][1]
             else:
-                end = anchors[cfg.anchor] + np.array([0.0, 0.0, cfg.h_scale * robot.approach_height + cfg.offset])
+                end = np.array([*(anchor.xy if anchor.source == FIXED else sources[anchor.source]), anchor.z])
             # The first phase's target stands from the first frame; only the gripper moves from home.
             start = out[-1][1] if out else end
             grip0 = out[-1][3] if out else np.array(robot.home[len(robot.arm_joints) :])
