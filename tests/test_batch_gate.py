@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from mjstack.control.scripted import CommandTape
+from mjstack.control.planner import CommandTape
 from mjstack.errors import RunError
 from mjstack.gates import gate as gate_module
 from mjstack.gates.batch import run_batch

@@ -256,7 +256,13 @@ class PhaseCfg:
 
 @dataclass(kw_only=True, slots=True)
 class ControllerCfg:
-    """The scripted controller and its planner. Its commands go through the action terms of ``action``."""
+    """The scripted motion. Its commands go through the action terms of ``action``.
+
+    ``knots``, ``ik_tolerance`` and ``ik_iterations`` are mink's, which plans. A controller that watches makes
+    ``frame_iterations`` of batched inverse kinematics per frame; ``posture_gain`` pulls redundant joints to mink's nominal plan and
+    ``approach_gain`` the gripper upright; ``align`` is the share by which the jaws turn towards a cube's nearest face; a retry may go
+    up to ``hurry`` times as fast, and must be over ``rest_seconds`` before the window in which cubes must rest.
+    """
 
     name: str = MISSING
     action: dict[str, Any] = MISSING
@@ -264,6 +270,12 @@ class ControllerCfg:
     knots: int = MISSING
     ik_tolerance: float = MISSING
     ik_iterations: int = MISSING
+    frame_iterations: int = MISSING
+    posture_gain: float = MISSING
+    approach_gain: float = MISSING
+    align: float = MISSING
+    hurry: float = MISSING
+    rest_seconds: float = MISSING
 
 
 @dataclass(kw_only=True, slots=True)

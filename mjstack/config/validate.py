@@ -155,6 +155,10 @@ def _controller(cfg: Config) -> None:
         for part in ("h_scale", "offset"):
             if not math.isfinite(getattr(phase, part)):
                 raise ConfigError(f"{key}.{part}", getattr(phase, part), "a finite number")
+        if phase.grasps is not None and phase.grasps not in ("red", "blue"):
+            raise ConfigError(f"{key}.grasps", phase.grasps, "red, blue or null")
+        if phase.retry is not None and phase.retry not in cfg.controller.phases:
+            raise UnknownName(f"{key}.retry: phase", phase.retry, cfg.controller.phases)
         frames = phase.seconds / cfg.timing.frame_dt
         if abs(frames - round(frames)) > 1e-6:
             raise ConfigError(f"{key}.seconds", phase.seconds, f"a multiple of the frame, {cfg.timing.frame_dt:g} s")
@@ -164,6 +168,15 @@ def _controller(cfg: Config) -> None:
         raise ConfigError("controller.knots", cfg.controller.knots, "at least 3")
     _positive("controller.ik_tolerance", cfg.controller.ik_tolerance, "m")
     _positive_int("controller.ik_iterations", cfg.controller.ik_iterations)
+    _positive_int("controller.frame_iterations", cfg.controller.frame_iterations)
+    for key in ("posture_gain", "approach_gain", "align", "rest_seconds"):
+        value = getattr(cfg.controller, key)
+        if not (math.isfinite(value) and value >= 0.0):
+            raise ConfigError(f"controller.{key}", value, "a number that is not negative")
+    if cfg.controller.align > 1.0:
+        raise ConfigError("controller.align", cfg.controller.align, "a share from 0 to 1")
+    if not (math.isfinite(cfg.controller.hurry) and cfg.controller.hurry >= 1.0):
+        raise ConfigError("controller.hurry", cfg.controller.hurry, "a number of at least 1")
 
 
 def _gates(cfg: Config) -> None:

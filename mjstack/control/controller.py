@@ -7,7 +7,7 @@ from typing import Protocol
 import torch
 
 from mjstack.control.phases import Phase
-from mjstack.control.scripted import CommandTape
+from mjstack.control.planner import CommandTape
 
 
 class Controller(Protocol):

@@ -11,7 +11,7 @@ import torch
 
 from mjstack.config.schema import Config, TermCfg
 from mjstack.control.controller import Controller, TapeController
-from mjstack.control.scripted import CommandTape, ScriptedPlanner
+from mjstack.control.planner import CommandTape, ScriptedPlanner
 from mjstack.envs import Env, scripted_config
 from mjstack.gates.power import EnergyMeter
 from mjstack.gates.timing import step_graph

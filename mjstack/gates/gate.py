@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import Backend, Config
-from mjstack.control.scripted import ScriptedPlanner
+from mjstack.control.planner import ScriptedPlanner
 from mjstack.gates.episode import NOMINAL, Advance, Episode, FrameHook, Reset, State, run_episode
 from mjstack.gates.sizing import size_batch
 from mjstack.managers.reset import required_fields
