@@ -83,6 +83,8 @@ class RobotCfg:
     aperture_sites: list[str] = MISSING
     aperture_geoms: dict[str, list[str]] = field(default_factory=dict)
     aperture_bodies: dict[str, str] = field(default_factory=dict)
+    approach_body: str = MISSING
+    approach_axis: list[float] = MISSING
     jaw_bodies: list[str] = MISSING
     replace_collision: bool = False
     approach_height: float = MISSING

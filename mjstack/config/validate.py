@@ -104,6 +104,9 @@ def _robot(cfg: Config) -> None:
     _length("robot.gripper_open", robot.gripper_open, n_grip)
     _length("robot.gripper_closed", robot.gripper_closed, n_grip)
     _length("robot.aperture_sites", robot.aperture_sites, 2)
+    _length("robot.approach_axis", robot.approach_axis, 3)
+    if abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3:
+        raise ConfigError("robot.approach_axis", robot.approach_axis, "a vector of length 1, such as [0, 0, -1]")
     for key, names in (("robot.ik_joints", robot.ik_joints), ("robot.locked", list(robot.locked))):
         for name in names:
             if name not in robot.arm_joints:
