@@ -86,6 +86,8 @@ class RobotCfg:
     aperture_sites: list[str] = MISSING
     aperture_geoms: dict[str, list[str]] = field(default_factory=dict)
     aperture_bodies: dict[str, str] = field(default_factory=dict)
+    approach_body: str = MISSING
+    approach_axis: list[float] = MISSING
     jaw_bodies: list[str] = MISSING
     replace_collision: bool = False
     approach_height: float = MISSING
@@ -114,6 +116,10 @@ class SceneCfg:
     cube_half: float = MISSING
     cube_mass: float = MISSING
     cube_friction: list[float] = MISSING
+    # Where a box stands: the cubes' places in it, and how far above a cube's centre it is held.
+    red_slot: list[float] | None = None
+    blue_slot: list[float] | None = None
+    grasp_offset: float = 0.0
 
 
 @dataclass(kw_only=True, slots=True)
@@ -218,12 +224,16 @@ class TerminationTermCfg(TermCfg):
 
 @dataclass(kw_only=True, slots=True)
 class TaskCfg:
-    """What has to be achieved, sampled at frame ends. The rules' thresholds are in `AcceptanceCfg`."""
+    """What has to be achieved, sampled at frame ends. The rules' thresholds are in `AcceptanceCfg`.
+
+    ``evidence`` names the subclass of ``Evidence`` that judges a scripted episode.
+    """
 
     name: str = MISSING
     control_hz: float = MISSING
     episode_frames: int = MISSING
     goal_height: float = MISSING
+    evidence: str = MISSING
     success: TermCfg | None = None
 
 
@@ -231,20 +241,35 @@ class TaskCfg:
 class PhaseCfg:
     """One phase of the scripted grasp.
 
-    ``anchor`` is ``red``, ``blue`` (a cube's centre), ``on_blue`` (where the red cube's centre goes) or null (hold the last
-    command). The target lies ``h_scale`` approach heights plus ``offset`` above it.
+    ``anchor`` is one of `mjstack.control.phases.build_anchors`, such as ``red`` (a cube's centre), or null (the last target
+    holds). The target lies ``h_scale`` approach heights plus ``offset`` above it, and ``scene.grasp_offset`` too where the cube
+    is ``in_hand``.
+
+    The rest is for a controller that watches (``controller=scripted``): ``look`` measures the anchor's cube anew when the phase
+    begins, ``grasps`` names the cube that both jaws must press on when it ends, and ``retry`` the phase to go back to if they
+    do not.
     """
 
     anchor: str | None = None
     h_scale: float = 0.0
     offset: float = 0.0
+    in_hand: bool = False
     gripper: str = MISSING
     seconds: float = MISSING
+    look: bool = False
+    grasps: str | None = None
+    retry: str | None = None
 
 
 @dataclass(kw_only=True, slots=True)
 class ControllerCfg:
-    """The scripted controller and its planner. Its commands go through the action terms of ``action``."""
+    """The scripted motion. Its commands go through the action terms of ``action``.
+
+    ``knots``, ``ik_tolerance`` and ``ik_iterations`` are mink's, which plans. A controller that watches makes
+    ``frame_iterations`` of batched inverse kinematics per frame; ``posture_gain`` pulls redundant joints to mink's nominal plan and
+    ``approach_gain`` the gripper upright; ``align`` is the share by which the jaws turn towards a cube's nearest face; a retry may go
+    up to ``hurry`` times as fast, and must be over ``rest_seconds`` before the window in which cubes must rest.
+    """
 
     name: str = MISSING
     action: dict[str, Any] = MISSING
@@ -252,6 +277,12 @@ class ControllerCfg:
     knots: int = MISSING
     ik_tolerance: float = MISSING
     ik_iterations: int = MISSING
+    frame_iterations: int = MISSING
+    posture_gain: float = MISSING
+    approach_gain: float = MISSING
+    align: float = MISSING
+    hurry: float = MISSING
+    rest_seconds: float = MISSING
 
 
 @dataclass(kw_only=True, slots=True)

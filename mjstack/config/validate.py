@@ -13,7 +13,7 @@ JOBS = ("gates", "replay", "scaling", "study", "reachability")
 CONDIMS = (1, 3, 4, 6)
 SCALING_BACKENDS = ("mjwarp", "native")
 SECTIONS = ("physics", "episode", "env_step")
-ANCHORS = ("red", "blue", "on_blue")
+ANCHORS = ("red", "blue", "on_blue", "over_red", "over_blue", "red_slot", "blue_slot")
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
 _WORLD = re.compile(r"(\d+:)?\d+")
@@ -109,6 +109,9 @@ def _robot(cfg: Config) -> None:
     _length("robot.gripper_open", robot.gripper_open, n_grip)
     _length("robot.gripper_closed", robot.gripper_closed, n_grip)
     _length("robot.aperture_sites", robot.aperture_sites, 2)
+    _length("robot.approach_axis", robot.approach_axis, 3)
+    if abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3:
+        raise ConfigError("robot.approach_axis", robot.approach_axis, "a vector of length 1, such as [0, 0, -1]")
     for key, names in (("robot.ik_joints", robot.ik_joints), ("robot.locked", list(robot.locked))):
         for name in names:
             if name not in robot.arm_joints:
@@ -164,6 +167,10 @@ def _controller(cfg: Config) -> None:
         for part in ("h_scale", "offset"):
             if not math.isfinite(getattr(phase, part)):
                 raise ConfigError(f"{key}.{part}", getattr(phase, part), "a finite number")
+        if phase.grasps is not None and phase.grasps not in ("red", "blue"):
+            raise ConfigError(f"{key}.grasps", phase.grasps, "red, blue or null")
+        if phase.retry is not None and phase.retry not in cfg.controller.phases:
+            raise UnknownName(f"{key}.retry: phase", phase.retry, cfg.controller.phases)
         frames = phase.seconds / cfg.timing.frame_dt
         if abs(frames - round(frames)) > 1e-6:
             raise ConfigError(f"{key}.seconds", phase.seconds, f"a multiple of the frame, {cfg.timing.frame_dt:g} s")
@@ -173,6 +180,15 @@ def _controller(cfg: Config) -> None:
         raise ConfigError("controller.knots", cfg.controller.knots, "at least 3")
     _positive("controller.ik_tolerance", cfg.controller.ik_tolerance, "m")
     _positive_int("controller.ik_iterations", cfg.controller.ik_iterations)
+    _positive_int("controller.frame_iterations", cfg.controller.frame_iterations)
+    for key in ("posture_gain", "approach_gain", "align", "rest_seconds"):
+        value = getattr(cfg.controller, key)
+        if not (math.isfinite(value) and value >= 0.0):
+            raise ConfigError(f"controller.{key}", value, "a number that is not negative")
+    if cfg.controller.align > 1.0:
+        raise ConfigError("controller.align", cfg.controller.align, "a share from 0 to 1")
+    if not (math.isfinite(cfg.controller.hurry) and cfg.controller.hurry >= 1.0):
+        raise ConfigError("controller.hurry", cfg.controller.hurry, "a number of at least 1")
 
 
 def _gates(cfg: Config) -> None:

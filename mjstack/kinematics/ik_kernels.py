@@ -1,6 +1,10 @@
-"""Warp kernels for the aperture centre: forward kinematics and damped least squares, one thread per world."""
+"""Warp kernels for the aperture: forward kinematics and damped least squares, one thread per world."""
 
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
 import warp as wp
 
 wp.config.log_level = wp.LOG_ERROR  # before the first use, which starts Warp
@@ -12,6 +16,7 @@ SLIDE = 1
 # dead end at the limits (from home, over the reBot's whole reach, 97 % instead of 91 % are found); a near one converges fast.
 FAR_DAMPING = wp.constant(0.1)
 NAN = wp.constant(float("nan"))
+DOWN = wp.constant(wp.vec3(0.0, 0.0, -1.0))
 
 
 @wp.struct
@@ -25,77 +30,64 @@ class Chain:
     axis: wp.array[wp.vec3]  # of unit length, in that frame
     kind: wp.array[int]  # HINGE or SLIDE
     column: wp.array[int]  # of the command
-    moved: wp.array[int]  # which of the joints that inverse kinematics moves, or -1
+    low: wp.array[float]  # where inverse kinematics keeps the joint; infinite where it does not move it
+    high: wp.array[float]
     trunk: int
     fork: int
     end: int
     first_site: wp.vec3  # seen from the last link before it
     second_site: wp.vec3
+    approach: wp.vec3  # the gripper's approach axis, of unit length, seen from the trunk's last link
 
 
-@wp.struct
-class Moved:
-    """The joints that inverse kinematics moves."""
+@dataclass(frozen=True)
+class Shape:
+    """What a solve kernel is compiled for, so that its loops unroll and its working memory is registers."""
 
-    column: wp.array[int]  # of the command
-    low: wp.array[float]
-    high: wp.array[float]
-
-
-@wp.struct
-class Scratch:
-    """Working memory. Worlds are the last dimension where they can be, so that neighbouring threads read neighbours."""
-
-    command: wp.array2d[float]  # the iterate, (nworld, n)
-    anchor: wp.array2d[wp.vec3]  # a point on each moved joint's axis, (n_moved, nworld)
-    axis: wp.array2d[wp.vec3]  # in the world, (n_moved, nworld)
-    jacobian: wp.array2d[wp.vec3]  # one column of three per moved joint, (n_moved, nworld)
-    step: wp.array2d[float]  # (n_moved, nworld)
-    held: wp.array2d[int]  # 1: the step ends at the joint's limit, (n_moved, nworld)
+    kinds: tuple[int, ...]  # HINGE or SLIDE, of each link
+    moved: tuple[bool, ...]  # whether inverse kinematics moves it
+    trunk: int
+    fork: int
 
 
 @wp.func
-def follow(
-    chain: Chain, scratch: Scratch, command: wp.array2d[float], w: int, first: int, last: int, start: wp.transform
-) -> wp.transform:
-    """Pose after links ``first`` to ``last`` (exclusive), from a pose; notes the axes of the moved joints."""
+def turn(pose: wp.transform, axis: wp.vec3, kind: int, value: float) -> wp.transform:
+    """A joint's frame after it has moved."""
+    if kind == HINGE:
+        return wp.transform_multiply(pose, wp.transform(wp.vec3(), wp.quat_from_axis_angle(axis, value)))
+    return wp.transform_multiply(pose, wp.transform(value * axis, wp.quat_identity()))
+
+
+@wp.func
+def follow(chain: Chain, command: wp.array2d[float], w: int, first: int, last: int, start: wp.transform) -> wp.transform:
+    """Pose after links ``first`` to ``last`` (exclusive), from a pose."""
     pose = start
     for i in range(first, last):
-        pose = wp.transform_multiply(pose, chain.frame[i])
-        axis = chain.axis[i]
-        k = chain.moved[i]
-        if k >= 0:
-            scratch.anchor[k, w] = wp.transform_get_translation(pose)
-            scratch.axis[k, w] = wp.transform_vector(pose, axis)
-        value = command[w, chain.column[i]]
-        if chain.kind[i] == HINGE:
-            pose = wp.transform_multiply(pose, wp.transform(wp.vec3(), wp.quat_from_axis_angle(axis, value)))
-        else:
-            pose = wp.transform_multiply(pose, wp.transform(value * axis, wp.quat_identity()))
+        pose = turn(wp.transform_multiply(pose, chain.frame[i]), chain.axis[i], chain.kind[i], command[w, chain.column[i]])
     return pose
 
 
-@wp.func
-def forward(chain: Chain, scratch: Scratch, command: wp.array2d[float], w: int) -> wp.vec3:
-    """Aperture centre at a command; leaves its Jacobian in the working memory."""
-    trunk = follow(chain, scratch, command, w, 0, chain.trunk, wp.transform_identity())
-    first = wp.transform_point(follow(chain, scratch, command, w, chain.trunk, chain.fork, trunk), chain.first_site)
-    second = wp.transform_point(follow(chain, scratch, command, w, chain.fork, chain.end, trunk), chain.second_site)
-    centre = wp.lerp(first, second, 0.5)
-    for i in range(chain.end):
-        k = chain.moved[i]
-        if k >= 0:
-            # Behind the trunk a joint moves one site only, and so the midpoint by half as much.
-            point, share = centre, wp.float32(1.0)
-            if i >= chain.fork:
-                point, share = second, wp.float32(0.5)
-            elif i >= chain.trunk:
-                point, share = first, wp.float32(0.5)
-            direction = scratch.axis[k, w]
-            if chain.kind[i] == HINGE:
-                direction = wp.cross(direction, point - scratch.anchor[k, w])
-            scratch.jacobian[k, w] = share * direction
-    return centre
+@wp.kernel(enable_backward=False)
+def aperture_kernel(chain: Chain, command: wp.array2d[float], centre: wp.array[wp.vec3]) -> None:
+    """Aperture centre of every world."""
+    w = wp.tid()
+    trunk = follow(chain, command, w, 0, chain.trunk, wp.transform_identity())
+    first = wp.transform_point(follow(chain, command, w, chain.trunk, chain.fork, trunk), chain.first_site)
+    second = wp.transform_point(follow(chain, command, w, chain.fork, chain.end, trunk), chain.second_site)
+    centre[w] = wp.lerp(first, second, 0.5)
+
+
+@wp.kernel(enable_backward=False)
+def directions_kernel(
+    chain: Chain, command: wp.array2d[float], closing: wp.array[wp.vec3], approach: wp.array[wp.vec3]
+) -> None:
+    """Unit vectors of every world's gripper: from the first site to the second, and the approach axis."""
+    w = wp.tid()
+    trunk = follow(chain, command, w, 0, chain.trunk, wp.transform_identity())
+    first = wp.transform_point(follow(chain, command, w, chain.trunk, chain.fork, trunk), chain.first_site)
+    second = wp.transform_point(follow(chain, command, w, chain.fork, chain.end, trunk), chain.second_site)
+    closing[w] = wp.normalize(wp.sub(second, first))
+    approach[w] = wp.transform_vector(trunk, chain.approach)
 
 
 @wp.func
@@ -109,94 +101,166 @@ def within(value: float, low: float, high: float) -> float:
     return bounded
 
 
-@wp.func
-def find_step(moved: Moved, scratch: Scratch, w: int, error: wp.vec3, damping: float) -> float:
-    """Damped least-squares step within the limits; returns its largest part.
+@cache
+def solve_kernel(shape: Shape) -> wp.Kernel:
+    """The kernel that moves every world's aperture centre towards its target.
 
-    A joint that would pass its limit is stopped there, and the others are solved again for what it leaves to do: merely
-    cutting the step would stall beside a limit.
+    Joints that inverse kinematics does not move are followed once per solve where they come after the ones that it does,
+    as the wrist's roll and the fingers do: an iteration then takes the moved links alone.
     """
-    n = moved.column.shape[0]
-    for k in range(n):
-        scratch.held[k, w] = 0
-    lambda_squared = damping * damping + FAR_DAMPING * wp.dot(error, error)
-    for _ in range(n):
-        rest = error
-        gram = lambda_squared * wp.identity(n=3, dtype=float)
-        for k in range(n):
-            column = scratch.jacobian[k, w]
-            if scratch.held[k, w] == 1:
-                rest -= scratch.step[k, w] * column
-            else:
-                gram += wp.outer(column, column)
-        weights = wp.inverse(gram) * rest
-        stopped = wp.int32(0)
-        for k in range(n):
-            if scratch.held[k, w] == 0:
-                at = scratch.command[w, moved.column[k]]
-                step = wp.dot(scratch.jacobian[k, w], weights)
-                bounded = wp.clamp(at + step, moved.low[k], moved.high[k])
-                if bounded != at + step:
-                    step = bounded - at
-                    scratch.held[k, w] = 1
-                    stopped += 1
-                scratch.step[k, w] = step
-        if stopped == 0:
-            break
-    largest = wp.float32(0.0)
-    for k in range(n):
-        largest = wp.max(largest, wp.abs(scratch.step[k, w]))
-    return largest
+    n, forked = len(shape.kinds), any(shape.moved[shape.trunk :])
+    # Links that an iteration follows: these up to TRUNK carry both sites, and so on as in Chain.
+    TRUNK = shape.trunk if forked else max((i + 1 for i in range(n) if shape.moved[i]), default=0)
+    FORK, END = (shape.fork, n) if forked else (TRUNK, TRUNK)
+    # Links after them, from the trunk's, to the first site and to the second.
+    TRUNK_REST = (TRUNK, shape.trunk)
+    FIRST_REST, SECOND_REST = ((0, 0), (0, 0)) if forked else ((shape.trunk, shape.fork), (shape.fork, n))
+    Values = wp.types.vector(length=max(END, 1), dtype=float)
+    Rows = wp.types.matrix(shape=(max(END, 1), 3), dtype=float)  # a vector per link
 
+    @wp.func
+    def find_step(jacobian: Any, q: Any, wish: Any, low: Any, high: Any, error: wp.vec3, damping: float) -> Any:
+        """Damped least-squares step within the limits; what ``wish`` asks for is done as far as it moves no centre.
 
-@wp.kernel(enable_backward=False)
-def aperture_kernel(chain: Chain, scratch: Scratch, command: wp.array2d[float], centre: wp.array[wp.vec3]) -> None:
-    """Aperture centre of every world."""
-    w = wp.tid()
-    centre[w] = forward(chain, scratch, command, w)
+        A joint that would pass its limit is stopped there, and the others are solved again for what it leaves to do: merely
+        cutting the step would stall beside a limit.
+        """
+        given = wish  # of a stopped joint: its step
+        step = wish
+        held = Values()
+        lambda_squared = damping * damping + FAR_DAMPING * wp.dot(error, error)
+        stopped = wp.int32(1)
+        while stopped > 0:  # each pass stops another joint, or is the last
+            rest = error
+            gram = lambda_squared * wp.identity(n=3, dtype=float)
+            for i in range(END):
+                column = jacobian[i]
+                rest -= given[i] * column
+                if held[i] == 0.0:
+                    gram += wp.outer(column, column)
+            weights = wp.inverse(gram) * rest
+            stopped = wp.int32(0)
+            for i in range(END):
+                if held[i] == 0.0:
+                    part = given[i] + wp.dot(jacobian[i], weights)
+                    bounded = wp.clamp(q[i] + part, low[i], high[i])
+                    if bounded != q[i] + part:
+                        part = bounded - q[i]
+                        given[i] = part
+                        held[i] = 1.0
+                        stopped += 1
+                    step[i] = part
+        return step
 
+    @wp.kernel(enable_backward=False, module="unique")
+    def solve(
+        chain: Chain,
+        given: wp.array2d[float],
+        target: wp.array[wp.vec3],
+        posture: wp.array2d[float],
+        iterations: int,
+        wishing: int,
+        damping: float,
+        max_step: float,
+        posture_gain: float,
+        approach_gain: float,
+        near: float,
+        tolerance: float,
+        command: wp.array2d[float],
+        distance: wp.array[float],
+        unreachable: wp.array[wp.bool],
+    ) -> None:
+        """``command`` is the nearest iterate; of those nearer than ``near``, the last."""
+        w = wp.tid()
+        goal = target[w]
+        finite = wp.isfinite(goal)
+        for j in range(given.shape[1]):
+            finite = finite and wp.isfinite(given[w, j])
+            command[w, j] = given[w, j]
+            if wishing > 0:
+                finite = finite and wp.isfinite(posture[w, j])
+        q, low, high, home = Values(), Values(), Values(), Values()
+        for i in range(END):
+            j = chain.column[i]
+            low[i] = chain.low[i]
+            high[i] = chain.high[i]
+            q[i] = within(given[w, j], low[i], high[i])
+            home[i] = posture[w, j]
+            if wp.static(shape.moved[i]):
+                command[w, j] = q[i]
+        if not finite:
+            distance[w] = NAN
+            unreachable[w] = True
+            return
+        rest = follow(chain, given, w, wp.static(TRUNK_REST[0]), wp.static(TRUNK_REST[1]), wp.transform_identity())
+        first_end = follow(chain, given, w, wp.static(FIRST_REST[0]), wp.static(FIRST_REST[1]), rest)
+        second_end = follow(chain, given, w, wp.static(SECOND_REST[0]), wp.static(SECOND_REST[1]), rest)
+        first_site = wp.transform_point(first_end, chain.first_site)
+        second_site = wp.transform_point(second_end, chain.second_site)
+        approach = wp.transform_vector(rest, chain.approach)
+        best = q
+        nearest = wp.float32(0.0)
+        for iteration in range(iterations + 1):
+            anchors, axes = Rows(), Rows()
+            trunk = wp.transform(wp.vec3(), wp.quat_identity())
+            for i in range(TRUNK):
+                pose = wp.transform_multiply(trunk, chain.frame[i])
+                anchors[i] = wp.transform_get_translation(pose)
+                axes[i] = wp.transform_vector(pose, chain.axis[i])
+                trunk = turn(pose, chain.axis[i], wp.static(shape.kinds[i]), q[i])
+            branch = trunk
+            for i in range(TRUNK, FORK):
+                pose = wp.transform_multiply(branch, chain.frame[i])
+                anchors[i] = wp.transform_get_translation(pose)
+                axes[i] = wp.transform_vector(pose, chain.axis[i])
+                branch = turn(pose, chain.axis[i], wp.static(shape.kinds[i]), q[i])
+            first = wp.transform_point(branch, first_site)
+            branch = trunk
+            for i in range(FORK, END):
+                pose = wp.transform_multiply(branch, chain.frame[i])
+                anchors[i] = wp.transform_get_translation(pose)
+                axes[i] = wp.transform_vector(pose, chain.axis[i])
+                branch = turn(pose, chain.axis[i], wp.static(shape.kinds[i]), q[i])
+            second = wp.transform_point(branch, second_site)
+            centre = wp.lerp(first, second, 0.5)
+            error = goal - centre
+            left = wp.length(error)
+            if iteration == 0 or left < nearest or left < near:
+                nearest = left
+                best = q
+            if iteration < iterations:
+                jacobian = Rows()
+                for i in range(END):
+                    if wp.static(shape.moved[i]):
+                        # Behind the trunk a joint moves one site only, and so the midpoint by half as much.
+                        point, share = centre, wp.float32(1.0)
+                        if wp.static(i >= FORK):
+                            point, share = second, wp.float32(0.5)
+                        elif wp.static(i >= TRUNK):
+                            point, share = first, wp.float32(0.5)
+                        direction = axes[i]
+                        if wp.static(shape.kinds[i] == HINGE):
+                            direction = wp.cross(direction, point - anchors[i])
+                        jacobian[i] = share * direction
+                wish = Values()
+                if iteration < wishing:
+                    lever = wp.cross(wp.transform_vector(trunk, approach), DOWN)
+                    for i in range(END):
+                        if wp.static(shape.moved[i]):
+                            wish[i] = posture_gain * (home[i] - q[i])
+                            if wp.static(shape.kinds[i] == HINGE and i < TRUNK):
+                                wish[i] += approach_gain * wp.dot(axes[i], lever)
+                step = find_step(jacobian, q, wish, low, high, error, damping)
+                largest = wp.float32(0.0)
+                for i in range(END):
+                    largest = wp.max(largest, wp.abs(step[i]))
+                scale = wp.min(1.0, max_step / wp.max(largest, 1.0e-12))
+                for i in range(END):
+                    q[i] = wp.clamp(q[i] + scale * step[i], low[i], high[i])
+        for i in range(END):
+            if wp.static(shape.moved[i]):
+                command[w, chain.column[i]] = best[i]
+        distance[w] = nearest
+        unreachable[w] = not (nearest <= tolerance)
 
-@wp.kernel(enable_backward=False)
-def solve_kernel(
-    chain: Chain,
-    moved: Moved,
-    scratch: Scratch,
-    given: wp.array2d[float],
-    target: wp.array[wp.vec3],
-    iterations: int,
-    damping: float,
-    max_step: float,
-    command: wp.array2d[float],
-    distance: wp.array[float],
-) -> None:
-    """Moves every world's aperture centre towards its target; ``command`` holds the nearest iterate."""
-    w = wp.tid()
-    goal = target[w]
-    finite = wp.isfinite(goal)
-    for j in range(given.shape[1]):
-        command[w, j] = given[w, j]
-        finite = finite and wp.isfinite(given[w, j])
-    for k in range(moved.column.shape[0]):
-        j = moved.column[k]
-        command[w, j] = within(given[w, j], moved.low[k], moved.high[k])
-    if not finite:
-        distance[w] = NAN
-        return
-    for j in range(given.shape[1]):
-        scratch.command[w, j] = command[w, j]
-    error = goal - forward(chain, scratch, scratch.command, w)
-    nearest = wp.length(error)
-    for _ in range(iterations):
-        largest = find_step(moved, scratch, w, error, damping)
-        scale = wp.min(1.0, max_step / wp.max(largest, 1.0e-12))
-        for k in range(moved.column.shape[0]):
-            j = moved.column[k]
-            at = scratch.command[w, j] + scale * scratch.step[k, w]
-            scratch.command[w, j] = wp.clamp(at, moved.low[k], moved.high[k])
-        error = goal - forward(chain, scratch, scratch.command, w)
-        left = wp.length(error)
-        if left < nearest:
-            nearest = left
-            for k in range(moved.column.shape[0]):
-                command[w, moved.column[k]] = scratch.command[w, moved.column[k]]
-    distance[w] = nearest
+    return solve
