@@ -47,12 +47,17 @@ PATHS: dict[str, list[str] | None] = {
     "mdp/termination.py": ["time_out", "success", "non_finite", "overflow", "CubeOffTable.__call__", "JointLimit.__call__"],
     "mdp/action.py": ["JointPosition.write_commands", "Gripper.write_commands", "EndEffectorDelta.write_commands"],
     "mdp/reset.py": [
-        *("home", "_write", "_write_robot", "_write_cube", "_Columns.write"),
+        *("home", "_write", "_write_robot", "_write_cube"),
         *(
             f"{name}.__call__"
             for name in ("JointNoise", "JitterCubes", "RandomizeCubes", "CubeMass", "CubeFriction", "ActuatorGains")
         ),
     ],
+    "mdp/variation.py": [
+        *(f"{name}.{n}" for name in ("CubeMasses", "SlidingFriction", "ServoGains") for n in ("read", "write")),
+        *(f"_Elements.{n}" for n in ("read", "write", "scale")),
+    ],
+    "mdp/layout.py": ["FromLayout.__call__"],
     "mdp/placement.py": ["Placement.choose", "Placement._choose"],
     "tasks/stack.py": [
         *(f"CubePair.{n}" for n in ("pose", "speed", "clearance", "offset", "stacked", "supported")),

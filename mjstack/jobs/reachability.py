@@ -12,6 +12,9 @@ from typing import cast
 import numpy as np
 
 from mjstack.config.schema import Config, ReachabilityJobCfg
+from mjstack.control.phases import BLUE as AT_BLUE
+from mjstack.control.phases import RED as AT_RED
+from mjstack.control.phases import anchor_of
 from mjstack.errors import ConfigError
 from mjstack.gates.gate import GateContext
 from mjstack.jobs.outcome import JobOutcome
@@ -28,7 +31,6 @@ log = logging.getLogger(__name__)
 _MOST_POINTS = 100_000
 _SHARE = 500  # points between two looks at the clock
 _FINE = 0.001  # [m] to which regions are given
-_CUBE_ANCHORS = ("red", "blue", "on_blue")
 
 
 def check_reachability(cfg: Config) -> None:
@@ -37,6 +39,7 @@ def check_reachability(cfg: Config) -> None:
         if getattr(cfg, key):
             raise ConfigError(key, "true", "false with job=reachability, which moves nothing", "Leave it out")
     resolve_backend(cfg)
+    find_levels(cfg)
     job, half = cast(ReachabilityJobCfg, cfg.job), cfg.scene.table_half
     points = math.prod(2 * int(half[k] / job.step) + 1 for k in (0, 1))
     if points > _MOST_POINTS or job.step > min(half[:2]):
@@ -77,16 +80,18 @@ def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> Job
 def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
     """Heights above a cube's centre [m] at which the task needs the aperture centre, and the gripper's command there.
 
-    ``grasp`` is the controller's lowest target at a cube and ``carry`` its highest; ``approach`` is the approach height.
+    ``approach`` is the controller's first target, ``grasp`` its lowest where a cube stands, and ``carry`` its highest there.
     """
-    robot, levels = cfg.robot, []
-    for phase in cfg.controller.phases.values():
-        if phase.anchor in _CUBE_ANCHORS:
-            base = 2.0 * cfg.scene.cube_half if phase.anchor == "on_blue" else 0.0
-            levels.append((base + phase.h_scale * robot.approach_height + phase.offset, phase.gripper))
-    low, high = min(height for height, _ in levels), max(height for height, _ in levels)
-    carry = next(gripper for height, gripper in levels if height == high)
-    return {"grasp": (low, "open"), "approach": (robot.approach_height, "open"), "carry": (high, carry)}
+    center, targets = table_top(cfg.scene) + cfg.scene.cube_half, []
+    for name, phase in cfg.controller.phases.items():
+        anchor = anchor_of(cfg, name)
+        if anchor is not None and anchor.source in (AT_RED, AT_BLUE):
+            targets.append((anchor.z - center, phase.gripper))
+    if not targets:
+        raise ConfigError("controller.phases", list(cfg.controller.phases), "a phase with a cube as its anchor")
+    low, high = min(height for height, _ in targets), max(height for height, _ in targets)
+    # The jaws close where they grasp, but come there open, which reaches less far where one jaw stays.
+    return {"grasp": (low, "open"), "approach": targets[0], "carry": next(t for t in targets if t[0] == high)}
 
 
 def axes(cfg: Config) -> tuple[np.ndarray, np.ndarray]:
@@ -221,8 +226,9 @@ def _write(context: GateContext, folder: Path, levels: list[ReachLevel], regions
         f"round, at every level; points are {1e3 * job.step:g} mm apart. Regions keep cubes of any yaw on the table.",
         f"Reached: inverse kinematics of {', '.join(robot.ik_joints)} brings the aperture centre within "
         f"{1e3 * context.cfg.controller.ik_tolerance:g} mm. Collisions are not looked at.",
-        f"Tilt: the smallest angle between the axis of {robot.arm_joints[-1]} and straight down that a solution has. A controller "
-        "that goes on from where it is need not find that solution, and may stop at a joint limit short of a reached point.",
+        f"Tilt: the smallest angle between the axis of {robot.arm_joints[-1]} and straight down that a solution has. A "
+        "controller that goes on from where it is need not find that solution, and may stop at a joint limit short of a point "
+        "that is reached.",
         "Reached does not mean grasped: how many worlds succeed, the batch gate tells.",
     ]
     write_atomic(folder / "reachability.csv", to_csv(found))

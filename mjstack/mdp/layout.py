@@ -14,11 +14,10 @@ import torch
 
 from mjstack.errors import ArgumentError, ParameterError
 from mjstack.managers.base import EnvView, uses_fields
-from mjstack.mdp.geometry import joint_positions, named_pose, pose_w
+from mjstack.mdp.geometry import joint_positions, named_pose, pose_w, robot
 from mjstack.mdp.layout_file import column_names, read_layout_file, short
 from mjstack.mdp.placement import reach_distances
-from mjstack.mdp.reset import bounds, write_robot
-from mjstack.mdp.variation import FRICTION_FIELDS, GAIN_FIELDS, MASS_FIELDS, CubeMasses, ServoGains, SlidingFriction
+from mjstack.mdp.variation import FRICTION_FIELDS, GAIN_FIELDS, MASS_FIELDS, CubeMasses, ServoGains, SlidingFriction, bounds
 from mjstack.report.record import write_atomic
 
 _ROUNDING = 1e-6  # of a range's ends, which float32 does not hold exactly
@@ -100,7 +99,9 @@ class FromLayout:
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes qpos, ctrl and the model fields that the file has columns for."""
-        write_robot(env, mask, self._command.index_select(0, env.world))
+        tensors, command = robot(env), self._command.index_select(0, env.world)
+        tensors.qpos.write_masked(env.sim.qpos, mask, command)
+        tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
         places, quats = self._places.index_select(0, env.world), self._quats.index_select(0, env.world)
         for number, name in enumerate(env.index.objects):
             view = pose_w(env, name)

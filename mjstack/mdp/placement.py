@@ -152,7 +152,7 @@ def reach_distances(env: EnvView, xy: np.ndarray) -> np.ndarray:
     """
     robot, scene = env.cfg.robot, env.cfg.scene
     center = table_top(scene) + scene.cube_half
-    points = np.array([[[x, y, center + rise] for rise in (0.0, robot.approach_height)] for x, y in xy])
+    points = np.array([[[x, y, center + rise] for rise in (scene.grasp_offset, robot.approach_height)] for x, y in xy])
     reach = PointReach(env.sim.model, robot, robot.gripper_open)
     return reach.solve(points.reshape(-1, 3)).distance.reshape(-1, 2)
 
@@ -168,7 +168,7 @@ def require_reach(env: EnvView, name: str, region: tuple[float, float]) -> None:
     for cube, at in zip(env.index.objects, (scene.red_xy, scene.blue_xy), strict=True):
         axes = []
         for k in (0, 1):
-            room = scene.table_half[k] - scene.cube_half
+            room = scene.table_half[k] - math.sqrt(2.0) * scene.cube_half  # as `Placement` keeps them, for any yaw
             low, high = (
                 np.clip(at[k] + s * region[k], scene.table_center[k] - room, scene.table_center[k] + room) for s in (-1, 1)
             )

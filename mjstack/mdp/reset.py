@@ -12,12 +12,12 @@ from mjstack.managers.base import EnvView, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import named_pose, pose_w, robot
 from mjstack.mdp.placement import Placement, require_reach
-from mjstack.mdp.variation import FRICTION_FIELDS, GAIN_FIELDS, MASS_FIELDS, CubeMasses, ServoGains, SlidingFriction
+from mjstack.mdp.variation import FRICTION_FIELDS, GAIN_FIELDS, MASS_FIELDS, CubeMasses, ServoGains, SlidingFriction, bounds
 
 
 def home(env: EnvView, mask: torch.Tensor, *, pose: str = "home") -> None:
     """Puts the robot at its home command, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
-    write_robot(env, mask, named_pose(env, pose).expand(env.nworld, -1))
+    _write_robot(env, mask, named_pose(env, pose).expand(env.nworld, -1))
     env.sim.qvel.masked_fill_(mask[:, None], 0.0)
 
 
@@ -46,7 +46,7 @@ class JointNoise:
         """Writes qpos and ctrl."""
         noise = random_uniform(env, self.label, self._width.shape[0])
         command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
-        write_robot(env, mask, torch.clamp(command, self._low, self._high))
+        _write_robot(env, mask, torch.clamp(command, self._low, self._high))
 
 
 class JitterCubes:
@@ -194,8 +194,7 @@ def _write(view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor) -> None:
     torch.where(mask[:, None], value.to(view.dtype), view, out=view)
 
 
-def write_robot(env: EnvView, mask: torch.Tensor, command: torch.Tensor) -> None:
-    """Puts the masked worlds' robot at a command ``(nworld, n)``: qpos and ctrl."""
+def _write_robot(env: EnvView, mask: torch.Tensor, command: torch.Tensor) -> None:
     tensors = robot(env)
     tensors.qpos.write_masked(env.sim.qpos, mask, command)
     tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
@@ -212,14 +211,3 @@ def _write_cube(env: EnvView, mask: torch.Tensor, name: str, dx: torch.Tensor, d
 def _not_negative(name: str, value: float) -> None:
     if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0.0):
         raise ParameterError(name, value, "a number that is not negative")
-
-
-def bounds(name: str, values: Sequence[float]) -> tuple[float, float]:
-    """The smallest and largest value of a parameter that has both.
-
-    Raises:
-        ParameterError: They are not positive, or not in order.
-    """
-    if len(values) != 2 or not 0.0 < values[0] <= values[1] < math.inf:
-        raise ParameterError(name, list(values), "two positive numbers, the smaller one first")
-    return float(values[0]), float(values[1])

@@ -6,10 +6,12 @@ value as the field holds it, so that writing what was read changes nothing.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 
+from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView
 from mjstack.scene.index import Columns
 
@@ -107,6 +109,17 @@ class ServoGains:
         held = (factor.double() * self._kp).to(self._gain.dtype).double() / self._kp
         self._gain.scale(mask, held)
         self._bias.scale(mask, held)
+
+
+def bounds(name: str, values: Sequence[float]) -> tuple[float, float]:
+    """The smallest and largest value of a parameter that has both.
+
+    Raises:
+        ParameterError: They are not positive, or not in order.
+    """
+    if len(values) != 2 or not 0.0 < values[0] <= values[1] < math.inf:
+        raise ParameterError(name, list(values), "two positive numbers, the smaller one first")
+    return float(values[0]), float(values[1])
 
 
 class _Elements:

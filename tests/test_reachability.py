@@ -1,0 +1,373 @@
+"""What the arm reaches: against MuJoCo and mink, regions that are refused, obstacles, and the job's files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from environments import configure, on_shared_sim
+
+import mjstack
+from mjstack.cli import run
+from mjstack.config.schema import Config
+from mjstack.errors import ConfigError, ParameterError
+from mjstack.gates.gate import GateContext
+from mjstack.jobs import check_job, reachability
+from mjstack.jobs.reachability import find_levels, find_region
+from mjstack.kinematics.mink_ik import ApertureIk
+from mjstack.kinematics.reach import PointReach
+from mjstack.mdp.placement import Placement
+from mjstack.report.reachability import ReachLevel
+from mjstack.scene import SceneIndex, build_model, table_top
+
+Stage = Callable[[str], GateContext]
+
+
+def points_over(cfg: Config, n: int, seed: int = 0) -> np.ndarray:
+    """Random points over the cubes' regions, from the table up to where cubes are carried."""
+    rng = np.random.default_rng(seed)
+    scene = cfg.scene
+    places = np.array([scene.red_xy, scene.blue_xy])[rng.integers(2, size=n)]
+    xy = places + rng.uniform(-1, 1, (n, 2)) * scene.random_xy
+    return np.column_stack((xy, table_top(scene) + scene.cube_half + rng.uniform(0.0, 0.15, n)))
+
+
+def aperture(ik: ApertureIk, cfg: Config, q: np.ndarray, gripper: list[float]) -> np.ndarray:
+    """Where mink's model has the aperture centre at a solution."""
+    command = ik.home.copy()
+    command[-len(gripper) :] = gripper
+    joints = sorted(cfg.robot.ik_joints, key=cfg.robot.arm_joints.index)
+    command[[cfg.robot.arm_joints.index(name) for name in joints]] = q
+    return ik.aperture(command)
+
+
+@pytest.mark.parametrize("grip", ["open", "closed"])
+def test_solutions_are_where_mujoco_says(stage: Stage, robot: str, grip: str) -> None:
+    cfg = stage(robot).cfg
+    gripper = cfg.robot.gripper_open if grip == "open" else cfg.robot.gripper_closed
+    reach = PointReach(stage(robot).model, cfg.robot, gripper)
+    ik = ApertureIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
+    points = points_over(cfg, 20)
+    for found in (reach.solve(points), reach.solve_upright(points, 5e-4)):
+        assert found.distance.max() < 5e-4
+        for point, q, distance in zip(points, found.q, found.distance, strict=True):
+            at = aperture(ik, cfg, q, gripper)
+            assert np.linalg.norm(at - point) == pytest.approx(distance, abs=1e-9)
+            assert ik.solve(point, np.array(gripper), ik.home)[1] < 5e-4  # mink gets there too
+
+
+def test_the_tilt_is_that_of_the_gripper_and_the_smallest(stage: Stage, robot: str) -> None:
+    cfg, model = stage(robot).cfg, stage(robot).model
+    reach = PointReach(model, cfg.robot, cfg.robot.gripper_open)
+    points = points_over(cfg, 6)
+    upright, any_ = reach.solve_upright(points, 5e-4), reach.solve(points)
+    assert (upright.tilt <= any_.tilt + 1e-9).all()
+    data, last = mujoco.MjData(model), model.joint(cfg.robot.arm_joints[-1])
+    joints = sorted(cfg.robot.ik_joints, key=cfg.robot.arm_joints.index)
+    for point, q, tilt in zip(points, upright.q, upright.tilt, strict=True):
+        for name, value in zip([*cfg.robot.arm_joints, *cfg.robot.gripper_joints], cfg.robot.home, strict=True):
+            data.qpos[model.joint(name).qposadr[0]] = value
+        for name, value in {**cfg.robot.locked, **dict(zip(joints, q, strict=True))}.items():
+            data.qpos[model.joint(name).qposadr[0]] = value
+        mujoco.mj_kinematics(model, data)
+        axis = data.xaxis[last.id] * np.sign(data.xaxis[last.id] @ (point - data.xanchor[last.id]))
+        assert math.acos(-axis[2]) == pytest.approx(tilt, abs=1e-6)
+    # Nothing better is found from many other postures.
+    rng = np.random.default_rng(3)
+    for point, tilt in zip(points, upright.tilt, strict=True):
+        start = rng.uniform(reach._low, reach._high, (300, len(reach._low)))
+        many = np.tile(point, (300, 1))
+        found, _ = reach._descend(start, many, 100, 0.02)
+        found, left = reach._descend(found, many, 60)
+        assert reach._tilt(found[left < 5e-4]).min() > tilt - math.radians(0.5)
+
+
+def test_out_of_reach_is_as_far_as_it_is(stage: Stage, robot: str) -> None:
+    cfg = stage(robot).cfg
+    reach = PointReach(stage(robot).model, cfg.robot, cfg.robot.gripper_open)
+    far = np.array([[1.5, 0.0, 0.2], [1.6, 0.0, 0.2]])
+    distance = reach.solve(far).distance
+    # Stretched towards it: nothing of the range of 200,000 postures is nearer.
+    q = np.random.default_rng(0).uniform(reach._low, reach._high, (200_000, len(reach._low)))
+    nearest = np.linalg.norm(far[0] - reach._forward(q)[1], axis=1).min()
+    assert 0.0 < distance[0] <= nearest
+    assert distance[1] - distance[0] == pytest.approx(0.1, abs=1e-3)
+
+
+def test_joints_stay_within_both_ranges(stage: Stage, robot: str) -> None:
+    cfg, model = stage(robot).cfg, stage(robot).model
+    reach = PointReach(model, cfg.robot, cfg.robot.gripper_open)
+    points = np.random.default_rng(1).uniform([-0.3, -0.6, 0.0], [0.8, 0.6, 0.6], (200, 3))
+    joints = sorted(cfg.robot.ik_joints, key=cfg.robot.arm_joints.index)
+    for q in (reach.solve(points).q, reach.solve_upright(points, 5e-4).q):
+        for name, values in zip(joints, q.T, strict=True):
+            for low, high in (model.joint(name).range, model.actuator(name).ctrlrange):
+                assert values.min() >= low - 1e-12
+                assert values.max() <= high + 1e-12
+
+
+REGIONS = [
+    ("so101", "[0.12,0.05]", "red_cube at (0.450, -0.180) m the point at the cube is"),
+    ("so101", "[0.05,0.3]", "red_cube at"),
+    ("rebot", "[0.3,0.0]", None),  # the whole depth of its table is within reach
+    ("so101", "[0.03,0.03]", None),
+]
+
+
+@pytest.mark.parametrize(("robot", "xy", "says"), REGIONS)
+def test_a_region_beyond_the_arm_is_refused(robot: str, xy: str, says: str | None) -> None:
+    overrides = [f"robot={robot}", "sim=native", "reset=randomized", f"reset.cubes.params.xy={xy}"]
+    overrides.append("+reset.cubes.params.candidates=64")
+    if says is None:
+        mjstack.make_env(overrides, nworld=1)
+        return
+    with pytest.raises(ConfigError) as caught:
+        mjstack.make_env(overrides, nworld=1)
+    message = str(caught.value)
+    assert message.startswith("reset.cubes.params.xy=[")
+    assert says in message
+    assert "mm out of reach" in message
+    assert "job=reachability" in message
+    assert "\n" not in message
+
+
+def test_randomized_takes_the_layouts_region_and_the_command_line_another() -> None:
+    cfg = mjstack.load_config(["reset=randomized", "robot.layouts.stack.random_xy=[0.02,0.04]"])
+    assert cfg.reset["cubes"].params["xy"] == [0.02, 0.04]
+    cfg = mjstack.load_config(["reset=randomized", "reset.cubes.params.xy=[0.03,0.03]"])
+    assert cfg.reset["cubes"].params["xy"] == [0.03, 0.03]
+    for robot in ("so101", "rebot"):
+        cfg = mjstack.load_config(["reset=randomized", f"robot={robot}"])
+        assert min(cfg.reset["cubes"].params["xy"]) >= 0.05
+        assert cfg.reset["cubes"].params["gap"] == cfg.robot.finger_room
+    with pytest.raises(ConfigError, match=r"scene\.random_xy"):
+        mjstack.load_config(["scene.random_xy=[0.05,-0.01]"])
+
+
+def test_finger_room_is_what_the_open_jaws_need(stage: Stage, robot: str) -> None:
+    """Jaws around red, blue beside it at the smallest distance, any yaw. Only the SO-101's gripper hits, as it leans to its base."""
+    cfg, model, index = stage(robot).cfg, stage(robot).model, stage(robot).index
+    scene, data = cfg.scene, mujoco.MjData(model)
+    blue = index.geoms["blue_cube"][0]
+    distance = 2.0 * math.sqrt(2.0) * scene.cube_half + cfg.robot.finger_room
+    ik = ApertureIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
+    z = table_top(scene) + scene.cube_half
+
+    def touched(command: np.ndarray, at: np.ndarray, away: float, yaw: float, apart: float) -> set[str]:
+        data.qpos[:] = model.qpos0
+        data.qpos[index.robot_qpos] = command
+        data.qpos[index.cube_qpos[0] : index.cube_qpos[0] + 3] = 5.0, 5.0, 5.0
+        beside = at[:2] + apart * np.array([math.cos(away), math.sin(away)])
+        pose = [*beside, z, math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)]
+        data.qpos[index.cube_qpos[1] : index.cube_qpos[1] + 7] = pose
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        pairs = [set(pair) for pair in data.contact.geom[: data.ncon].tolist()]
+        others = {g for pair in pairs if blue in pair for g in pair - {blue}}
+        return {model.geom(g).name for g in others} - {"table"}
+
+    closer = blocked = False
+    for corner in ((-1, -1), (0, 0), (1, 1)):
+        at = np.array([*(np.array(scene.red_xy) + np.array(corner) * scene.random_xy), z])
+        command, left = ik.solve(at, np.array(cfg.robot.gripper_open), ik.home)
+        assert left < 5e-4
+        for away in np.arange(0.0, 2.0 * math.pi, math.radians(10.0)):
+            for yaw in np.arange(0.0, 0.5 * math.pi, 0.25):
+                base = math.cos(away - math.atan2(-at[1], -at[0]))
+                hit = touched(command, at, away, yaw, distance)
+                assert not hit or (robot == "so101" and base > 0.4), (hit, math.degrees(away))
+                blocked = blocked or bool(hit)
+                closer = closer or (base < 0.0 and bool(touched(command, at, away, yaw, distance - 0.01)))
+    assert closer  # a centimetre less would not do
+    assert blocked is (robot == "so101")
+
+
+def with_wall(cfg: Config, xy: tuple[float, float], half: tuple[float, float], euler: float = 0.0) -> mujoco.MjModel:
+    """The scene with one more geom that is fixed to the world."""
+    from mjstack.robots import robot_spec
+    from mjstack.scene import build_scene
+
+    spec = robot_spec(cfg.robot, cfg.model)
+    z = table_top(cfg.scene) + 0.0275
+    quat = [math.cos(0.5 * euler), 0.0, 0.0, math.sin(0.5 * euler)]
+    spec.worldbody.add_geom(name="box_wall", type=mujoco.mjtGeom.mjGEOM_BOX, pos=[*xy, z], size=[*half, 0.0275], quat=quat)
+    return build_scene(spec, cfg.scene, cfg.timing, cfg.solver, jaw_bodies=cfg.robot.jaw_bodies)
+
+
+@pytest.mark.parametrize("euler", [0.0, 0.6])
+def test_nothing_starts_in_a_wall(robot: str, euler: float) -> None:
+    cfg = configure("reset=randomized", robot=robot)
+    red_x, red_y = cfg.scene.red_xy
+    model = with_wall(cfg, (red_x, red_y + 0.06), (0.05, 0.003), euler)
+    index, wall = SceneIndex(model, cfg.robot), model.geom("box_wall").id
+    placement = Placement(cfg, model, index, region=(0.05, 0.05), gap=0.01, pose=cfg.robot.start)
+    draws = 2.0 * torch.rand((500, 2, 64, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1.0
+    offsets, free = placement._choose(draws)
+    assert free.all()
+    cube = model.geom("red_cube").id
+    data = mujoco.MjData(model)
+    nearest = math.inf
+    for number, (dx, dy) in enumerate(offsets[:, 0].tolist()):
+        data.qpos[index.cube_qpos[0] : index.cube_qpos[0] + 2] = red_x + dx, red_y + dy
+        yaw = 0.1 * number
+        data.qpos[index.cube_qpos[0] + 2] = model.qpos0[index.cube_qpos[0] + 2]
+        data.qpos[index.cube_qpos[0] + 3 : index.cube_qpos[0] + 7] = math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)
+        mujoco.mj_kinematics(model, data)
+        nearest = min(nearest, mujoco.mj_geomDistance(model, data, cube, wall, 1.0, None))
+    assert nearest >= 0.01 - 1e-6
+    without = Placement(cfg, build_model(cfg), index, region=(0.05, 0.05), gap=0.01, pose=cfg.robot.start)
+    assert float(without._choose(draws)[0][:, 0, 1].max()) > float(offsets[:, 0, 1].max()) + 0.01
+
+
+def test_a_wall_that_leaves_no_room_is_said() -> None:
+    cfg = configure("reset=randomized")
+    model = with_wall(cfg, (cfg.scene.red_xy[0], cfg.scene.red_xy[1]), (0.1, 0.1))
+    placement = Placement(cfg, model, SceneIndex(model, cfg.robot), region=(0.05, 0.05), gap=0.01, pose=cfg.robot.start)
+    with pytest.raises(ParameterError, match="found none in 20000 of 20000 trials"):
+        placement.require_room("xy", [0.05, 0.05], 16)
+
+
+def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
+    """Red's first free candidate alone would leave blue no place in some worlds."""
+    overrides = ["scene.red_xy=[0.29,-0.13]", "scene.blue_xy=[0.37,-0.13]", "scene.random_xy=[0.03,0.03]"]
+    cfg = configure("reset=randomized", *overrides)
+    cfg.reset["cubes"].params["gap"] = 0.04
+    model = build_model(cfg)
+    index = SceneIndex(model, cfg.robot)
+    placement = Placement(cfg, model, index, region=(0.03, 0.03), gap=0.04, pose=cfg.robot.start)
+    placement.require_room("xy", [0.03, 0.03], 16)
+    draws = 2.0 * torch.rand((500, 2, 16, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1.0
+    offsets, free = placement._choose(draws)
+    places = offsets + torch.tensor([cfg.scene.red_xy, cfg.scene.blue_xy], dtype=torch.float64)
+    apart = torch.linalg.vector_norm(places[:, 0] - places[:, 1], dim=1)
+    assert free.all()
+    assert float(apart.min()) >= 2.0 * math.sqrt(2.0) * 0.022 + 0.04
+
+
+def level(cfg: Config, reached: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> ReachLevel:
+    x, y = np.meshgrid(*reachability.axes(cfg))
+    tilt = np.where(reached(x, y), 0.3, np.nan)
+    return ReachLevel(name="grasp", height=0.0, gripper="open", residual=np.zeros_like(tilt), tilt=tilt)
+
+
+def test_regions_stay_inside_what_is_reached() -> None:
+    cfg = mjstack.load_config(["job=reachability", "job.step=0.005", "job.margin=0.01"])
+    x0, y0 = cfg.scene.red_xy
+    half_plane = level(cfg, lambda x, y: (x <= x0 + 0.08) & (y >= y0 - 0.09))
+    region = find_region(cfg, [half_plane], "red_cube", [x0, y0])
+    # From the last point that is reached, a step short of the first that is not: a margin less.
+    assert region.square == pytest.approx(0.07, abs=0.005)
+    assert 0.0 <= 0.07 - region.largest[0] <= 0.005
+    assert 0.0 <= 0.08 - region.largest[1] <= 0.005
+    assert region.reached
+    assert region.tilt == pytest.approx(0.3)
+    near = level(cfg, lambda x, y: x <= x0 + 0.055)
+    assert not find_region(cfg, [half_plane, near], "red_cube", [x0, y0]).reached
+    island = find_region(cfg, [level(cfg, lambda x, y: x < x0 - 0.05)], "red_cube", [x0, y0])
+    assert (island.square, island.largest, island.reached) == (0.0, (0.0, 0.0), False)
+    assert math.isnan(island.tilt)
+    everywhere = find_region(cfg, [level(cfg, lambda x, y: x < 9.0)], "red_cube", [x0, y0])
+    scene = cfg.scene
+    for k in (0, 1):  # the table's edge ends it, for a cube of any yaw
+        edge = scene.table_half[k] - abs((x0, y0)[k] - scene.table_center[k]) - math.sqrt(2.0) * scene.cube_half
+        assert 0.0 <= edge - everywhere.largest[k] <= 0.001
+
+
+def test_levels_are_the_controllers(robot: str) -> None:
+    cfg = mjstack.load_config([f"robot={robot}", "job=reachability"])
+    h = cfg.robot.approach_height
+    levels = find_levels(cfg)
+    assert levels == {"grasp": (pytest.approx(0.0), "open"), "approach": (pytest.approx(h), "open"), "carry": levels["carry"]}
+    assert levels["carry"] == (pytest.approx(h + 0.09), "open")
+    cfg = mjstack.load_config(["job=reachability", "controller.phases.lift_red.offset=0.2"])
+    assert find_levels(cfg)["carry"] == (pytest.approx(0.29), "closed")
+
+
+def test_the_job_leaves_a_map(robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["job=reachability", f"robot={robot}", "job.step=0.04", f"hydra.run.dir={tmp_path}"]
+    status = run([*args, "job.margin=0"])
+    report = json.loads((tmp_path / "report.json").read_text())
+    gates = {gate["name"]: gate for gate in report["gates"]}
+    assert list(gates) == ["grasp", "approach", "carry", "red_cube", "blue_cube"]
+    # Between points that are 40 mm apart the worse counts, which the SO-101's region may not survive.
+    assert status == (0 if report["status"] == "pass" else 1)
+    with (tmp_path / "reachability.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    cfg = mjstack.load_config([f"robot={robot}"])
+    reach = PointReach(build_model(cfg), cfg.robot, cfg.robot.gripper_open)
+    for row in rows[:: len(rows) // 7]:
+        point = np.array([[float(row["x_m"]), float(row["y_m"]), table_top(cfg.scene) + cfg.scene.cube_half]])
+        distance = float(reach.solve(point).distance[0])
+        assert (row["grasp_reached"] == "1") is (distance <= 5e-4)
+        assert float(row["grasp_residual_m"]) == pytest.approx(distance, rel=0.01, abs=2e-6)
+        assert (row["grasp_tilt_deg"] != "") is (row["grasp_reached"] == "1")
+    held = np.load(tmp_path / "reachability.npz")
+    assert held["reached"].shape == (3, len(held["y_m"]), len(held["x_m"]))
+    assert int(held["reached"][0].sum()) == sum(row["grasp_reached"] == "1" for row in rows)
+    assert gates["grasp"]["metrics"]["reached_fraction"] == pytest.approx(held["reached"][0].mean())
+    text = (tmp_path / "reachability.md").read_text()
+    assert "| red_cube | (" in text
+    assert "![reachability.png](reachability.png)" in text
+    assert (tmp_path / "reachability.png").stat().st_size > 10_000
+    assert "largest square" in capsys.readouterr().out
+
+
+def test_a_region_that_is_not_reached_fails_the_job(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["job=reachability", "job.step=0.02", "scene.random_xy=[0.12,0.05]", f"hydra.run.dir={tmp_path}"]
+    assert run(args) == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert "scene.random_xy 0.12 x 0.05 m is not reached with 10 mm to spare" in out
+    assert json.loads((tmp_path / "report.json").read_text())["status"] == "fail"
+
+
+def test_an_interrupted_job_keeps_its_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = reachability.map_level
+
+    def stop_later(context: GateContext, name: str, *rest: object) -> ReachLevel:
+        if name == "carry":
+            raise KeyboardInterrupt
+        return whole(context, name, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(reachability, "map_level", stop_later)
+    assert run(["job=reachability", "job.step=0.05", f"hydra.run.dir={tmp_path}"]) == 130
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["status"] == "interrupted"
+    assert [gate["name"] for gate in report["gates"]] == ["grasp", "approach"]
+    head = (tmp_path / "reachability.csv").read_text().splitlines()[0]
+    assert "approach_tilt_deg" in head
+    assert "carry" not in head
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["job.step=0"], "job.step=0"),
+        (["job.step=-0.01"], "job.step=-0.01"),
+        (["job.step=0.0001"], "job.step=0.0001: expected 0.00"),
+        (["job.step=1.0"], "job.step=1.0"),
+        (["job.margin=-0.01"], "job.margin=-0.01"),
+        (["job.margin=nan"], "job.margin=nan"),
+        (["view=true"], "view=true"),
+        (["job.stepp=0.01"], "job.step"),
+    ],
+)
+def test_bad_settings_are_refused_in_one_line(overrides: list[str], says: str) -> None:
+    with pytest.raises(mjstack.MjstackError) as caught:
+        check_job(mjstack.load_config(["job=reachability", *overrides]))
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_a_native_environment_checks_reach_without_warp() -> None:
+    env = on_shared_sim("native", 3, configure("reset=randomized"))
+    assert env.reset_manager is not None
+    source = Path(mjstack.__file__).parent / "kinematics" / "reach.py"
+    assert "import warp" not in source.read_text()
