@@ -87,6 +87,10 @@ class RobotCfg:
     approach_axis: list[float] = MISSING
     jaw_bodies: list[str] = MISSING
     replace_collision: bool = False
+    roll_joint: str = MISSING
+    posture_gain: float = MISSING
+    approach_gain: float = MISSING
+    align: float = MISSING
     approach_height: float = MISSING
     layouts: dict[str, LayoutCfg] = MISSING
 
@@ -241,7 +245,7 @@ class PhaseCfg:
     is ``in_hand``.
 
     The rest is for a controller that watches (``controller=scripted``): ``look`` measures the anchor's cube anew when the phase
-    begins, ``grasps`` names the cube that both jaws must press on when it ends, and ``retry`` the phase to go back to if they
+    begins, ``centers`` names a held cube whose own centre goes to the target, however it lies in the hand, ``grasps`` names the cube that both jaws must press on when it ends, and ``retry`` the phase to go back to if they
     do not.
     """
 
@@ -252,6 +256,7 @@ class PhaseCfg:
     gripper: str = MISSING
     seconds: float = MISSING
     look: bool = False
+    centers: str | None = None
     grasps: str | None = None
     retry: str | None = None
 

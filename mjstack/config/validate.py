@@ -107,7 +107,11 @@ def _robot(cfg: Config) -> None:
     _length("robot.approach_axis", robot.approach_axis, 3)
     if abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3:
         raise ConfigError("robot.approach_axis", robot.approach_axis, "a vector of length 1, such as [0, 0, -1]")
-    for key, names in (("robot.ik_joints", robot.ik_joints), ("robot.locked", list(robot.locked))):
+    for key, names in (
+        ("robot.ik_joints", robot.ik_joints),
+        ("robot.locked", list(robot.locked)),
+        ("robot.roll_joint", [robot.roll_joint]),
+    ):
         for name in names:
             if name not in robot.arm_joints:
                 raise UnknownName(f"{key}: arm joint", name, robot.arm_joints)
@@ -158,8 +162,9 @@ def _controller(cfg: Config) -> None:
         for part in ("h_scale", "offset"):
             if not math.isfinite(getattr(phase, part)):
                 raise ConfigError(f"{key}.{part}", getattr(phase, part), "a finite number")
-        if phase.grasps is not None and phase.grasps not in ("red", "blue"):
-            raise ConfigError(f"{key}.grasps", phase.grasps, "red, blue or null")
+        for part in ("grasps", "centers"):
+            if getattr(phase, part) not in (None, "red", "blue"):
+                raise ConfigError(f"{key}.{part}", getattr(phase, part), "red, blue or null")
         if phase.retry is not None and phase.retry not in cfg.controller.phases:
             raise UnknownName(f"{key}.retry: phase", phase.retry, cfg.controller.phases)
         frames = phase.seconds / cfg.timing.frame_dt
