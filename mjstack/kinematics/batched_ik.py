@@ -22,7 +22,7 @@ _Pose = tuple[np.ndarray, np.ndarray]  # position and quaternion (wxyz)
 _Link = tuple[_Pose, np.ndarray, int, int]  # frame, axis, kind, column of the command
 
 _NEAR = 0.00002  # m: with a gain, an iterate this close to the target replaces a closer one that came before
-_SETTLING = 2  # last iterations of a solve, in which no gain counts: they undo what the others cost in distance
+_SETTLING = 3  # last iterations of a solve, in which no gain counts: they undo what the others cost in distance
 
 
 class BatchedIk:
