@@ -192,7 +192,7 @@ def test_reaches_what_mink_reaches(
     """From home, both drawn there: on and above the table, and wherever the arm reaches above the table's height.
 
     In front of the base nothing that mink reaches is missed. Behind it, where the way from home ends at the joints' limits,
-    either one ends short where the other arrives; mink, which damps nothing, far more often.
+    either one ends short at times where the other arrives. Both draw the arm home, so most solutions are the same one.
     """
     context = stage(robot)
     top = context.cfg.scene.table_center[2] + context.cfg.scene.table_half[2]
@@ -216,7 +216,7 @@ def test_reaches_what_mink_reaches(
                 f"{(ours & ~theirs).sum()}; joints apart: median {np.median(apart):.4f} rad, over 0.1 rad in "
                 f"{(apart > 0.1).sum()}; from home on average {away.mean():.4f} rad, mink {mink_away.mean():.4f} rad"
             )
-        assert theirs.mean() > 0.7
+        assert theirs.mean() > 0.8
         assert (ours | ~theirs)[front].all()
         assert (theirs & ~ours).sum() <= 10
         assert ours.sum() > theirs.sum()
