@@ -170,6 +170,8 @@ BAD = [
     (["controller.knots=2"], "controller.knots=2"),
     (["robot.home=[0,0]"], "robot.home"),
     (["robot.ik_joints=[elbow]"], "elbow_flex"),
+    (["robot.approach_axis=[0,0,2]"], "a vector of length 1"),
+    (["robot.approach_axis=[0,1]"], "robot.approach_axis"),
     (["nworld=3", "nworld="], "nworld"),
     (["nworld=[1,"], ""),
 ]

@@ -22,7 +22,7 @@ LAYERS = [
     {"tasks"},
     {"envs"},
     {"adapters", "gates"},
-    {"benchmark", "benchmark_physics"},
+    {"benchmark", "benchmark_physics", "benchmark_ik"},
     {"jobs"},
     {"cli"},
 ]
@@ -40,7 +40,7 @@ HOMES = {
     "gymnasium": ("adapters/",),
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),
-    "rich": ("jobs/", "cli.py", "benchmark.py", "benchmark_physics.py", "managers/base.py"),
+    "rich": ("jobs/", "cli.py", "benchmark.py", "benchmark_physics.py", "benchmark_ik.py", "managers/base.py"),
 }
 
 

@@ -22,7 +22,7 @@ _Pose = tuple[np.ndarray, np.ndarray]  # position and quaternion (wxyz)
 _Link = tuple[_Pose, np.ndarray, int, int]  # frame, axis, kind, column of the command
 
 _NEAR = 0.00002  # m: with a gain, an iterate this close to the target replaces a closer one that came before
-_SETTLING = 2  # last iterations of a solve, in which no gain counts: they undo what the others cost in distance
+_SETTLING = 3  # last iterations of a solve, a quarter if that is more: no gain counts, so they undo what it cost in distance
 
 
 class BatchedIk:
@@ -67,7 +67,7 @@ class BatchedIk:
             robot: The robot's profile.
             nworld: Number of worlds.
             device: Where the worlds are: ``"cpu"`` or ``"cuda:N"``.
-            iterations: Steps per solve; with a gain at least 3, because the last two go for the target alone.
+            iterations: Steps per solve. With a gain at least 4, because the last three, or a quarter, go for the target alone.
             damping: Of the least squares at the target [m/rad]; it grows with the distance. More is calmer near a stretched
                 arm, and slower there.
             max_step: Largest change of any joint per iteration [rad].
@@ -111,7 +111,7 @@ class BatchedIk:
         self.device = wp.device_to_torch(self._device)
         self._block_dim = block_dim
         self._posture_gain = posture_gain
-        wishing = iterations - _SETTLING if gained else 0
+        wishing = iterations - max(_SETTLING, iterations // 4) if gained else 0
         near = _NEAR if gained else -1.0
         self._settings = [iterations, wishing, damping, max_step, posture_gain, approach_gain, near, tolerance]
         with wp.ScopedDevice(self._device):

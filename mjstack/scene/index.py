@@ -146,9 +146,10 @@ class SceneIndex:
 
 
 def find(model: mujoco.MjModel, kind: str, name: str) -> int:
-    """Index of a named joint, actuator, site or sensor; an unknown name is an error that lists the known ones."""
+    """Index of a named body, joint, actuator, site or sensor; an unknown name is an error that lists the known ones."""
     index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
     if index < 0:
-        count = {"joint": model.njnt, "actuator": model.nu, "site": model.nsite, "sensor": model.nsensor}[kind]
+        counts = {"body": model.nbody, "joint": model.njnt, "actuator": model.nu, "site": model.nsite, "sensor": model.nsensor}
+        count = counts[kind]
         raise UnknownName(kind, name, [getattr(model, kind)(i).name for i in range(count)])
     return index
