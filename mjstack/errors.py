@@ -214,18 +214,17 @@ class DatasetError(MjstackError):
 class UnwrittenError(MjstackError):
     """A dataset that could not be written any further, such as on a full disk."""
 
-    def __init__(self, folder: str, error: OSError, kept: int, lost: int) -> None:
+    def __init__(self, folder: str, error: OSError, kept: int) -> None:
         """Builds the message.
 
         Args:
             folder: The dataset.
             error: What the system says.
-            kept: Episodes that are in the dataset.
-            lost: Episodes that were given to the writer since.
+            kept: Episodes that were committed before.
         """
         super().__init__(
-            f"{folder}: {error.strerror or error}: {kept} finished episodes are kept, {lost} after them are not. Make room, "
-            "and do the same again: it goes on after the last one kept."
+            f"{folder}: cannot be written ({error.strerror or error}): {kept} committed episodes are kept, those added since "
+            "are not. Make room or correct it, and do the same again: it goes on after the last one kept."
         )
 
 

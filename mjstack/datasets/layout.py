@@ -50,12 +50,20 @@ def all_features(features: Mapping[str, Feature]) -> dict[str, tuple[str, int]]:
 
 
 def make_info(
-    spec: DatasetSpec, *, file_mb: int, episodes: int = 0, frames: int = 0, tasks: int = 0, shards: int = 0
+    spec: DatasetSpec,
+    *,
+    provenance: Sequence[Mapping[str, Any]] = (),
+    file_mb: int = 100,
+    episodes: int = 0,
+    frames: int = 0,
+    tasks: int = 0,
+    shards: int = 0,
 ) -> dict[str, Any]:
     """The content of info.json. LeRobot does not read the block ``mjstack``.
 
     Args:
         spec: What the dataset is.
+        provenance: Of each writer that differed from the one before, with its first episode.
         file_mb: Size of a data file at which the next begins [MiB].
         episodes: How many there are.
         frames: Likewise.
@@ -86,7 +94,7 @@ def make_info(
             "shards": shards,
             "units": {name: list(feature.units) for name, feature in spec.features.items()},
             "values": dict(spec.values),
-            **spec.provenance,
+            "provenance": list(provenance),
         },
     }
 
@@ -146,9 +154,7 @@ def episodes_table(spec: DatasetSpec, rows: Mapping[str, Sequence[Any]], statist
         statistics: Each episode's, over all features one after the other.
     """
     pa, _ = require_pyarrow()
-    columns: dict[str, Any] = {}
-    for name, values in rows.items():
-        columns[name] = pa.array(values, type=_row_type(spec, name))
+    columns: dict[str, Any] = dict(rows)
     stacked = {kind: np.stack([episode[kind] for episode in statistics]) for kind in NAMES}
     starts = np.arange(len(statistics) + 1, dtype=np.int32)
     lengths = pa.array(np.asarray(rows["length"], dtype=np.int64))
@@ -157,7 +163,27 @@ def episodes_table(spec: DatasetSpec, rows: Mapping[str, Sequence[Any]], statist
             values = pa.array(np.ascontiguousarray(stacked[kind][:, part]).reshape(-1))
             columns[f"stats/{name}/{kind}"] = pa.ListArray.from_arrays(starts * (part.stop - part.start), values)
         columns[f"stats/{name}/count"] = pa.ListArray.from_arrays(starts, lengths)
-    return pa.table(columns)
+    return pa.table(columns, schema=pa.schema(list(episodes_types(spec).items())))
+
+
+def episodes_types(spec: DatasetSpec) -> dict[str, Any]:
+    """Arrow types of the episodes' columns, in the order of the files."""
+    pa, _ = require_pyarrow()
+    own = {"success": pa.bool_(), "seed": pa.int64(), "world": pa.int64()}
+    types = {
+        "episode_index": pa.int64(),
+        "tasks": pa.list_(pa.string()),
+        **dict.fromkeys(
+            ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index"), pa.int64()
+        ),
+        **own,
+        **{name: _arrow_type(dtype) for name, dtype in spec.values.items()},
+        **dict.fromkeys(("meta/episodes/chunk_index", "meta/episodes/file_index"), pa.int64()),
+    }
+    for name in all_features(spec.features):
+        types |= {f"stats/{name}/{kind}": pa.list_(pa.float64()) for kind in NAMES}
+        types[f"stats/{name}/count"] = pa.list_(pa.int64())
+    return types
 
 
 def feature_slices(features: Mapping[str, Feature]) -> dict[str, slice]:
@@ -182,6 +208,12 @@ def statistics_of(table: Any, features: Mapping[str, Feature]) -> list[dict[str,
     return [{kind: joined[kind][row] for kind in NAMES} for row in range(len(table))]
 
 
+def counts_of(table: Any, features: Mapping[str, Feature]) -> list[set[int]]:
+    """The frames that each episode's statistics are of, as each feature has them."""
+    columns = [table[f"stats/{name}/count"].to_pylist() for name in all_features(features)]
+    return [{count for counted in row for count in counted} for row in zip(*columns, strict=True)]
+
+
 def stats_json(features: Mapping[str, Feature], count: int, statistics: Mapping[str, np.ndarray]) -> bytes:
     """The content of stats.json."""
     return to_json(
@@ -190,13 +222,6 @@ def stats_json(features: Mapping[str, Feature], count: int, statistics: Mapping[
             for name, part in feature_slices(features).items()
         }
     )
-
-
-def _row_type(spec: DatasetSpec, name: str) -> Any:
-    pa, _ = require_pyarrow()
-    if name == "tasks":
-        return pa.list_(pa.string())
-    return _arrow_type("bool" if name == "success" else spec.values.get(name, "int64"))
 
 
 def _arrow_type(dtype: str) -> Any:

@@ -8,8 +8,11 @@ import json
 import os
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from mjstack.datasets import layout
 from mjstack.datasets.arrow import require_pyarrow
@@ -57,7 +60,10 @@ def read_info(folder: Path) -> dict[str, Any] | None:
     try:
         info = json.loads(path.read_text(encoding="utf-8"))
         own = info["mjstack"]
-        own["shards"], own["config_sha256"], info["total_episodes"], info["total_frames"], info["total_tasks"], info["features"]
+        counts = [info["total_episodes"], info["total_frames"], info["total_tasks"], own["shards"]]
+        if not all(isinstance(count, int) for count in counts):
+            raise TypeError(f"totals {counts}")
+        own["config_sha256"], own["provenance"]
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(
             f"{path} cannot be read as mjstack's ({type(error).__name__}: {error}), expected a dataset written by mjstack. "
@@ -72,7 +78,7 @@ def check_same(folder: Path, info: dict[str, Any], spec: DatasetSpec) -> None:
     Raises:
         DatasetError: It has another configuration, or other columns.
     """
-    theirs, ours = info["mjstack"], layout.make_info(spec, file_mb=1)
+    theirs, ours = info["mjstack"], layout.make_info(spec)
     if theirs["config_sha256"] != spec.config_sha256:
         raise DatasetError(
             f"{folder} has episodes of configuration {theirs['config_sha256']}, expected {spec.config_sha256}. Give another "
@@ -101,40 +107,59 @@ def read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
         return require_pyarrow()[1].read_table(path).slice(0, info["total_tasks"])["task"].to_pylist()
 
 
-def read_shards(folder: Path, info: dict[str, Any], columns: list[str] | None = None) -> Iterator[tuple[int, Any, Any]]:
-    """Every shard that counts: its number, its episodes as a table, and its data file.
+@dataclass(eq=False, kw_only=True, slots=True)
+class StoredShard:
+    """A shard that counts.
+
+    Attributes:
+        number: Which one.
+        rows: The episodes' columns that are no statistics.
+        statistics: The episodes' statistics, over all features one after the other.
+        counts: The frames that each feature's statistics are of, for each episode.
+        data: The open data file, a `pyarrow.parquet.ParquetFile`.
+    """
+
+    number: int
+    rows: dict[str, list[Any]]
+    statistics: list[dict[str, np.ndarray]]
+    counts: list[set[int]]
+    data: Any
+
+
+def read_shards(folder: Path, info: dict[str, Any], spec: DatasetSpec) -> Iterator[StoredShard]:
+    """Every shard that counts, one after the other.
 
     Args:
         folder: The dataset.
         info: Its info.json.
-        columns: Columns of the episodes; all of them if None.
+        spec: What it holds.
 
     Raises:
         DatasetError: A file is missing or damaged, or has other episodes or frames than it should.
     """
     _, parquet = require_pyarrow()
     episodes = frames = 0
-    for shard in range(info["mjstack"]["shards"]):
-        path = layout.episodes_path(folder, shard)
+    for number in range(info["mjstack"]["shards"]):
+        path, data = layout.episodes_path(folder, number), layout.data_path(folder, number)
         with readable(path):
-            table = parquet.ParquetFile(path).read(columns=columns)
-            first, ends, lengths = (
-                table["episode_index"].to_pylist(),
-                table["dataset_to_index"].to_pylist(),
-                table["length"].to_pylist(),
-            )
-        if first != list(range(episodes, episodes + len(first))) or not first:
+            table = parquet.ParquetFile(path).read()
+            for name, kind in layout.episodes_types(spec).items():
+                if table.schema.field(name).type != kind:
+                    raise ValueError(f"{name} is {table.schema.field(name).type}, not {kind}")
+            rows = {name: table[name].to_pylist() for name in table.column_names if not name.startswith("stats/")}
+            statistics, counts = layout.statistics_of(table, spec.features), layout.counts_of(table, spec.features)
+        numbers, lengths = rows["episode_index"], rows["length"]
+        if not numbers or numbers != list(range(episodes, episodes + len(numbers))):
             raise DatasetError(f"{path} has other episodes than from {episodes} on. Restore it, or give another folder")
-        data = layout.data_path(folder, shard)
+        episodes, frames = episodes + len(numbers), frames + sum(lengths)
         with readable(data):
             file = parquet.ParquetFile(data)
-        episodes, frames = episodes + len(first), frames + sum(lengths)
-        if file.metadata.num_rows != sum(lengths) or ends[-1] != frames:
+        if file.metadata.num_rows != sum(lengths) or rows["dataset_to_index"][-1] != frames:
             raise DatasetError(
-                f"{data} has {file.metadata.num_rows} frames up to {frames}, expected {sum(lengths)} up to {ends[-1]}. "
-                "Restore it, or give another folder"
+                f"{data} has {file.metadata.num_rows} frames up to {frames}, expected {sum(lengths)} up to "
+                f"{rows['dataset_to_index'][-1]}. Restore it, or give another folder"
             )
-        yield shard, table, file
+        yield StoredShard(number=number, rows=rows, statistics=statistics, counts=counts, data=file)
         file.close()
     if (episodes, frames) != (info["total_episodes"], info["total_frames"]):
         raise DatasetError(
@@ -167,12 +192,11 @@ def readable(path: Path) -> Iterator[None]:
     pa, _ = require_pyarrow()
     try:
         yield
-    except (OSError, KeyError, pa.ArrowException) as error:
-        reason = (
-            "missing"
-            if isinstance(error, FileNotFoundError)
-            else f"damaged ({(str(error).splitlines() or ['?'])[0].rstrip('.')})"
-        )
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} is missing, expected a file of the dataset. Restore it, or give another folder") from error
+    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+        text = error.args[0] if isinstance(error, KeyError) else error  # a KeyError's own text is quoted
+        reason = str(text).partition("\n")[0].rstrip(".")
         raise DatasetError(
-            f"{path} is {reason}, expected a parquet file of a dataset. Restore it, or give another folder"
+            f"{path} is damaged ({reason}), expected it as it was written. Restore it, or give another folder"
         ) from error

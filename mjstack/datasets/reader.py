@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mjstack.datasets import layout
+from mjstack.datasets.arrow import require_pyarrow
 from mjstack.datasets.opening import read_info, read_shards, read_tasks, readable, uncommitted
 from mjstack.datasets.spec import INDICES, DatasetSpec, Feature
 from mjstack.datasets.statistics import NAMES, RunningStatistics, episode_statistics
@@ -50,6 +51,7 @@ def read_dataset(folder: Path | str) -> StoredDataset:
     Raises:
         DatasetError: The first thing that is wrong.
     """
+    require_pyarrow()
     folder = Path(folder)
     info = read_info(folder) if folder.is_dir() else None
     if info is None:
@@ -61,27 +63,23 @@ def read_dataset(folder: Path | str) -> StoredDataset:
         )
     total = RunningStatistics(sum(dim for _, dim in layout.all_features(spec.features).values()))
     episodes: dict[str, list[Any]] = {}
-    for shard, table, file in read_shards(folder, info):
-        path = layout.data_path(folder, shard)
-        _check_schema(path, file.schema_arrow, layout.frames_schema(spec))
-        rows = {name: table[name].to_pylist() for name in table.column_names if not name.startswith("stats/")}
-        recorded = layout.statistics_of(table, spec.features)
-        if file.num_row_groups != len(table):
-            raise _wrong(path, "row groups", file.num_row_groups, f"{len(table)}, one for each episode")
-        for row in range(len(table)):
-            _check_row(path, {name: values[row] for name, values in rows.items()}, shard)
+    for shard in read_shards(folder, info, spec):
+        path, lines = layout.data_path(folder, shard.number), layout.episodes_path(folder, shard.number)
+        _check_schema(path, shard.data.schema_arrow, layout.frames_schema(spec))
+        if shard.data.num_row_groups != len(shard.statistics):
+            raise _wrong(path, "row groups", shard.data.num_row_groups, f"{len(shard.statistics)}, one for each episode")
+        for number, recorded in enumerate(shard.statistics):
+            row = {name: values[number] for name, values in shard.rows.items()}
+            _check_row(lines, row, shard.number)
             with readable(path):
-                frames = file.read_row_group(row)
-            _check_frames(path, frames, {name: values[row] for name, values in rows.items()}, spec, tasks)
+                frames = shard.data.read_row_group(number)
+            _check_frames(path, frames, row, spec, tasks)
+            if shard.counts[number] != {row["length"]}:
+                raise _wrong(lines, f"count of episode {row['episode_index']}", sorted(shard.counts[number]), row["length"])
             found = episode_statistics(_numbers(frames, spec))
-            count = rows["length"][row]
-            if any(counted != [count] for counted in _counts(table, row, spec)):
-                raise _wrong(
-                    layout.episodes_path(folder, shard), f"count of episode {rows['episode_index'][row]}", "others", count
-                )
-            _check_statistics(layout.episodes_path(folder, shard), recorded[row], found, spec)
-            total.add(count, found)
-        for name, values in rows.items():
+            _check_statistics(lines, recorded, found, spec)
+            total.add(row["length"], found)
+        for name, values in shard.rows.items():
             episodes.setdefault(name, []).extend(values)
     leftover = uncommitted(folder, info["mjstack"]["shards"])
     if total.count:
@@ -90,9 +88,9 @@ def read_dataset(folder: Path | str) -> StoredDataset:
 
 
 def _read_spec(folder: Path, info: dict[str, Any]) -> DatasetSpec:
-    own = dict(info["mjstack"])
+    own = info["mjstack"]
     try:
-        units, values, config, _ = own.pop("units"), own.pop("values"), own.pop("config_sha256"), own.pop("shards")
+        units = own["units"]
         features = {
             name: Feature(dtype=feature["dtype"], names=tuple(feature["names"]), units=tuple(units[name]))
             for name, feature in info["features"].items()
@@ -102,13 +100,20 @@ def _read_spec(folder: Path, info: dict[str, Any]) -> DatasetSpec:
             robot_type=info["robot_type"],
             fps=info["fps"],
             features=features,
-            config_sha256=config,
-            values=values,
-            provenance=own,
+            config_sha256=own["config_sha256"],
+            values=own["values"],
+            provenance={name: value for name, value in own["provenance"][-1].items() if name != "from_episode"},
         )
-        counts = {"episodes": info["total_episodes"], "frames": info["total_frames"], "tasks": info["total_tasks"]}
-        expected = layout.make_info(spec, file_mb=info["data_files_size_in_mb"], shards=info["mjstack"]["shards"], **counts)
-    except (KeyError, TypeError) as error:
+        expected = layout.make_info(
+            spec,
+            provenance=own["provenance"],
+            file_mb=info["data_files_size_in_mb"],
+            episodes=info["total_episodes"],
+            frames=info["total_frames"],
+            tasks=info["total_tasks"],
+            shards=own["shards"],
+        )
+    except (KeyError, TypeError, IndexError) as error:
         raise DatasetError(
             f"{folder / layout.INFO} has no usable {error}, expected all of LeRobot's keys. Write it anew"
         ) from error
@@ -143,6 +148,10 @@ def _check_frames(path: Path, frames: Any, row: dict[str, Any], spec: DatasetSpe
     number, length = row["episode_index"], row["length"]
     if len(frames) != length:
         raise _wrong(path, f"frames of episode {number}", len(frames), length)
+    for name, (_, dim) in layout.all_features(spec.features).items():
+        numbers = _values(frames, name, dim)
+        if numbers.null_count or len(numbers) != length * dim:
+            raise _wrong(path, f"{name} of episode {number}", "empty places", "a number in every place")
     task = np.unique(frames["task_index"].to_numpy())
     if len(task) != 1 or not 0 <= task[0] < len(tasks) or row["tasks"] != [tasks[task[0]]]:
         raise _wrong(path, f"task_index of episode {number}", task.tolist(), f"that of {row['tasks']}")
@@ -158,14 +167,6 @@ def _check_frames(path: Path, frames: Any, row: dict[str, Any], spec: DatasetSpe
         if not np.array_equal(found, values):
             first = int(np.flatnonzero(found != values)[0])
             raise _wrong(path, f"{name} of episode {number}, frame {first}", found[first], values[first])
-    for name in frames.column_names:
-        column = frames[name].combine_chunks()
-        if (
-            column.null_count or column.flatten().null_count
-            if name in spec.features and spec.features[name].dim > 1
-            else column.null_count
-        ):
-            raise _wrong(path, f"{name} of episode {number}", "empty places", "a number in every place")
     if not np.isfinite(_numbers(frames, spec)).all():
         raise _wrong(path, f"episode {number}", "numbers that are not finite", "finite ones")
 
@@ -174,14 +175,15 @@ def _numbers(frames: Any, spec: DatasetSpec) -> np.ndarray:
     """All numbers of some frames, shape ``(dim, frames)``, float64."""
     blocks = []
     for name, (_, dim) in layout.all_features(spec.features).items():
-        column = frames[name].combine_chunks()
-        values = column.flatten() if dim > 1 else column
-        blocks.append(values.to_numpy(zero_copy_only=False).reshape(len(frames), dim).T)
+        values = _values(frames, name, dim).to_numpy(zero_copy_only=False)
+        blocks.append(values.reshape(len(frames), dim).T)
     return np.concatenate(blocks, dtype=np.float64)
 
 
-def _counts(table: Any, row: int, spec: DatasetSpec) -> list[list[int]]:
-    return [table[f"stats/{name}/count"][row].as_py() for name in layout.all_features(spec.features)]
+def _values(frames: Any, name: str, dim: int) -> Any:
+    """A column's numbers one after the other."""
+    column = frames[name].combine_chunks()
+    return column.flatten() if dim > 1 else column
 
 
 def _check_statistics(path: Path, found: dict[str, np.ndarray], expected: dict[str, np.ndarray], spec: DatasetSpec) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -56,7 +57,7 @@ class DatasetSpec:
             ``action``, ``next.reward``, ``next.done`` and ``next.success`` by these names; others are kept as they are.
         config_sha256: Hash of what the episodes depend on. A dataset is gone on with under the same hash only.
         values: What each episode brings beside success, seed and world, by name, as one of `VALUE_DTYPES`.
-        provenance: What else is to be kept, such as seed and versions; JSON's types only.
+        provenance: What else is to be known of this call's episodes, such as seed and versions, in JSON's types.
     """
 
     robot_type: str
@@ -79,6 +80,10 @@ class DatasetSpec:
                 raise ArgumentError(label, name, f"a name of letters, digits and _ other than {', '.join(EPISODE_COLUMNS)}")
             if dtype not in VALUE_DTYPES:
                 raise ArgumentError(label, dtype, f"one of {', '.join(VALUE_DTYPES)}")
+        try:
+            json.dumps(dict(self.provenance), allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ArgumentError("provenance", error, "what JSON can hold") from error
 
 
 @dataclass(eq=False, kw_only=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import weakref
 from collections.abc import Iterator, Sequence
@@ -60,6 +61,7 @@ class DatasetWriter:
         self.committed: list[tuple[int, int]] = []
         self.frames = 0
         self._file_mb, self._shards, self._open = file_mb, 0, True
+        self._provenance: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}
         self._tasks_committed = 0
         self._statistics = RunningStatistics(sum(dim for _, dim in layout.all_features(spec.features).values()))
@@ -70,7 +72,7 @@ class DatasetWriter:
             self._unlock = weakref.finalize(self, os.close, lock_folder(self.folder))
             self._resume()
         except OSError as error:
-            raise UnwrittenError(str(folder), error, len(self.committed), 0) from error
+            raise UnwrittenError(str(folder), error, len(self.committed)) from error
         self._shard = self._next_shard()
 
     def __enter__(self) -> DatasetWriter:
@@ -131,11 +133,17 @@ class DatasetWriter:
         if info is not None:
             check_same(self.folder, info, self.spec)
             self._tasks = {task: index for index, task in enumerate(read_tasks(self.folder, info))}
-            for _, table, _ in read_shards(self.folder, info):
-                rows = {name: table[name].to_pylist() for name in ("length", "seed", "world")}
-                self._take_in(rows, layout.statistics_of(table, self.spec.features))
+            self._provenance = info["mjstack"]["provenance"]
+            for shard in read_shards(self.folder, info, self.spec):
+                self._take_in(shard.rows, shard.statistics)
         for path in uncommitted(self.folder, self._shards):
             path.unlink()
+        # Where the last writer and this one differ, such as in a version, both are on record.
+        while self._provenance and self._provenance[-1]["from_episode"] == len(self.committed):
+            del self._provenance[-1]
+        now = json.loads(json.dumps(dict(self.spec.provenance)))
+        if not self._provenance or {**self._provenance[-1], "from_episode": 0} != {**now, "from_episode": 0}:
+            self._provenance.append({"from_episode": len(self.committed), **now})
         staging = Staging()
         try:
             self._stage_totals(staging)
@@ -172,6 +180,7 @@ class DatasetWriter:
             )
         info = layout.make_info(
             self.spec,
+            provenance=self._provenance,
             file_mb=self._file_mb,
             episodes=len(self.committed),
             frames=self.frames,
@@ -187,12 +196,14 @@ class DatasetWriter:
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
         """Closes the writer if something goes wrong in the middle of a file, and removes what was on its way."""
-        kept, pending = len(self.committed), self.pending
+        kept, frames = len(self.committed), self.frames
         try:
             yield
         except BaseException as error:
             self._open = False
             self._shard.staging.discard()
+            del self.committed[kept:]
+            self.frames, self._shard = frames, self._next_shard()
             if isinstance(error, OSError):
-                raise UnwrittenError(str(self.folder), error, kept, pending) from error
+                raise UnwrittenError(str(self.folder), error, kept) from error
             raise
