@@ -21,7 +21,7 @@ LAYERS = [
     {"mdp"},
     {"tasks"},
     {"envs"},
-    {"adapters", "gates"},
+    {"adapters", "datasets", "gates"},
     {"benchmark", "benchmark_physics", "benchmark_ik"},
     {"jobs"},
     {"cli"},
@@ -40,6 +40,7 @@ HOMES = {
     "gymnasium": ("adapters/",),
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),
+    "pyarrow": ("datasets/",),
     "rich": ("jobs/", "cli.py", "benchmark.py", "benchmark_physics.py", "benchmark_ik.py", "managers/base.py"),
 }
 
