@@ -47,13 +47,15 @@ class Cone(Enum):
 class LayoutCfg:
     """Where a scene's objects stand for one robot, and the buffer sizes its contacts need.
 
-    ``nconmax`` and ``njmax`` are for the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions.
+    ``random_xy`` is how far ``reset=randomized`` moves each cube off its place in x and y. ``nconmax`` and ``njmax`` are for
+    the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions.
     """
 
     table_center: list[float] = MISSING
     table_half: list[float] = MISSING
     red_xy: list[float] = MISSING
     blue_xy: list[float] = MISSING
+    random_xy: list[float] = MISSING
     nconmax: int = MISSING
     njmax: int = MISSING
     env_nconmax: int = MISSING
@@ -64,7 +66,8 @@ class LayoutCfg:
 class RobotCfg:
     """An arm: names of its parts and the commands of the task.
 
-    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments.
+    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments. ``finger_room`` is what the
+    open jaws need around a cube.
     """
 
     name: str = MISSING
@@ -92,6 +95,7 @@ class RobotCfg:
     approach_gain: float = MISSING
     align: float = MISSING
     approach_height: float = MISSING
+    finger_room: float = MISSING
     layouts: dict[str, LayoutCfg] = MISSING
 
 
@@ -112,6 +116,7 @@ class SceneCfg:
     table_friction: list[float] = MISSING
     red_xy: list[float] = MISSING
     blue_xy: list[float] = MISSING
+    random_xy: list[float] = MISSING
     cube_half: float = MISSING
     cube_mass: float = MISSING
     cube_friction: list[float] = MISSING
@@ -413,6 +418,17 @@ class StudyJobCfg(JobCfg):
 
 
 @dataclass(kw_only=True, slots=True)
+class ReachabilityJobCfg(JobCfg):
+    """What the arm reaches on the table, and how far cubes may stand from their places.
+
+    ``step`` is the distance of the map's points. A region counts as reached if it is still ``margin`` wider all round.
+    """
+
+    step: float = MISSING
+    margin: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
 class Config:
     """Everything a run needs."""
 
@@ -440,5 +456,6 @@ class Config:
     graph: GraphMode = MISSING
     view: bool = MISSING
     video: bool = MISSING
+    layout: str | None = None
     run: str | None = None
     world: str | None = None

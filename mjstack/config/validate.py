@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import re
 
-from mjstack.config.schema import Config, ScalingJobCfg, SolverCfg, StudyJobCfg
+from mjstack.config.schema import Config, ReachabilityJobCfg, ScalingJobCfg, SolverCfg, StudyJobCfg
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput")
-JOBS = ("gates", "replay", "scaling", "study")
+JOBS = ("gates", "replay", "scaling", "study", "reachability")
 CONDIMS = (1, 3, 4, 6)
 SCALING_BACKENDS = ("mjwarp", "native")
 SECTIONS = ("physics", "episode", "env_step")
@@ -36,6 +36,8 @@ def validate(cfg: Config) -> None:
     for key in ("run", "world"):
         if getattr(cfg, key) is not None and cfg.job.name != "replay":
             raise ConfigError(key, getattr(cfg, key), "null, because it is for job=replay alone", "Add job=replay")
+    if cfg.layout is not None and not any(term.func.endswith(".FromLayout") for term in cfg.reset.values()):
+        raise ConfigError("layout", cfg.layout, "null, because no reset term reads it", "Add reset=layout")
     if not _DEVICE.fullmatch(cfg.sim.device):
         raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N")
     _timing(cfg)
@@ -48,6 +50,9 @@ def validate(cfg: Config) -> None:
         _scaling(cfg.job)
     if isinstance(cfg.job, StudyJobCfg):
         _study(cfg.job)
+    if isinstance(cfg.job, ReachabilityJobCfg):
+        _positive("job.step", cfg.job.step, "m")
+        _not_negative("job.margin", cfg.job.margin, "m")
 
 
 def _timing(cfg: Config) -> None:
@@ -121,6 +126,7 @@ def _robot(cfg: Config) -> None:
     if robot.arm_force_limit is not None:
         _positive("robot.arm_force_limit", robot.arm_force_limit, "N m")
     _positive("robot.approach_height", robot.approach_height, "m")
+    _not_negative("robot.finger_room", robot.finger_room, "m")
     if cfg.scene.name not in robot.layouts:
         raise UnknownName(f"robot.layouts of {robot.name}: scene", cfg.scene.name, robot.layouts)
 
@@ -146,6 +152,9 @@ def _scene(cfg: Config) -> None:
                     value,
                     f"{'xy'[axis]} within [{low:.3f}, {high:.3f}] m, so that the cube is on the table",
                 )
+    _length("scene.random_xy", scene.random_xy, 2)
+    for number in scene.random_xy:
+        _not_negative("scene.random_xy", number, "m")
     apart = math.dist(scene.red_xy, scene.blue_xy)
     if not apart >= 2.0 * math.sqrt(2.0) * scene.cube_half:
         raise ConfigError("scene.red_xy", scene.red_xy, f"a cube that does not touch the blue one at {scene.blue_xy}")
@@ -258,6 +267,11 @@ def _positive_int(key: str, value: int) -> None:
 def _positive(key: str, value: float, unit: str = "") -> None:
     if not (math.isfinite(value) and value > 0.0):
         raise ConfigError(key, value, f"a positive number{f' [{unit}]' if unit else ''}")
+
+
+def _not_negative(key: str, value: float, unit: str = "") -> None:
+    if not (math.isfinite(value) and value >= 0.0):
+        raise ConfigError(key, value, f"a number that is not negative{f' [{unit}]' if unit else ''}")
 
 
 def _length(key: str, value: list, size: int) -> None:
