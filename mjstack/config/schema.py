@@ -250,8 +250,8 @@ class PhaseCfg:
     is ``in_hand``.
 
     The rest is for a controller that watches (``controller=scripted``): ``look`` measures the anchor's cube anew when the phase
-    begins, ``centers`` names a held cube whose own centre goes to the target, however it lies in the hand, ``grasps`` names the cube that both jaws must press on when it ends, and ``retry`` the phase to go back to if they
-    do not.
+    begins, ``centers`` names a held cube whose own centre goes to the target, however it lies in the hand, ``grasps`` names the
+    cube that both jaws must press on when the phase ends, and ``retry`` the phase to go back to if they do not.
     """
 
     anchor: str | None = None
@@ -271,9 +271,9 @@ class ControllerCfg:
     """The scripted motion. Its commands go through the action terms of ``action``.
 
     ``knots``, ``ik_tolerance`` and ``ik_iterations`` are mink's, which plans. A controller that watches makes
-    ``frame_iterations`` of batched inverse kinematics per frame; ``posture_gain`` pulls redundant joints to mink's nominal plan and
-    ``approach_gain`` the gripper upright; ``align`` is the share by which the jaws turn towards a cube's nearest face; a retry may go
-    up to ``hurry`` times as fast, and must be over ``rest_seconds`` before the window in which cubes must rest.
+    ``frame_iterations`` of batched inverse kinematics per frame; ``posture_gain`` pulls redundant joints to mink's nominal
+    plan and ``approach_gain`` turns the gripper upright; ``align`` is the share by which the jaws turn towards a cube's nearest
+    face; a retry may go up to ``hurry`` times as fast, and must be over ``rest_seconds`` before the window of rest.
     """
 
     name: str = MISSING

@@ -17,14 +17,37 @@ class Controller(Protocol):
         phases: The phases, laid out as a world that is not held up goes through them.
         frames: Length of the episode.
         phase: Number of the phase that each world's last command belonged to, shape ``(nworld,)``, int64.
+        error: Largest distance from a target that inverse kinematics left [m], shape ``(nworld,)``.
+        retries: Grasps that were tried again, shape ``(nworld,)``, int32.
     """
 
     phases: list[Phase]
     frames: int
     phase: torch.Tensor
+    error: torch.Tensor
+    retries: torch.Tensor
 
     def command(self) -> torch.Tensor:
         """Commands of the next frame, shape ``(nworld, nu)``."""
+
+
+class Recorded:
+    """Commands that were given in an episode, to be given again."""
+
+    def __init__(self, frames: int, nworld: int, nu: int, device: torch.device) -> None:
+        """Allocates; NaN until it is written."""
+        self.frames = frames
+        self._commands = torch.full((frames, nworld, nu), torch.nan, dtype=torch.float32, device=device)
+        self._next = torch.zeros(1, dtype=torch.int64, device=device)
+
+    def append(self, command: torch.Tensor) -> None:
+        """Takes the next frame's, shape ``(nworld, nu)``. No host read."""
+        self._commands.index_copy_(0, self._next, command[None].float())
+        self._next.add_(1)
+
+    def command(self, frame: int) -> torch.Tensor:
+        """Those of one frame, shape ``(nworld, nu)``."""
+        return self._commands[frame]
 
 
 class TapeController:
@@ -37,6 +60,8 @@ class TapeController:
         self._phase_at = torch.tensor(numbers, device=device)
         self._next = torch.zeros(1, dtype=torch.int64, device=device)
         self.phase = torch.zeros(nworld, dtype=torch.int64, device=device)
+        self.error = torch.as_tensor(tape.waypoint_error, device=device)
+        self.retries = torch.zeros(nworld, dtype=torch.int32, device=device)
 
     def command(self) -> torch.Tensor:
         """Commands of the next frame, shape ``(nworld, nu)``."""

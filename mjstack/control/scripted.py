@@ -147,7 +147,7 @@ class ScriptedController:
         return empty & (self.retries == 0) & (self._can_retry.index_select(0, self.phase)) & (rate <= self._hurry), rate
 
     def _off_center(self) -> torch.Tensor:
-        """From a held cube's centre to the aperture centre [m], shape ``(nworld, 3)``; zero where a phase does not ask for it."""
+        """From a held cube's centre to the aperture centre [m], shape ``(nworld, 3)``; zero where a phase does not ask."""
         at, held = aperture_center(self._env).float(), self._centers.index_select(0, self.phase)
         out = torch.zeros_like(at)
         for number, name in enumerate(CUBES):
