@@ -17,7 +17,7 @@ from mjstack.gates.gate import GateContext
 from mjstack.gates.throughput import run_throughput
 from mjstack.report.record import Status
 from mjstack.sim import Overflow, Simulation
-from mjstack.tasks.stack import Rule, StackEvidence
+from mjstack.tasks.stack import StackEvidence, StackRule
 
 AFTER_RELEASE = 480
 
@@ -33,7 +33,7 @@ def teleport(context: GateContext, world: int) -> Callable[[int, Simulation], No
 
 
 def rules(bits: torch.Tensor) -> list[set[str]]:
-    return [{rule.name for rule in Rule if int(b) & rule} for b in bits]
+    return [{rule.name for rule in StackRule if int(b) & rule} for b in bits]
 
 
 def test_native(robot: str, stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]) -> None:
@@ -119,7 +119,7 @@ def test_overflow_in_exactly_the_crowded_world(
     evidence = StackEvidence(context.cfg, context.index, context.planner.phases, 3, sim.device)
     for _ in range(3):
         sim.step(10)
-        evidence.update(sim)
+        evidence.update(sim, torch.zeros(3, dtype=torch.int64))
     bits = sim.overflow.tolist()
     assert bits[1] & Overflow.NEFC
     assert bits[0] == bits[2] == 0

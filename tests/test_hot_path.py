@@ -61,7 +61,7 @@ PATHS: dict[str, list[str] | None] = {
         "StackSuccess.reset",
     ],
     "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
-    "control/scripted.py": ["CommandTape.command"],
+    "control/planner.py": ["CommandTape.command"],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",
         "BatchedIk.aperture",

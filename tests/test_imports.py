@@ -21,7 +21,7 @@ LAYERS = [
     {"mdp"},
     {"tasks"},
     {"envs"},
-    {"adapters", "gates"},
+    {"adapters", "datasets", "gates"},
     {"benchmark", "benchmark_physics", "benchmark_ik"},
     {"jobs"},
     {"cli"},
@@ -34,12 +34,13 @@ HOMES = {
     "mujoco_menagerie": ("robots/source.py",),
     "hydra": ("config/", "cli.py"),
     "omegaconf": ("config/", "cli.py", "jobs/"),
-    "matplotlib": ("report/picture.py", "report/curves.py"),
+    "matplotlib": ("report/picture.py", "report/curves.py", "report/reachability.py"),
     "imageio_ffmpeg": ("report/picture.py",),
     "pynvml": ("gates/power.py",),
     "gymnasium": ("adapters/",),
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),
+    "pyarrow": ("datasets/",),
     "rich": ("jobs/", "cli.py", "benchmark.py", "benchmark_physics.py", "benchmark_ik.py", "managers/base.py"),
 }
 

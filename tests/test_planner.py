@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjstack.control.scripted import CommandTape
+from mjstack.control.planner import CommandTape
 from mjstack.errors import Unreachable
 from mjstack.gates.gate import GateContext
 

@@ -20,7 +20,7 @@ from mjstack.gates.episode import snapshot, start_worlds
 from mjstack.gates.gate import GateContext
 from mjstack.gates.replay import _sizes_alone
 from mjstack.sim import BatchSizes
-from mjstack.tasks.stack import Rule
+from mjstack.tasks.stack import StackRule
 
 FAILING, ACCEPTED = "0:4", "1:3"  # of the run below
 
@@ -58,7 +58,7 @@ def copy_of(folder: Path, tmp_path: Path) -> Path:
 
 def test_failing_world_fails_again_bit_for_bit(earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
     record = record_of(earlier, 0)
-    assert record.failed[4] == Rule.STACKED
+    assert record.failed[4] == StackRule.STACKED
     status, report = replay(earlier, f"world={FAILING}")
     assert status == 1
     assert report["status"] == "fail"
@@ -71,10 +71,10 @@ def test_failing_world_fails_again_bit_for_bit(earlier: Path, replay: Callable[.
     assert len(broken) == 1
     assert broken[0].startswith(f"STACKED: BROKEN, not stacked: xy_err up to {1e3 * record.values['xy_err_m'][4]:.3g} mm")
     assert "at most 1.5 mm" in broken[0]
-    assert len(gate["details"]) == len(Rule)
+    assert len(gate["details"]) == len(StackRule)
     with np.load(tmp_path / "out" / "trajectory.npz") as held:
         assert np.array_equal(held["qpos"][-1], record.qpos[4])
-        assert (int(held["seed"]), int(held["world"]), int(held["failed"])) == (0, 4, int(Rule.STACKED))
+        assert (int(held["seed"]), int(held["world"]), int(held["failed"])) == (0, 4, int(StackRule.STACKED))
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         ".hydra",
         "replayed_config.yaml",
@@ -143,7 +143,7 @@ def test_saved_configuration_is_the_runs_own(earlier: Path, replay: Callable[...
 def test_another_verdict_is_said(earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
     folder = copy_of(earlier, tmp_path)
     record = record_of(folder, 0)
-    record.failed[3] = int(Rule.CARRY)
+    record.failed[3] = int(StackRule.CARRY)
     record.qpos[3, 14] += 0.002  # somewhere in blue's position
     record.write(folder)
     status, report = replay(folder, "world=3")

@@ -12,10 +12,18 @@ import pytest
 import torch
 from stack_checker import BLUE, RED, Outcome, check_world
 
-from mjstack.tasks.stack import Rule, StackEvidence, Verdict, describe_rules
+from mjstack.tasks.evidence import Verdict, describe_rules
+from mjstack.tasks.stack import StackEvidence, StackRule
 
 HAIR = 2e-6  # [m], [m/s], [rad]: a good deal more than float32 rounds at these sizes
-NUMBERS = ("xy_err", "dz", "rest_speed", "peak_speed", "rest_position", "rest_rotation")
+NUMBERS = {
+    "xy_err": "xy_err_m",
+    "dz": "dz_m",
+    "rest_speed": "rest_speed_m_per_s",
+    "peak_speed": "peak_speed_m_per_s",
+    "rest_position": "rest_position_m",
+    "rest_rotation": "rest_rotation_deg",
+}
 
 
 @dataclass
@@ -43,6 +51,7 @@ def feed(worlds: list[World], rec: SimpleNamespace, dtype: torch.dtype = torch.f
     index = SimpleNamespace(cube_qpos=[1, 8], cube_qvel=[1, 7])
     n = len(worlds)
     evidence = StackEvidence(rec.cfg, index, rec.phases, n, torch.device("cpu"))
+    phase_at = torch.tensor([i for i, p in enumerate(rec.phases) for _ in range(p.start, p.stop)])
     arm = np.array([[w.arm] for w in worlds])
     pose = np.stack([w.pose.reshape(len(w.pose), 14) for w in worlds])
     velocity = np.stack([w.velocity.reshape(len(w.velocity), 12) for w in worlds])
@@ -55,12 +64,12 @@ def feed(worlds: list[World], rec: SimpleNamespace, dtype: torch.dtype = torch.f
     for frame in range(pose.shape[1]):
         sim.qpos = torch.tensor(np.hstack([arm, pose[:, frame]]), dtype=dtype)
         sim.qvel = torch.tensor(np.hstack([arm, velocity[:, frame]]), dtype=dtype)
-        evidence.update(sim)
+        evidence.update(sim, phase_at[min(frame, len(phase_at) - 1)].expand(n))
     return evidence.verdict(sim)
 
 
 def names_of(bits: int) -> set[str]:
-    return {rule.name for rule in Rule if bits & rule}
+    return {rule.name for rule in StackRule if bits & rule}
 
 
 def reference(w: World) -> Outcome:
@@ -77,8 +86,11 @@ def reference(w: World) -> Outcome:
 
 def assert_same(verdict: Verdict, k: int, expected: Outcome) -> None:
     assert names_of(int(verdict.failed[k])) == expected.failed
-    for name in NUMBERS:
-        assert float(getattr(verdict, name)[k]) == pytest.approx(getattr(expected, name), abs=1e-6, rel=1e-4, nan_ok=True), name
+    for name, value in NUMBERS.items():
+        wanted = getattr(expected, name)
+        wanted = math.degrees(wanted) if value.endswith("_deg") else wanted
+        tolerance = math.degrees(1e-6) if value.endswith("_deg") else 1e-6
+        assert float(verdict.values[value][k]) == pytest.approx(wanted, abs=tolerance, rel=1e-4, nan_ok=True), name
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -385,7 +397,7 @@ def test_iteration_limits_are_no_overflow(recorded: Callable[[str], SimpleNamesp
 
 
 def test_every_rule_has_words_and_a_case() -> None:
-    assert {rule.name for rule in Rule} == set().union(*(rules for _, rules in CASES.values()))
-    for rule in Rule:
-        assert describe_rules(int(rule))
-    assert describe_rules(int(Rule.LIFT | Rule.STACKED)).count(",") == 1
+    assert {rule.name for rule in StackRule} == set().union(*(rules for _, rules in CASES.values()))
+    for rule in StackRule:
+        assert describe_rules(StackRule, int(rule))
+    assert describe_rules(StackRule, int(StackRule.LIFT | StackRule.STACKED)).count(",") == 1

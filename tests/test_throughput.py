@@ -154,7 +154,7 @@ def test_bare_steps_play_the_same_trajectory(
     assert problem == ""
     assert torch.equal(sim.qpos, final)
     monkeypatch.setattr(type(sim), "bare_step", lambda _: lambda: None)
-    assert sections._play_bare(context, sim)[1] == "1 worlds did not stack with bare steps"  # type: ignore[arg-type]
+    assert sections._play_bare(context, sim)[1] == "1 worlds did not do the task with bare steps"  # type: ignore[arg-type]
 
 
 def test_bare_steps_that_lose_worlds_do_not_count(

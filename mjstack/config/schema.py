@@ -47,13 +47,15 @@ class Cone(Enum):
 class LayoutCfg:
     """Where a scene's objects stand for one robot, and the buffer sizes its contacts need.
 
-    ``nconmax`` and ``njmax`` are for the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions.
+    ``random_xy`` is how far ``reset=randomized`` moves each cube off its place in x and y. ``nconmax`` and ``njmax`` are for
+    the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions.
     """
 
     table_center: list[float] = MISSING
     table_half: list[float] = MISSING
     red_xy: list[float] = MISSING
     blue_xy: list[float] = MISSING
+    random_xy: list[float] = MISSING
     nconmax: int = MISSING
     njmax: int = MISSING
     env_nconmax: int = MISSING
@@ -64,7 +66,8 @@ class LayoutCfg:
 class RobotCfg:
     """An arm: names of its parts and the commands of the task.
 
-    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments.
+    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments. ``finger_room`` is what the
+    open jaws need around a cube.
     """
 
     name: str = MISSING
@@ -87,7 +90,12 @@ class RobotCfg:
     approach_axis: list[float] = MISSING
     jaw_bodies: list[str] = MISSING
     replace_collision: bool = False
+    roll_joint: str = MISSING
+    posture_gain: float = MISSING
+    approach_gain: float = MISSING
+    align: float = MISSING
     approach_height: float = MISSING
+    finger_room: float = MISSING
     layouts: dict[str, LayoutCfg] = MISSING
 
 
@@ -108,9 +116,14 @@ class SceneCfg:
     table_friction: list[float] = MISSING
     red_xy: list[float] = MISSING
     blue_xy: list[float] = MISSING
+    random_xy: list[float] = MISSING
     cube_half: float = MISSING
     cube_mass: float = MISSING
     cube_friction: list[float] = MISSING
+    # Where a box stands: the cubes' places in it, and how far above a cube's centre it is held.
+    red_slot: list[float] | None = None
+    blue_slot: list[float] | None = None
+    grasp_offset: float = 0.0
 
 
 @dataclass(kw_only=True, slots=True)
@@ -215,12 +228,16 @@ class TerminationTermCfg(TermCfg):
 
 @dataclass(kw_only=True, slots=True)
 class TaskCfg:
-    """What has to be achieved, sampled at frame ends. The rules' thresholds are in `AcceptanceCfg`."""
+    """What has to be achieved, sampled at frame ends. The rules' thresholds are in `AcceptanceCfg`.
+
+    ``evidence`` names the subclass of ``Evidence`` that judges a scripted episode.
+    """
 
     name: str = MISSING
     control_hz: float = MISSING
     episode_frames: int = MISSING
     goal_height: float = MISSING
+    evidence: str = MISSING
     success: TermCfg | None = None
 
 
@@ -228,20 +245,36 @@ class TaskCfg:
 class PhaseCfg:
     """One phase of the scripted grasp.
 
-    ``anchor`` is ``red``, ``blue`` (a cube's centre), ``on_blue`` (where the red cube's centre goes) or null (hold the last
-    command). The target lies ``h_scale`` approach heights plus ``offset`` above it.
+    ``anchor`` is one of `mjstack.control.phases.build_anchors`, such as ``red`` (a cube's centre), or null (the last target
+    holds). The target lies ``h_scale`` approach heights plus ``offset`` above it, and ``scene.grasp_offset`` too where the cube
+    is ``in_hand``.
+
+    The rest is for a controller that watches (``controller=scripted``): ``look`` measures the anchor's cube anew when the phase
+    begins, ``centers`` names a held cube whose own centre goes to the target, however it lies in the hand, ``grasps`` names the cube that both jaws must press on when it ends, and ``retry`` the phase to go back to if they
+    do not.
     """
 
     anchor: str | None = None
     h_scale: float = 0.0
     offset: float = 0.0
+    in_hand: bool = False
     gripper: str = MISSING
     seconds: float = MISSING
+    look: bool = False
+    centers: str | None = None
+    grasps: str | None = None
+    retry: str | None = None
 
 
 @dataclass(kw_only=True, slots=True)
 class ControllerCfg:
-    """The scripted controller and its planner. Its commands go through the action terms of ``action``."""
+    """The scripted motion. Its commands go through the action terms of ``action``.
+
+    ``knots``, ``ik_tolerance`` and ``ik_iterations`` are mink's, which plans. A controller that watches makes
+    ``frame_iterations`` of batched inverse kinematics per frame; ``posture_gain`` pulls redundant joints to mink's nominal plan and
+    ``approach_gain`` the gripper upright; ``align`` is the share by which the jaws turn towards a cube's nearest face; a retry may go
+    up to ``hurry`` times as fast, and must be over ``rest_seconds`` before the window in which cubes must rest.
+    """
 
     name: str = MISSING
     action: dict[str, Any] = MISSING
@@ -249,6 +282,12 @@ class ControllerCfg:
     knots: int = MISSING
     ik_tolerance: float = MISSING
     ik_iterations: int = MISSING
+    frame_iterations: int = MISSING
+    posture_gain: float = MISSING
+    approach_gain: float = MISSING
+    align: float = MISSING
+    hurry: float = MISSING
+    rest_seconds: float = MISSING
 
 
 @dataclass(kw_only=True, slots=True)
@@ -379,6 +418,17 @@ class StudyJobCfg(JobCfg):
 
 
 @dataclass(kw_only=True, slots=True)
+class ReachabilityJobCfg(JobCfg):
+    """What the arm reaches on the table, and how far cubes may stand from their places.
+
+    ``step`` is the distance of the map's points. A region counts as reached if it is still ``margin`` wider all round.
+    """
+
+    step: float = MISSING
+    margin: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
 class Config:
     """Everything a run needs."""
 
@@ -406,5 +456,6 @@ class Config:
     graph: GraphMode = MISSING
     view: bool = MISSING
     video: bool = MISSING
+    layout: str | None = None
     run: str | None = None
     world: str | None = None

@@ -17,7 +17,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
-from mjstack.config.schema import Config, ScalingJobCfg, StudyJobCfg
+from mjstack.config.schema import Config, ReachabilityJobCfg, ScalingJobCfg, StudyJobCfg
 from mjstack.config.terms import type_terms
 from mjstack.config.validate import validate
 from mjstack.errors import MjstackError, UnknownName, suggest
@@ -30,6 +30,7 @@ _KINDS = {"Integer": "an integer", "Float": "a number", "Boolean": "true or fals
 ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
 ConfigStore.instance().store(group="job", name="study_schema", node=StudyJobCfg, provider="mjstack")
 ConfigStore.instance().store(group="job", name="scaling_schema", node=ScalingJobCfg, provider="mjstack")
+ConfigStore.instance().store(group="job", name="reachability_schema", node=ReachabilityJobCfg, provider="mjstack")
 
 
 class CompositionError(MjstackError):

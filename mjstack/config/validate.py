@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 import re
 
-from mjstack.config.schema import Config, ScalingJobCfg, SolverCfg, StudyJobCfg
+from mjstack.config.schema import Config, ReachabilityJobCfg, ScalingJobCfg, SolverCfg, StudyJobCfg
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput")
-JOBS = ("gates", "replay", "scaling", "study")
+JOBS = ("gates", "replay", "scaling", "study", "reachability")
 CONDIMS = (1, 3, 4, 6)
 SCALING_BACKENDS = ("mjwarp", "native")
 SECTIONS = ("physics", "episode", "env_step")
-ANCHORS = ("red", "blue", "on_blue")
+ANCHORS = ("red", "blue", "on_blue", "over_red", "over_blue", "red_slot", "blue_slot")
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
 _WORLD = re.compile(r"(\d+:)?\d+")
@@ -36,6 +36,8 @@ def validate(cfg: Config) -> None:
     for key in ("run", "world"):
         if getattr(cfg, key) is not None and cfg.job.name != "replay":
             raise ConfigError(key, getattr(cfg, key), "null, because it is for job=replay alone", "Add job=replay")
+    if cfg.layout is not None and not any(term.func.endswith(".FromLayout") for term in cfg.reset.values()):
+        raise ConfigError("layout", cfg.layout, "null, because no reset term reads it", "Add reset=layout")
     if not _DEVICE.fullmatch(cfg.sim.device):
         raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N")
     _timing(cfg)
@@ -48,6 +50,9 @@ def validate(cfg: Config) -> None:
         _scaling(cfg.job)
     if isinstance(cfg.job, StudyJobCfg):
         _study(cfg.job)
+    if isinstance(cfg.job, ReachabilityJobCfg):
+        _positive("job.step", cfg.job.step, "m")
+        _not_negative("job.margin", cfg.job.margin, "m")
 
 
 def _timing(cfg: Config) -> None:
@@ -107,7 +112,11 @@ def _robot(cfg: Config) -> None:
     _length("robot.approach_axis", robot.approach_axis, 3)
     if abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3:
         raise ConfigError("robot.approach_axis", robot.approach_axis, "a vector of length 1, such as [0, 0, -1]")
-    for key, names in (("robot.ik_joints", robot.ik_joints), ("robot.locked", list(robot.locked))):
+    for key, names in (
+        ("robot.ik_joints", robot.ik_joints),
+        ("robot.locked", list(robot.locked)),
+        ("robot.roll_joint", [robot.roll_joint]),
+    ):
         for name in names:
             if name not in robot.arm_joints:
                 raise UnknownName(f"{key}: arm joint", name, robot.arm_joints)
@@ -117,6 +126,7 @@ def _robot(cfg: Config) -> None:
     if robot.arm_force_limit is not None:
         _positive("robot.arm_force_limit", robot.arm_force_limit, "N m")
     _positive("robot.approach_height", robot.approach_height, "m")
+    _not_negative("robot.finger_room", robot.finger_room, "m")
     if cfg.scene.name not in robot.layouts:
         raise UnknownName(f"robot.layouts of {robot.name}: scene", cfg.scene.name, robot.layouts)
 
@@ -142,6 +152,9 @@ def _scene(cfg: Config) -> None:
                     value,
                     f"{'xy'[axis]} within [{low:.3f}, {high:.3f}] m, so that the cube is on the table",
                 )
+    _length("scene.random_xy", scene.random_xy, 2)
+    for number in scene.random_xy:
+        _not_negative("scene.random_xy", number, "m")
     apart = math.dist(scene.red_xy, scene.blue_xy)
     if not apart >= 2.0 * math.sqrt(2.0) * scene.cube_half:
         raise ConfigError("scene.red_xy", scene.red_xy, f"a cube that does not touch the blue one at {scene.blue_xy}")
@@ -158,6 +171,11 @@ def _controller(cfg: Config) -> None:
         for part in ("h_scale", "offset"):
             if not math.isfinite(getattr(phase, part)):
                 raise ConfigError(f"{key}.{part}", getattr(phase, part), "a finite number")
+        for part in ("grasps", "centers"):
+            if getattr(phase, part) not in (None, "red", "blue"):
+                raise ConfigError(f"{key}.{part}", getattr(phase, part), "red, blue or null")
+        if phase.retry is not None and phase.retry not in cfg.controller.phases:
+            raise UnknownName(f"{key}.retry: phase", phase.retry, cfg.controller.phases)
         frames = phase.seconds / cfg.timing.frame_dt
         if abs(frames - round(frames)) > 1e-6:
             raise ConfigError(f"{key}.seconds", phase.seconds, f"a multiple of the frame, {cfg.timing.frame_dt:g} s")
@@ -167,6 +185,15 @@ def _controller(cfg: Config) -> None:
         raise ConfigError("controller.knots", cfg.controller.knots, "at least 3")
     _positive("controller.ik_tolerance", cfg.controller.ik_tolerance, "m")
     _positive_int("controller.ik_iterations", cfg.controller.ik_iterations)
+    _positive_int("controller.frame_iterations", cfg.controller.frame_iterations)
+    for key in ("posture_gain", "approach_gain", "align", "rest_seconds"):
+        value = getattr(cfg.controller, key)
+        if not (math.isfinite(value) and value >= 0.0):
+            raise ConfigError(f"controller.{key}", value, "a number that is not negative")
+    if cfg.controller.align > 1.0:
+        raise ConfigError("controller.align", cfg.controller.align, "a share from 0 to 1")
+    if not (math.isfinite(cfg.controller.hurry) and cfg.controller.hurry >= 1.0):
+        raise ConfigError("controller.hurry", cfg.controller.hurry, "a number of at least 1")
 
 
 def _gates(cfg: Config) -> None:
@@ -240,6 +267,11 @@ def _positive_int(key: str, value: int) -> None:
 def _positive(key: str, value: float, unit: str = "") -> None:
     if not (math.isfinite(value) and value > 0.0):
         raise ConfigError(key, value, f"a positive number{f' [{unit}]' if unit else ''}")
+
+
+def _not_negative(key: str, value: float, unit: str = "") -> None:
+    if not (math.isfinite(value) and value >= 0.0):
+        raise ConfigError(key, value, f"a number that is not negative{f' [{unit}]' if unit else ''}")
 
 
 def _length(key: str, value: list, size: int) -> None:

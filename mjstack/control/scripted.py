@@ -1,239 +1,231 @@
-"""The scripted grasp: phases, targets of the aperture centre, and the command tape of every world."""
+"""The scripted controller: every world goes through its phases by itself, watches its cubes, and needs no host."""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Generator
-from contextlib import closing
-from dataclasses import dataclass
+import math
 
 import numpy as np
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.control.planning_pool import PARALLEL_FROM, WORLDS_PER_PROCESS, Plan, plan_in_parallel
-from mjstack.errors import Unreachable
-from mjstack.kinematics.mink_ik import ApertureIk
-from mjstack.scene import table_top
-from mjstack.sim.native import available_cores
+from mjstack.control.phases import FIXED, anchor_of, build_phases
+from mjstack.kinematics.batched_ik import BatchedIk
+from mjstack.managers.base import EnvView
+from mjstack.mdp.geometry import aperture_center, jaw_forces, pose_w, robot
+from mjstack.scene.index import CUBES
+
+LOADED = 1e-5  # N: a jaw that presses with more touches the cube (protocol of the box task)
+_QUARTER = 0.5 * math.pi
+_MOST_OFF = 0.02  # m: a cube that is farther from the aperture centre is not in the hand
+_STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
+_ROLL_STEP = 0.05  # rad per frame
+_DONE = 1e-3  # frames: a phase is over this much before its last frame would be
 
 
-@dataclass(frozen=True, slots=True)
-class Phase:
-    """A phase as frames ``start`` to ``stop`` (exclusive) of the episode."""
+class ScriptedController:
+    """Phase, time and targets of every world as tensors; targets from where its cubes are; batched inverse kinematics.
 
-    name: str
-    start: int
-    stop: int
+    A phase moves the aperture centre by smoothstep from the last phase's target to its own. Where it says ``look``, the cube's
+    place is measured when it begins. A grasp without load on both jaws at its end is tried once more, from the phase ``retry``,
+    if the rest can be done in time: such a world then goes faster than the others, at most ``controller.hurry`` times.
 
+    A world that the environment has reset starts over by itself.
 
-def build_phases(cfg: Config) -> list[Phase]:
-    """The controller's phases laid out over the episode's frames."""
-    phases, start = [], 0
-    for name, phase in cfg.controller.phases.items():
-        stop = start + round(phase.seconds / cfg.timing.frame_dt)
-        phases.append(Phase(name, start, stop))
-        start = stop
-    return phases
-
-
-class CommandTape:
-    """Commands of every world for the whole episode, held as a few knots per phase.
-
-    The arm's motion between two targets is a polynomial in the smoothstep parameter through Chebyshev points, so that 600
-    frames need some 40 solutions of inverse kinematics a world, and memory does not grow with the episode.
+    Attributes:
+        phases: The phases, laid out as a world without a retry goes through them.
+        frames: Length of the episode.
+        phase: Number of the phase that each world's last command belonged to, shape ``(nworld,)``, int64.
+        retries: Grasps tried again in this episode, shape ``(nworld,)``, int32.
+        error: Largest distance that inverse kinematics left at the end of any phase [m], shape ``(nworld,)``.
+        unreachable: Whether a target was farther than ``controller.ik_tolerance``, shape ``(nworld,)``, bool.
     """
 
-    def __init__(self, knots: np.ndarray, weights: np.ndarray, segments: np.ndarray, waypoint_error: np.ndarray) -> None:
-        """Wraps a plan.
+    def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
+        """Allocates for the environment's worlds.
 
         Args:
-            knots: Commands, shape ``(nworld, n, nu)``.
-            weights: Weight of each knot of a frame's segment, shape ``(frames, k)``.
-            segments: First knot of each frame's segment, shape ``(frames,)``.
-            waypoint_error: Largest distance [m] from a target at any knot, shape ``(nworld,)``.
-        """
-        self.waypoint_error = waypoint_error
-        self.frames, self._k = weights.shape
-        self._segments = torch.from_numpy(segments)
-        self._weights = torch.from_numpy(weights)
-        self._knots = torch.from_numpy(knots)
-        self._offsets = torch.arange(self._k)
-
-    def to(self, device: torch.device, dtype: torch.dtype) -> CommandTape:
-        """The same tape on a device."""
-        moved = copy.copy(self)
-        moved._weights, moved._knots = self._weights.to(device, dtype), self._knots.to(device, dtype)
-        moved._segments, moved._offsets = self._segments.to(device), self._offsets.to(device)
-        return moved
-
-    def command(self, frame: int | torch.Tensor) -> torch.Tensor:
-        """Commands of one frame.
-
-        Args:
-            frame: Its number; or shape ``(1,)``, int64, on the tape's device, for a captured graph.
-
-        Returns:
-            Shape ``(nworld, nu)``.
-        """
-        if isinstance(frame, int):
-            frame = torch.tensor([frame], device=self._offsets.device)
-        knots = self._knots.index_select(1, self._segments.index_select(0, frame) + self._offsets)
-        # Not einsum, whose rounding depends on nworld: a world's commands would not be those it gets alone.
-        return (self._weights.index_select(0, frame)[0][:, None] * knots).sum(1)
-
-
-class ScriptedPlanner:
-    """Plans command tapes for cubes at given places, with mink."""
-
-    def __init__(self, cfg: Config, *, parallel_from: int = PARALLEL_FROM, processes: int | None = None) -> None:
-        """Plans the nominal layout, from which every other plan starts.
-
-        Args:
-            cfg: The configuration.
-            parallel_from: Number of distinct worlds from which on other processes help with them.
-            processes: How many plan then, this one among them; by default as many as there are cores and work for.
+            env: The environment; its action terms must take absolute joint commands.
+            nominal: Commands at the end of each phase in the nominal layout, which redundant joints keep close to, shape
+                ``(phases, nu)``.
 
         Raises:
-            Unreachable: A nominal target is out of reach.
+            MjstackError: A phase has an anchor that the scene lacks.
         """
-        self._cfg = cfg
-        self._parallel_from, self._processes = parallel_from, processes
+        cfg, device, n = env.cfg, env.device, env.nworld
+        self._env, self._cfg = env, cfg
         self.phases = build_phases(cfg)
-        self.ik = ApertureIk(
-            cfg.robot, cfg.model, tolerance=cfg.controller.ik_tolerance, iterations=cfg.controller.ik_iterations
+        self.frames = self.phases[-1].stop
+        self._build_tables(cfg, device)
+        c = cfg.controller
+        self._ik = BatchedIk(
+            env.sim.model,
+            cfg.robot,
+            n,
+            device,
+            iterations=c.frame_iterations,
+            posture_gain=c.posture_gain,
+            approach_gain=c.approach_gain,
+            tolerance=c.ik_tolerance,
         )
-        self._nodes = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, cfg.controller.knots))
-        self._weights, self._segments = self._frame_weights()
-        self._seed: np.ndarray | None = None
-        self._last: tuple[np.ndarray, CommandTape] | None = None
-        nominal = np.array([[*cfg.scene.red_xy, *cfg.scene.blue_xy]])
-        self._seed = self.plan_world(0, nominal[0])[0]
+        self._uses_posture = c.posture_gain > 0.0
+        tensors = robot(env)
+        self._n_arm = env.index.n_arm
+        self._nominal = torch.as_tensor(nominal, dtype=torch.float32, device=device)
+        self._home_grip = tensors.home[self._n_arm :].float()
 
-    def plan(self, cubes_xy: np.ndarray, progress: Callable[[int], None] | None = None) -> CommandTape:
-        """Plans one tape per world; worlds whose cubes stand alike share the work.
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.zeros((n, *shape), dtype=dtype, device=device)
 
-        Args:
-            cubes_xy: Red x, y and blue x, y at the start [m], shape ``(nworld, 4)``.
-            progress: Called with the number of worlds done.
+        self.phase, self._time, self._rate = zeros(dtype=torch.int64), zeros(), zeros()
+        self.retries, self.error = zeros(dtype=torch.int32), zeros()
+        self.unreachable = zeros(dtype=torch.bool)
+        self._seen = zeros(3, 2)  # x and y of red, of blue, and of a fixed place
+        self._from, self._to = zeros(3), zeros(3)
+        n_grip = len(cfg.robot.gripper_joints)
+        self._grip_from, self._grip_to = zeros(n_grip), zeros(n_grip)
+        self._command = zeros(len(cfg.robot.home))
+        self._yaw, self._roll = zeros(3), zeros()
+        self._roll_column, self._roll_sign = self._find_roll()
 
-        Raises:
-            Unreachable: A target is out of reach; names the world (the first one), the phase and the distance.
-            WorkerLost: A process that helps has ended.
-        """
-        if self._last is not None and np.array_equal(self._last[0], cubes_xy):
-            return self._last[1]  # the gates of one run play the same batch
-        nworld = cubes_xy.shape[0]
-        knots = np.full((nworld, len(self.phases) * len(self._nodes), len(self._cfg.robot.home)), np.nan)
-        error = np.full(nworld, np.nan)
-        first: dict[bytes, int] = {}
-        twin = np.array([first.setdefault(xy.tobytes(), world) for world, xy in enumerate(cubes_xy)], dtype=np.intp)
-        alike = np.bincount(twin, minlength=nworld)
-        done = 0
-        with closing(self._plans(list(first.values()), cubes_xy)) as plans:
-            for world, *plan in plans:
-                knots[world], error[world] = plan
-                done += int(alike[world])
-                if progress is not None:
-                    progress(done)
-        if len(first) < nworld:
-            knots, error = knots[twin], error[twin]
-        tape = CommandTape(knots, self._weights, self._segments, error)
-        if nworld > 1:
-            self._last = (cubes_xy.copy(), tape)
-        return tape
+    def command(self) -> torch.Tensor:
+        """Commands of the next frame, shape ``(nworld, nu)``, float32. The controller's own memory: do not write into it."""
+        fresh = self._env.frame == 0
+        self._advance(fresh)
+        length = self._length.index_select(0, self.phase)
+        u = (self._time / length).clamp(max=1.0)
+        s = (u * u * (3.0 - 2.0 * u))[:, None]
+        target = torch.lerp(self._from, self._to, s)
+        grip = torch.lerp(self._grip_from, self._grip_to, s)
+        posture = self._nominal.index_select(0, self.phase)
+        start = torch.where(fresh[:, None], posture, self._command)
+        start[:, self._n_arm :] = grip
+        if self._cfg.controller.align > 0.0:
+            self._turn(start, fresh)
+        command, distance = self._ik.solve(start, target, posture if self._uses_posture else None)
+        self._command.copy_(command)
+        last = self._time >= length - _DONE
+        self.error.copy_(torch.where(last, torch.maximum(self.error, distance), self.error))
+        self.unreachable |= last & ~(distance <= self._cfg.controller.ik_tolerance)
+        return self._command
 
-    def path_error(self, cubes_xy: np.ndarray) -> float:
-        """Largest distance [m] of the aperture centre from its straight path at any frame, for one layout ``(4,)``."""
-        tape = self.plan(cubes_xy[None])
-        worst = 0.0
-        for phase, (start, end, _, _) in zip(self.phases, self._targets(cubes_xy), strict=True):
-            for frame in range(phase.start, phase.stop):
-                s = _smoothstep((frame + 1 - phase.start) / (phase.stop - phase.start))
-                at = self.ik.aperture(tape.command(frame)[0].numpy())
-                worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start)))))
-        return worst
+    def _advance(self, fresh: torch.Tensor) -> None:
+        """Time goes on by a frame; worlds whose phase is over enter the next one, or try their grasp again."""
+        length = self._length.index_select(0, self.phase)
+        over = (self._time >= length - _DONE) & (self.phase < len(self.phases) - 1) & ~fresh
+        retry, rate = self._judge_grasp(over)
+        phase = torch.where(retry, self._retry_to.index_select(0, self.phase), self.phase + over)
+        phase.masked_fill_(fresh, 0)
+        self._rate.copy_(torch.where(retry, rate, self._rate)).masked_fill_(fresh, 1.0)
+        left_over = (self._time - length).clamp(min=0.0) * over
+        entering = over | fresh
+        self._time.copy_(torch.where(entering, left_over * ~fresh, self._time)).add_(self._rate)
+        self.retries += retry
+        self.phase.copy_(phase)
+        for buffer in (self.retries, self.error, self.unreachable):
+            buffer.masked_fill_(fresh, 0)
 
-    def plan_world(self, world: int, xy: np.ndarray) -> tuple[np.ndarray, float]:
-        """Plans one world, starting from the nominal plan, so that its neighbours do not matter.
+        self._look(entering)
+        rows = entering[:, None]
+        table, source = self._target.index_select(0, phase), self._source.index_select(0, phase)
+        place = self._seen.gather(1, source[:, None, None].expand(-1, 1, 2))[:, 0]
+        to = torch.cat((table[:, :2] + place, table[:, 2:]), dim=1)
+        to = torch.where(self._holds.index_select(0, phase)[:, None], self._to, to + self._off_center())
+        self._from.copy_(torch.where(rows, torch.where(fresh[:, None], to, self._to), self._from))
+        self._to.copy_(torch.where(rows, to, self._to))
+        closing = torch.where(fresh[:, None], self._home_grip, self._grip_to)
+        self._grip_from.copy_(torch.where(rows, closing, self._grip_from))
+        self._grip_to.copy_(torch.where(rows, self._grip.index_select(0, phase), self._grip_to))
 
-        Args:
-            world: Its number, for the error.
-            xy: Red x, y and blue x, y at the start [m], shape ``(4,)``.
+    def _judge_grasp(self, over: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Worlds that try their grasp again, ``(nworld,)`` bool, and how fast they go on, ``(nworld,)``."""
+        held = torch.stack([(jaw_forces(self._env, name) > LOADED).all(1) for name in CUBES], dim=1)
+        grasps = self._grasps.index_select(0, self.phase)
+        empty = over & (grasps >= 0) & ~held.gather(1, grasps.clamp(min=0)[:, None])[:, 0]
+        again = self._retry_to.index_select(0, self.phase)
+        time_left = (self.frames - self._rest - self._env.frame).clamp(min=1)
+        rate = (self._needed.index_select(0, again) / time_left).clamp(min=1.0)
+        return empty & (self.retries == 0) & (self._can_retry.index_select(0, self.phase)) & (rate <= self._hurry), rate
 
-        Returns:
-            Commands at the knots, shape ``(n, nu)``, and the largest distance [m] from a target at any.
-
-        Raises:
-            Unreachable: A target is out of reach.
-        """
-        n = len(self._nodes)
-        knots = np.empty((len(self.phases) * n, len(self._cfg.robot.home)))
-        worst, command = 0.0, self.ik.home
-        for i, (phase, (start, end, grip0, grip1)) in enumerate(zip(self.phases, self._targets(xy), strict=True)):
-            still = bool((start == end).all() and (grip0 == grip1).all())
-            for j, s in enumerate(self._nodes):
-                k = i * n + j
-                repeated = (still and j > 0) or (j == 0 and i > 0)
-                if not repeated:
-                    guess = command if self._seed is None else self._seed[k]
-                    target = start + s * (end - start)
-                    command, distance = self.ik.solve(target, grip0 + s * (grip1 - grip0), guess)
-                    if not distance <= self.ik.tolerance:
-                        raise Unreachable(world, phase.name, target.tolist(), distance, self.ik.tolerance)
-                    worst = max(worst, distance)
-                knots[k] = command
-        return knots, worst
-
-    def _plans(self, worlds: list[int], cubes_xy: np.ndarray) -> Generator[Plan]:
-        """The plans of some worlds, one after the other here, or shared out where there are many; then in any order."""
-        if len(worlds) >= self._parallel_from:
-            processes = self._processes or min(available_cores(), len(worlds) // WORLDS_PER_PROCESS)
-            if processes > 1:
-                yield from plan_in_parallel(self._cfg, self.plan_world, worlds, cubes_xy, processes)
-                return
-        for world in worlds:
-            yield world, *self.plan_world(world, cubes_xy[world])
-
-    def _targets(self, xy: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """Start and end of the aperture centre and of the gripper command, per phase."""
-        robot, scene = self._cfg.robot, self._cfg.scene
-        half, top = scene.cube_half, table_top(scene)
-        anchors = {
-            "red": np.array([xy[0], xy[1], top + half]),
-            "blue": np.array([xy[2], xy[3], top + half]),
-            "on_blue": np.array([xy[2], xy[3], top + 3.0 * half]),
-        }
-        grips = {"open": np.array(robot.gripper_open), "closed": np.array(robot.gripper_closed)}
-        out: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-        for cfg in self._cfg.controller.phases.values():
-            grip = grips[cfg.gripper]
-            if cfg.anchor is None:
-                end = out[-1][1]
-            else:
-                end = anchors[cfg.anchor] + np.array([0.0, 0.0, cfg.h_scale * robot.approach_height + cfg.offset])
-            # The first phase's target stands from the first frame; only the gripper moves from home.
-            start = out[-1][1] if out else end
-            grip0 = out[-1][3] if out else np.array(robot.home[len(robot.arm_joints) :])
-            out.append((start, end, grip0, grip))
+    def _off_center(self) -> torch.Tensor:
+        """From a held cube's centre to the aperture centre [m], shape ``(nworld, 3)``; zero where a phase does not ask for it."""
+        at, held = aperture_center(self._env).float(), self._centers.index_select(0, self.phase)
+        out = torch.zeros_like(at)
+        for number, name in enumerate(CUBES):
+            off = (at - pose_w(self._env, name)[:, :3].float()).clamp(-_MOST_OFF, _MOST_OFF)
+            out = torch.where((held == number)[:, None], off, out)
         return out
 
-    def _frame_weights(self) -> tuple[np.ndarray, np.ndarray]:
-        """Barycentric Lagrange weights of the Chebyshev points, for every frame."""
-        n = len(self._nodes)
-        bary = (-1.0) ** np.arange(n)
-        bary[[0, -1]] *= 0.5
-        rows, segments = [], []
-        for i, phase in enumerate(self.phases):
-            for frame in range(phase.start, phase.stop):
-                s = _smoothstep((frame + 1 - phase.start) / (phase.stop - phase.start))
-                gap = s - self._nodes
-                hit = np.abs(gap) < 1e-12
-                row = hit.astype(float) if hit.any() else (bary / gap) / (bary / gap).sum()
-                rows.append(row)
-                segments.append(i * n)
-        return np.array(rows), np.array(segments)
+    def _turn(self, command: torch.Tensor, fresh: torch.Tensor) -> None:
+        """Rolls the open jaws towards a face of the cube that a phase looks at, by a little per frame.
 
+        A cube looks the same every quarter turn. A roll about the approach axis turns the closing axis less in the horizontal
+        plane than about the axis, the more the gripper is tilted.
+        """
+        self._roll.masked_fill_(fresh, 0.0)
+        column = self._nominal[0, self._roll_column]
+        command[:, self._roll_column] = column + self._roll
+        closing, approach = self._ik.directions(command)
+        yaw = self._yaw.gather(1, self._source.index_select(0, self.phase)[:, None])[:, 0]
+        off = yaw - torch.atan2(closing[:, 1], closing[:, 0])
+        off = off - _QUARTER * torch.round(off / _QUARTER)
+        # Two faces are in question, a quarter turn apart; what has been turned so far counts for its own.
+        both = torch.stack((off, off - torch.copysign(torch.full_like(off, _QUARTER), off)))
+        upright = (-approach[:, 2]).clamp(min=0.2)
+        wanted = self._roll + self._roll_sign * torch.atan2(torch.sin(both), torch.cos(both) * upright)
+        cost = (wanted - _STAY * self._roll).abs()
+        wanted = torch.where(cost[0] <= cost[1], wanted[0], wanted[1])
+        step = (self._cfg.controller.align * wanted - self._roll).clamp(-_ROLL_STEP, _ROLL_STEP)
+        self._roll += step * self._aligns.index_select(0, self.phase)
+        command[:, self._roll_column] = column + self._roll
 
-def _smoothstep(u: float) -> float:
-    return u * u * (3.0 - 2.0 * u)
+    def _find_roll(self) -> tuple[int, float]:
+        """Column of the joint that rolls the gripper, and which way it turns the closing axis, seen from above."""
+        names = [*self._cfg.robot.arm_joints, *self._cfg.robot.gripper_joints]
+        column = names.index(self._cfg.robot.roll_joint)
+        command = self._nominal[:1].expand(self._env.nworld, -1).clone()
+        before = self._ik.directions(command)[0][0].double().cpu()
+        command[:, column] += 0.1
+        after = self._ik.directions(command)[0][0].double().cpu()
+        return column, math.copysign(1.0, float(before[0] * after[1] - before[1] * after[0]))
+
+    def _look(self, entering: torch.Tensor) -> None:
+        """Measures the cubes that the phases which begin ask for."""
+        wanted = self._looks.index_select(0, self.phase)
+        for number, name in enumerate(CUBES):
+            now = entering & (wanted == number)
+            seen = self._seen[:, number]
+            pose = pose_w(self._env, name).float()
+            seen.copy_(torch.where(now[:, None], pose[:, :2], seen))
+            w, x, y, z = pose[:, 3:].unbind(1)
+            yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            self._yaw[:, number] = torch.where(now, yaw, self._yaw[:, number])
+
+    def _build_tables(self, cfg: Config, device: torch.device) -> None:
+        """What each phase says, as tensors."""
+        names, specs = list(cfg.controller.phases), list(cfg.controller.phases.values())
+        cubes = {"red": 0, "blue": 1, None: -1}
+        anchors = [anchor_of(cfg, name) for name in names]
+        grips = {"open": cfg.robot.gripper_open, "closed": cfg.robot.gripper_closed}
+        frames = [phase.stop - phase.start for phase in self.phases]
+
+        def table(values: list, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.tensor(values, dtype=dtype, device=device)
+
+        self._length = table(frames)
+        self._target = table([[*a.xy, a.z] if a else [0.0] * 3 for a in anchors])
+        self._source = table([FIXED if a is None else a.source for a in anchors], torch.int64)
+        self._holds = table([a is None for a in anchors], torch.bool)
+        self._grip = table([grips[spec.gripper] for spec in specs])
+        looks = [-1 if a is None or not spec.look else a.source for a, spec in zip(anchors, specs, strict=True)]
+        self._looks = table(looks, torch.int64)
+        self._aligns = table(
+            [look >= 0 and spec.gripper == "open" for look, spec in zip(looks, specs, strict=True)], torch.bool
+        )
+        self._grasps = table([cubes[spec.grasps] for spec in specs], torch.int64)
+        self._centers = table([cubes[spec.centers] for spec in specs], torch.int64)
+        self._can_retry = table([spec.retry is not None for spec in specs], torch.bool)
+        self._retry_to = table([names.index(spec.retry) if spec.retry else 0 for spec in specs], torch.int64)
+        # From the start of a phase to that of the last one, where the arm rests.
+        self._needed = table([self.phases[-1].start - phase.start for phase in self.phases])
+        self._hurry = cfg.controller.hurry
+        self._rest = cfg.gate.acceptance.window + math.ceil(cfg.controller.rest_seconds / cfg.timing.frame_dt)

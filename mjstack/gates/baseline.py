@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjstack.gates.gate import GateContext, acceptance_thresholds, judge_one
+from mjstack.gates.gate import GateContext, judge_one
 from mjstack.report.record import GateResult
 
 
@@ -12,8 +12,9 @@ def run_baseline(context: GateContext) -> list[GateResult]:
     """Runs the nominal episode on native MuJoCo and judges it."""
     cfg = context.cfg
     sim, episode = context.nominal
-    status, reason, metrics = judge_one(episode.verdict)
-    context.say(f"stack check: xy_err={metrics['xy_err_m']:.4f} dz={metrics['dz_m']:.4f}")
+    status, reason, metrics = judge_one(context.evidence.rules, episode.verdict)
+    headline = context.evidence.headline(metrics)
+    context.say(f"{cfg.task.name} check: {headline}")
     metrics["episode_s"] = episode.seconds
     metrics["world_steps_per_s"] = episode.tape.frames * cfg.timing.substeps / episode.seconds
     metrics["waypoint_error_m"] = float(episode.tape.waypoint_error.max())
@@ -22,6 +23,6 @@ def run_baseline(context: GateContext) -> list[GateResult]:
     metrics["peak_constraint_rows"] = int(sim.peak_constraints[0])
     metrics["backend"] = sim.description
     context.shown, context.shown_by = episode, "baseline world"
-    thresholds = acceptance_thresholds(cfg) | {"waypoint_error_m": cfg.controller.ik_tolerance}
-    summary = reason or f"xy_err {1e3 * metrics['xy_err_m']:.1f} mm, dz {1e3 * metrics['dz_m']:.1f} mm"
+    thresholds = context.evidence.thresholds(cfg) | {"waypoint_error_m": cfg.controller.ik_tolerance}
+    summary = reason or headline
     return [GateResult(name="baseline", status=status, reason=summary, thresholds=thresholds, metrics=metrics)]

@@ -11,11 +11,11 @@ import numpy as np
 from mjstack.errors import name_worlds
 from mjstack.gates.batch_record import FAILING, BatchRecord, write_failing
 from mjstack.gates.episode import Episode
-from mjstack.gates.gate import GateContext, TimedEpisode, acceptance_thresholds, failing_rules
+from mjstack.gates.gate import GateContext, TimedEpisode, failing_rules
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status, Value
 from mjstack.sim import Simulation
-from mjstack.tasks.stack import RULE_TEXT, Rule
+from mjstack.tasks.evidence import Rule
 
 log = logging.getLogger(__name__)
 
@@ -28,12 +28,14 @@ class _Tally:
 
     Attributes:
         several: Whether there are several seeds; then a world's name has its seed too.
+        rules: The task's.
         low: Smallest of everything measured, by name.
         high: Largest likewise.
         ends: Hashes of the final states.
     """
 
     several: bool
+    rules: type[Rule]
     seeds: int = 0
     worlds: int = 0
     failed: list[str] = field(default_factory=list)
@@ -52,9 +54,9 @@ class _Tally:
         self.seconds += episode.seconds
         self.steps += int(sim.step_count.sum())
         self.failed += [self._name(record.seed, world) for world in np.flatnonzero(record.failed).tolist()]
-        for rule, worlds in failing_rules(record.failed).items():
+        for rule, worlds in failing_rules(self.rules, record.failed).items():
             self.broken.setdefault(rule, []).extend(self._name(record.seed, world) for world in worlds)
-        self.rows += record.failing_rows()
+        self.rows += record.failing_rows(self.rules)
         measured = record.values | {
             "waypoint_error_m": episode.tape.waypoint_error,
             "peak_contacts": sim.peak_contacts.cpu().numpy(),
@@ -75,7 +77,7 @@ def run_batch(context: GateContext) -> list[GateResult]:
     """Plays the task in nworld worlds that start differently, under every seed, and judges each."""
     cfg = context.cfg
     t = cfg.gate.batch
-    tally = _Tally(t.seeds > 1)
+    tally = _Tally(t.seeds > 1, context.evidence.rules)
     problems: list[str] = []
     details: list[str] = []
     sim = context.batch_simulation(cfg.nworld)
@@ -158,13 +160,10 @@ def _judge(
         "success_rate_low95": low,
         "success_rate_high95": high,
         "distinct_final_states": len(tally.ends),
-        "xy_err_max_m": tally.high["xy_err_m"],
-        "dz_min_m": tally.low["dz_m"],
-        "dz_max_m": tally.high["dz_m"],
-        "peak_speed_max_m_per_s": tally.high["peak_speed_m_per_s"],
-        "rest_speed_max_m_per_s": tally.high["rest_speed_m_per_s"],
-        "rest_position_max_m": tally.high["rest_position_m"],
-        "rest_rotation_max_deg": tally.high["rest_rotation_deg"],
+        **{
+            metric: (tally.low if side == "min" else tally.high)[value]
+            for metric, (value, side) in context.evidence.summaries.items()
+        },
         "waypoint_error_max_m": tally.high["waypoint_error_m"],
         "peak_contacts_per_world": int(tally.high["peak_contacts"]),
         "peak_constraint_rows_per_world": int(tally.high["peak_constraint_rows"]),
@@ -174,10 +173,10 @@ def _judge(
     if not bad:  # how fast worlds are that do not do the task is no figure
         metrics |= {"episode_s": tally.seconds, "world_steps_per_s": tally.steps / tally.seconds}
     details = [
-        *(f"{RULE_TEXT[rule]}: {name_worlds(worlds, tally.worlds, _NAMED, what)}" for rule, worlds in tally.broken.items()),
+        *(f"{rule.text}: {name_worlds(worlds, tally.worlds, _NAMED, what)}" for rule, worlds in tally.broken.items()),
         *details,
     ]
-    counts = "; ".join(f"{RULE_TEXT[rule]} in {len(worlds)}" for rule, worlds in tally.broken.items())
+    counts = "; ".join(f"{rule.text} in {len(worlds)}" for rule, worlds in tally.broken.items())
     interval = f"{_percent(rate)}, 95 % interval {_percent(low, '')} to {_percent(high)}"
     summary = f"{accepted} of {tally.worlds} {what} accepted ({interval}), {len(tally.ends)} distinct"
     failing = f"{name_worlds(bad, tally.worlds, what=what)} failed: {counts}"
@@ -194,7 +193,7 @@ def _judge(
     if bad and context.folder is not None:
         details.append(f"{FAILING} has every failing world with what was measured")
         reason += f". To look at one: job=replay run={context.folder} world={bad[0]}"
-    thresholds = acceptance_thresholds(cfg)
+    thresholds = dict(context.evidence.thresholds(cfg))
     thresholds |= {"failed_worlds": t.failed_worlds, "distinct_fraction": t.distinct_fraction}
     return GateResult(
         name="batch",

@@ -14,7 +14,7 @@ from mjstack.errors import RunError
 from mjstack.gates.gate import measured_values
 from mjstack.report.record import write_atomic
 from mjstack.sim import Simulation
-from mjstack.tasks.stack import Rule, Verdict
+from mjstack.tasks.evidence import Rule, Verdict
 
 FAILING = "failing_worlds.csv"
 
@@ -27,7 +27,7 @@ class BatchRecord:
         seed: The seed.
         backend: ``native`` or ``mjwarp``.
         device: Where they were stepped, such as ``cuda:0``.
-        failed: Bits of `Rule`, shape ``(nworld,)``, int32.
+        failed: Bits of the task's rules, shape ``(nworld,)``, int32.
         values: What the acceptance measured, by name with unit, each ``(nworld,)``.
         qpos: Final positions, shape ``(nworld, nq)``, in the backend's precision.
     """
@@ -90,14 +90,14 @@ class BatchRecord:
         np.savez_compressed(buffer, **arrays)
         write_atomic(folder / _file_name(self.seed), buffer.getvalue())
 
-    def failing_rows(self) -> list[str]:
+    def failing_rows(self, rules: type[Rule]) -> list[str]:
         """A line of the table for every failing world: the rules that it broke, and all that was measured."""
         return [
             ",".join(
                 (
                     str(self.seed),
                     str(world),
-                    " ".join(rule.name or "" for rule in Rule if self.failed[world] & int(rule)),
+                    " ".join(rule.name or "" for rule in rules if self.failed[world] & int(rule)),
                     *(f"{values[world]:.6g}" for values in self.values.values()),
                 )
             )

@@ -10,13 +10,14 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config, TermCfg
-from mjstack.control.scripted import CommandTape, ScriptedPlanner
+from mjstack.control.controller import Controller, TapeController
+from mjstack.control.planner import CommandTape, ScriptedPlanner
 from mjstack.envs import Env, scripted_config
 from mjstack.gates.power import EnergyMeter
 from mjstack.gates.timing import step_graph
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
-from mjstack.tasks.stack import StackEvidence, Verdict
+from mjstack.tasks.evidence import Verdict, evidence_class
 
 _EAGER = 2  # frames: the warm-up, and the one that is captured
 
@@ -46,6 +47,7 @@ class Episode:
         tape: The commands that were played.
         seconds: Wall time of the frames alone [s]; where they are captured, of as many replayed ones.
         qpos: World 0 at every frame end, shape ``(frames, nq)``, if it was recorded.
+        phase: Number of its phase in every frame, shape ``(frames,)``, likewise.
         states: Snapshots of all worlds after the frames that were asked for.
         warm_up_seconds: The eager first call of what is captured [s]; 0 if it was captured before, or never is.
         capture_seconds: The capture alone [s], likewise.
@@ -56,6 +58,7 @@ class Episode:
     tape: CommandTape
     seconds: float
     qpos: np.ndarray | None = None
+    phase: np.ndarray | None = None
     states: dict[int, State] = field(default_factory=dict)
     warm_up_seconds: float = 0.0
     capture_seconds: float = 0.0
@@ -126,20 +129,20 @@ def run_episode(
         meter: Takes in the energy of the frames from the third on, when all are replayed.
     """
     env, tape = start_worlds(sim, index, cfg, reset, planner, advance, worlds)
-    evidence = StackEvidence(cfg, index, planner.phases, sim.nworld, sim.device)
-    now = torch.zeros(1, dtype=torch.int64, device=sim.device)
+    controller: Controller = TapeController(tape, planner.phases, sim.nworld, sim.device)
+    evidence = evidence_class(cfg)(cfg, index, planner.phases, sim.nworld, sim.device)
 
     def work() -> None:
-        env.action_manager.take(tape.command(now))
+        env.action_manager.take(controller.command())
         env.advance()
-        evidence.update(sim)
-        now.add_(1)
+        evidence.update(sim, controller.phase)
 
     play = env.captured(work, "a frame of the episode")
     # On Warp's CPU device physics alone is captured, once for all episodes.
     graph = play if sim.device.type == "cuda" else step_graph(sim, cfg.timing.substeps, kinematics=True)
     before = (0.0, 0.0) if graph is None else (graph.warm_up_seconds, graph.capture_seconds)
     trajectory = np.full((tape.frames, sim.qpos.shape[1]), np.nan) if record else None
+    phase = np.full(tape.frames, -1) if record else None
     states: dict[int, State] = {}
     sim.synchronize()
     began = time.perf_counter()
@@ -155,6 +158,8 @@ def run_episode(
             on_frame(frame, sim)
         if trajectory is not None:
             trajectory[frame] = sim.qpos[0].cpu().numpy()
+        if phase is not None:
+            phase[frame] = int(controller.phase[0])
         if frame in snapshots:
             states[frame] = snapshot(sim)
         if advance is not None:
@@ -172,7 +177,7 @@ def run_episode(
     seconds -= warm_up + capture
     if warm_up:  # the first frame was it
         seconds *= tape.frames / (tape.frames - 1)
-    return Episode(evidence.verdict(sim), tape, seconds, trajectory, states, warm_up, capture, captured)
+    return Episode(evidence.verdict(sim), tape, seconds, trajectory, phase, states, warm_up, capture, captured)
 
 
 def snapshot(sim: Simulation) -> State:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import Backend, Config
-from mjstack.control.scripted import ScriptedPlanner
+from mjstack.control.planner import ScriptedPlanner
 from mjstack.gates.episode import NOMINAL, Advance, Episode, FrameHook, Reset, State, run_episode
 from mjstack.gates.sizing import size_batch
 from mjstack.managers.reset import required_fields
@@ -20,7 +20,7 @@ from mjstack.report.record import GateResult, Status
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import BatchSizes, Simulation, make_simulation, resolve_backend, resolve_device, resolve_sizes
 from mjstack.sim.sizes import apply_configured
-from mjstack.tasks.stack import Rule, Verdict, describe_rules
+from mjstack.tasks.evidence import Evidence, Rule, Verdict, describe_rules, evidence_class
 
 Say = Callable[[str], None]
 
@@ -111,6 +111,11 @@ class GateContext:
         return SceneIndex(self.model, self.cfg.robot)
 
     @cached_property
+    def evidence(self) -> type[Evidence]:
+        """How the task is judged."""
+        return evidence_class(self.cfg)
+
+    @cached_property
     def planner(self) -> ScriptedPlanner:
         """The planner, its nominal plan made."""
         return ScriptedPlanner(self.cfg)
@@ -177,44 +182,19 @@ class GateContext:
         return next(phase.start for phase in self.planner.phases if phase.name == name)
 
 
-def judge_one(verdict: Verdict) -> tuple[Status, str, dict]:
+def judge_one(rules: type[Rule], verdict: Verdict) -> tuple[Status, str, dict]:
     """Status, reason and metrics of a one-world episode."""
     bits = int(verdict.failed[0])
     metrics = {name: float(values[0]) for name, values in measured_values(verdict).items()}
     status = Status.failed if bits else Status.passed
-    return status, f"failed: {describe_rules(bits)}" if bits else "", metrics
+    return status, f"failed: {describe_rules(rules, bits)}" if bits else "", metrics
 
 
 def measured_values(verdict: Verdict) -> dict[str, np.ndarray]:
     """What the acceptance measured, by name with unit, on the host; each of shape ``(nworld,)``."""
-    values = {
-        "xy_err_m": verdict.xy_err,
-        "dz_m": verdict.dz,
-        "rest_speed_m_per_s": verdict.rest_speed,
-        "peak_speed_m_per_s": verdict.peak_speed,
-        "rest_position_m": verdict.rest_position,
-        "rest_rotation_deg": verdict.rest_rotation.double().rad2deg(),
-    }
-    return {name: value.double().cpu().numpy() for name, value in values.items()}
+    return {name: value.double().cpu().numpy() for name, value in verdict.values.items()}
 
 
-def acceptance_thresholds(cfg: Config) -> dict:
-    """The acceptance rules' numbers, with units, for a report."""
-    t = cfg.gate.acceptance
-    return {
-        "xy_err_max_m": t.xy_err,
-        "dz_min_m": t.dz_min,
-        "dz_max_m": t.dz_max,
-        "lift_frames": t.lift_frames,
-        "carry_distance_m": t.carry_distance,
-        "support_gap_m": t.support_gap,
-        "rest_speed_m_per_s": t.rest_speed,
-        "rest_position_m": t.rest_position,
-        "rest_rotation_deg": t.rest_rotation_deg,
-        "window_frames": t.window,
-    }
-
-
-def failing_rules(failed: np.ndarray) -> dict[Rule, list[int]]:
+def failing_rules(rules: type[Rule], failed: np.ndarray) -> dict[Rule, list[int]]:
     """Which worlds broke which rule."""
-    return {rule: np.flatnonzero(failed & int(rule)).tolist() for rule in Rule if (failed & int(rule)).any()}
+    return {rule: np.flatnonzero(failed & int(rule)).tolist() for rule in rules if (failed & int(rule)).any()}

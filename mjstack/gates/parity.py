@@ -10,7 +10,7 @@ import torch
 from mjstack.config.schema import Config
 from mjstack.config.validate import PARITY_FIELDS
 from mjstack.gates.episode import NOMINAL, State, restore
-from mjstack.gates.gate import GateContext, acceptance_thresholds, judge_one
+from mjstack.gates.gate import GateContext, judge_one
 from mjstack.math import quat_angle
 from mjstack.report.record import GateResult, Status, Value
 from mjstack.sim import Simulation, describe_overflow
@@ -24,7 +24,7 @@ def run_parity(context: GateContext) -> list[GateResult]:
     problems: list[str] = []
     details: list[str] = []
     metrics: dict[str, Value] = {"backend": mjwarp.description}
-    thresholds: dict[str, Value] = dict(acceptance_thresholds(cfg))
+    thresholds: dict[str, Value] = dict(context.evidence.thresholds(cfg))
 
     for name, phase in cfg.gate.parity.states.items():
         state = reference.states[context.phase_end(phase)]
@@ -44,7 +44,7 @@ def run_parity(context: GateContext) -> list[GateResult]:
             problems.append(line)
 
     episode = context.run(mjwarp, NOMINAL, record=True, on_frame=context.on_frame)
-    status, reason, judged = judge_one(episode.verdict)
+    status, reason, judged = judge_one(context.evidence.rules, episode.verdict)
     if status is Status.failed:
         problems.append(reason)
     if int(mjwarp.overflow[0]):
@@ -66,12 +66,12 @@ def run_parity(context: GateContext) -> list[GateResult]:
             problems.append(f"{cube} cube ends {1e3 * distance:.2f} mm and {angle:.2f} deg from native's")
     thresholds["final.position_m"] = cfg.gate.parity.cube_position
     thresholds["final.rotation_deg"] = cfg.gate.parity.cube_rotation_deg
-    context.say(f"stack check: xy_err={judged['xy_err_m']:.4f} dz={judged['dz_m']:.4f} ({mjwarp.description})")
+    headline = context.evidence.headline(judged)
+    context.say(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
     context.shown, context.shown_by = episode, "parity world"
     mjwarp.close()
     summary = "; ".join(problems) or (
-        f"xy_err {1e3 * judged['xy_err_m']:.1f} mm, dz {1e3 * judged['dz_m']:.1f} mm; red "
-        f"{1e3 * float(metrics['final.red.position_m'] or 0):.2f} mm from native's"
+        f"{headline}; red {1e3 * float(metrics['final.red.position_m'] or 0):.2f} mm from native's"
     )
     return [
         GateResult(

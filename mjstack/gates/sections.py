@@ -281,11 +281,9 @@ def _play_bare(context: GateContext, sim: MjwarpSimulation) -> tuple[float, str]
     bad = int(_lost(sim).sum())
     if bad:
         return seconds, f"{bad} worlds overflowed or diverged with bare steps"
-    red, blue = (sim.qpos[:, a : a + 3] for a in context.index.cube_qpos)
-    apart, rules = red - blue, cfg.gate.acceptance
-    stacked = (apart[:, :2].norm(dim=1) <= rules.xy_err) & (apart[:, 2] >= rules.dz_min) & (apart[:, 2] <= rules.dz_max)
-    fallen = int((~stacked).sum())
-    return seconds, f"{fallen} worlds did not stack with bare steps" if fallen else ""
+    judge = context.evidence(cfg, context.index, context.planner.phases, sim.nworld, sim.device)
+    fallen = int((~judge.placed(sim)).sum())
+    return seconds, f"{fallen} worlds did not do the task with bare steps" if fallen else ""
 
 
 def _lost(sim: Simulation) -> torch.Tensor:

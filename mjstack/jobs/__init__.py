@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
-from mjstack.jobs import gates, replay, scaling, study
+from mjstack.jobs import gates, reachability, replay, scaling, study
 from mjstack.jobs.outcome import JobOutcome
 
 __all__ = ["JOBS", "JobOutcome", "check_job", "job_folder", "run_job"]
@@ -36,6 +36,7 @@ JOBS = {
     "gates": Job(gates.check_machine, gates.run_gates_job),
     "replay": Job(replay.check_replay, replay.run_replay_job, keys=replay.KEYS),
     "scaling": Job(scaling.check_scaling, scaling.run_scaling_job, folder=scaling.scaling_folder),
+    "reachability": Job(reachability.check_reachability, reachability.run_reachability_job),
     "study": Job(study.check_study, study.run_study_job),
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mjstack.config.schema import Backend, Config
-from mjstack.control.scripted import ScriptedPlanner
+from mjstack.control.planner import ScriptedPlanner
 from mjstack.envs import build_env
 from mjstack.errors import ConfigError
 from mjstack.gates.batch_record import clear_records

@@ -13,7 +13,7 @@ from rich.markup import escape
 from mjstack.config.schema import Backend, Config, SimCfg
 from mjstack.errors import ConfigError, DeviceError
 from mjstack.gates.batch_record import BatchRecord
-from mjstack.gates.gate import GateContext, acceptance_thresholds, judge_one
+from mjstack.gates.gate import GateContext, judge_one
 from mjstack.gates.replay import ReplayedWorld, replay_world
 from mjstack.gates.runner import run_guarded
 from mjstack.jobs.earlier_run import EarlierRun
@@ -22,9 +22,8 @@ from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.reported import Record, check_showing, run_provenance, run_reported
 from mjstack.report.record import GateResult, Status, Value, write_atomic
-from mjstack.scene import SceneIndex
 from mjstack.sim import resolve_backend, resolve_device
-from mjstack.tasks.stack import Rule, describe_rules
+from mjstack.tasks.evidence import describe_rules
 
 KEYS = ("job", "run", "world", "sim", "view", "video")
 """What its command line may set. All else is the earlier run's."""
@@ -163,16 +162,16 @@ def _replay(
         device=device,
         on_frame=context.on_frame if first else None,
     )
-    status, reason, metrics = judge_one(done.episode.verdict)
-    reason = reason or f"accepted, xy_err {1e3 * metrics['xy_err_m']:.1f} mm, dz {1e3 * metrics['dz_m']:.1f} mm"
-    reason += f"; {_compare(plan, done, backend, device, context.index)}"
+    status, reason, metrics = judge_one(context.evidence.rules, done.episode.verdict)
+    reason = reason or f"accepted, {context.evidence.headline(metrics)}"
+    reason += f"; {_compare(plan, done, backend, device, context)}"
     if first:
         context.shown, context.shown_by = done.episode, f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
     for finding in done.findings:
         context.say(escape(f"  {finding}"))
     values: dict[str, Value] = {"backend": done.description, "seed": plan.seed, "world": plan.world, **metrics}
     if plan.record is not None:
-        values["recorded"] = describe_rules(int(plan.record.failed[plan.world])) or "accepted"
+        values["recorded"] = describe_rules(context.evidence.rules, int(plan.record.failed[plan.world])) or "accepted"
     name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
     assert context.folder is not None
     try:
@@ -185,31 +184,32 @@ def _replay(
             name=f"replay_{backend.value}",
             status=status,
             reason=reason,
-            thresholds=acceptance_thresholds(plan.cfg),
+            thresholds=context.evidence.thresholds(plan.cfg),
             metrics=values,
             details=[*(str(finding) for finding in done.findings), *notes],
         )
     ]
 
 
-def _compare(plan: ReplayPlan, done: ReplayedWorld, backend: Backend, device: str, index: SceneIndex) -> str:
+def _compare(plan: ReplayPlan, done: ReplayedWorld, backend: Backend, device: str, context: GateContext) -> str:
     """What the batch gate recorded of this world, against what happened now."""
     record = plan.record
     if record is None:
         return "that run recorded no verdict, because its batch gate did not get there"
     bits = int(record.failed[plan.world])
-    told = describe_rules(bits) or "accepted"
+    rules = context.evidence.rules
+    told = describe_rules(rules, bits) or "accepted"
     same = bits == done.failed
     if record.backend != backend.value:
         return f"that run's {record.backend} world had {'the same verdict' if same else f'another verdict: {told}'}"
     ours, theirs = done.qpos_end, record.qpos[plan.world]
     if np.array_equal(ours, theirs, equal_nan=True):
         return "as recorded, and it ends bit for bit where it did"
-    apart = max(float(np.linalg.norm(ours[a : a + 3] - theirs[a : a + 3])) for a in index.cube_qpos)
+    apart = max(float(np.linalg.norm(ours[a : a + 3] - theirs[a : a + 3])) for a in context.index.cube_qpos)
     ends = f"its cubes end {1e3 * apart:.3g} mm from where they did"
     cuda = device.startswith("cuda") or record.device.startswith("cuda")
     why = ", and runs on CUDA agree to rounding only" if cuda else ""
     if same:
         return f"as recorded, but {ends}{why}"
-    pool = ", and a world alone shares no contact pool" if bits & Rule.OVERFLOW else ""
+    pool = ", and a world alone shares no contact pool" if bits & rules["OVERFLOW"] else ""
     return f"NOT as recorded ({told}): {ends}{why}{pool}"

@@ -28,7 +28,6 @@ from mjstack.report.study import StudyRow, to_markdown
 from mjstack.report.table import to_csv
 from mjstack.sim import LOST_PHYSICS, Simulation, SolverLimit, make_simulation
 from mjstack.sim.sizes import resolve_measuring_sizes
-from mjstack.tasks.stack import RULE_TEXT
 
 log = logging.getLogger(__name__)
 
@@ -147,9 +146,9 @@ def _measure(context: GateContext, job: StudyJobCfg, base: _Base, row: StudyRow)
         verdict = context.run(sim, cfg.reset).verdict
         failed = verdict.failed.cpu().numpy()
         row.worlds, row.accepted = sim.nworld, int((failed == 0).sum())
-        broken = failing_rules(failed)
-        row.broken_rules = ", ".join(f"{RULE_TEXT[rule]} in {len(worlds)}" for rule, worlds in broken.items())
-        row.peak_rows, row.xy_err_max_m = int(sim.peak_constraints.max()), float(verdict.xy_err.max())
+        broken = failing_rules(context.evidence.rules, failed)
+        row.broken_rules = ", ".join(f"{rule.text} in {len(worlds)}" for rule, worlds in broken.items())
+        row.peak_rows, row.xy_err_max_m = int(sim.peak_constraints.max()), float(verdict.values["xy_err_m"].max())
         limits: torch.Tensor | None = getattr(sim, "solver_limits", None)  # native MuJoCo does not tell
         if limits is not None:
             row.iteration_limit_worlds = int((limits & SolverLimit.ITERATIONS != 0).sum())

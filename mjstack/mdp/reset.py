@@ -11,13 +11,13 @@ from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import named_pose, pose_w, robot
-from mjstack.mdp.placement import Placement
-from mjstack.scene.index import Columns
+from mjstack.mdp.placement import Placement, require_reach
+from mjstack.mdp.variation import FRICTION_FIELDS, GAIN_FIELDS, MASS_FIELDS, CubeMasses, ServoGains, SlidingFriction
 
 
 def home(env: EnvView, mask: torch.Tensor, *, pose: str = "home") -> None:
     """Puts the robot at its home command, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
-    _write_robot(env, mask, named_pose(env, pose).expand(env.nworld, -1))
+    write_robot(env, mask, named_pose(env, pose).expand(env.nworld, -1))
     env.sim.qvel.masked_fill_(mask[:, None], 0.0)
 
 
@@ -46,7 +46,7 @@ class JointNoise:
         """Writes qpos and ctrl."""
         noise = random_uniform(env, self.label, self._width.shape[0])
         command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
-        _write_robot(env, mask, torch.clamp(command, self._low, self._high))
+        write_robot(env, mask, torch.clamp(command, self._low, self._high))
 
 
 class JitterCubes:
@@ -79,8 +79,9 @@ class JitterCubes:
 class RandomizeCubes:
     """Puts each cube anywhere in a region around its place where nothing is in its way.
 
-    Both cubes stay on the table, apart from each other, and clear of the arm at its start, joint noise included. Each world
-    draws some candidates and takes the first that fits, so that the number of operations is fixed.
+    Both cubes stay on the table, apart from each other, and clear of what is fixed to the world and of the arm at its start,
+    joint noise included. Each world draws some candidates and takes the first pair that fits, so that the number of operations
+    is fixed. Regions that the arm does not reach are refused.
     """
 
     label = "reset.cubes"
@@ -106,7 +107,7 @@ class RandomizeCubes:
             pose: Where the arm is then, ``home`` or ``start``.
 
         Raises:
-            ParameterError: A value is out of range, or the region leaves no free place.
+            ParameterError: A value is out of range, the region leaves no free place, or the arm does not reach all of it.
         """
         if len(xy) != 2:
             raise ParameterError("xy", list(xy), "two numbers [m]")
@@ -126,6 +127,7 @@ class RandomizeCubes:
             noise=sum(noise),
         )
         self._placement.require_room("xy", list(xy), candidates)
+        require_reach(env, "xy", (xy[0], xy[1]))
         self._placement.to(env.device, env.sim.qpos.dtype)
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
@@ -137,75 +139,41 @@ class RandomizeCubes:
             _write_cube(env, mask, name, dx, dy, self._yaw * draws[:, number, 0])
 
 
-@uses_fields("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")
+@uses_fields(*MASS_FIELDS)
 class CubeMass:
-    """Scales each cube's mass and inertia.
-
-    A cube is a body of its own on a free joint, so that what the compiler derives from the mass scales with it, and need
-    not be computed anew.
-    """
+    """Scales each cube's mass and inertia."""
 
     label = "reset.mass"
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Takes the smallest and largest factor."""
-        self._low, self._high = _bounds("scale", scale)
-        bodies = list(env.index.bodies.values())
-        dofs = [dof + i for _, dof in env.index.objects.values() for i in range(6)]
-        self._columns = {
-            "body_mass": _Columns(env, "body_mass", bodies),
-            "body_inertia": _Columns(env, "body_inertia", bodies),
-            "body_subtreemass": _Columns(env, "body_subtreemass", bodies),
-        }
-        self._inverse = {
-            "body_invweight0": _Columns(env, "body_invweight0", bodies),
-            "dof_invweight0": _Columns(env, "dof_invweight0", dofs),
-        }
+        self._low, self._high = bounds("scale", scale)
+        self._masses = CubeMasses(env)
+        self._nominal = self._masses.nominal.to(env.sim.qpos.dtype)
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes the mass fields."""
         factors = random_uniform(env, self.label, len(env.index.bodies), self._low, self._high)
-        for columns in self._columns.values():
-            columns.write(mask, factors)
-        self._inverse["body_invweight0"].write(mask, 1.0 / factors)
-        self._inverse["dof_invweight0"].write(mask, (1.0 / factors).repeat_interleave(6, dim=1))
+        self._masses.write(mask, self._nominal * factors)
 
 
-@uses_fields("geom_friction")
+@uses_fields(*FRICTION_FIELDS)
 class CubeFriction:
-    """Draws the sliding friction of each cube, and of the grip.
-
-    MuJoCo takes the larger coefficient of the two geoms in a contact, or that of the geom with the higher priority. So the
-    table, and jaws of the cubes' own priority, get the smallest coefficient, which leaves the cube's draw in force; jaws of
-    higher priority (SO-101's) get a draw of their own, the same for both.
-    """
+    """Draws the sliding friction of each cube, and of the grip; see `SlidingFriction`."""
 
     label = "reset.friction"
 
     def __init__(self, env: EnvView, *, sliding: Sequence[float]) -> None:
         """Takes the smallest and largest coefficient."""
-        self._low, self._high = _bounds("sliding", sliding)
-        model, device = env.sim.model, env.device
-        cubes = list(env.index.geoms.values())
-        priority = model.geom_priority[cubes[0][0]]
-        bodies = [model.body(name).id for name in env.cfg.robot.jaw_bodies]
-        jaws = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies]
-        above = [g for g in jaws if model.geom_priority[g] > priority]
-        level = [model.geom("table").id, *(g for g in jaws if g not in above)]
-        self._drawn = [Columns(geoms, device) for geoms in (*cubes, above) if geoms]
-        self._lowered = Columns(level, device)
-        self._least = torch.tensor(self._low, dtype=env.sim.qpos.dtype, device=device)
+        self._low, self._high = bounds("sliding", sliding)
+        self._friction = SlidingFriction(env, self._low)
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes geom_friction."""
-        sliding = env.sim.fields["geom_friction"][..., 0]
-        values = random_uniform(env, self.label, len(self._drawn), self._low, self._high).to(sliding.dtype)
-        for number, geoms in enumerate(self._drawn):
-            geoms.write_masked(sliding, mask, values[:, number, None])
-        self._lowered.write_masked(sliding, mask, self._least)
+        self._friction.write(mask, random_uniform(env, self.label, len(self._friction.names), self._low, self._high))
 
 
-@uses_fields("actuator_gainprm", "actuator_biasprm")
+@uses_fields(*GAIN_FIELDS)
 class ActuatorGains:
     """Scales the stiffness and damping of each of the robot's position servos by one factor per servo."""
 
@@ -213,32 +181,12 @@ class ActuatorGains:
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Takes the smallest and largest factor."""
-        self._low, self._high = _bounds("scale", scale)
-        servos = env.index.ctrl.tolist()
-        # A position servo's gain is kp and its bias (0, -kp, -kv): scaling all of them scales both.
-        self._columns = [_Columns(env, name, servos) for name in ("actuator_gainprm", "actuator_biasprm")]
+        self._low, self._high = bounds("scale", scale)
+        self._gains = ServoGains(env)
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes gains and biases."""
-        factors = random_uniform(env, self.label, len(env.index.ctrl), self._low, self._high)
-        for columns in self._columns:
-            columns.write(mask, factors)
-
-
-class _Columns:
-    """Some elements of a per-world model field, and the model's own values of them."""
-
-    def __init__(self, env: EnvView, name: str, elements: Sequence[int]) -> None:
-        self._view = env.sim.fields[name]
-        self._elements = Columns(elements, env.device)
-        nominal = torch.from_numpy(getattr(env.sim.model, name)[list(elements)].copy())
-        self._nominal = nominal.to(env.device, self._view.dtype)
-
-    def write(self, mask: torch.Tensor, factors: torch.Tensor) -> None:
-        """Writes nominal times factor, ``(nworld, elements)``, into the masked worlds."""
-        extra = [1] * (self._nominal.dim() - 1)
-        value = self._nominal * factors.to(self._view.dtype).view(*factors.shape, *extra)
-        self._elements.write_masked(self._view, mask, value)
+        self._gains.write(mask, random_uniform(env, self.label, len(env.index.ctrl), self._low, self._high))
 
 
 def _write(view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor) -> None:
@@ -246,7 +194,8 @@ def _write(view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor) -> None:
     torch.where(mask[:, None], value.to(view.dtype), view, out=view)
 
 
-def _write_robot(env: EnvView, mask: torch.Tensor, command: torch.Tensor) -> None:
+def write_robot(env: EnvView, mask: torch.Tensor, command: torch.Tensor) -> None:
+    """Puts the masked worlds' robot at a command ``(nworld, n)``: qpos and ctrl."""
     tensors = robot(env)
     tensors.qpos.write_masked(env.sim.qpos, mask, command)
     tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
@@ -256,7 +205,8 @@ def _write_cube(env: EnvView, mask: torch.Tensor, name: str, dx: torch.Tensor, d
     """Moves the masked worlds' cube off the place where the simulation's reset has put it."""
     view = pose_w(env, name)
     place = view[:, :3] + torch.stack((dx, dy, torch.zeros_like(dx)), dim=1)
-    _write(view, mask, torch.cat((place, quat_from_yaw(yaw)), dim=1))
+    # Float64, because a float32 cosine need not be that of any angle, and a file of layouts has the angle.
+    _write(view, mask, torch.cat((place, quat_from_yaw(yaw.double()).to(place.dtype)), dim=1))
 
 
 def _not_negative(name: str, value: float) -> None:
@@ -264,7 +214,12 @@ def _not_negative(name: str, value: float) -> None:
         raise ParameterError(name, value, "a number that is not negative")
 
 
-def _bounds(name: str, values: Sequence[float]) -> tuple[float, float]:
+def bounds(name: str, values: Sequence[float]) -> tuple[float, float]:
+    """The smallest and largest value of a parameter that has both.
+
+    Raises:
+        ParameterError: They are not positive, or not in order.
+    """
     if len(values) != 2 or not 0.0 < values[0] <= values[1] < math.inf:
         raise ParameterError(name, list(values), "two positive numbers, the smaller one first")
     return float(values[0]), float(values[1])

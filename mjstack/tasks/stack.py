@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from enum import IntFlag
+from collections.abc import Mapping
+from typing import ClassVar
 
+import numpy as np
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.control.scripted import Phase
+from mjstack.control.phases import Phase
 from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView
 from mjstack.math import lowest_corner, quat_angle
 from mjstack.mdp.geometry import gripper_opening
+from mjstack.report.record import Value
 from mjstack.scene import SceneIndex, table_top
 from mjstack.sim.simulation import LOST_PHYSICS, Simulation
+from mjstack.tasks.evidence import Evidence, Rule, Verdict
+from mjstack.tasks.stack_findings import explain_stack
 
 
-class Rule(IntFlag):
+class StackRule(Rule):
     """What a world can fail by; a world passes with none set."""
 
     FINITE = 1 << 0
@@ -32,42 +36,24 @@ class Rule(IntFlag):
     REST_POSITION = 1 << 8
     REST_ROTATION = 1 << 9
 
+    @property
+    def text(self) -> str:
+        """What went wrong, in words."""
+        return _TEXT[self]
 
-RULE_TEXT = {
-    Rule.FINITE: "state not finite",
-    Rule.STEPS: "step counter off",
-    Rule.OVERFLOW: "buffer overflow",
-    Rule.LIFT: "red not lifted",
-    Rule.CARRY: "red not carried",
-    Rule.STACKED: "not stacked",
-    Rule.SUPPORTED: "blue not on the table",
-    Rule.REST_SPEED: "cube moving",
-    Rule.REST_POSITION: "cube drifting",
-    Rule.REST_ROTATION: "cube turning",
+
+_TEXT = {
+    StackRule.FINITE: "state not finite",
+    StackRule.STEPS: "step counter off",
+    StackRule.OVERFLOW: "buffer overflow",
+    StackRule.LIFT: "red not lifted",
+    StackRule.CARRY: "red not carried",
+    StackRule.STACKED: "not stacked",
+    StackRule.SUPPORTED: "blue not on the table",
+    StackRule.REST_SPEED: "cube moving",
+    StackRule.REST_POSITION: "cube drifting",
+    StackRule.REST_ROTATION: "cube turning",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What the evidence says, on the device.
-
-    Attributes:
-        failed: Bits of `Rule`, shape ``(nworld,)``, int32.
-        xy_err: Horizontal distance of the cube centres at the end [m], shape ``(nworld,)``.
-        dz: Height of red above blue at the end [m], shape ``(nworld,)``.
-        rest_speed: RMS over the window, larger of both cubes [m/s], shape ``(nworld,)``.
-        peak_speed: Largest instead of RMS; reported, not judged.
-        rest_position: Largest distance between any two frames of the window, larger of both cubes [m].
-        rest_rotation: Likewise [rad].
-    """
-
-    failed: torch.Tensor
-    xy_err: torch.Tensor
-    dz: torch.Tensor
-    rest_speed: torch.Tensor
-    peak_speed: torch.Tensor
-    rest_position: torch.Tensor
-    rest_rotation: torch.Tensor
 
 
 class CubePair:
@@ -110,11 +96,19 @@ class CubePair:
         return (clearance[:, 1].abs() <= self._t.support_gap) & inside
 
 
-class StackEvidence:
-    """Collects what the acceptance rules need. Memory: O(window) per world, whatever the episode's length.
+class StackEvidence(Evidence):
+    """Collects what the acceptance rules need. Memory: O(window) per world, whatever the episode's length."""
 
-    The frame is counted on the device, so that a captured graph can hold `update`.
-    """
+    rules = StackRule
+    summaries: ClassVar = {
+        "xy_err_max_m": ("xy_err_m", "max"),
+        "dz_min_m": ("dz_m", "min"),
+        "dz_max_m": ("dz_m", "max"),
+        "peak_speed_max_m_per_s": ("peak_speed_m_per_s", "max"),
+        "rest_speed_max_m_per_s": ("rest_speed_m_per_s", "max"),
+        "rest_position_max_m": ("rest_position_m", "max"),
+        "rest_rotation_max_deg": ("rest_rotation_deg", "max"),
+    }
 
     def __init__(self, cfg: Config, index: SceneIndex, phases: list[Phase], nworld: int, device: torch.device) -> None:
         """Allocates for nworld worlds."""
@@ -122,12 +116,9 @@ class StackEvidence:
         self._cubes = CubePair(cfg, index, device)
         self._frames = phases[-1].stop
         self._frame = torch.zeros(1, dtype=torch.int64, device=device)
-        frames = [f for phase in phases for f in range(phase.start, phase.stop)]
-        lift, carry = _frames_of(phases, self._t.lift_phases), _frames_of(phases, [self._t.carry_phase])
-        window = set(range(self._frames - self._t.window, self._frames))
-        # What a frame counts for; the last row is for frames after the end, which count for nothing.
-        rows = [[f in lift, f in carry, f in window] for f in frames] + [[False] * 3]
+        rows = [[phase.name in self._t.lift_phases, phase.name == self._t.carry_phase] for phase in phases]
         self._counts_for = torch.tensor(rows, device=device)
+        self._window = torch.tensor([self._frames - self._t.window, self._frames], device=device)
 
         def buffer(*shape: int, value: float = 0.0) -> torch.Tensor:
             return torch.full((nworld, *shape), value, dtype=torch.float32, device=device)
@@ -141,11 +132,12 @@ class StackEvidence:
         self._speed = buffer(self._t.window, 2, value=math.nan)
         self._xy_err, self._dz = buffer(value=math.nan), buffer(value=math.nan)
 
-    def update(self, sim: Simulation) -> None:
+    def update(self, sim: Simulation, phase: torch.Tensor) -> None:
         """Takes in the state at the end of a frame. Fixed shapes, no host read."""
         t, cubes = self._t, self._cubes
-        counts_for = self._counts_for.index_select(0, self._frame.clamp(max=self._frames))[0]
-        in_lift, in_carry, in_window = counts_for.unbind(0)
+        going = self._frame < self._frames  # frames after the end count for nothing
+        in_lift, in_carry = (self._counts_for.index_select(0, phase) & going).unbind(1)
+        in_window = (self._frame >= self._window[0]) & going
         finite, stacked, supported = self._ok.unbind(0)
         # 0 times a number that is not finite is NaN, which is no longer 0.
         finite &= ((sim.qpos * 0.0).sum(1) + (sim.qvel * 0.0).sum(1)) == 0.0
@@ -183,22 +175,63 @@ class StackEvidence:
         complete = int(self._frame) == self._frames
         wanted = self._frames * self._timing.substeps
         held = {
-            Rule.FINITE: finite,
-            Rule.STEPS: (sim.step_count == wanted) & complete,
-            Rule.OVERFLOW: (sim.overflow & LOST_PHYSICS) == 0,
-            Rule.LIFT: self._lift_best >= t.lift_frames,
-            Rule.CARRY: self._carried,
-            Rule.STACKED: stacked & complete,
-            Rule.SUPPORTED: supported & complete,
-            Rule.REST_SPEED: rms <= t.rest_speed,
-            Rule.REST_POSITION: position <= t.rest_position,
-            Rule.REST_ROTATION: rotation <= math.radians(t.rest_rotation_deg),
+            StackRule.FINITE: finite,
+            StackRule.STEPS: (sim.step_count == wanted) & complete,
+            StackRule.OVERFLOW: (sim.overflow & LOST_PHYSICS) == 0,
+            StackRule.LIFT: self._lift_best >= t.lift_frames,
+            StackRule.CARRY: self._carried,
+            StackRule.STACKED: stacked & complete,
+            StackRule.SUPPORTED: supported & complete,
+            StackRule.REST_SPEED: rms <= t.rest_speed,
+            StackRule.REST_POSITION: position <= t.rest_position,
+            StackRule.REST_ROTATION: rotation <= math.radians(t.rest_rotation_deg),
         }
         failed = torch.zeros_like(sim.overflow)
         for rule, ok in held.items():
             failed |= int(rule) * (~ok).to(failed.dtype)
         peak = self._speed.amax((1, 2))
-        return Verdict(failed, self._xy_err, self._dz, rms, peak, position, rotation)
+        return Verdict(
+            failed,
+            {
+                "xy_err_m": self._xy_err,
+                "dz_m": self._dz,
+                "rest_speed_m_per_s": rms,
+                "peak_speed_m_per_s": peak,
+                "rest_position_m": position,
+                "rest_rotation_deg": rotation.double().rad2deg(),
+            },
+        )
+
+    def placed(self, sim: Simulation) -> torch.Tensor:
+        """Whether red is on blue right now."""
+        return self._cubes.stacked(*self._cubes.offset(self._cubes.pose(sim)))
+
+    @classmethod
+    def thresholds(cls, cfg: Config) -> dict[str, Value]:
+        """The rules' numbers, with units."""
+        t = cfg.gate.acceptance
+        return {
+            "xy_err_max_m": t.xy_err,
+            "dz_min_m": t.dz_min,
+            "dz_max_m": t.dz_max,
+            "lift_frames": t.lift_frames,
+            "carry_distance_m": t.carry_distance,
+            "support_gap_m": t.support_gap,
+            "rest_speed_m_per_s": t.rest_speed,
+            "rest_position_m": t.rest_position,
+            "rest_rotation_deg": t.rest_rotation_deg,
+            "window_frames": t.window,
+        }
+
+    @classmethod
+    def explain(cls, cfg: Config, frames: Mapping[str, np.ndarray], values: Mapping[str, float]) -> dict[str, tuple[str, str]]:
+        """See `explain_stack`."""
+        return explain_stack(cfg, frames, values)
+
+    @classmethod
+    def headline(cls, values: Mapping[str, float]) -> str:
+        """How well red stands on blue."""
+        return f"xy_err {1e3 * values['xy_err_m']:.1f} mm, dz {1e3 * values['dz_m']:.1f} mm"
 
     def _spread(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Largest pairwise distance [m] and angle [rad] over the window: the pairs one lag apart at a time."""
@@ -211,15 +244,6 @@ class StackEvidence:
             distance = torch.maximum(distance, torch.linalg.vector_norm(a[..., :3] - b[..., :3], dim=-1).amax((1, 2)))
             angle = torch.maximum(angle, quat_angle(a[..., 3:], b[..., 3:]).amax((1, 2)))
         return distance, angle
-
-
-def describe_rules(bits: int) -> str:
-    """The rules in a bit set, in words."""
-    return ", ".join(RULE_TEXT[rule] for rule in Rule if bits & rule)
-
-
-def _frames_of(phases: list[Phase], names: list[str]) -> set[int]:
-    return {frame for phase in phases if phase.name in names for frame in range(phase.start, phase.stop)}
 
 
 class StackSuccess:

@@ -1,0 +1,81 @@
+"""The phases of the scripted motion: when they are, and where the aperture centre goes in each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mjstack.config.schema import Config, SceneCfg
+from mjstack.errors import ConfigError
+
+RED, BLUE, FIXED = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """A phase as frames ``start`` to ``stop`` (exclusive) of the episode."""
+
+    name: str
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """What a phase's target counts from.
+
+    Attributes:
+        source: ``RED`` or ``BLUE``, where x and y are those of a cube, or ``FIXED``.
+        xy: The fixed place [m]; for a cube, zero.
+        z: Height [m].
+    """
+
+    source: int
+    xy: tuple[float, float]
+    z: float
+
+
+def build_phases(cfg: Config) -> list[Phase]:
+    """The controller's phases laid out over the episode's frames."""
+    phases, start = [], 0
+    for name, phase in cfg.controller.phases.items():
+        stop = start + round(phase.seconds / cfg.timing.frame_dt)
+        phases.append(Phase(name, start, stop))
+        start = stop
+    return phases
+
+
+def build_anchors(scene: SceneCfg) -> dict[str, Anchor]:
+    """The anchors of a scene, by the name that a phase uses.
+
+    ``red``, ``blue``: a cube's centre. ``on_blue``: red's centre once it is stacked. ``over_red``, ``over_blue``: the table's
+    surface where a cube stands. ``red_slot``, ``blue_slot``: the table's surface under a cube's place in the box.
+    """
+    top, half = scene.table_center[2] + scene.table_half[2], scene.cube_half
+    anchors = {
+        "red": Anchor(RED, (0.0, 0.0), top + half),
+        "blue": Anchor(BLUE, (0.0, 0.0), top + half),
+        "on_blue": Anchor(BLUE, (0.0, 0.0), top + 3.0 * half),
+        "over_red": Anchor(RED, (0.0, 0.0), top),
+        "over_blue": Anchor(BLUE, (0.0, 0.0), top),
+    }
+    for name in ("red_slot", "blue_slot"):
+        if (xy := getattr(scene, name)) is not None:
+            anchors[name] = Anchor(FIXED, (xy[0], xy[1]), top)
+    return anchors
+
+
+def anchor_of(cfg: Config, phase: str) -> Anchor | None:
+    """The anchor of a phase, its height being that of the phase's target; None where the last target holds.
+
+    Raises:
+        ConfigError: The scene has no such anchor.
+    """
+    spec, anchors = cfg.controller.phases[phase], build_anchors(cfg.scene)
+    if spec.anchor is None:
+        return None
+    if spec.anchor not in anchors:
+        expected = f"one of {', '.join(anchors)} (scene {cfg.scene.name})"
+        raise ConfigError(f"controller.phases.{phase}.anchor", spec.anchor, expected)
+    found = anchors[spec.anchor]
+    above = spec.h_scale * cfg.robot.approach_height + spec.offset + (cfg.scene.grasp_offset if spec.in_hand else 0.0)
+    return Anchor(found.source, found.xy, found.z + above)

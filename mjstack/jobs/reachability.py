@@ -1,0 +1,241 @@
+"""Job *reachability*: what the arm reaches on the table, at which tilt, and how far from their places the cubes may stand."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from mjstack.config.schema import Config, ReachabilityJobCfg
+from mjstack.errors import ConfigError
+from mjstack.gates.gate import GateContext
+from mjstack.jobs.outcome import JobOutcome
+from mjstack.jobs.progress import ProgressBar
+from mjstack.jobs.reported import Record, run_reported
+from mjstack.kinematics.reach import PointReach
+from mjstack.report.reachability import CubeRegion, ReachLevel, ReachMap, save_map, to_csv, to_markdown, to_npz
+from mjstack.report.record import GateResult, Status, write_atomic
+from mjstack.scene import BLUE, RED, table_top
+from mjstack.sim import resolve_backend
+
+log = logging.getLogger(__name__)
+
+_MOST_POINTS = 100_000
+_SHARE = 500  # points between two looks at the clock
+_FINE = 0.001  # [m] to which regions are given
+_CUBE_ANCHORS = ("red", "blue", "on_blue")
+
+
+def check_reachability(cfg: Config) -> None:
+    """Raises for what cannot be done, before anything is written."""
+    for key in ("view", "video"):
+        if getattr(cfg, key):
+            raise ConfigError(key, "true", "false with job=reachability, which moves nothing", "Leave it out")
+    resolve_backend(cfg)
+    job, half = cast(ReachabilityJobCfg, cfg.job), cfg.scene.table_half
+    points = math.prod(2 * int(half[k] / job.step) + 1 for k in (0, 1))
+    if points > _MOST_POINTS or job.step > min(half[:2]):
+        least = math.sqrt(4.0 * half[0] * half[1] / _MOST_POINTS)
+        raise ConfigError("job.step", job.step, f"{least:.4f} to {min(half[:2]):g} m; this table would have {points} points")
+
+
+def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
+    """Draws the map and leaves reachability.csv, .npz, .md, .png and the report.
+
+    Args:
+        cfg: The configuration.
+        folder: Where they go.
+        overrides: What was asked for on the command line.
+
+    Returns:
+        How it ended: a pass if the region of ``reset=randomized`` is reached with the margin, around both cubes' places.
+    """
+
+    def work(context: GateContext, bar: ProgressBar, record: Record) -> None:
+        levels: list[ReachLevel] = []
+        for name, (height, gripper) in find_levels(cfg).items():
+            bar.start(name)
+            began = time.perf_counter()
+            levels.append(map_level(context, name, height, gripper, lambda done, total: bar.advance("points", done, total)))
+            _write(context, folder, levels, [])
+            record(_level_result(levels[-1], time.perf_counter() - began))
+        began = time.perf_counter()
+        regions = [find_region(cfg, levels, RED, cfg.scene.red_xy), find_region(cfg, levels, BLUE, cfg.scene.blue_xy)]
+        _write(context, folder, levels, regions)
+        for region in regions:
+            record(_region_result(cfg, region, time.perf_counter() - began))
+        _draw(context, folder, levels, regions)
+
+    return run_reported(cfg, folder, overrides, f"task {cfg.task.name}, what the arm reaches", work)
+
+
+def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
+    """Heights above a cube's centre [m] at which the task needs the aperture centre, and the gripper's command there.
+
+    ``grasp`` is the controller's lowest target at a cube and ``carry`` its highest; ``approach`` is the approach height.
+    """
+    robot, levels = cfg.robot, []
+    for phase in cfg.controller.phases.values():
+        if phase.anchor in _CUBE_ANCHORS:
+            base = 2.0 * cfg.scene.cube_half if phase.anchor == "on_blue" else 0.0
+            levels.append((base + phase.h_scale * robot.approach_height + phase.offset, phase.gripper))
+    low, high = min(height for height, _ in levels), max(height for height, _ in levels)
+    carry = next(gripper for height, gripper in levels if height == high)
+    return {"grasp": (low, "open"), "approach": (robot.approach_height, "open"), "carry": (high, carry)}
+
+
+def axes(cfg: Config) -> tuple[np.ndarray, np.ndarray]:
+    """The map's columns and rows: x and y [m] of points on the table, one in its middle."""
+    step, scene = cast(ReachabilityJobCfg, cfg.job).step, cfg.scene
+    counts = [int(scene.table_half[k] / step + 1e-9) for k in (0, 1)]
+    x, y = (scene.table_center[k] + step * np.arange(-counts[k], counts[k] + 1) for k in (0, 1))
+    return x, y
+
+
+def map_level(
+    context: GateContext, name: str, height: float, gripper: str, progress: Callable[[int, int], object]
+) -> ReachLevel:
+    """Solves every point of one height."""
+    cfg = context.cfg
+    command = cfg.robot.gripper_open if gripper == "open" else cfg.robot.gripper_closed
+    reach, tolerance = PointReach(context.model, cfg.robot, command), cfg.controller.ik_tolerance
+    x, y = axes(cfg)
+    level = table_top(cfg.scene) + cfg.scene.cube_half + height
+    points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), level)], axis=-1).reshape(-1, 3)
+    residual, tilt = np.empty(len(points)), np.empty(len(points))
+    for first in range(0, len(points), _SHARE):
+        part = slice(first, first + _SHARE)
+        found = reach.solve_upright(points[part], tolerance)
+        residual[part], tilt[part] = found.distance, np.where(found.distance <= tolerance, found.tilt, np.nan)
+        progress(min(first + _SHARE, len(points)), len(points))
+    shape = len(y), len(x)
+    return ReachLevel(name=name, height=height, gripper=gripper, residual=residual.reshape(shape), tilt=tilt.reshape(shape))
+
+
+def find_region(cfg: Config, levels: list[ReachLevel], cube: str, place: list[float]) -> CubeRegion:
+    """The largest regions around a place that are reached at every level, with the margin, and stay on the table.
+
+    Between two points of the map the worse one counts.
+    """
+    job, scene = cast(ReachabilityJobCfg, cfg.job), cfg.scene
+    x, y = axes(cfg)
+    blocked = ~np.logical_and.reduce([level.reached for level in levels])
+    rows, columns = np.nonzero(blocked)
+    away = np.stack((np.abs(x[columns] - place[0]), np.abs(y[rows] - place[1])), axis=1) - job.step - job.margin
+    edge = [_map_edge(axis, place[k]) - job.margin for k, axis in enumerate((x, y))]
+
+    def most_y(half_x: float) -> float:
+        """How far a region of this half-width goes in y; negative where there is none."""
+        beside = away[away[:, 0] <= half_x, 1]
+        return min(edge[1], beside.min(initial=math.inf)) if half_x <= edge[0] else -1.0
+
+    room = [scene.table_half[k] - math.sqrt(2.0) * scene.cube_half - abs(place[k] - scene.table_center[k]) for k in (0, 1)]
+    square, largest = 0.0, (0.0, 0.0)
+    for half_x in np.arange(0.0, max(room[0], 0.0) + 1e-9, _FINE):
+        half_y = min(room[1], most_y(half_x))
+        if half_y < 0.0:
+            continue
+        half_y = _FINE * math.floor(half_y / _FINE + 1e-9)
+        if half_y >= half_x - 1e-9:
+            square = half_x
+        if half_x * half_y > largest[0] * largest[1]:
+            largest = float(half_x), half_y
+    wide, deep = scene.random_xy
+    inside = np.ix_(np.abs(y - place[1]) <= deep + 1e-9, np.abs(x - place[0]) <= wide + 1e-9)
+    return CubeRegion(
+        name=cube,
+        place=(place[0], place[1]),
+        configured=(wide, deep),
+        square=float(square),
+        largest=largest,
+        tilt=float(levels[0].tilt[inside].max(initial=-math.inf)),
+        reached=most_y(wide) >= deep - 1e-9,
+    )
+
+
+def _map_edge(axis: np.ndarray, at: float) -> float:
+    return float(min(at - axis[0], axis[-1] - at))
+
+
+def _level_result(level: ReachLevel, seconds: float) -> GateResult:
+    share = float(level.reached.mean())
+    metrics: dict[str, float | int | str | bool | None] = {
+        "height_above_cube_center_m": level.height,
+        "points": level.reached.size,
+        "reached_fraction": share,
+    }
+    reason = f"{level.height:.3f} m above a cube's centre, {level.gripper}: {100.0 * share:.1f} % of the table reached"
+    if share:
+        low, high = (float(np.degrees(end(level.tilt))) for end in (np.nanmin, np.nanmax))
+        metrics |= {"smallest_tilt_deg": low, "largest_tilt_deg": high}
+        reason += f", tilted by {low:.0f} to {high:.0f} degrees at least"
+    return GateResult(name=level.name, status=Status.passed, reason=reason, seconds=seconds, metrics=metrics)
+
+
+def _region_result(cfg: Config, region: CubeRegion, seconds: float) -> GateResult:
+    margin = cast(ReachabilityJobCfg, cfg.job).margin
+    reason = (
+        f"scene.random_xy {region.configured[0]:g} x {region.configured[1]:g} m is {'' if region.reached else 'not '}reached "
+        f"with {1e3 * margin:g} mm to spare; the largest square is {region.square:.3f} m, the largest rectangle "
+        f"{region.largest[0]:.3f} x {region.largest[1]:.3f} m"
+    )
+    metrics: Mapping[str, float] = {
+        "random_x_m": region.configured[0],
+        "random_y_m": region.configured[1],
+        "largest_square_m": region.square,
+        "largest_x_m": region.largest[0],
+        "largest_y_m": region.largest[1],
+        "largest_tilt_in_region_deg": float(np.degrees(region.tilt)),
+    }
+    status = Status.passed if region.reached else Status.failed
+    thresholds = {"margin_m": margin}
+    return GateResult(
+        name=region.name, status=status, reason=reason, seconds=seconds, thresholds=dict(thresholds), metrics=dict(metrics)
+    )
+
+
+def _map(context: GateContext, levels: list[ReachLevel], regions: list[CubeRegion]) -> ReachMap:
+    cfg = context.cfg
+    x, y = axes(cfg)
+    return ReachMap(
+        title=f"{cfg.robot.title}, task {cfg.task.name}: what the arm reaches",
+        x=x,
+        y=y,
+        table=(cfg.scene.table_center[:2], cfg.scene.table_half[:2]),
+        levels=levels,
+        regions=regions,
+    )
+
+
+def _write(context: GateContext, folder: Path, levels: list[ReachLevel], regions: list[CubeRegion], picture: str = "") -> None:
+    """The tables, as far as they are known."""
+    found = _map(context, levels, regions)
+    job, robot = cast(ReachabilityJobCfg, context.cfg.job), context.cfg.robot
+    notes = [
+        f"Half-widths in m, around the place. A region counts as reached if it still is with {1e3 * job.margin:g} mm more all "
+        f"round, at every level; points are {1e3 * job.step:g} mm apart. Regions keep cubes of any yaw on the table.",
+        f"Reached: inverse kinematics of {', '.join(robot.ik_joints)} brings the aperture centre within "
+        f"{1e3 * context.cfg.controller.ik_tolerance:g} mm. Collisions are not looked at.",
+        f"Tilt: the smallest angle between the axis of {robot.arm_joints[-1]} and straight down that a solution has. A controller "
+        "that goes on from where it is need not find that solution, and may stop at a joint limit short of a reached point.",
+        "Reached does not mean grasped: how many worlds succeed, the batch gate tells.",
+    ]
+    write_atomic(folder / "reachability.csv", to_csv(found))
+    write_atomic(folder / "reachability.npz", to_npz(found))
+    write_atomic(folder / "reachability.md", to_markdown(found, notes, picture))
+
+
+def _draw(context: GateContext, folder: Path, levels: list[ReachLevel], regions: list[CubeRegion]) -> None:
+    """The picture. Its failure takes nothing back."""
+    try:
+        save_map(folder / "reachability.png", _map(context, levels, regions))
+    except Exception as error:
+        log.exception("drawing failed")
+        context.say(f"no picture: {str(error) or type(error).__name__}")
+        return
+    _write(context, folder, levels, regions, "reachability.png")

@@ -1,0 +1,201 @@
+"""What the arm reaches: inverse kinematics of many points at once in numpy, for checks and maps.
+
+`mink_ik` plans and `batched_ik` runs with the worlds. Here points have nothing to do with worlds, no Warp is loaded, and the
+gripper's tilt matters too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from mjstack.config.schema import RobotCfg
+from mjstack.errors import MjstackError
+from mjstack.scene.index import find
+
+_DAMPING = 1e-3  # [m/rad] of the steps towards a point
+_MAX_STEP = 0.3  # [rad] per joint and iteration
+_CONVERGED = 1e-6  # [m]
+_STILL = 1e-5  # [rad] a step that is smaller ends the way
+_POINTING = 0.02  # [m/rad] what the pointing direction weighs against the position while the tilt is reduced
+_STARTS = (-0.6, 0.0, 0.6)  # [rad] off home, of each joint after the first: on which branch of solutions it begins
+
+
+@dataclass(frozen=True, slots=True)
+class Reached:
+    """What was found at each point.
+
+    Attributes:
+        q: The ik joints [rad], shape ``(n, joints)``.
+        distance: From the aperture centre to the point [m], shape ``(n,)``.
+        tilt: Of the gripper from pointing straight down [rad], shape ``(n,)``.
+    """
+
+    q: np.ndarray
+    distance: np.ndarray
+    tilt: np.ndarray
+
+
+class PointReach:
+    """Brings the aperture centre to points, for one opening of the gripper; collisions are not looked at.
+
+    The other joints stay at the robot's home, or where they are locked. The gripper points along the last arm joint's axis.
+    """
+
+    def __init__(self, model: mujoco.MjModel, robot: RobotCfg, gripper: Sequence[float]) -> None:
+        """Reads axes and limits of the ik joints.
+
+        Args:
+            model: A compiled model that contains the robot, alone or in a scene. It is not kept.
+            robot: The robot's profile.
+            gripper: Command of the gripper [rad, m].
+
+        Raises:
+            UnknownName: The model lacks a joint or site of the robot.
+            MjstackError: One of the ik joints is not a hinge.
+        """
+        data = mujoco.MjData(model)
+        n_arm = len(robot.arm_joints)
+        command = dict(zip([*robot.arm_joints, *robot.gripper_joints], [*robot.home[:n_arm], *gripper], strict=True))
+        command |= robot.locked
+        for name, value in command.items():
+            data.qpos[model.jnt_qposadr[find(model, "joint", name)]] = value
+        mujoco.mj_kinematics(model, data)
+        joints = sorted((find(model, "joint", name) for name in robot.ik_joints), key=lambda j: int(model.jnt_bodyid[j]))
+        for j in joints:
+            if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
+                raise MjstackError(f"joint '{model.joint(j).name}' is no hinge, expected one of each of robot.ik_joints.")
+        self._home = np.array([command[model.joint(j).name] for j in joints])
+        self._anchors, self._axes = data.xanchor[joints].copy(), data.xaxis[joints].copy()
+        sites = [find(model, "site", name) for name in robot.aperture_sites]
+        self._tip = data.site_xpos[sites].mean(axis=0)
+        last = find(model, "joint", robot.arm_joints[-1])
+        pointing = data.xaxis[last]
+        self._pointing = pointing * np.sign(pointing @ (self._tip - data.xanchor[last]))
+        span = model.jnt_range[joints].copy()
+        actuators = [find(model, "actuator", model.joint(j).name) for j in joints]
+        for k, a in enumerate(actuators):
+            if model.actuator_ctrllimited[a]:
+                low, high = model.actuator_ctrlrange[a]
+                span[k] = max(span[k, 0], low), min(span[k, 1], high)
+        self._low, self._high = span.T
+
+    def solve(self, points: np.ndarray, iterations: int = 60) -> Reached:
+        """Goes as near to each point as it can, from a few starts.
+
+        Args:
+            points: Targets [m], shape ``(n, 3)``.
+            iterations: Most steps per start.
+        """
+        q = np.tile(self._home, (len(points), 1))
+        distance = np.full(len(points), np.inf)
+        for off in sorted(_STARTS, key=abs):
+            left = np.flatnonzero(distance > _CONVERGED)
+            if not left.size:
+                break
+            found, error = self._descend(self._start(points[left], off), points[left], iterations)
+            better = error < distance[left]
+            q[left[better]], distance[left[better]] = found[better], error[better]
+        return Reached(q, distance, self._tilt(q))
+
+    def solve_upright(self, points: np.ndarray, tolerance: float, iterations: int = 60) -> Reached:
+        """Likewise, and of the solutions within tolerance takes the one whose gripper is tilted least.
+
+        Args:
+            points: Targets [m], shape ``(n, 3)``.
+            tolerance: Distance that counts as reached [m].
+            iterations: Most steps per start.
+        """
+        best = self.solve(points, iterations)
+        q, distance, tilt = best.q.copy(), best.distance.copy(), best.tilt.copy()
+        reached = np.flatnonzero(distance <= tolerance)
+        for start in [q[reached], *(self._start(points[reached], off) for off in _STARTS)]:
+            found, _ = self._descend(start, points[reached], iterations, _POINTING)
+            found, error = self._descend(found, points[reached], iterations)
+            lower = (error <= tolerance) & (self._tilt(found) < tilt[reached])
+            rows = reached[lower]
+            q[rows], distance[rows], tilt[rows] = found[lower], error[lower], self._tilt(found)[lower]
+        return Reached(q, distance, tilt)
+
+    def _start(self, points: np.ndarray, off: float) -> np.ndarray:
+        """Home, turned towards the points where the first joint stands upright, the other joints bent by ``off``."""
+        q = np.tile(self._home + off, (len(points), 1))
+        axis, anchor = self._axes[0], self._anchors[0]
+        q[:, 0] = self._home[0]
+        if abs(axis[2]) > 0.99:
+            ahead, arm = points - anchor, self._tip - anchor
+            turn = np.arctan2(ahead[:, 1], ahead[:, 0]) - np.arctan2(arm[1], arm[0])
+            q[:, 0] += np.sign(axis[2]) * ((turn + np.pi) % (2.0 * np.pi) - np.pi)
+        return np.clip(q, self._low, self._high)
+
+    def _descend(
+        self, start: np.ndarray, points: np.ndarray, iterations: int, pointing: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Damped least squares within the limits. Points that are reached drop out, unless the tilt is being reduced."""
+        q, left = start.copy(), np.arange(len(points))
+        for _ in range(iterations):
+            jacobian, tip, direction = self._forward(q[left])
+            error = points[left] - tip
+            far = np.linalg.norm(error, axis=1)
+            if pointing:
+                turning = np.cross(self._world_axes, direction[:, None]).swapaxes(1, 2)
+                jacobian = np.concatenate((jacobian, pointing * turning), axis=1)
+                error = np.concatenate((error, pointing * ([0.0, 0.0, -1.0] - direction)), axis=1)
+            else:
+                keep = far > _CONVERGED
+                left, jacobian, error, far = left[keep], jacobian[keep], error[keep], far[keep]
+                if not left.size:
+                    break
+            step = self._step(q[left], jacobian, error, _DAMPING if pointing else _DAMPING + 0.05 * far)
+            moved = np.clip(q[left] + step, self._low, self._high)
+            still = np.abs(moved - q[left]).max(axis=1) < _STILL
+            q[left] = moved
+            left = left[~still]
+            if not left.size:
+                break
+        return q, np.linalg.norm(points - self._forward(q)[1], axis=1)
+
+    def _step(self, q: np.ndarray, jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray | float) -> np.ndarray:
+        """One step. A joint that would leave its range is held, and the others take over."""
+        weight = np.broadcast_to(np.square(damping), len(q))[:, None, None] * np.eye(q.shape[1])
+        free = np.ones_like(q, dtype=bool)
+        for _ in range(3):
+            open_ = jacobian * free[:, None]
+            rhs = np.einsum("nij,ni->nj", open_, error)[..., None]
+            step = np.linalg.solve(np.einsum("nij,nik->njk", open_, open_) + weight, rhs)[..., 0] * free
+            out = ((q <= self._low) & (step < 0.0)) | ((q >= self._high) & (step > 0.0))
+            if not out.any():
+                break
+            free &= ~out
+        return step * np.minimum(1.0, _MAX_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+
+    def _forward(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Jacobian ``(n, 3, joints)``, aperture centre and pointing direction, both ``(n, 3)``.
+
+        A product of exponentials: each joint turns what follows it about its axis at home.
+        """
+        n, joints = q.shape
+        rotation, shift = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
+        axes, anchors = np.empty((n, joints, 3)), np.empty((n, joints, 3))
+        for k, (axis, anchor) in enumerate(zip(self._axes, self._anchors, strict=True)):
+            axes[:, k], anchors[:, k] = rotation @ axis, rotation @ anchor + shift
+            turn = _rotations(axis, q[:, k] - self._home[k])
+            shift = shift + np.einsum("nij,nj->ni", rotation, anchor - turn @ anchor)
+            rotation = rotation @ turn
+        tip = rotation @ self._tip + shift
+        self._world_axes = axes
+        return np.cross(axes, tip[:, None] - anchors).swapaxes(1, 2), tip, rotation @ self._pointing
+
+    def _tilt(self, q: np.ndarray) -> np.ndarray:
+        return np.arccos(np.clip(-self._forward(q)[2][:, 2], -1.0, 1.0))
+
+
+def _rotations(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Rotations about one axis, shape ``(n, 3, 3)``."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    s, c = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
+    return np.eye(3) + s * cross + (1.0 - c) * (cross @ cross)
