@@ -47,8 +47,8 @@ class Cone(Enum):
 class LayoutCfg:
     """Where a scene's objects stand for one robot, and the buffer sizes its contacts need.
 
-    ``nconmax`` and ``njmax`` are for the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions. ``random_xy``: how far
-    off its place a randomised cube may be. A scene with a box has a ``home`` of its own, clear of it.
+    ``nconmax`` and ``njmax`` are for the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions. ``random_xy`` is
+    how far off its place a randomised cube may be. A scene with a box has a ``home`` of its own, clear of it.
     """
 
     table_center: list[float] = MISSING

@@ -144,6 +144,8 @@ def _scene(cfg: Config) -> None:
     if not apart >= 2.0 * math.sqrt(2.0) * scene.cube_half:
         raise ConfigError("scene.red_xy", scene.red_xy, f"a cube that does not touch the blue one at {scene.blue_xy}")
     _length("scene.random_xy", scene.random_xy, 2)
+    if not min(scene.random_xy) >= 0.0:
+        raise ConfigError("scene.random_xy", scene.random_xy, "two numbers that are not negative [m]")
     if scene.box is not None:
         _box(scene, scene.box)
 
@@ -160,7 +162,7 @@ def _box(scene: SceneCfg, box: BoxCfg) -> None:
         raise ConfigError("scene.box.height", box.height, f"more than the floor's thickness, {box.floor:g} m")
     for key in ("floor_solref", "wall_solref"):
         first, second = getattr(box, key)
-        if not (first > 0.0 and second > 0.0 or first < 0.0 and second < 0.0):
+        if not (min(first, second) > 0.0 or max(first, second) < 0.0):
             expected = "a time constant [s] and a damping ratio, or stiffness and damping as two negative numbers"
             raise ConfigError(f"scene.box.{key}", getattr(box, key), expected)
     outer = [half + box.wall for half in box.half]
@@ -210,7 +212,7 @@ def _gates(cfg: Config) -> None:
         named += [("gate.acceptance.lift_phases", name) for name in gate.acceptance.lift_phases]
     if cfg.task.evidence.endswith(".BoxEvidence"):
         if cfg.scene.box is None:
-            raise ConfigError("scene", cfg.scene.name, f"a scene with a box, because {cfg.task.evidence} judges it", "Set scene=box")
+            raise ConfigError("scene", cfg.scene.name, "a scene with a box, for task.evidence BoxEvidence", "Set scene=box")
         named += [("task.evidence", f"{role}_{cube}") for cube in ("red", "blue") for role in BOX_ROLES]
     named += [("gate.throughput.from_phase", gate.throughput.from_phase)]
     for key, name in named:

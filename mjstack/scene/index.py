@@ -95,7 +95,7 @@ class SceneIndex:
         bodies: Body index of those objects.
         geoms: Geom indices of those objects.
         jaw_force: First sensordata address of each jaw's force on an object (3 numbers), by the object's name.
-        support_force: Likewise of the force that the world and the other cube exert on it; only a scene with a box measures them.
+        support_force: Likewise of the world's and the other cube's force on it; only a scene with a box measures them.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
