@@ -60,10 +60,12 @@ def measure_arrangements(
     sim = context.simulation(cfg.nworld, Backend.mjwarp, device)
     assert isinstance(sim, MjwarpSimulation)
     first = context.phase_start(cfg.gate.throughput.from_phase)
-    episode = context.run(sim, cfg.reset, snapshots=frozenset([first - 1]))
-    state, tape = episode.states[first - 1], episode.tape
+    episode = context.run(sim, cfg.reset, snapshots=frozenset([first - 1]), keep_commands=True)
+    state, tape = episode.states[first - 1], episode.commands
+    assert tape is not None
     columns = torch.as_tensor(context.index.ctrl, device=sim.device)
-    commands = [tape.command(f) for f in range(first, min(first + frames, tape.frames))]
+    tape.rewind()
+    commands = [tape.command() for _ in range(min(first + frames, tape.frames))][first:]
     bare, substeps = sim.bare_step(), cfg.timing.substeps
 
     def plain() -> None:

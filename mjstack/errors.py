@@ -201,6 +201,42 @@ class ArgumentError(MjstackError):
         self.name = name
 
 
+class DatasetError(MjstackError):
+    """A dataset of demonstrations that cannot be opened or read, or an episode that does not fit into it."""
+
+    exit_code = 2
+
+    def __init__(self, message: str) -> None:
+        """Takes the message without its full stop: what is wrong with its value, what was expected, and what to do."""
+        super().__init__(f"{message}.")
+
+
+class UnwrittenError(MjstackError):
+    """A dataset that could not be written any further, such as on a full disk."""
+
+    def __init__(self, folder: str, error: OSError, kept: int) -> None:
+        """Builds the message.
+
+        Args:
+            folder: The dataset.
+            error: What the system says.
+            kept: Episodes that were committed before.
+        """
+        super().__init__(
+            f"{folder}: cannot be written ({error.strerror or error}): {kept} committed episodes are kept, those added since "
+            "are not. Make room or correct it, and do the same again: it goes on after the last one kept."
+        )
+
+
+class MissingExtra(MjstackError):
+    """A package that is not installed, because it comes with an extra."""
+
+    exit_code = 2
+
+    def __init__(self, what: str, package: str, extra: str) -> None:
+        super().__init__(f"{what} needs {package}, which is not installed: run pip install 'mjstack[{extra}]'.")
+
+
 def suggest(name: str, available: Iterable[str]) -> str:
     """Lists the available names, the nearest match first if there is one."""
     names = sorted(available)

@@ -227,9 +227,9 @@ def first_frames(stage: Callable[[str], GateContext]) -> Iterator[Callable[[Batc
 
     def run(sizes: BatchSizes) -> Peaks:
         sim = make_simulation(context.model, context.cfg, 2, backend=Backend.mjwarp, device="cpu", sizes=sizes)
-        env, tape = start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
-        for frame in range(3):
-            env.step(tape.command(frame))
+        env, controller = start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+        for _ in range(3):
+            env.step(controller.command())
         found = read_peaks(sim)
         sim.close()
         return found

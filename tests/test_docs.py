@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-GUIDES = ["tutorial.md", *(name for name in ("terms.md",) if (DOCS / name).exists())]
+GUIDES = ["tutorial.md", *(name for name in ("terms.md", "datasets.md") if (DOCS / name).exists())]
 
 
 def python_lines(markdown: str) -> str:

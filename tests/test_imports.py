@@ -21,8 +21,8 @@ LAYERS = [
     {"mdp"},
     {"tasks"},
     {"envs"},
-    {"adapters", "gates"},
-    {"benchmark", "benchmark_physics"},
+    {"adapters", "datasets", "gates"},
+    {"benchmark", "benchmark_physics", "benchmark_ik"},
     {"jobs"},
     {"cli"},
 ]
@@ -40,7 +40,8 @@ HOMES = {
     "gymnasium": ("adapters/",),
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),
-    "rich": ("jobs/", "cli.py", "benchmark.py", "benchmark_physics.py", "managers/base.py"),
+    "pyarrow": ("datasets/",),
+    "rich": ("jobs/", "cli.py", "benchmark.py", "benchmark_physics.py", "benchmark_ik.py", "managers/base.py"),
 }
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from mjstack.config.schema import Config
 from mjstack.control import planning_pool, scripted
-from mjstack.control.planning_pool import Plan
 from mjstack.control.planner import ScriptedPlanner
+from mjstack.control.planning_pool import Plan
 from mjstack.errors import Unreachable, WorkerLost
 from mjstack.gates.gate import GateContext
 

@@ -165,8 +165,8 @@ def test_bare_steps_that_lose_worlds_do_not_count(
     start = sections.start_worlds
 
     def short(*args: Any) -> Any:
-        env, tape = start(*args)
-        return env, SimpleNamespace(frames=2, command=tape.command)
+        env, controller = start(*args)
+        return env, SimpleNamespace(frames=2, command=controller.command)
 
     monkeypatch.setattr(sections, "start_worlds", short)
     assert sections._play_bare(context, sim)[1] == "1 worlds overflowed or diverged with bare steps"  # type: ignore[arg-type]

@@ -17,14 +17,53 @@ class Controller(Protocol):
         phases: The phases, laid out as a world that is not held up goes through them.
         frames: Length of the episode.
         phase: Number of the phase that each world's last command belonged to, shape ``(nworld,)``, int64.
+        error: Largest distance from a target that inverse kinematics left [m], shape ``(nworld,)``.
+        retries: Grasps that were tried again, shape ``(nworld,)``, int32.
     """
 
     phases: list[Phase]
     frames: int
     phase: torch.Tensor
+    error: torch.Tensor
+    retries: torch.Tensor
 
     def command(self) -> torch.Tensor:
         """Commands of the next frame, shape ``(nworld, nu)``."""
+
+
+class Recorded:
+    """What a controller gave in an episode, to be given again; itself a controller that only repeats."""
+
+    def __init__(self, source: Controller, nu: int) -> None:
+        """Allocates for the worlds and frames of a controller; NaN until it is written.
+
+        Args:
+            source: The controller.
+            nu: Width of its commands.
+        """
+        self.phases, self.frames = source.phases, source.frames
+        self.phase, self.error, self.retries = torch.zeros_like(source.phase), source.error, source.retries
+        nworld, device = source.phase.shape[0], source.phase.device
+        self._commands = torch.full((self.frames, nworld, nu), torch.nan, dtype=torch.float32, device=device)
+        self._phases = torch.zeros((self.frames, nworld), dtype=torch.int16, device=device)
+        self._next = torch.zeros(1, dtype=torch.int64, device=device)
+
+    def append(self, command: torch.Tensor, phase: torch.Tensor) -> None:
+        """Takes the next frame's command, ``(nworld, nu)``, and phase, ``(nworld,)``. No host read."""
+        self._commands.index_copy_(0, self._next, command[None].float())
+        self._phases.index_copy_(0, self._next, phase[None].to(torch.int16))
+        self._next.add_(1)
+
+    def rewind(self) -> None:
+        """From here on it repeats."""
+        self._next.zero_()
+
+    def command(self) -> torch.Tensor:
+        """Commands of the next frame, shape ``(nworld, nu)``."""
+        out = self._commands.index_select(0, self._next)[0]
+        self.phase.copy_(self._phases.index_select(0, self._next)[0])
+        self._next.add_(1)
+        return out
 
 
 class TapeController:
@@ -37,6 +76,8 @@ class TapeController:
         self._phase_at = torch.tensor(numbers, device=device)
         self._next = torch.zeros(1, dtype=torch.int64, device=device)
         self.phase = torch.zeros(nworld, dtype=torch.int64, device=device)
+        self.error = torch.as_tensor(tape.waypoint_error, device=device)
+        self.retries = torch.zeros(nworld, dtype=torch.int32, device=device)
 
     def command(self) -> torch.Tensor:
         """Commands of the next frame, shape ``(nworld, nu)``."""

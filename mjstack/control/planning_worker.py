@@ -7,8 +7,8 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
-from mjstack.control.planning_pool import Plan
 from mjstack.control.planner import ScriptedPlanner
+from mjstack.control.planning_pool import Plan
 from mjstack.errors import Unreachable
 
 

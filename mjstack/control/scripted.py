@@ -11,10 +11,14 @@ from mjstack.config.schema import Config
 from mjstack.control.phases import FIXED, anchor_of, build_phases
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.base import EnvView
-from mjstack.mdp.geometry import jaw_forces, pose_w, robot
+from mjstack.mdp.geometry import aperture_center, jaw_forces, pose_w, robot
 from mjstack.scene.index import CUBES
 
 LOADED = 1e-5  # N: a jaw that presses with more touches the cube (protocol of the box task)
+_QUARTER = 0.5 * math.pi
+_MOST_OFF = 0.02  # m: a cube that is farther from the aperture centre is not in the hand
+_STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
+_ROLL_STEP = 0.05  # rad per frame
 _DONE = 1e-3  # frames: a phase is over this much before its last frame would be
 
 
@@ -52,7 +56,18 @@ class ScriptedController:
         self.phases = build_phases(cfg)
         self.frames = self.phases[-1].stop
         self._build_tables(cfg, device)
-        self._ik = BatchedIk(env.sim.model, cfg.robot, n, device, iterations=cfg.controller.frame_iterations)
+        c = cfg.controller
+        self._ik = BatchedIk(
+            env.sim.model,
+            cfg.robot,
+            n,
+            device,
+            iterations=c.frame_iterations,
+            posture_gain=c.posture_gain,
+            approach_gain=c.approach_gain,
+            tolerance=c.ik_tolerance,
+        )
+        self._uses_posture = c.posture_gain > 0.0
         tensors = robot(env)
         self._n_arm = env.index.n_arm
         self._nominal = torch.as_tensor(nominal, dtype=torch.float32, device=device)
@@ -69,6 +84,8 @@ class ScriptedController:
         n_grip = len(cfg.robot.gripper_joints)
         self._grip_from, self._grip_to = zeros(n_grip), zeros(n_grip)
         self._command = zeros(len(cfg.robot.home))
+        self._yaw, self._roll = zeros(3), zeros()
+        self._roll_column, self._roll_sign = self._find_roll()
 
     def command(self) -> torch.Tensor:
         """Commands of the next frame, shape ``(nworld, nu)``, float32. The controller's own memory: do not write into it."""
@@ -82,7 +99,9 @@ class ScriptedController:
         posture = self._nominal.index_select(0, self.phase)
         start = torch.where(fresh[:, None], posture, self._command)
         start[:, self._n_arm :] = grip
-        command, distance = self._ik.solve(start, target)
+        if self._cfg.controller.align > 0.0:
+            self._turn(start, fresh)
+        command, distance = self._ik.solve(start, target, posture if self._uses_posture else None)
         self._command.copy_(command)
         last = self._time >= length - _DONE
         self.error.copy_(torch.where(last, torch.maximum(self.error, distance), self.error))
@@ -110,7 +129,7 @@ class ScriptedController:
         table, source = self._target.index_select(0, phase), self._source.index_select(0, phase)
         place = self._seen.gather(1, source[:, None, None].expand(-1, 1, 2))[:, 0]
         to = torch.cat((table[:, :2] + place, table[:, 2:]), dim=1)
-        to = torch.where(self._holds.index_select(0, phase)[:, None], self._to, to)
+        to = torch.where(self._holds.index_select(0, phase)[:, None], self._to, to + self._off_center())
         self._from.copy_(torch.where(rows, torch.where(fresh[:, None], to, self._to), self._from))
         self._to.copy_(torch.where(rows, to, self._to))
         closing = torch.where(fresh[:, None], self._home_grip, self._grip_to)
@@ -127,13 +146,59 @@ class ScriptedController:
         rate = (self._needed.index_select(0, again) / time_left).clamp(min=1.0)
         return empty & (self.retries == 0) & (self._can_retry.index_select(0, self.phase)) & (rate <= self._hurry), rate
 
+    def _off_center(self) -> torch.Tensor:
+        """From a held cube's centre to the aperture centre [m], shape ``(nworld, 3)``; zero where a phase does not ask."""
+        at, held = aperture_center(self._env).float(), self._centers.index_select(0, self.phase)
+        out = torch.zeros_like(at)
+        for number, name in enumerate(CUBES):
+            off = (at - pose_w(self._env, name)[:, :3].float()).clamp(-_MOST_OFF, _MOST_OFF)
+            out = torch.where((held == number)[:, None], off, out)
+        return out
+
+    def _turn(self, command: torch.Tensor, fresh: torch.Tensor) -> None:
+        """Rolls the open jaws towards a face of the cube that a phase looks at, by a little per frame.
+
+        A cube looks the same every quarter turn. A roll about the approach axis turns the closing axis less in the horizontal
+        plane than about the axis, the more the gripper is tilted.
+        """
+        self._roll.masked_fill_(fresh, 0.0)
+        column = self._nominal[0, self._roll_column]
+        command[:, self._roll_column] = column + self._roll
+        closing, approach = self._ik.directions(command)
+        yaw = self._yaw.gather(1, self._source.index_select(0, self.phase)[:, None])[:, 0]
+        off = yaw - torch.atan2(closing[:, 1], closing[:, 0])
+        off = off - _QUARTER * torch.round(off / _QUARTER)
+        # Two faces are in question, a quarter turn apart; what has been turned so far counts for its own.
+        both = torch.stack((off, off - torch.copysign(torch.full_like(off, _QUARTER), off)))
+        upright = (-approach[:, 2]).clamp(min=0.2)
+        wanted = self._roll + self._roll_sign * torch.atan2(torch.sin(both), torch.cos(both) * upright)
+        cost = (wanted - _STAY * self._roll).abs()
+        wanted = torch.where(cost[0] <= cost[1], wanted[0], wanted[1])
+        step = (self._cfg.controller.align * wanted - self._roll).clamp(-_ROLL_STEP, _ROLL_STEP)
+        self._roll += step * self._aligns.index_select(0, self.phase)
+        command[:, self._roll_column] = column + self._roll
+
+    def _find_roll(self) -> tuple[int, float]:
+        """Column of the joint that rolls the gripper, and which way it turns the closing axis, seen from above."""
+        names = [*self._cfg.robot.arm_joints, *self._cfg.robot.gripper_joints]
+        column = names.index(self._cfg.robot.roll_joint)
+        command = self._nominal[:1].expand(self._env.nworld, -1).clone()
+        before = self._ik.directions(command)[0][0].double().cpu()
+        command[:, column] += 0.1
+        after = self._ik.directions(command)[0][0].double().cpu()
+        return column, math.copysign(1.0, float(before[0] * after[1] - before[1] * after[0]))
+
     def _look(self, entering: torch.Tensor) -> None:
         """Measures the cubes that the phases which begin ask for."""
         wanted = self._looks.index_select(0, self.phase)
         for number, name in enumerate(CUBES):
             now = entering & (wanted == number)
             seen = self._seen[:, number]
-            seen.copy_(torch.where(now[:, None], pose_w(self._env, name)[:, :2].float(), seen))
+            pose = pose_w(self._env, name).float()
+            seen.copy_(torch.where(now[:, None], pose[:, :2], seen))
+            w, x, y, z = pose[:, 3:].unbind(1)
+            yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            self._yaw[:, number] = torch.where(now, yaw, self._yaw[:, number])
 
     def _build_tables(self, cfg: Config, device: torch.device) -> None:
         """What each phase says, as tensors."""
@@ -153,7 +218,11 @@ class ScriptedController:
         self._grip = table([grips[spec.gripper] for spec in specs])
         looks = [-1 if a is None or not spec.look else a.source for a, spec in zip(anchors, specs, strict=True)]
         self._looks = table(looks, torch.int64)
+        self._aligns = table(
+            [look >= 0 and spec.gripper == "open" for look, spec in zip(looks, specs, strict=True)], torch.bool
+        )
         self._grasps = table([cubes[spec.grasps] for spec in specs], torch.int64)
+        self._centers = table([cubes[spec.centers] for spec in specs], torch.int64)
         self._can_retry = table([spec.retry is not None for spec in specs], torch.bool)
         self._retry_to = table([names.index(spec.retry) if spec.retry else 0 for spec in specs], torch.int64)
         # From the start of a phase to that of the last one, where the arm rests.

@@ -16,8 +16,8 @@ def run_baseline(context: GateContext) -> list[GateResult]:
     headline = context.evidence.headline(metrics)
     context.say(f"{cfg.task.name} check: {headline}")
     metrics["episode_s"] = episode.seconds
-    metrics["world_steps_per_s"] = episode.tape.frames * cfg.timing.substeps / episode.seconds
-    metrics["waypoint_error_m"] = float(episode.tape.waypoint_error.max())
+    metrics["world_steps_per_s"] = episode.frames * cfg.timing.substeps / episode.seconds
+    metrics["waypoint_error_m"] = float(episode.waypoint_error.max())
     metrics["path_error_m"] = context.planner.path_error(np.array([*cfg.scene.red_xy, *cfg.scene.blue_xy]))
     metrics["peak_contacts"] = int(sim.peak_contacts[0])
     metrics["peak_constraint_rows"] = int(sim.peak_constraints[0])

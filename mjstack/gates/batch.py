@@ -58,7 +58,7 @@ class _Tally:
             self.broken.setdefault(rule, []).extend(self._name(record.seed, world) for world in worlds)
         self.rows += record.failing_rows(self.rules)
         measured = record.values | {
-            "waypoint_error_m": episode.tape.waypoint_error,
+            "waypoint_error_m": episode.waypoint_error,
             "peak_contacts": sim.peak_contacts.cpu().numpy(),
             "peak_constraint_rows": sim.peak_constraints.cpu().numpy(),
         }

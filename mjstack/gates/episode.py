@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config, TermCfg
-from mjstack.control.controller import Controller, TapeController
-from mjstack.control.planner import CommandTape, ScriptedPlanner
+from mjstack.control.controller import Controller, Recorded, TapeController
+from mjstack.control.planner import ScriptedPlanner
 from mjstack.envs import Env, scripted_config
 from mjstack.gates.power import EnergyMeter
 from mjstack.gates.timing import step_graph
@@ -25,6 +25,7 @@ FrameHook = Callable[[int, Simulation], None]
 Advance = Callable[[str, int, int], None]
 """Reports progress: what is going on, how much is done, and of how much."""
 
+SCRIPTED = "scripted"  # the controller that watches; any other name plays a plan
 Reset = dict[str, TermCfg]
 NOMINAL: Reset = {"home": TermCfg(func="mjstack.mdp.reset.home")}
 
@@ -44,7 +45,9 @@ class Episode:
 
     Attributes:
         verdict: The acceptance of every world.
-        tape: The commands that were played.
+        frames: How many.
+        waypoint_error: Largest distance from a target that inverse kinematics left [m], shape ``(nworld,)``.
+        retries: Grasps that were tried again, shape ``(nworld,)``.
         seconds: Wall time of the frames alone [s]; where they are captured, of as many replayed ones.
         qpos: World 0 at every frame end, shape ``(frames, nq)``, if it was recorded.
         phase: Number of its phase in every frame, shape ``(frames,)``, likewise.
@@ -52,10 +55,13 @@ class Episode:
         warm_up_seconds: The eager first call of what is captured [s]; 0 if it was captured before, or never is.
         capture_seconds: The capture alone [s], likewise.
         captured: Whether whole frames were replayed; on Warp's CPU device, where physics alone is, they are not.
+        commands: The commands that were given, if they were recorded.
     """
 
     verdict: Verdict
-    tape: CommandTape
+    frames: int
+    waypoint_error: np.ndarray
+    retries: np.ndarray
     seconds: float
     qpos: np.ndarray | None = None
     phase: np.ndarray | None = None
@@ -63,6 +69,7 @@ class Episode:
     warm_up_seconds: float = 0.0
     capture_seconds: float = 0.0
     captured: bool = False
+    commands: Recorded | None = None
 
 
 def start_worlds(
@@ -73,8 +80,8 @@ def start_worlds(
     planner: ScriptedPlanner,
     advance: Advance | None = None,
     worlds: Sequence[int] | None = None,
-) -> tuple[Env, CommandTape]:
-    """Resets every world and plans its commands from where its cubes then stand.
+) -> tuple[Env, Controller]:
+    """Resets every world; the configured controller plans from where its cubes then stand, or looks for itself.
 
     Args:
         sim: The worlds.
@@ -86,17 +93,21 @@ def start_worlds(
         worlds: Their numbers, which random numbers depend on: ``[17]`` starts one world as world 17 of any batch starts.
 
     Returns:
-        The environment that the commands go through, and the commands, which are its actions.
+        The environment that the commands go through, and what gives the commands, which are its actions.
     """
     env = Env(sim, index, scripted_config(cfg, reset=reset), check_faults=False)  # the acceptance names lost worlds
     if worlds is not None:
         env.world.copy_(torch.tensor(worlds))
     env.reset(seed=cfg.seed)
     sim.forward()
+    if cfg.controller.name == SCRIPTED:
+        from mjstack.control.scripted import ScriptedController  # loads Warp, which a planned native run does not need
+
+        return env, ScriptedController(env, planner.nominal)
     cubes = torch.cat([sim.qpos[:, a : a + 2] for a in index.cube_qpos], dim=1)
     progress = None if advance is None else (lambda done: advance("planning", done, sim.nworld))
-    tape = planner.plan(cubes.double().cpu().numpy(), progress)
-    return env, tape.to(sim.device, sim.ctrl.dtype)
+    tape = planner.plan(cubes.double().cpu().numpy(), progress).to(sim.device, sim.ctrl.dtype)
+    return env, TapeController(tape, planner.phases, sim.nworld, sim.device)
 
 
 def run_episode(
@@ -112,6 +123,8 @@ def run_episode(
     advance: Advance | None = None,
     worlds: Sequence[int] | None = None,
     meter: EnergyMeter | None = None,
+    keep_commands: bool = False,
+    repeat: Recorded | None = None,
 ) -> Episode:
     """Plays the scripted task once in every world and judges it.
 
@@ -127,13 +140,22 @@ def run_episode(
         advance: Told about progress.
         worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start_worlds`.
         meter: Takes in the energy of the frames from the third on, when all are replayed.
+        keep_commands: Record all commands, on the device.
+        repeat: Give these commands instead of the controller's.
     """
-    env, tape = start_worlds(sim, index, cfg, reset, planner, advance, worlds)
-    controller: Controller = TapeController(tape, planner.phases, sim.nworld, sim.device)
+    env, controller = start_worlds(sim, index, cfg, reset, planner, advance, worlds)
+    frames = controller.frames
+    recorded = Recorded(controller, env.action_manager.action_dim) if keep_commands else None
+    if repeat is not None:
+        repeat.rewind()
+        controller = repeat
     evidence = evidence_class(cfg)(cfg, index, planner.phases, sim.nworld, sim.device)
 
     def work() -> None:
-        env.action_manager.take(controller.command())
+        command = controller.command()
+        if recorded is not None:
+            recorded.append(command, controller.phase)
+        env.action_manager.take(command)
         env.advance()
         evidence.update(sim, controller.phase)
 
@@ -141,13 +163,13 @@ def run_episode(
     # On Warp's CPU device physics alone is captured, once for all episodes.
     graph = play if sim.device.type == "cuda" else step_graph(sim, cfg.timing.substeps, kinematics=True)
     before = (0.0, 0.0) if graph is None else (graph.warm_up_seconds, graph.capture_seconds)
-    trajectory = np.full((tape.frames, sim.qpos.shape[1]), np.nan) if record else None
-    phase = np.full(tape.frames, -1) if record else None
+    trajectory = np.full((frames, sim.qpos.shape[1]), np.nan) if record else None
+    phase = np.full(frames, -1) if record else None
     states: dict[int, State] = {}
     sim.synchronize()
     began = time.perf_counter()
     aside = 0.0  # what reading the counter takes
-    for frame in range(tape.frames):
+    for frame in range(frames):
         if meter is not None and frame == _EAGER:
             sim.synchronize()
             reading = time.perf_counter()
@@ -165,7 +187,7 @@ def run_episode(
         if advance is not None:
             if frame % 10 == 9:
                 sim.synchronize()  # so that the bar shows work done, not work queued
-            advance("frames", frame + 1, tape.frames)
+            advance("frames", frame + 1, frames)
     sim.synchronize()
     seconds = time.perf_counter() - began - aside
     if meter is not None:
@@ -176,8 +198,21 @@ def run_episode(
     play.drop()  # its memory, which only the collector would find otherwise
     seconds -= warm_up + capture
     if warm_up:  # the first frame was it
-        seconds *= tape.frames / (tape.frames - 1)
-    return Episode(evidence.verdict(sim), tape, seconds, trajectory, phase, states, warm_up, capture, captured)
+        seconds *= frames / (frames - 1)
+    return Episode(
+        evidence.verdict(sim),
+        frames,
+        controller.error.double().cpu().numpy(),
+        controller.retries.cpu().numpy(),
+        seconds,
+        trajectory,
+        phase,
+        states,
+        warm_up,
+        capture,
+        captured,
+        recorded,
+    )
 
 
 def snapshot(sim: Simulation) -> State:

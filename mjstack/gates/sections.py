@@ -12,10 +12,11 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Backend, GraphMode
+from mjstack.control.controller import Recorded
 from mjstack.envs import Env
 from mjstack.errors import name_worlds
 from mjstack.gates.env_step import measure_env_step
-from mjstack.gates.episode import State, restore, run_episode, snapshot, start_worlds
+from mjstack.gates.episode import SCRIPTED, State, restore, run_episode, snapshot, start_worlds
 from mjstack.gates.gate import GateContext, TimedEpisode
 from mjstack.gates.power import EnergyMeter
 from mjstack.gates.timing import WARM_UP, Timing, capture_problem, frames_that_fit, spread, step_graph, timed
@@ -141,6 +142,7 @@ def measure_episode(
     played: list[TimedEpisode] = [before] if before is not None and not mjwarp else []
     bare: list[float] = []
     ratios: list[float] = []
+    controlled: list[float] = []  # what the controller adds to frames that only repeat its commands
     estimate = 0.0 if frame_seconds is None else frame_seconds * frames
     if before is not None:
         estimate = max(estimate, before.seconds)
@@ -150,13 +152,18 @@ def measure_episode(
     meter.clear()
     while len(played) < watch.repetitions and time.perf_counter() - began + estimate <= watch.seconds:
         turn_began = time.perf_counter()
-        episode = run_episode(sim, context.index, cfg, context.planner, cfg.reset, meter=meter)
+        # A plan can be evaluated again; what a controller that watches did has to be kept.
+        keep = mjwarp and cfg.controller.name == SCRIPTED
+        episode = run_episode(sim, context.index, cfg, context.planner, cfg.reset, meter=meter, keep_commands=keep)
         played.append(TimedEpisode.of(episode, sim))
         if mjwarp:
-            seconds, problem = _play_bare(context, cast("MjwarpSimulation", sim))
+            seconds, problem = _play_bare(context, cast("MjwarpSimulation", sim), episode.commands)
             section.problem = section.problem or problem
             bare.append(seconds)
             ratios.append(episode.seconds / seconds)
+        if keep:
+            again = run_episode(sim, context.index, cfg, context.planner, cfg.reset, repeat=episode.commands)
+            controlled.append(episode.seconds / again.seconds - 1.0)
         estimate = time.perf_counter() - turn_began
         context.tell("episode, repetitions", len(played), watch.repetitions)
     if not played and before is not None:
@@ -187,6 +194,9 @@ def measure_episode(
     if ratios:
         section.figures |= spread("bare_seconds", bare) | spread("bare_ratio", ratios)
         section.headline += f" ({statistics.median(ratios):.3f} x bare steps)"
+        if controlled:
+            section.figures |= spread("controller_over_frame", controlled)
+            section.headline += f", controller {100.0 * statistics.median(controlled):+.1f} %"
     elif mjwarp:
         section.facts["bare_ratio"] = "not measured: no time for an episode and as many bare steps"
     if len(played) > sum(p is before for p in played):
@@ -246,10 +256,10 @@ def _carry_start(context: GateContext, sim: Simulation) -> State:
     cfg, t = context.cfg, context.cfg.gate.throughput
     count = min(sim.nworld, t.start_worlds)
     some = context.simulation(count, Backend.native, "cpu")
-    env, tape = start_worlds(some, context.index, cfg, cfg.reset, context.planner)
+    env, controller = start_worlds(some, context.index, cfg, cfg.reset, context.planner)
     first = context.phase_start(t.from_phase)
     for frame in range(first):
-        env.step(tape.command(frame))
+        env.step(controller.command())
         context.tell("frames to the start", frame + 1, first)
     state = snapshot(some)
     env.close()
@@ -257,10 +267,10 @@ def _carry_start(context: GateContext, sim: Simulation) -> State:
     return State(state.qpos[worlds], state.qvel[worlds], state.ctrl[worlds])
 
 
-def _play_bare(context: GateContext, sim: MjwarpSimulation) -> tuple[float, str]:
+def _play_bare(context: GateContext, sim: MjwarpSimulation, recorded: Recorded | None = None) -> tuple[float, str]:
     """The same commands from the same start on bare steps: seconds, and why they would not count.
 
-    The tape is evaluated in the loop, as it is in the episode. Overflow bits stay until a reset: one look at the end has all.
+    A plan is evaluated in the loop, as it is in the episode. Overflow bits stay until a reset: one look at the end has all.
     """
     cfg, substeps = context.cfg, context.cfg.timing.substeps
     step = sim.bare_step()
@@ -268,11 +278,14 @@ def _play_bare(context: GateContext, sim: MjwarpSimulation) -> tuple[float, str]
         step()
     if sim.device.type == "cuda" and cfg.graph is not GraphMode.off and not step.captured:
         return math.nan, "the bare steps could not be captured"
-    _, tape = start_worlds(sim, context.index, cfg, cfg.reset, context.planner)
+    _, controller = start_worlds(sim, context.index, cfg, cfg.reset, context.planner)
+    if recorded is not None:
+        recorded.rewind()
+        controller = recorded
 
     def play() -> None:
-        for frame in range(tape.frames):
-            sim.ctrl.copy_(tape.command(frame))
+        for _ in range(controller.frames):
+            sim.ctrl.copy_(controller.command())
             for _ in range(substeps):
                 step()
 

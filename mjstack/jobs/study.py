@@ -100,10 +100,10 @@ def _prepare(context: GateContext, job: StudyJobCfg) -> _Base:
     """The configured solver's worlds, played up to where they hold the cube."""
     cfg, advance = context.cfg, context.advance
     sim = _simulation(context)
-    env, tape = start_worlds(sim, context.index, cfg, cfg.reset, context.planner, advance)
+    env, controller = start_worlds(sim, context.index, cfg, cfg.reset, context.planner, advance)
     first = context.phase_start(cfg.gate.throughput.from_phase)
     for frame in range(first):
-        env.step(tape.command(frame))
+        env.step(controller.command())
         if advance is not None:
             advance("frames to the cube in hand", frame + 1, first)
     state = snapshot(sim)

@@ -100,7 +100,7 @@ class ApertureIk:
         self._task.target[:] = target
         configuration = self._configuration
         configuration.update(self._to_qpos(command))
-        distance = math.inf
+        nearest, distance = configuration.q[self._qpos].copy(), math.inf
         for _ in range(self._iterations):
             try:
                 step = mink.solve_ik(
@@ -113,13 +113,15 @@ class ApertureIk:
                     constraints=self._constraints,
                 )
             except mink.NoSolutionFound:
-                return command, math.inf
+                break
             largest = float(np.abs(step).max())
             configuration.integrate_inplace(step * min(1.0, _MAX_STEP / max(largest, 1e-12)), 1.0)
-            distance = float(np.linalg.norm(self._task.compute_error(configuration)))
+            left = float(np.linalg.norm(self._task.compute_error(configuration)))
+            if left < distance:  # undamped, the pull towards home can end in swinging to and fro, farther from the target
+                nearest, distance = configuration.q[self._qpos].copy(), left
             if distance < _CONVERGED * self.tolerance:
                 break
-        return configuration.q[self._qpos].copy(), distance
+        return nearest, distance
 
     def aperture(self, command: np.ndarray) -> np.ndarray:
         """Aperture centre [m] at a command, shape ``(3,)``."""

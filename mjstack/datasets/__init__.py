@@ -1,0 +1,10 @@
+"""Demonstrations on disk in the layout of LeRobotDataset v3, written and checked with pyarrow alone."""
+
+from __future__ import annotations
+
+from mjstack.datasets.arrow import require_pyarrow
+from mjstack.datasets.reader import StoredDataset, read_dataset
+from mjstack.datasets.spec import DatasetSpec, EpisodeData, Feature
+from mjstack.datasets.writer import DatasetWriter
+
+__all__ = ["DatasetSpec", "DatasetWriter", "EpisodeData", "Feature", "StoredDataset", "read_dataset", "require_pyarrow"]

@@ -1,0 +1,661 @@
+"""Datasets in the layout of LeRobotDataset v3: what is on disk, and that nothing committed is ever lost."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import weakref
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from mjstack.datasets import DatasetSpec, DatasetWriter, EpisodeData, Feature, layout, read_dataset, staging
+from mjstack.datasets.shard import Shard
+from mjstack.datasets.statistics import NAMES, QUANTILES
+from mjstack.errors import ArgumentError, DatasetError, MissingExtra, UnwrittenError
+
+GUIDE = Path(__file__).resolve().parents[1] / "docs" / "datasets.md"
+JOINTS = ("shoulder", "elbow", "jaw")
+
+
+def vector(*names: str, dtype: str = "float32", unit: str = "rad") -> Feature:
+    return Feature(dtype=dtype, names=names, units=(unit,) * len(names))
+
+
+SPEC = DatasetSpec(
+    robot_type="so101",
+    fps=50,
+    features={
+        "observation.state": vector(*JOINTS),
+        "action": vector("shoulder", "jaw"),
+        "next.reward": vector("reward", unit="1"),
+        "next.done": vector("done", dtype="bool", unit="1"),
+        "count": vector("count", dtype="int32", unit="1"),
+    },
+    config_sha256="c" * 64,
+    values={"xy_err": "float64", "peak": "int64", "settled": "bool", "note": "string"},
+    provenance={"seed": 7, "versions": {"mujoco": "4.0.0"}},
+)
+
+
+def episode(world: int, *, frames: int = 0, seed: int = 7, task: str = "stack", **changed: Any) -> EpisodeData:
+    """Random frames that depend on the world alone; the number of frames too, unless it is given."""
+    frames = frames or 20 + 3 * (world % 5)
+    random = np.random.default_rng(world)
+    arrays = {
+        "observation.state": random.normal(size=(frames, 3)) * (1.0, 1e-3, 100.0) + (0.0, 5.0, -3.0),
+        "action": random.normal(size=(frames, 2)).astype(np.float32),
+        "next.reward": random.random(frames),
+        "next.done": np.arange(frames) == frames - 1,
+        "count": np.arange(frames)[::-1],
+    }
+    values = {"xy_err": 1e-3 * world, "peak": np.int32(world), "settled": np.bool_(world % 2 == 0), "note": f"w{world}"}
+    return replace(
+        EpisodeData(arrays=arrays, task=task, success=world % 3 != 0, seed=seed, world=world, values=values), **changed
+    )
+
+
+def write(folder: Path, worlds: range, *, batch: int = 3, spec: DatasetSpec = SPEC) -> None:
+    """Adds worlds in batches, each committed."""
+    with DatasetWriter(folder, spec) as writer:
+        for first in range(worlds.start, worlds.stop, batch):
+            writer.add([episode(world) for world in range(first, min(first + batch, worlds.stop))])
+            writer.flush()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def frames_of(table: pa.Table, name: str) -> np.ndarray:
+    return np.array(table[name].to_pylist())
+
+
+def test_the_files_are_those_of_lerobot(tmp_path: Path) -> None:
+    """What LeRobotDataset v3.0 writes for such features, file by file (from a dataset that lerobot 0.6.1 wrote)."""
+    write(tmp_path, range(5))
+    assert set(contents(tmp_path)) == {
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+        *(f"{kind}/chunk-000/file-00{shard}.parquet" for kind in ("data", "meta/episodes") for shard in (0, 1)),
+    }
+    info = json.loads((tmp_path / "meta/info.json").read_text())
+    own = info.pop("mjstack")
+    features = info.pop("features")
+    frames = sum(20 + 3 * (world % 5) for world in range(5))
+    assert info == {
+        "codebase_version": "v3.0",
+        "robot_type": "so101",
+        "fps": 50,
+        "total_episodes": 5,
+        "total_frames": frames,
+        "total_tasks": 1,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": None,
+        "splits": {"train": "0:5"},
+    }
+    assert features["observation.state"] == {"dtype": "float32", "shape": [3], "names": list(JOINTS)}
+    assert features["next.done"] == {"dtype": "bool", "shape": [1], "names": ["done"]}
+    assert list(features)[-5:] == ["timestamp", "frame_index", "episode_index", "index", "task_index"]
+    assert features["timestamp"] == {"dtype": "float32", "shape": [1], "names": None}
+    assert own["config_sha256"] == "c" * 64
+    assert own["units"]["action"] == ["rad", "rad"]
+    assert own["provenance"] == [{"from_episode": 0, "seed": 7, "versions": {"mujoco": "4.0.0"}}]
+
+    schema = pq.read_schema(tmp_path / "data/chunk-000/file-000.parquet")
+    assert schema.names == list(features)
+    assert schema.field("observation.state").type == pa.list_(pa.float32(), 3)
+    assert [str(schema.field(name).type) for name in ("next.reward", "next.done", "index")] == ["float", "bool", "int64"]
+    told = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
+    assert told["action"] == {"feature": {"dtype": "float32", "_type": "Value"}, "length": 2, "_type": "List"}
+    assert told["next.done"] == {"dtype": "bool", "_type": "Value"}
+
+    tasks = pq.read_table(tmp_path / "meta/tasks.parquet")
+    assert tasks.to_pylist() == [{"task_index": 0, "task": "stack"}]
+    assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]
+
+    rows = pq.read_table(tmp_path / "meta/episodes")
+    statistics = [f"stats/{name}/{kind}" for name in features for kind in (*NAMES, "count")]
+    own_columns = ["success", "seed", "world", "xy_err", "peak", "settled", "note"]
+    places = [f"{kind}/{index}_index" for kind in ("data", "meta/episodes") for index in ("chunk", "file")]
+    ranges = ["dataset_from_index", "dataset_to_index"]
+    assert sorted(rows.column_names) == sorted(
+        ["episode_index", "tasks", "length", *ranges, *places, *own_columns, *statistics]
+    )
+    assert {str(rows.schema.field(name).type) for name in statistics} == {"list<element: double>", "list<element: int64>"}
+    assert rows["tasks"].to_pylist() == [["stack"]] * 5
+    assert rows["data/file_index"].to_pylist() == [0, 0, 0, 1, 1]
+    assert rows["note"].to_pylist() == [f"w{world}" for world in range(5)]
+
+
+def test_what_is_read_is_what_was_added(tmp_path: Path) -> None:
+    write(tmp_path, range(4))
+    table = pq.read_table(tmp_path / "data")
+    start = 0
+    for world in range(4):
+        added = episode(world)
+        length = len(added.arrays["action"])
+        part = table.slice(start, length)
+        for name, array in added.arrays.items():
+            expected = array.astype(SPEC.features[name].dtype)
+            assert np.array_equal(frames_of(part, name), expected)
+        assert np.array_equal(frames_of(part, "timestamp"), (np.arange(length) / 50).astype(np.float32))
+        assert part["episode_index"].unique().to_pylist() == [world]
+        start += length
+    assert table["index"].to_pylist() == list(range(start))
+    stored = read_dataset(tmp_path)
+    assert stored.spec == SPEC
+    assert stored.episodes["world"] == [0, 1, 2, 3]
+    assert stored.episodes["success"] == [False, True, True, False]
+    assert not stored.leftover
+
+
+def test_statistics_are_those_of_all_frames(tmp_path: Path) -> None:
+    """Episodes of unequal length, over several commits and a resumed writer; a column far from zero that hardly moves."""
+    write(tmp_path, range(4))
+    write(tmp_path, range(4, 11))
+    stats = json.loads((tmp_path / "meta/stats.json").read_text())
+    table = pq.read_table(tmp_path / "data")
+    rows = pq.read_table(tmp_path / "meta/episodes")
+    lengths = np.array(rows["length"].to_pylist())
+    assert set(stats) == set(table.column_names)
+    for name in table.column_names:
+        frames = frames_of(table, name).astype(np.float64).reshape(len(table), -1)
+        found = stats[name]
+        assert found["count"] == [len(table)]
+        assert found["min"] == frames.min(0).tolist()
+        assert found["max"] == frames.max(0).tolist()
+        assert np.allclose(found["mean"], frames.mean(0), rtol=1e-12, atol=1e-12)
+        assert np.allclose(found["std"], frames.std(0), rtol=1e-9, atol=1e-12)
+        episodes = np.split(frames, np.cumsum(lengths)[:-1])
+        for kind, quantile in QUANTILES.items():
+            each = np.array([np.quantile(one, quantile, axis=0) for one in episodes])
+            assert np.allclose(rows[f"stats/{name}/{kind}"].to_pylist(), each, rtol=1e-12, atol=1e-12)
+            assert np.allclose(found[kind], np.average(each, axis=0, weights=lengths), rtol=1e-9, atol=1e-12)
+
+
+def test_a_resumed_dataset_is_the_uninterrupted_one(tmp_path: Path) -> None:
+    write(tmp_path / "one", range(9))
+    for worlds in (range(3), range(3, 6), range(6, 9)):
+        write(tmp_path / "three", worlds)
+    assert contents(tmp_path / "one") == contents(tmp_path / "three")
+
+
+def test_writers_that_differ_are_on_record(tmp_path: Path) -> None:
+    write(tmp_path, range(2))
+    newer = replace(SPEC, provenance={"seed": 7, "versions": {"mujoco": "4.1.0"}})
+    with DatasetWriter(tmp_path, newer):  # adds nothing: whoever comes next takes its place
+        pass
+    newest = replace(SPEC, provenance={"seed": 7, "versions": {"mujoco": "4.2.0"}})
+    write(tmp_path, range(2, 3), spec=newest)
+    write(tmp_path, range(3, 4), spec=newest)
+    found = read_dataset(tmp_path).info["mjstack"]["provenance"]
+    assert [(one["from_episode"], one["versions"]["mujoco"]) for one in found] == [(0, "4.0.0"), (2, "4.2.0")]
+
+
+def test_tasks_keep_their_indices(tmp_path: Path) -> None:
+    with DatasetWriter(tmp_path, SPEC) as writer:
+        writer.add([episode(0, task="stack"), episode(1, task="box")])
+    with DatasetWriter(tmp_path, SPEC) as writer:
+        writer.add([episode(2, task="reach"), episode(3, task="box")])
+    assert read_dataset(tmp_path).tasks == ["stack", "box", "reach"]
+    table = pq.read_table(tmp_path / "data")
+    assert [table.filter(pa.compute.equal(table["episode_index"], k))["task_index"][0].as_py() for k in range(4)] == [
+        0,
+        1,
+        2,
+        1,
+    ]
+
+
+def test_a_full_file_is_committed_and_chunks_follow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(layout, "CHUNK", 2)
+    with DatasetWriter(tmp_path, SPEC, file_mb=1) as writer:
+        writer.add([episode(world, frames=8000) for world in range(25)])
+        assert writer.committed
+        assert writer.pending
+    files = sorted(tmp_path.glob("data/*/*.parquet"))
+    assert [str(path.relative_to(tmp_path / "data")) for path in files[:3]] == [
+        "chunk-000/file-000.parquet",
+        "chunk-000/file-001.parquet",
+        "chunk-001/file-000.parquet",
+    ]
+    sizes = [path.stat().st_size for path in files]
+    assert max(sizes) <= 2**20
+    assert min(sizes[:-1]) > 0.5 * 2**20
+    assert read_dataset(tmp_path).info["total_episodes"] == 25
+
+
+def test_frames_are_not_held(tmp_path: Path) -> None:
+    """Nothing refers to the caller's arrays when `add` returns, and writing into them does no harm."""
+    with DatasetWriter(tmp_path, SPEC) as writer:
+        added = episode(1)
+        kept = added.arrays["action"].copy()
+        writer.add([added])
+        added.arrays["action"][:] = 0.0
+        gone = [weakref.ref(array) for array in added.arrays.values()]
+        del added
+        assert all(ref() is None for ref in gone)
+        before = pa.total_allocated_bytes()
+        writer.add([episode(2, frames=600) for _ in range(20)])
+        assert pa.total_allocated_bytes() - before < 2**20
+    assert np.array_equal(frames_of(pq.read_table(tmp_path / "data").slice(0, len(kept)), "action"), kept)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import test_datasets as t
+folder, survive = Path(sys.argv[1]), int(sys.argv[2])
+writer = t.DatasetWriter(folder, t.SPEC)
+writer.add([t.episode(w, task="stack" if w < 3 else "box") for w in range(3)])
+writer.flush()
+real, done = os.replace, []
+def replace(*args):
+    if len(done) == survive:
+        os.kill(os.getpid(), signal.SIGKILL)
+    done.append(args)
+    real(*args)
+os.replace = replace
+writer.add([t.episode(w, task="box") for w in range(3, 6)])
+print("added", flush=True)
+writer.flush()
+print("committed", flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("survive", range(6))
+def test_a_kill_at_any_moment_keeps_what_was_committed(survive: int, tmp_path: Path) -> None:
+    """SIGKILL before each file of the second commit takes its place: data, tasks, episodes, statistics, info; and after."""
+    folder = tmp_path / "dataset"
+    program = [sys.executable, "-c", KILLED.format(tests=str(Path(__file__).parent)), str(folder), str(survive)]
+    killed = subprocess.run(program, capture_output=True, text=True, timeout=300)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert killed.stdout.split()[-1] == ("committed" if survive == 5 else "added")
+    kept = 6 if survive == 5 else 3
+    stored = read_dataset(folder)
+    assert stored.episodes["world"] == list(range(kept))
+    assert bool(stored.leftover) == (survive < 5)
+    with DatasetWriter(folder, SPEC) as writer:
+        assert writer.committed == [(7, world) for world in range(kept)]
+        assert not read_dataset(folder).leftover
+        writer.add([episode(world, task="box") for world in range(kept, 6)])
+    with DatasetWriter(tmp_path / "whole", SPEC) as whole:
+        whole.add([episode(world) for world in range(3)])
+        whole.flush()
+        whole.add([episode(world, task="box") for world in range(3, 6)])
+    assert contents(folder) == contents(tmp_path / "whole")
+
+
+class FullDisk:
+    """Files that take so many bytes in all, and then say that there is no room."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, room: int) -> None:
+        self.room = room
+        fdopen = os.fdopen
+        monkeypatch.setattr(staging.os, "fdopen", lambda *args: self.wrap(fdopen(*args)))
+
+    def wrap(self, file: Any) -> Any:
+        disk = self
+
+        class File:
+            def write(self, data: bytes) -> int:
+                disk.room -= memoryview(data).nbytes
+                if disk.room < 0:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                return file.write(data)
+
+            def __getattr__(self, name: str) -> Any:
+                return getattr(file, name)
+
+        return File()
+
+
+def second_batch(writer: DatasetWriter) -> None:
+    writer.add([episode(world, frames=300) for world in range(3, 6)])
+    writer.flush()
+
+
+def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
+    """Wherever in the second batch the room ends: in each of its frames' files and in each of the small ones."""
+    write(tmp_path / "probe", range(3))
+    with DatasetWriter(tmp_path / "probe", SPEC) as writer, pytest.MonkeyPatch.context() as patch:
+        disk = FullDisk(patch, 10**9)
+        second_batch(writer)
+        needed = 10**9 - disk.room
+    failed = 0
+    for number, room in enumerate([*np.linspace(0, needed - 1, 12).astype(int), needed - 2000, needed]):
+        folder = tmp_path / str(number)
+        write(folder, range(3))
+        before = contents(folder)
+        writer = DatasetWriter(folder, SPEC)
+        with pytest.MonkeyPatch.context() as patch:
+            FullDisk(patch, int(room))
+            if room >= needed:
+                second_batch(writer)
+                break
+            with pytest.raises(UnwrittenError, match=r"No space left on device\): 3 committed episodes are kept") as caught:
+                second_batch(writer)
+            assert "\n" not in str(caught.value)
+            with pytest.raises(DatasetError, match="the writer is closed"):
+                writer.flush()
+        failed += 1
+        assert len(writer.committed) == 3
+        writer.close()
+        assert contents(folder) == before
+        with DatasetWriter(folder, SPEC) as again:
+            second_batch(again)
+        assert contents(folder) == contents(tmp_path / "probe")
+    assert failed == 13
+
+
+def test_a_real_limit_of_the_system(tmp_path: Path) -> None:
+    """The kernel refuses to let a file grow, in the middle of the frames."""
+    program = """
+import resource, signal, sys
+sys.path.insert(0, sys.argv[1])
+import test_datasets as t
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+writer = t.DatasetWriter(sys.argv[2], t.SPEC)
+writer.add([t.episode(0)])
+writer.flush()
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+try:
+    writer.add([t.episode(w, frames=600) for w in range(1, 200)])
+except t.UnwrittenError as error:
+    print(error)
+"""
+    command = [sys.executable, "-c", program, str(Path(__file__).parent), str(tmp_path / "dataset")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"File too large\): 1 committed episodes are kept", done.stdout)
+    stored = read_dataset(tmp_path / "dataset")
+    assert stored.episodes["world"] == [0]
+    assert not stored.leftover
+
+
+def test_ctrl_c_waits_for_the_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It comes in the middle of the second of three: two are kept."""
+    add, calls = Shard.add, []
+
+    def interrupted(self: Shard, *args: Any) -> None:
+        calls.append(args)
+        if len(calls) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        add(self, *args)
+
+    monkeypatch.setattr(Shard, "add", interrupted)
+    with pytest.raises(KeyboardInterrupt), DatasetWriter(tmp_path, SPEC) as writer:
+        writer.add([episode(world) for world in range(3)])
+    assert read_dataset(tmp_path).episodes["world"] == [0, 1]
+
+
+def test_an_error_elsewhere_keeps_what_was_added(tmp_path: Path) -> None:
+    def play() -> None:
+        with DatasetWriter(tmp_path, SPEC) as writer:
+            writer.add([episode(0)])
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        play()
+    assert read_dataset(tmp_path).episodes["world"] == [0]
+
+
+def test_another_configuration_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, range(1))
+    before = contents(tmp_path)
+    with pytest.raises(DatasetError, match=f"episodes of configuration {'c' * 64}, expected {'d' * 64}. Give another folder"):
+        DatasetWriter(tmp_path, replace(SPEC, config_sha256="d" * 64))
+    others = [
+        (replace(SPEC, fps=25), "has fps=50, expected 25"),
+        (replace(SPEC, robot_type="rebot"), "has robot_type=so101, expected rebot"),
+        (replace(SPEC, features={**SPEC.features, "action": vector("shoulder", "hand")}), r"has features\['action'\]=.*jaw"),
+        (replace(SPEC, features={**SPEC.features, "next.success": vector("s")}), r"has features\['next.success'\]=None"),
+        (replace(SPEC, features={**SPEC.features, "action": vector("shoulder", "jaw", unit="m")}), r"has units\['action'\]"),
+        (replace(SPEC, values={}), "has values"),
+    ]
+    for spec, message in others:
+        with pytest.raises(DatasetError, match=message):
+            DatasetWriter(tmp_path, spec)
+    assert contents(tmp_path) == before
+
+
+def test_other_folders_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(DatasetError, match="is a file, expected a folder"):
+        DatasetWriter(tmp_path / "file", SPEC)
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "cat.jpg").write_text("x")
+    with pytest.raises(DatasetError, match=r"has cat.jpg and no meta/info.json"):
+        DatasetWriter(tmp_path / "photos", SPEC)
+    for name, text, message in [
+        ("lerobot", '{"codebase_version": "v3.0", "total_episodes": 1}', "KeyError: 'mjstack'"),
+        ("broken", '{"codebase', "JSONDecodeError"),
+        ("list", "[]", "TypeError"),
+    ]:
+        path = tmp_path / name / "meta" / "info.json"
+        path.parent.mkdir(parents=True)
+        path.write_text(text)
+        with pytest.raises(DatasetError, match=message) as caught:
+            DatasetWriter(tmp_path / name, SPEC)
+        assert "\n" not in str(caught.value)
+        assert contents(tmp_path / name) == {"meta/info.json": text.encode()}
+
+
+def test_a_writer_at_a_time(tmp_path: Path) -> None:
+    with DatasetWriter(tmp_path, SPEC) as writer:
+        with pytest.raises(DatasetError, match="is open in another writer"):
+            DatasetWriter(tmp_path, SPEC)
+        writer.add([episode(0)])
+    write(tmp_path, range(1, 2))
+    assert read_dataset(tmp_path).episodes["world"] == [0, 1]
+
+
+def with_array(name: str, array: Any) -> EpisodeData:
+    good = episode(1)
+    return replace(good, arrays={**good.arrays, name: array})
+
+
+NOT_FINITE = episode(1).arrays["action"].copy()
+NOT_FINITE[5, 1] = np.nan
+BAD_EPISODES = {
+    r"action has shape \(23, 3\), expected \(23, 2\)": with_array("action", np.zeros((23, 3))),
+    r"action has shape \(22, 2\), expected \(23, 2\)": with_array("action", np.zeros((22, 2))),
+    r"observation.state has shape \(0, 3\), expected \(frames, 3\)": with_array("observation.state", np.zeros((0, 3))),
+    r"action has shape \(23,\)": with_array("action", np.zeros(23)),
+    r"next.done is float64, expected bool": with_array("next.done", np.zeros(23)),
+    r"action is not finite in 1 of 23 frames \(first: 5\)": with_array("action", NOT_FINITE),
+    r"observation.state is not finite in 23 of 23": with_array("observation.state", np.full((23, 3), 1e300)),
+    r"feature 'acton' is not in the DatasetSpec. Did you mean 'action'": with_array("acton", np.zeros((23, 2))),
+    r"no feature 'observation.state', expected": replace(
+        episode(1), arrays={k: v for k, v in episode(1).arrays.items() if k != "observation.state"}
+    ),
+    r"no value 'xy_err'": replace(episode(1), values={}),
+    r"value 'xy' is not in the DatasetSpec": replace(episode(1), values={**episode(1).values, "xy": 1.0}),
+    r"xy_err is 'small', expected float64": replace(episode(1), values={**episode(1).values, "xy_err": "small"}),
+    r"peak is 1.5, expected int64": replace(episode(1), values={**episode(1).values, "peak": 1.5}),
+    r"peak is 9223372036854775808, expected int64": replace(episode(1), values={**episode(1).values, "peak": 2**63}),
+    r"settled is 1, expected bool": replace(episode(1), values={**episode(1).values, "settled": 1}),
+    r"note is 3, expected string": replace(episode(1), values={**episode(1).values, "note": 3}),
+    r"success is 'yes', expected bool": replace(episode(1), success="yes"),
+    r"count has numbers too large for int32": with_array("count", np.full(23, 2**31)),
+    r"found an empty task": episode(1, task=" "),
+}
+
+
+@pytest.mark.parametrize("message", BAD_EPISODES)
+def test_an_episode_that_does_not_fit_is_refused_with_its_batch(message: str, tmp_path: Path) -> None:
+    with DatasetWriter(tmp_path, SPEC) as writer:
+        with pytest.raises(DatasetError, match=rf"^episode of seed 7, world 1: .*{message}") as caught:
+            writer.add([episode(0), BAD_EPISODES[message]])
+        assert "\n" not in str(caught.value)
+        assert writer.pending == 0
+        writer.add([episode(2)])
+    assert read_dataset(tmp_path).episodes["world"] == [2]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fps": 0}, "fps: found 0"),
+        ({"fps": 50.0}, "fps: found 50.0"),
+        ({"features": {}}, "features: found none"),
+        ({"features": {"a/b": vector("x")}}, "without /"),
+        ({"features": {"index": vector("x")}}, "which the writer adds"),
+        ({"features": {"a": vector("x", dtype="float16")}}, r"features\['a'\].dtype: found float16"),
+        ({"features": {"a": vector()}}, "at least one name"),
+        ({"features": {"a": vector("x", "x")}}, "each once"),
+        ({"features": {"a": Feature(dtype="bool", names=("x",), units=())}}, "1 units"),
+        ({"values": {"length": "int64"}}, r"values\['length'\]"),
+        ({"values": {"a b": "int64"}}, r"values\['a b'\]"),
+        ({"values": {"a": "float16"}}, "found float16"),
+        ({"provenance": {"seed": np.int64(3)}}, "what JSON can hold"),
+        ({"provenance": {"x": float("nan")}}, "what JSON can hold"),
+    ],
+)
+def test_a_spec_that_cannot_be_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ArgumentError, match=message):
+        replace(SPEC, **change)
+
+
+def test_without_pyarrow_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    for use in (lambda: DatasetWriter(tmp_path / "new", SPEC), lambda: read_dataset(tmp_path)):
+        with pytest.raises(MissingExtra, match=re.escape("pip install 'mjstack[datasets]'")):
+            use()
+    assert not (tmp_path / "new").exists()
+
+
+def edit_table(path: Path, change: Callable[[pa.Table], pa.Table], rows: int | None = None) -> None:
+    """Writes a parquet file anew, changed, with its row groups as they were."""
+    file = pq.ParquetFile(path)
+    groups = [file.read_row_group(k) for k in range(file.num_row_groups)]
+    file.close()
+    table = change(pa.concat_tables(groups))
+    with pq.ParquetWriter(path, table.schema) as writer:
+        start = 0
+        for group in groups:
+            length = len(group) if rows is None else rows
+            writer.write_table(table.slice(start, length), row_group_size=max(length, 1))
+            start += length
+
+
+def set_column(name: str, change: Callable[[list], list], kind: pa.DataType | None = None) -> Callable[[pa.Table], pa.Table]:
+    def edit(table: pa.Table) -> pa.Table:
+        column = table.schema.get_field_index(name)
+        values = pa.array(change(table[name].to_pylist()), type=kind or table.schema.field(name).type)
+        return table.set_column(column, table.schema.field(name).with_type(values.type), values)
+
+    return edit
+
+
+def edit_json(path: Path, change: Callable[[dict], None]) -> None:
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+def swap(values: list) -> list:
+    return [values[1], values[0], *values[2:]]
+
+
+DATA, ROWS, INFO, STATS = (
+    "data/chunk-000/file-000.parquet",
+    "meta/episodes/chunk-000/file-000.parquet",
+    layout.INFO,
+    layout.STATS,
+)
+DAMAGE: dict[str, tuple[str, Any]] = {
+    "index of episode 0, frame 0": (DATA, set_column("index", swap)),
+    "timestamp of episode 0, frame 0": (DATA, set_column("timestamp", swap)),
+    "frame_index of episode 0, frame 0": (DATA, set_column("frame_index", swap)),
+    "episode_index of episode 0": (DATA, set_column("episode_index", lambda v: [1, *v[1:]])),
+    "task_index of episode 0": (DATA, set_column("task_index", lambda v: [3 for _ in v])),
+    "(min|max|mean) of action": (DATA, set_column("action", lambda v: [[9.0, 9.0], *v[1:]])),
+    "q10 of action|mean of action": (DATA, set_column("action", lambda v: [[1.0001 * a for a in v[0]], *v[1:]])),
+    "next.reward of episode 0: found empty places": (DATA, set_column("next.reward", lambda v: [None, *v[1:]])),
+    "action of episode 0: found empty places": (DATA, set_column("action", lambda v: [None, *v[1:]])),
+    "numbers that are not finite": (DATA, set_column("next.reward", lambda v: [float("nan"), *v[1:]])),
+    "type of next.reward: found double": (DATA, set_column("next.reward", list, pa.float64())),
+    "type of action": (DATA, set_column("action", list, pa.list_(pa.float32()))),
+    "found .*expected .*'action'": (DATA, lambda table: table.drop_columns(["action"])),
+    "has 66 frames": (DATA, lambda table: table.slice(0, 66)),
+    "types for Hugging Face": (DATA, lambda table: table.replace_schema_metadata({})),
+    "has 69 frames": (ROWS, set_column("length", lambda v: [v[0] + 1, *v[1:]])),
+    "data/file_index of episode 0": (ROWS, set_column("data/file_index", lambda v: [1, *v[1:]])),
+    "dataset_to_index of episode 0": (ROWS, set_column("dataset_from_index", lambda v: [1, *v[1:]])),
+    "other episodes than from 0": (ROWS, set_column("episode_index", swap)),
+    r"task_index of episode 0.*\['box'\]": (ROWS, set_column("tasks", lambda v: [["box"], *v[1:]])),
+    "std of action": (ROWS, set_column("stats/action/std", lambda v: [[2.0 * v[0][0], v[0][1]], *v[1:]])),
+    "count of episode 0": (ROWS, set_column("stats/action/count", lambda v: [[1], *v[1:]])),
+    "damaged .*stats/action/q99": (ROWS, lambda table: table.drop_columns(["stats/action/q99"])),
+    "3 episodes and 69 frames, expected 4 and 69": (INFO, lambda info: info.update(total_episodes=4, splits={"train": "0:4"})),
+    "expected 3 and 70": (INFO, lambda info: info.update(total_frames=70)),
+    "has 1 tasks, expected 2": (INFO, lambda info: info.update(total_tasks=2)),
+    "splits": (INFO, lambda info: info["splits"].update(train="0:2")),
+    "no usable 'robot_type'": (INFO, lambda info: info.pop("robot_type")),
+    "codebase_version: found v2.1": (INFO, lambda info: info.update(codebase_version="v2.1")),
+    "total_videos: found 0": (INFO, lambda info: info.update(total_videos=0)),
+    "stats.json: count: found": (STATS, lambda stats: [one.update(count=[70]) for one in stats.values()]),
+    "mean of action": (STATS, lambda stats: stats["action"]["mean"].__setitem__(1, 0.5)),
+    "stats.json cannot be read": (STATS, lambda stats: stats.pop("action")),
+}
+
+
+@pytest.mark.parametrize("message", DAMAGE)
+def test_the_reader_finds_damage(message: str, tmp_path: Path) -> None:
+    write(tmp_path, range(3))
+    read_dataset(tmp_path)
+    file, change = DAMAGE[message]
+    if file.endswith(".json"):
+        edit_json(tmp_path / file, change)
+    else:
+        edit_table(tmp_path / file, change)
+    with pytest.raises(DatasetError, match=message) as caught:
+        read_dataset(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("file", [DATA, ROWS, layout.TASKS, INFO, STATS])
+def test_missing_and_cut_files_are_named(file: str, tmp_path: Path) -> None:
+    write(tmp_path, range(3))
+    whole = (tmp_path / file).read_bytes()
+    (tmp_path / file).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DatasetError, match=re.escape(file)):
+        read_dataset(tmp_path)
+    (tmp_path / file).unlink()
+    for use in [read_dataset] + ([lambda folder: DatasetWriter(folder, SPEC)] if file != STATS else []):
+        with pytest.raises(DatasetError, match=re.escape(file)):
+            use(tmp_path)
+    if file == STATS:  # it follows from the episodes' own: the next writer writes it anew
+        DatasetWriter(tmp_path, SPEC).close()
+        assert (tmp_path / file).read_bytes() == whole
+
+
+def test_the_guides_lines_read_it_in_another_process(tmp_path: Path) -> None:
+    """The guide's reading lines, and nothing else, on a dataset of the same folder and names."""
+    (lines,) = [block for block in re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.S) if "DatasetWriter" not in block]
+    assert "mjstack" not in re.sub(r'info\["mjstack"\]', "", lines)
+    write(tmp_path / "outputs" / "demos", range(3))
+    done = subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.splitlines()
+    assert first == "{'episode_index': 0, 'length': 20, 'success': False, 'seed': 7, 'world': 0}"
+    assert second == f"(23, 3) {list(JOINTS)} {['rad'] * 3}"
