@@ -152,7 +152,7 @@ def test_randomized_takes_the_layouts_region_and_the_command_line_another() -> N
 
 
 def test_finger_room_is_what_the_open_jaws_need(stage: Stage, robot: str) -> None:
-    """Jaws around red, blue beside it at the smallest distance, any yaw. Only the SO-101's gripper hits, leaning to its base."""
+    """Jaws around red, blue beside it at the smallest distance, any yaw. Only the SO-101 hits, towards its base."""
     cfg, model, index = stage(robot).cfg, stage(robot).model, stage(robot).index
     scene, data = cfg.scene, mujoco.MjData(model)
     blue = index.geoms["blue_cube"][0]

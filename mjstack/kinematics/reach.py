@@ -42,7 +42,7 @@ class Reached:
 class PointReach:
     """Brings the aperture centre to points, for one opening of the gripper; collisions are not looked at.
 
-    The other joints stay at the robot's home, or where they are locked. The gripper points along the last arm joint's axis.
+    The other joints stay at the robot's home, or where they are locked. The gripper points along the robot's ``approach_axis``.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg, gripper: Sequence[float]) -> None:
@@ -72,9 +72,7 @@ class PointReach:
         self._anchors, self._axes = data.xanchor[joints].copy(), data.xaxis[joints].copy()
         sites = [find(model, "site", name) for name in robot.aperture_sites]
         self._tip = data.site_xpos[sites].mean(axis=0)
-        last = find(model, "joint", robot.arm_joints[-1])
-        pointing = data.xaxis[last]
-        self._pointing = pointing * np.sign(pointing @ (self._tip - data.xanchor[last]))
+        self._pointing = data.body(robot.approach_body).xmat.reshape(3, 3) @ robot.approach_axis
         span = model.jnt_range[joints].copy()
         actuators = [find(model, "actuator", model.joint(j).name) for j in joints]
         for k, a in enumerate(actuators):
