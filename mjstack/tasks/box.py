@@ -254,10 +254,9 @@ class BoxEvidence(Evidence):
 
         beyond, speed = cubes.beyond(low, high), cubes.speed(sim, turn)
         still = free & (beyond <= t.inside) & (speed < t.rest_speed)
-        self._rest_run.add_(1.0).mul_(still)
+        self._rest_run.copy_(torch.where(going, (self._rest_run + 1.0) * still, self._rest_run))
         self._settled.copy_(torch.where(role["settle"], self._rest_run, self._settled))
-        for kept, value in zip(self._last.unbind(0), (beyond, speed, cubes.off_slot(pos)), strict=True):
-            kept.copy_(value)
+        self._last.copy_(torch.where(going, torch.stack((beyond, speed, cubes.off_slot(pos))), self._last))
         self._frame += 1
 
     def verdict(self, sim: Simulation) -> Verdict:
