@@ -113,7 +113,7 @@ def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> Bo
             out.failed.add(f"CARRY_{color.upper()}")
 
         grasps = [run for run in runs(loaded, frames_in("close")) if len(run) >= rules.grasp_frames]
-        grasped_at = grasps[0][rules.grasp_frames - 1] if grasps else None
+        grasped_at = grasps[-1][rules.grasp_frames - 1] if grasps else None  # the last one made while closing
         unloaded = 0
         if grasped_at is not None:
             unloaded = sum(not loaded[f] for f in frames_in("close", "lift", "carry", "hold") if f >= grasped_at)

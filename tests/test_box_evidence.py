@@ -305,6 +305,8 @@ both("one_jaw_loses_it_in_the_carry", {"DROP_*"}, _unloaded("carry", 70, 0))
 both("the_other_jaw_loses_it_in_the_hold", {"DROP_*"}, _unloaded("hold", -1, 1))
 both("lost_at_the_start_of_the_lift", {"DROP_*"}, _unloaded("lift", 0, 1))
 both("lost_as_the_closing_ends", {"DROP_*"}, _unloaded("close", -1, 0))
+both("lost_with_nine_frames_of_closing_left", {"DROP_*"}, _unloaded("close", -10, 0))
+both("lost_and_grasped_anew_in_the_last_ten_frames_of_closing", set(), _unloaded("close", -11, 0))
 both("released_in_the_first_frame_of_the_opening", set(), _unloaded("open", 0, 0))
 
 

@@ -206,7 +206,7 @@ class BoxEvidence(Evidence):
             self._carry_run,
             self._carry_far,
             self._carry_best,  # farthest of any run that is long enough
-            self._unloaded,  # frames between grasp and release
+            self._unloaded,  # frames between the last grasp and the release
             self._over,  # in the last frame of the hold
             self._opening,  # widest without contact since the opening began
             self._settled,  # frames at rest in the box, as of the settling's last frame
@@ -243,6 +243,8 @@ class BoxEvidence(Evidence):
         far = torch.where(self._carry_run >= t.carry_frames, self._carry_far, 0.0)
         torch.maximum(self._carry_best, far, out=self._carry_best)
 
+        # A grasp that slips while the jaws still close has to be made anew; what counts is the last one.
+        self._unloaded.masked_fill_(role["close"] & (self._grasp_run == t.grasp_frames), 0.0)
         grasped = self._grasp_best >= t.grasp_frames
         in_hand = role["close"] | role["lift"] | role["carry"] | role["hold"]
         self._unloaded.add_(grasped & in_hand & ~loaded)
