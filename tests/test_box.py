@@ -22,7 +22,7 @@ from mjstack.gates.episode import NOMINAL, run_episode
 from mjstack.gates.gate import GateContext
 from mjstack.math import quat_to_matrix
 from mjstack.scene import BLUE, RED, LowestPoint, SceneIndex, build_model
-from mjstack.sim import make_simulation
+from mjstack.sim import Simulation, make_simulation
 from mjstack.tasks.box import BoxRule, BoxSuccess
 from mjstack.tasks.box_terms import GraspNext, InBox, Place, ReachNext, ToSlot
 from mjstack.tasks.evidence import describe_rules
@@ -385,7 +385,16 @@ def test_mjwarp_fills_the_box(robot: str, device: str) -> None:
     context.__dict__["planner"] = _planner(robot)
     nworld, reset = (1, NOMINAL) if device == "cpu" else (64, context.cfg.reset)
     sim = make_simulation(context.model, context.cfg, nworld, backend=Backend.mjwarp, device=device)
-    episode = run_episode(sim, context.index, context.cfg, context.planner, reset)
+    carry = context.phase_start("carry_red") + 75
+    supports: dict[int, list[bool]] = {}
+
+    def feel(frame: int, sim: Simulation) -> None:
+        if frame in (20, carry, 1999):  # on the table, red in the air, in the box
+            felt = [sim.sensordata[:, context.index.support_force[name][0] :][:, :3].norm(dim=1) > 1e-5 for name in (RED, BLUE)]
+            supports[frame] = [bool(pressed.all()) for pressed in felt]
+
+    episode = run_episode(sim, context.index, context.cfg, context.planner, reset, on_frame=feel)
+    assert supports == {20: [True, True], carry: [False, True], 1999: [True, True]}
     for failed in episode.verdict.failed.tolist():
         assert failed == 0, describe_rules(BoxRule, failed)
     assert episode.captured == (device != "cpu")
