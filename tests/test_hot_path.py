@@ -65,6 +65,14 @@ PATHS: dict[str, list[str] | None] = {
         "StackSuccess.__call__",
         "StackSuccess.reset",
     ],
+    "tasks/box.py": [
+        *(f"CubesAndBox.{n}" for n in ("pose", "bounds", "speed", "beyond", "over", "inside", "off_slot")),
+        *(f"CubesAndBox.{n}" for n in ("pressed", "supported", "opening", "_forces")),
+        *(f"BoxEvidence.{n}" for n in ("update", "_extend")),
+        "BoxSuccess.__call__",
+        "BoxSuccess.reset",
+    ],
+    "tasks/box_terms.py": [*(f"{n}.__call__" for n in ("ToSlot", "Place", "InBox", "ReachNext", "GraspNext")), "cubes_inside"],
     "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
     "control/planner.py": ["CommandTape.command"],
     "kinematics/batched_ik.py": [

@@ -206,7 +206,7 @@ class BoxEvidence(Evidence):
             self._carry_run,
             self._carry_far,
             self._carry_best,  # farthest of any run that is long enough
-            self._unloaded,  # frames between grasp and release
+            self._unloaded,  # frames between the last grasp and the release
             self._over,  # in the last frame of the hold
             self._opening,  # widest without contact since the opening began
             self._settled,  # frames at rest in the box, as of the settling's last frame
@@ -243,6 +243,8 @@ class BoxEvidence(Evidence):
         far = torch.where(self._carry_run >= t.carry_frames, self._carry_far, 0.0)
         torch.maximum(self._carry_best, far, out=self._carry_best)
 
+        # A grasp that slips while the jaws still close has to be made anew; what counts is the last one.
+        self._unloaded.masked_fill_(role["close"] & (self._grasp_run == t.grasp_frames), 0.0)
         grasped = self._grasp_best >= t.grasp_frames
         in_hand = role["close"] | role["lift"] | role["carry"] | role["hold"]
         self._unloaded.add_(grasped & in_hand & ~loaded)
@@ -254,10 +256,9 @@ class BoxEvidence(Evidence):
 
         beyond, speed = cubes.beyond(low, high), cubes.speed(sim, turn)
         still = free & (beyond <= t.inside) & (speed < t.rest_speed)
-        self._rest_run.add_(1.0).mul_(still)
+        self._rest_run.copy_(torch.where(going, (self._rest_run + 1.0) * still, self._rest_run))
         self._settled.copy_(torch.where(role["settle"], self._rest_run, self._settled))
-        for kept, value in zip(self._last.unbind(0), (beyond, speed, cubes.off_slot(pos)), strict=True):
-            kept.copy_(value)
+        self._last.copy_(torch.where(going, torch.stack((beyond, speed, cubes.off_slot(pos))), self._last))
         self._frame += 1
 
     def verdict(self, sim: Simulation) -> Verdict:
