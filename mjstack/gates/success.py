@@ -18,7 +18,7 @@ from mjstack.gates.episode import SCRIPTED
 from mjstack.gates.gate import GateContext, failing_rules
 from mjstack.gates.regions import Region, find_regions
 from mjstack.gates.success_record import BOTH, PICTURE, REGIONS, Start, SuccessRecord, layout_name
-from mjstack.gates.watch import FailureWatch, Sign
+from mjstack.gates.watch import FailureWatch, describe_sign
 from mjstack.math import wilson_interval
 from mjstack.mdp.layout import write_layout
 from mjstack.report.markdown import format_percent
@@ -242,6 +242,8 @@ def _judge(
     reason = "; ".join([reason, *problems])
     if rate < t.rate:
         problems.append("rate")
+    if not regions:
+        details.append(f"no region has {t.cell_episodes} episodes (gate.success.cell_episodes): more seeds have more")
     if tally.unreachable:
         details.append(f"target out of reach: {name_worlds(tally.unreachable, n, _NAMED, 'episodes')}")
     details += [f"{rule.text}: {name_worlds(worlds, n, _NAMED, 'episodes')}" for rule, worlds in tally.broken.items()]
@@ -301,15 +303,16 @@ def _tables(cfg: Config, tally: _Tally, per_seed: list[int], regions: list[Regio
     if tally.signs:
         rows = [
             [
-                tally.phases[phase] if phase >= 0 else "",
-                Sign(sign).text,
+                describe_sign(sign, tally.phases[phase] if phase >= 0 else ""),
                 str(len(worlds)),
                 ", ".join(worlds[:8]) + (", ..." if len(worlds) > 8 else ""),
             ]
             for (phase, sign), worlds in sorted(tally.signs.items())
         ]
-        header = ["phase", "first sign", "failed episodes", "which"]
+        header = ["first sign of failure", "failed episodes", "which"]
         tables.append(Table(title="Where it went wrong", header=header, rows=rows))
+    if not regions:
+        return tables
     worst = [[r.where, str(r.episodes), str(r.accepted), *_rate_cells(r.accepted, r.episodes)] for r in regions]
     tables.append(
         Table(

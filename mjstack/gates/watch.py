@@ -45,6 +45,11 @@ _TEXT = {
 }
 
 
+def describe_sign(sign: int, phase: str) -> str:
+    """A sign in words, with the phase's name if there is one."""
+    return f"{phase}: {Sign(sign).text}" if phase else Sign(sign).text
+
+
 class FailureWatch:
     """Notes the first sign of failure in every world, and the phase and frame in which it was seen.
 

@@ -18,6 +18,7 @@ from mjstack.gates.replay import ReplayedWorld, replay_world
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
 from mjstack.gates.success_record import STEM
+from mjstack.gates.watch import FailureWatch, describe_sign
 from mjstack.jobs.earlier_run import EarlierRun
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.outcome import JobOutcome
@@ -169,6 +170,7 @@ def _replay(
 ) -> list[GateResult]:
     """Plays the world on one backend and says how it went, and whether that is what was recorded."""
     first = number == 0
+    watch = FailureWatch(plan.cfg) if plan.gate == "success" else None
     done = replay_world(
         context,
         seed=plan.seed,
@@ -176,14 +178,16 @@ def _replay(
         backend=backend,
         device=device,
         on_frame=context.on_frame if first else None,
+        watch=watch,
     )
     status, reason, metrics = judge_one(context.evidence.rules, done.episode.verdict)
     reason = reason or f"accepted, {context.evidence.headline(metrics)}"
     reason += f"; {_compare(plan, done, backend, device, context)}"
     if first:
         context.shown, context.shown_by = done.episode, f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
-    for finding in done.findings:
-        context.say(escape(f"  {finding}"))
+    told = [str(finding) for finding in done.findings] + ([] if watch is None else [_first_sign(watch, done, context)])
+    for line in told:
+        context.say(escape(f"  {line}"))
     values: dict[str, Value] = {"backend": done.description, "seed": plan.seed, "world": plan.world, **metrics}
     if plan.record is not None:
         values["recorded"] = describe_rules(context.evidence.rules, int(plan.record.failed[plan.world])) or "accepted"
@@ -201,9 +205,17 @@ def _replay(
             reason=reason,
             thresholds=context.evidence.thresholds(plan.cfg),
             metrics=values,
-            details=[*(str(finding) for finding in done.findings), *notes],
+            details=[*told, *notes],
         )
     ]
+
+
+def _first_sign(watch: FailureWatch, done: ReplayedWorld, context: GateContext) -> str:
+    """What the success gate would say of where the world went wrong."""
+    sign, frame, retries = int(watch.sign[0]), int(watch.frame[0]), int(done.episode.retries[0])
+    name = context.planner.phases[int(watch.phase[0])].name if sign else ""
+    when = f", seen in frame {frame}" if sign else ""
+    return f"first sign of failure: {describe_sign(sign, name) if sign else 'none'}{when}; grasps tried again: {retries}"
 
 
 def _compare(plan: ReplayPlan, done: ReplayedWorld, backend: Backend, device: str, context: GateContext) -> str:
