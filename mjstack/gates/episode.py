@@ -137,6 +137,7 @@ def run_episode(
     meter: EnergyMeter | None = None,
     keep_commands: bool = False,
     watch: Watch | None = None,
+    repeat: Recorded | None = None,
 ) -> Episode:
     """Plays the scripted task once in every world and judges it.
 
@@ -154,11 +155,14 @@ def run_episode(
         meter: Takes in the energy of the frames from the third on, when all are replayed.
         keep_commands: Record all commands, on the device.
         watch: Looks on, on the device.
+        repeat: Give these commands instead of the controller's.
     """
     env, controller = start_worlds(sim, index, cfg, reset, planner, advance, worlds)
     frames = controller.frames
-    nu = env.action_manager.action_dim
-    recorded = Recorded(frames, sim.nworld, nu, sim.device) if keep_commands else None
+    recorded = Recorded(controller, env.action_manager.action_dim) if keep_commands else None
+    if repeat is not None:
+        repeat.rewind()
+        controller = repeat
     evidence = evidence_class(cfg)(cfg, index, planner.phases, sim.nworld, sim.device)
     if watch is not None:
         watch.start(env)
@@ -166,7 +170,7 @@ def run_episode(
     def work() -> None:
         command = controller.command()
         if recorded is not None:
-            recorded.append(command)
+            recorded.append(command, controller.phase)
         env.action_manager.take(command)
         env.advance()
         evidence.update(sim, controller.phase)
