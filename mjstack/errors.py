@@ -32,6 +32,11 @@ class ConfigError(MjstackError):
         message = f"{key}={value}: expected {expected}."
         super().__init__(message + (f" {fix}." if fix else ""))
         self.key = key
+        self._facts = (value, expected, fix)
+
+    def at(self, key: str) -> ConfigError:
+        """The same error under the key that the user has set."""
+        return ConfigError(key, *self._facts)
 
 
 class UnknownName(MjstackError):

@@ -40,7 +40,7 @@ def test_every_file_composes(override: str) -> None:
 def test_walk_found_the_groups() -> None:
     found = set(choices())
     assert {"robot=so101", "robot=rebot", "timing=fine", "sim=mjwarp", "experiment=fine", "model=menagerie"} <= found
-    assert GATE_FILES == ["acceptance", "batch", "box", "capacity", "parity", "throughput"]
+    assert GATE_FILES == ["acceptance", "batch", "box", "capacity", "parity", "success", "throughput"]
 
 
 def test_every_group_has_an_init_so_that_it_ships() -> None:

@@ -34,7 +34,7 @@ HOMES = {
     "mujoco_menagerie": ("robots/source.py",),
     "hydra": ("config/", "cli.py"),
     "omegaconf": ("config/", "cli.py", "jobs/"),
-    "matplotlib": ("report/picture.py", "report/curves.py", "report/reachability.py"),
+    "matplotlib": ("report/picture.py", "report/curves.py", "report/reachability.py", "report/success.py"),
     "imageio_ffmpeg": ("report/picture.py",),
     "pynvml": ("gates/power.py",),
     "gymnasium": ("adapters/",),

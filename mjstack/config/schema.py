@@ -407,6 +407,26 @@ class ThroughputCfg:
 
 
 @dataclass(kw_only=True, slots=True)
+class SuccessGateCfg:
+    """The success gate: ``seeds`` seeds of nworld episodes each, of which the share ``rate`` must be accepted.
+
+    ``reset`` is how worlds start, unless ``reset=layout`` names a file. ``region`` sets the half-widths of the cubes' region in
+    x and y; null leaves them as ``reset`` has them. Start places are counted in cells ``cell`` wide, directions of a cube
+    relative to that of its place as seen from the base in bins of ``yaw_cell_deg``. The ``worst_regions`` worst cells with at
+    least ``cell_episodes`` episodes are in the report's text.
+    """
+
+    seeds: int = MISSING
+    rate: float = MISSING
+    region: list[float] | None = None
+    cell: float = MISSING
+    yaw_cell_deg: float = MISSING
+    cell_episodes: int = MISSING
+    worst_regions: int = MISSING
+    reset: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(kw_only=True, slots=True)
 class GateCfg:
     """Thresholds of every gate."""
 
@@ -416,6 +436,7 @@ class GateCfg:
     capacity: CapacityCfg = field(default_factory=CapacityCfg)
     batch: BatchGateCfg = field(default_factory=BatchGateCfg)
     throughput: ThroughputCfg = field(default_factory=ThroughputCfg)
+    success: SuccessGateCfg = field(default_factory=SuccessGateCfg)
 
 
 @dataclass(kw_only=True, slots=True)

@@ -33,6 +33,7 @@ def type_terms(cfg: Config) -> None:
     cfg.controller.action = _terms("controller.action", cfg.controller.action, ActionTermCfg)
     cfg.reset = _terms("reset", cfg.reset, TermCfg)
     cfg.gate.capacity.reset = _terms("gate.capacity.reset", cfg.gate.capacity.reset, TermCfg)
+    cfg.gate.success.reset = _terms("gate.success.reset", cfg.gate.success.reset, TermCfg)
     cfg.termination = _terms("termination", cfg.termination, TerminationTermCfg)
     cfg.reward = _terms("reward", cfg.reward, RewardTermCfg)
     cfg.observation = _terms("observation", cfg.observation, ObservationGroupCfg)

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 
-from mjstack.config.schema import BoxCfg, Config, ReachabilityJobCfg, ScalingJobCfg, SceneCfg, SolverCfg, StudyJobCfg
+from mjstack.config.schema import (
+    BoxCfg,
+    Config,
+    ReachabilityJobCfg,
+    ScalingJobCfg,
+    SceneCfg,
+    SolverCfg,
+    StudyJobCfg,
+    TermCfg,
+)
 from mjstack.errors import ConfigError, UnknownName
 
-GATES = ("baseline", "parity", "capacity", "batch", "throughput")
+GATES = ("baseline", "parity", "capacity", "batch", "throughput", "success")
 JOBS = ("gates", "replay", "scaling", "study", "reachability")
 CONDIMS = (1, 3, 4, 6)
 SCALING_BACKENDS = ("mjwarp", "native")
@@ -17,7 +27,7 @@ ANCHORS = ("red", "blue", "on_blue", "over_red", "over_blue", "red_slot", "blue_
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 BOX_ROLES = ("approach", "descend", "close", "lift", "carry", "hold", "open", "retreat", "settle")  # phases of each cube
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
-_WORLD = re.compile(r"(\d+:)?\d+")
+_WORLD = re.compile(r"((batch|success):)?(\d+:)?\d+")
 
 
 def validate(cfg: Config) -> None:
@@ -37,7 +47,7 @@ def validate(cfg: Config) -> None:
     for key in ("run", "world"):
         if getattr(cfg, key) is not None and cfg.job.name != "replay":
             raise ConfigError(key, getattr(cfg, key), "null, because it is for job=replay alone", "Add job=replay")
-    if cfg.layout is not None and not any(term.func.endswith(".FromLayout") for term in cfg.reset.values()):
+    if cfg.layout is not None and not reads_layout(cfg.reset):
         raise ConfigError("layout", cfg.layout, "null, because no reset term reads it", "Add reset=layout")
     if not _DEVICE.fullmatch(cfg.sim.device):
         raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N")
@@ -47,6 +57,7 @@ def validate(cfg: Config) -> None:
     _scene(cfg)
     _controller(cfg)
     _gates(cfg)
+    _success(cfg)
     if isinstance(cfg.job, ScalingJobCfg):
         _scaling(cfg.job)
     if isinstance(cfg.job, StudyJobCfg):
@@ -54,6 +65,16 @@ def validate(cfg: Config) -> None:
     if isinstance(cfg.job, ReachabilityJobCfg):
         _positive("job.step", cfg.job.step, "m")
         _not_negative("job.margin", cfg.job.margin, "m")
+
+
+def reads_layout(reset: Mapping[str, TermCfg]) -> bool:
+    """Whether worlds start as a file says."""
+    return any(term.func.endswith(".FromLayout") for term in reset.values())
+
+
+def places_cubes(term: TermCfg) -> bool:
+    """Whether a reset term puts cubes anywhere in a region, its parameter ``xy``."""
+    return term.func.endswith(".RandomizeCubes")
 
 
 def _timing(cfg: Config) -> None:
@@ -290,6 +311,41 @@ def _gates(cfg: Config) -> None:
     for name in gate.throughput.sections:
         if name not in SECTIONS:
             raise UnknownName("gate.throughput.sections: section", name, SECTIONS)
+
+
+def _success(cfg: Config) -> None:
+    t = cfg.gate.success
+    from_file = reads_layout(cfg.reset)
+    _positive_int("gate.success.seeds", t.seeds)
+    if cfg.seed + t.seeds > 1 << 32:
+        raise ConfigError("gate.success.seeds", t.seeds, f"at most {(1 << 32) - cfg.seed}, because seeds are 32-bit")
+    if from_file and t.seeds > 1:
+        raise ConfigError("gate.success.seeds", t.seeds, "1, because with reset=layout worlds start alike under every seed")
+    if not 0.0 <= t.rate <= 1.0:
+        raise ConfigError("gate.success.rate", t.rate, "a share from 0 to 1")
+    _positive("gate.success.cell", t.cell, "m")
+    if not 0.0 < t.yaw_cell_deg <= 90.0:
+        raise ConfigError("gate.success.yaw_cell_deg", t.yaw_cell_deg, "degrees, more than 0 and at most 90")
+    for name in ("cell_episodes", "worst_regions"):
+        _positive_int(f"gate.success.{name}", getattr(t, name))
+    if t.region is None:
+        return
+    _length("gate.success.region", t.region, 2)
+    if from_file:
+        raise ConfigError("gate.success.region", t.region, "null, because reset=layout says where cubes start")
+    if not any(places_cubes(term) for term in t.reset.values()):
+        raise ConfigError("gate.success.region", t.region, "null, because no term of gate.success.reset has a region")
+    scene = cfg.scene
+    for axis in (0, 1):
+        # A cube of any yaw is a disc of half its diagonal.
+        room = scene.table_half[axis] - math.sqrt(2.0) * scene.cube_half
+        most = min(room - abs(place[axis] - scene.table_center[axis]) for place in (scene.red_xy, scene.blue_xy))
+        if not 0.0 <= t.region[axis] <= most:
+            raise ConfigError(
+                "gate.success.region",
+                t.region,
+                f"half-widths that leave both cubes on the table, {'xy'[axis]} from 0 to {max(most, 0.0):.3f} m",
+            )
 
 
 def _scaling(job: ScalingJobCfg) -> None:

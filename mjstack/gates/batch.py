@@ -13,6 +13,7 @@ from mjstack.gates.batch_record import FAILING, BatchRecord, write_failing
 from mjstack.gates.episode import Episode
 from mjstack.gates.gate import GateContext, TimedEpisode, failing_rules
 from mjstack.math import wilson_interval
+from mjstack.report.markdown import format_percent
 from mjstack.report.record import GateResult, Status, Value
 from mjstack.sim import Simulation
 from mjstack.tasks.evidence import Rule
@@ -177,7 +178,7 @@ def _judge(
         *details,
     ]
     counts = "; ".join(f"{rule.text} in {len(worlds)}" for rule, worlds in tally.broken.items())
-    interval = f"{_percent(rate)}, 95 % interval {_percent(low, '')} to {_percent(high)}"
+    interval = f"{format_percent(rate)}, 95 % interval {format_percent(low, '')} to {format_percent(high)}"
     summary = f"{accepted} of {tally.worlds} {what} accepted ({interval}), {len(tally.ends)} distinct"
     failing = f"{name_worlds(bad, tally.worlds, what=what)} failed: {counts}"
     if len(bad) > t.failed_worlds:
@@ -203,11 +204,3 @@ def _judge(
         metrics=metrics,
         details=details,
     )
-
-
-def _percent(rate: float, unit: str = " %") -> str:
-    """A rate with as many digits as tell it from 0 and 1, at least two."""
-    gap = min(rate, 1.0 - rate)
-    digits = 2 if gap <= 0.0 else max(2, math.ceil(-math.log10(100.0 * gap)))
-    text = f"{100.0 * rate:.{digits}f}"
-    return text.rstrip("0").rstrip(".") + unit

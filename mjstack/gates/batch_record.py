@@ -17,6 +17,7 @@ from mjstack.sim import Simulation
 from mjstack.tasks.evidence import Rule, Verdict
 
 FAILING = "failing_worlds.csv"
+WORLDS = "worlds"  # the batch gate's files begin with this
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -52,13 +53,18 @@ class BatchRecord:
         )
 
     @classmethod
-    def read(cls, folder: Path, seed: int) -> BatchRecord | None:
-        """What a run kept for one seed, or None if its batch gate did not get there.
+    def read(cls, folder: Path, seed: int, stem: str = WORLDS) -> BatchRecord | None:
+        """What a run kept for one seed, or None if its gate did not get there.
+
+        Args:
+            folder: The run's.
+            seed: The seed.
+            stem: What the gate's files begin with.
 
         Raises:
             RunError: The file cannot be read.
         """
-        path = folder / _file_name(seed)
+        path = folder / _file_name(seed, stem)
         if not path.exists():
             return None
         try:
@@ -73,11 +79,11 @@ class BatchRecord:
                 )
         except Exception as error:  # numpy and zipfile fail in their own ways
             raise RunError(
-                f"{path}: cannot be read ({type(error).__name__}), expected what the batch gate wrote. Run the gate again."
+                f"{path}: cannot be read ({type(error).__name__}), expected what the gate wrote. Run the gate again."
             ) from error
 
-    def write(self, folder: Path) -> None:
-        """Writes ``worlds_seed<seed>.npz`` in one step."""
+    def write(self, folder: Path, stem: str = WORLDS, **more: np.ndarray) -> None:
+        """Writes ``<stem>_seed<seed>.npz`` in one step, with more arrays of the gate's own."""
         arrays: dict[str, Any] = {
             "seed": self.seed,
             "backend": self.backend,
@@ -85,10 +91,11 @@ class BatchRecord:
             "failed": self.failed,
             "qpos": self.qpos,
             **{f"value.{name}": values for name, values in self.values.items()},
+            **more,
         }
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)
-        write_atomic(folder / _file_name(self.seed), buffer.getvalue())
+        write_atomic(folder / _file_name(self.seed, stem), buffer.getvalue())
 
     def failing_rows(self, rules: type[Rule]) -> list[str]:
         """A line of the table for every failing world: the rules that it broke, and all that was measured."""
@@ -109,9 +116,9 @@ class BatchRecord:
         return ",".join(("seed", "world", "rules", *self.values))
 
 
-def write_failing(folder: Path, header: str, rows: Iterable[str]) -> None:
-    """Replaces failing_worlds.csv in one step."""
-    write_atomic(folder / FAILING, "\n".join((header, *rows)) + "\n")
+def write_failing(folder: Path, header: str, rows: Iterable[str], name: str = FAILING) -> None:
+    """Replaces failing_worlds.csv, or another table like it, in one step."""
+    write_atomic(folder / name, "\n".join((header, *rows)) + "\n")
 
 
 def clear_records(folder: Path) -> None:
@@ -120,5 +127,5 @@ def clear_records(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _file_name(seed: int | str) -> str:
-    return f"worlds_seed{seed}.npz"
+def _file_name(seed: int | str, stem: str = WORLDS) -> str:
+    return f"{stem}_seed{seed}.npz"

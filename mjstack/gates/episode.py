@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -17,13 +18,24 @@ from mjstack.gates.power import EnergyMeter
 from mjstack.gates.timing import step_graph
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
-from mjstack.tasks.evidence import Verdict, evidence_class
+from mjstack.tasks.evidence import Evidence, Verdict, evidence_class
 
 _EAGER = 2  # frames: the warm-up, and the one that is captured
 
 FrameHook = Callable[[int, Simulation], None]
 Advance = Callable[[str, int, int], None]
 """Reports progress: what is going on, how much is done, and of how much."""
+
+
+class Watch(Protocol):
+    """Looks on at an episode."""
+
+    def start(self, env: Env) -> None:
+        """Called once, when every world is at its start."""
+
+    def update(self, env: Env, controller: Controller, evidence: Evidence) -> None:
+        """Called at the end of every frame, inside what is captured: fixed shapes, no host read."""
+
 
 SCRIPTED = "scripted"  # the controller that watches; any other name plays a plan
 Reset = dict[str, TermCfg]
@@ -124,6 +136,7 @@ def run_episode(
     worlds: Sequence[int] | None = None,
     meter: EnergyMeter | None = None,
     keep_commands: bool = False,
+    watch: Watch | None = None,
     repeat: Recorded | None = None,
 ) -> Episode:
     """Plays the scripted task once in every world and judges it.
@@ -141,6 +154,7 @@ def run_episode(
         worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start_worlds`.
         meter: Takes in the energy of the frames from the third on, when all are replayed.
         keep_commands: Record all commands, on the device.
+        watch: Looks on, on the device.
         repeat: Give these commands instead of the controller's.
     """
     env, controller = start_worlds(sim, index, cfg, reset, planner, advance, worlds)
@@ -150,6 +164,8 @@ def run_episode(
         repeat.rewind()
         controller = repeat
     evidence = evidence_class(cfg)(cfg, index, planner.phases, sim.nworld, sim.device)
+    if watch is not None:
+        watch.start(env)
 
     def work() -> None:
         command = controller.command()
@@ -158,6 +174,8 @@ def run_episode(
         env.action_manager.take(command)
         env.advance()
         evidence.update(sim, controller.phase)
+        if watch is not None:
+            watch.update(env, controller, evidence)
 
     play = env.captured(work, "a frame of the episode")
     # On Warp's CPU device physics alone is captured, once for all episodes.

@@ -80,6 +80,7 @@ class GateContext:
         measured: Sizes that the scripted task needs, with a margin, once they have been measured.
         measured_env: Sizes that environments need likewise.
         shown: The one-world episode that pictures show, and ``shown_by``, what it is.
+        pictures: Files that gates have drawn.
     """
 
     cfg: Config
@@ -94,6 +95,13 @@ class GateContext:
     timed_episode: TimedEpisode | None = None
     shown: Episode | None = None
     shown_by: str = ""
+    pictures: list[str] = field(default_factory=list)
+
+    def with_config(self, cfg: Config) -> GateContext:
+        """A context for another configuration of the same scene and plan, which it shares; sizes and pictures are its own."""
+        other = replace(self, cfg=cfg, measured=None, measured_env=None, pictures=[])
+        other.__dict__.update(model=self.model, planner=self.planner)
+        return other
 
     @cached_property
     def model(self) -> mujoco.MjModel:

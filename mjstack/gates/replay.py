@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Backend, Config
-from mjstack.gates.episode import Episode, FrameHook, State, snapshot, start_worlds
+from mjstack.gates.episode import Episode, FrameHook, State, Watch, snapshot, start_worlds
 from mjstack.gates.gate import GateContext, measured_values
 from mjstack.managers.reset import required_fields
 from mjstack.math import lowest_corner
@@ -84,7 +84,14 @@ class ReplayedWorld:
 
 
 def replay_world(
-    context: GateContext, *, seed: int, world: int, backend: Backend, device: str, on_frame: FrameHook | None = None
+    context: GateContext,
+    *,
+    seed: int,
+    world: int,
+    backend: Backend,
+    device: str,
+    on_frame: FrameHook | None = None,
+    watch: Watch | None = None,
 ) -> ReplayedWorld:
     """Plays one world as it started in its batch.
 
@@ -97,6 +104,7 @@ def replay_world(
         backend: Native or MJWarp.
         device: ``cpu`` or ``cuda:N``.
         on_frame: Called after each frame.
+        watch: Looks on.
     """
     cfg = replace(context.cfg, seed=seed)
     sim = make_simulation(
@@ -119,7 +127,7 @@ def replay_world(
             if on_frame is not None:
                 on_frame(frame, sim)
 
-        episode = context.run(sim, cfg.reset, seed=seed, worlds=[world], on_frame=keep, record=True)
+        episode = context.run(sim, cfg.reset, seed=seed, worlds=[world], on_frame=keep, record=True, watch=watch)
         frames = _frames(states, episode, cfg, context)
         return ReplayedWorld(
             episode=episode,

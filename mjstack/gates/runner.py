@@ -13,6 +13,7 @@ from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import run_capacity
 from mjstack.gates.gate import GateContext
 from mjstack.gates.parity import run_parity
+from mjstack.gates.success import run_success
 from mjstack.gates.throughput import run_throughput
 from mjstack.report.record import GateResult, Status
 
@@ -26,6 +27,7 @@ GATES: dict[str, Gate] = {
     "capacity": run_capacity,
     "batch": run_batch,
     "throughput": run_throughput,
+    "success": run_success,
 }
 
 

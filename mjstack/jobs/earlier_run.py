@@ -10,7 +10,7 @@ from typing import Any
 from mjstack.config.schema import Config
 from mjstack.config.store import load_saved
 from mjstack.errors import MjstackError, RunError
-from mjstack.gates.batch_record import BatchRecord
+from mjstack.gates.batch_record import WORLDS, BatchRecord
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -60,16 +60,16 @@ class EarlierRun:
             ) from error
         return cls(folder=folder, cfg=cfg, provenance=provenance)
 
-    def batch_record(self, seed: int) -> BatchRecord | None:
-        """What its batch gate found under a seed, or None if it did not get there.
+    def batch_record(self, seed: int, stem: str = WORLDS) -> BatchRecord | None:
+        """What its batch gate found under a seed, or the gate whose files begin with ``stem``; None if it did not get there.
 
         Raises:
             RunError: The record cannot be read, or is not this run's.
         """
-        record = BatchRecord.read(self.folder, seed)
+        record = BatchRecord.read(self.folder, seed, stem)
         if record is not None and (record.seed != seed or len(record.failed) != self.cfg.nworld):
             raise RunError(
                 f"run={self.folder}: the record of seed {seed} has {len(record.failed)} worlds of seed {record.seed}, expected "
-                f"{self.cfg.nworld}, the run's nworld. Run the batch gate again."
+                f"{self.cfg.nworld}, the run's nworld. Run that gate again."
             )
         return record

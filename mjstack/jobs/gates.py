@@ -5,12 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from mjstack.config.schema import Backend, Config
+from mjstack.config.validate import reads_layout
 from mjstack.control.planner import ScriptedPlanner
 from mjstack.envs import build_env
 from mjstack.errors import ConfigError
 from mjstack.gates.batch_record import clear_records
 from mjstack.gates.gate import GateContext
 from mjstack.gates.runner import run_gates
+from mjstack.gates.success import success_config
+from mjstack.gates.success_record import clear_success
 from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.reported import Record, check_showing, run_reported
@@ -26,6 +29,19 @@ def check_machine(cfg: Config) -> None:
         key = "view" if cfg.view else "video"
         raise ConfigError(key, "true", "gates with baseline or parity, whose world is shown", "Add one of them to gates")
     check_showing(cfg)
+    if "success" in cfg.gates:
+        _check_success(cfg)
+
+
+def _check_success(cfg: Config) -> None:
+    """Raises if worlds cannot start as the success gate has them, by the key that says so."""
+    try:
+        build_env(success_config(cfg), nworld=1, backend=Backend.native, device="cpu").close()
+    except ConfigError as error:
+        if error.key.startswith("reset.") and not reads_layout(cfg.reset):
+            region = cfg.gate.success.region is not None and error.key.endswith(".params.xy")
+            raise error.at("gate.success.region" if region else f"gate.success.{error.key}") from error
+        raise
 
 
 def check_task(cfg: Config) -> None:
@@ -47,4 +63,5 @@ def run_gates_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome
 def _run(context: GateContext, bar: ProgressBar, record: Record) -> None:
     if context.folder is not None:
         clear_records(context.folder)
+        clear_success(context.folder, keep=None if context.cfg.layout is None else Path(context.cfg.layout))
     run_gates(context, bar.start, record)

@@ -16,6 +16,9 @@ from mjstack.gates.batch_record import BatchRecord
 from mjstack.gates.gate import GateContext, judge_one
 from mjstack.gates.replay import ReplayedWorld, replay_world
 from mjstack.gates.runner import run_guarded
+from mjstack.gates.success import success_config
+from mjstack.gates.success_record import STEM
+from mjstack.gates.watch import FailureWatch, describe_sign
 from mjstack.jobs.earlier_run import EarlierRun
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.outcome import JobOutcome
@@ -35,15 +38,17 @@ class ReplayPlan:
 
     Attributes:
         run: The earlier run.
-        cfg: Its configuration, on the first backend here.
+        gate: Whose world it is, ``batch`` or ``success``.
+        cfg: The configuration that the gate played under, on the first backend here.
         seed: The seed.
         world: The world's number.
         where: Backend and device, each played once; the first is the earlier run's unless ``sim`` says otherwise.
-        record: What the batch gate found there, or None.
+        record: What the gate found there, or None.
         note: What could not be as it was.
     """
 
     run: EarlierRun
+    gate: str
     cfg: Config
     seed: int
     world: int
@@ -73,26 +78,37 @@ def _plan(cfg: Config) -> ReplayPlan:
             raise ConfigError(key, "null", f"{expected}, because job=replay plays one again", fix)
     resolve_backend(cfg)  # what this command line asks for must be there
     run = EarlierRun.read(str(cfg.run))
-    head, _, tail = str(cfg.world).rpartition(":")
-    seed, world = int(head) if head else run.cfg.seed, int(tail)
-    last = run.cfg.seed + run.cfg.gate.batch.seeds - 1
+    *heads, tail = str(cfg.world).split(":")
+    gate = _whose(run.cfg, heads.pop(0) if heads and not heads[0].isdigit() else None, str(cfg.world))
+    seed, world = int(heads[0]) if heads else run.cfg.seed, int(tail)
+    last = run.cfg.seed + (run.cfg.gate.success if gate == "success" else run.cfg.gate.batch).seeds - 1
     if not run.cfg.seed <= seed <= last:
         seeds = f"seed {last}" if last == run.cfg.seed else f"a seed from {run.cfg.seed} to {last}"
         raise ConfigError("world", cfg.world, f"{seeds}, as that run has (seed:world)")
     if not world < run.cfg.nworld:
         raise ConfigError("world", cfg.world, f"a world from 0 to {run.cfg.nworld - 1}, as that run has")
-    record = run.batch_record(seed)
+    record = run.batch_record(seed, *([STEM] if gate == "success" else []))
+    played = success_config(run.cfg) if gate == "success" else run.cfg
     where, note = _choose(cfg.sim, run, record)
     backend, device = where[0]
     return ReplayPlan(
         run=run,
-        cfg=replace(run.cfg, sim=SimCfg(backend=backend, device=device), view=cfg.view, video=cfg.video),
+        gate=gate,
+        cfg=replace(played, sim=SimCfg(backend=backend, device=device), view=cfg.view, video=cfg.video),
         seed=seed,
         world=world,
         where=where,
         record=record,
         note=note,
     )
+
+
+def _whose(cfg: Config, named: str | None, world: str) -> str:
+    """The gate whose world is meant: the one that is named, else the one that the run had, *batch* if both."""
+    had = [gate for gate in ("batch", "success") if gate in cfg.gates]
+    if named is not None and named not in had:
+        raise ConfigError("world", world, f"a world of a gate that run had, {' or '.join(had) or 'neither batch nor success'}")
+    return named or (had[0] if had else "batch")
 
 
 def _choose(asked: SimCfg, run: EarlierRun, record: BatchRecord | None) -> tuple[list[tuple[Backend, str]], str]:
@@ -154,6 +170,7 @@ def _replay(
 ) -> list[GateResult]:
     """Plays the world on one backend and says how it went, and whether that is what was recorded."""
     first = number == 0
+    watch = FailureWatch(plan.cfg) if plan.gate == "success" else None
     done = replay_world(
         context,
         seed=plan.seed,
@@ -161,14 +178,16 @@ def _replay(
         backend=backend,
         device=device,
         on_frame=context.on_frame if first else None,
+        watch=watch,
     )
     status, reason, metrics = judge_one(context.evidence.rules, done.episode.verdict)
     reason = reason or f"accepted, {context.evidence.headline(metrics)}"
     reason += f"; {_compare(plan, done, backend, device, context)}"
     if first:
         context.shown, context.shown_by = done.episode, f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
-    for finding in done.findings:
-        context.say(escape(f"  {finding}"))
+    told = [str(finding) for finding in done.findings] + ([] if watch is None else [_first_sign(watch, done, context)])
+    for line in told:
+        context.say(escape(f"  {line}"))
     values: dict[str, Value] = {"backend": done.description, "seed": plan.seed, "world": plan.world, **metrics}
     if plan.record is not None:
         values["recorded"] = describe_rules(context.evidence.rules, int(plan.record.failed[plan.world])) or "accepted"
@@ -186,16 +205,24 @@ def _replay(
             reason=reason,
             thresholds=context.evidence.thresholds(plan.cfg),
             metrics=values,
-            details=[*(str(finding) for finding in done.findings), *notes],
+            details=[*told, *notes],
         )
     ]
 
 
+def _first_sign(watch: FailureWatch, done: ReplayedWorld, context: GateContext) -> str:
+    """What the success gate would say of where the world went wrong."""
+    sign, frame, retries = int(watch.sign[0]), int(watch.frame[0]), int(done.episode.retries[0])
+    name = context.planner.phases[int(watch.phase[0])].name if sign else ""
+    when = f", seen in frame {frame}" if sign else ""
+    return f"first sign of failure: {describe_sign(sign, name) if sign else 'none'}{when}; grasps tried again: {retries}"
+
+
 def _compare(plan: ReplayPlan, done: ReplayedWorld, backend: Backend, device: str, context: GateContext) -> str:
-    """What the batch gate recorded of this world, against what happened now."""
+    """What the gate recorded of this world, against what happened now."""
     record = plan.record
     if record is None:
-        return "that run recorded no verdict, because its batch gate did not get there"
+        return f"that run recorded no verdict, because its {plan.gate} gate did not get there"
     bits = int(record.failed[plan.world])
     rules = context.evidence.rules
     told = describe_rules(rules, bits) or "accepted"

@@ -75,6 +75,7 @@ def run_reported(cfg: Config, folder: Path, overrides: list[str], title: str, wo
         outcome.status = report.status
         report.write(folder)
         _draw(context, report, folder, console)
+        report.pictures += context.pictures
         report.write(folder)
     except KeyboardInterrupt:
         outcome.status = Status.interrupted

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from mjstack.report.record import GateResult, Report, Status, Value
+import math
+
+from mjstack.report.record import GateResult, Report, Status, Table, Value
 
 
 def to_markdown(report: Report) -> str:
@@ -18,6 +20,8 @@ def to_markdown(report: Report) -> str:
             lines += [gate.reason, ""]
         lines += _table("metric", gate.metrics) + _table("threshold", gate.thresholds)
         lines += [f"- {line}" for line in gate.details]
+        for table in gate.tables:
+            lines += ["", f"### {table.title}", "", *_rows(table)]
     lines += ["", "## Provenance", "", "| what | value |", "| --- | --- |"]
     for key, value in report.provenance.items():
         text = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else format_value(value)
@@ -35,6 +39,14 @@ def format_value(value: Value) -> str:
     return "" if value is None else str(value)
 
 
+def format_percent(rate: float, unit: str = " %") -> str:
+    """A rate with as many digits as tell it from 0 and 1, at least two."""
+    gap = min(rate, 1.0 - rate)
+    digits = 2 if gap <= 0.0 else max(2, math.ceil(-math.log10(100.0 * gap)))
+    text = f"{100.0 * rate:.{digits}f}"
+    return text.rstrip("0").rstrip(".") + unit
+
+
 def escape_cell(text: str) -> str:
     """Text as a cell of a Markdown table."""
     return text.replace("|", "\\|").replace("\n", " ")
@@ -43,6 +55,12 @@ def escape_cell(text: str) -> str:
 def headline(gate: GateResult) -> str:
     """One line about a gate, for the terminal."""
     return gate.reason or "ok"
+
+
+def _rows(table: Table) -> list[str]:
+    """A table as Markdown: its first column is text, the others are numbers."""
+    rule = ["---", *["---:"] * (len(table.header) - 1)]
+    return [f"| {' | '.join(escape_cell(cell) for cell in row)} |" for row in (table.header, rule, *table.rows)]
 
 
 def _table(title: str, values: dict[str, Value]) -> list[str]:

@@ -25,6 +25,21 @@ class Status(Enum):
 
 
 @dataclass(kw_only=True, slots=True)
+class Table:
+    """A table for people, all text.
+
+    Attributes:
+        title: What it shows.
+        header: Names of the columns.
+        rows: Cells, as many as there are columns.
+    """
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+
+
+@dataclass(kw_only=True, slots=True)
 class GateResult:
     """One gate's outcome.
 
@@ -36,6 +51,7 @@ class GateResult:
         thresholds: What was required, by name with unit.
         metrics: What was measured, by name with unit.
         details: Longer findings, a line each, for the report's text.
+        tables: Tables for the report's text.
     """
 
     name: str
@@ -45,6 +61,7 @@ class GateResult:
     thresholds: dict[str, Value] = field(default_factory=dict)
     metrics: dict[str, Value] = field(default_factory=dict)
     details: list[str] = field(default_factory=list)
+    tables: list[Table] = field(default_factory=list)
 
 
 @dataclass(kw_only=True, slots=True)

@@ -1,0 +1,154 @@
+"""Where an episode goes wrong: the first sign of failure of every world, kept on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+import torch
+
+from mjstack.config.schema import Config, PhaseCfg
+from mjstack.control.controller import Controller
+from mjstack.envs import Env
+from mjstack.mdp.geometry import jaw_forces
+from mjstack.scene.index import CUBES
+from mjstack.sim.simulation import LOST_PHYSICS
+from mjstack.tasks.evidence import Evidence
+
+LOADED = 1e-5  # N: a jaw that presses with more touches the cube, as the scripted controller and the box task see it
+GONE_FRAMES = 3  # in a row without load on both jaws: less may be a touch in passing
+
+
+class Sign(IntEnum):
+    """What the first sign of failure was. Of several in one frame, the lowest number counts."""
+
+    NONE = 0
+    PHYSICS = 1
+    EMPTY = 2
+    DROPPED = 3
+    MISSED = 4
+    LEFT = 5
+
+    @property
+    def text(self) -> str:
+        """The sign in words."""
+        return _TEXT[self]
+
+
+_TEXT = {
+    Sign.NONE: "no sign before the verdict",
+    Sign.PHYSICS: "physics lost",
+    Sign.EMPTY: "grasp empty, and not tried again",
+    Sign.DROPPED: "held cube lost its load",
+    Sign.MISSED: "not in place when let go",
+    Sign.LEFT: "left its place",
+}
+
+
+def describe_sign(sign: int, phase: str) -> str:
+    """A sign in words, with the phase's name if there is one."""
+    return f"{phase}: {Sign(sign).text}" if phase else Sign(sign).text
+
+
+class FailureWatch:
+    """Notes the first sign of failure in every world, and the phase and frame in which it was seen.
+
+    What counts as a sign:
+
+    - PHYSICS: the state is not finite, or a buffer overflowed.
+    - EMPTY: a phase that grasps is over, both jaws did not press on its cube in its last frame, and the world goes on.
+    - DROPPED: between that phase and the next opening of the gripper, both jaws have not pressed on the cube for three frames.
+    - MISSED: the first phase after the last one that carries, in which the gripper opens, is over, and the cubes are not where
+      they belong.
+    - LEFT: later, cubes that were where they belong are so no more.
+
+    A grasp that is tried again is no sign. A sign need not lead to failure, nor has every failure one: cubes that are in place
+    but move break their rule alone.
+
+    Attributes:
+        sign: Number of the `Sign`, shape ``(nworld,)``, int64.
+        phase: Number of the phase in which it was seen, -1 without one, shape ``(nworld,)``, int64.
+        frame: The frame likewise.
+    """
+
+    sign: torch.Tensor
+    phase: torch.Tensor
+    frame: torch.Tensor
+
+    def __init__(self, cfg: Config) -> None:
+        """Reads the phases."""
+        specs = list(cfg.controller.phases.values())
+        self._tables = _grasped(specs), _carried(specs)
+        carrying = [number for number, cube in enumerate(self._tables[1]) if cube >= 0]
+        self._release = carrying[-1] + 1 if carrying else len(specs)
+
+    def start(self, env: Env) -> None:
+        """Allocates for the environment's worlds."""
+        n, device = env.nworld, env.device
+
+        def full(value: int, dtype: torch.dtype = torch.int64, size: int = n) -> torch.Tensor:
+            return torch.full((size,), value, dtype=dtype, device=device)
+
+        self._grasped, self._carried = (torch.tensor(table, device=device) for table in self._tables)
+        self.sign, self.phase, self.frame = full(0), full(-1), full(-1)
+        self._now, self._at = full(0, size=1), full(0)
+        self._loaded = torch.zeros((n, len(CUBES)), dtype=torch.bool, device=device)
+        self._placed, self._gone = full(0, torch.bool), full(0, torch.int32)
+
+    def update(self, env: Env, controller: Controller, evidence: Evidence) -> None:
+        """Takes in the end of a frame. Fixed shapes, no host read."""
+        sim, phase = env.sim, controller.phase
+        loaded = torch.stack([(jaw_forces(env, name) > LOADED).all(1) for name in CUBES], dim=1)
+        placed = evidence.placed(sim)
+
+        # 0 times a number that is not finite is NaN, which is no longer 0.
+        finite = ((sim.qpos * 0.0).sum(1) + (sim.qvel * 0.0).sum(1)) == 0.0
+        lost = ~finite | ((sim.overflow & LOST_PHYSICS) != 0)
+        entered = phase > self._at
+        grasped = self._grasped.index_select(0, self._at)
+        empty = entered & (grasped >= 0) & ~_of(self._loaded, grasped)
+        carried = self._carried.index_select(0, phase)
+        self._gone.add_(1).mul_((carried >= 0) & ~_of(loaded, carried))
+        dropped = self._gone >= GONE_FRAMES
+        missed = entered & (self._at == self._release) & ~self._placed
+        left = (phase > self._release) & self._placed & ~placed
+
+        seen = torch.zeros_like(self.sign)
+        signs = {Sign.LEFT: left, Sign.MISSED: missed, Sign.DROPPED: dropped, Sign.EMPTY: empty, Sign.PHYSICS: lost}
+        for sign, found in signs.items():
+            seen.masked_fill_(found, int(sign))
+        first = (self.sign == 0) & (seen > 0)
+        ended = (seen == int(Sign.EMPTY)) | (seen == int(Sign.MISSED))  # what the phase before has left
+        self.sign.copy_(torch.where(first, seen, self.sign))
+        self.phase.copy_(torch.where(first, torch.where(ended, self._at, phase), self.phase))
+        self.frame.copy_(torch.where(first, self._now, self.frame))
+        self._at.copy_(phase)
+        self._loaded.copy_(loaded)
+        self._placed.copy_(placed)
+        self._now += 1
+
+
+def _of(table: torch.Tensor, cube: torch.Tensor) -> torch.Tensor:
+    """Each world's column, shape ``(nworld,)``; the first one where there is none (-1)."""
+    return table.gather(1, cube.clamp(min=0)[:, None])[:, 0]
+
+
+def _number(cube: str | None) -> int:
+    return -1 if cube is None else CUBES.index(f"{cube}_cube")
+
+
+def _grasped(specs: Sequence[PhaseCfg]) -> list[int]:
+    """Number of the cube that each phase grasps, or -1."""
+    return [_number(spec.grasps) for spec in specs]
+
+
+def _carried(specs: Sequence[PhaseCfg]) -> list[int]:
+    """Number of the cube that is in the hand all through each phase, or -1."""
+    out, cube = [], -1
+    for spec in specs:
+        if spec.gripper == "open":
+            cube = -1
+        out.append(cube if spec.grasps is None else -1)
+        if spec.grasps is not None:
+            cube = _number(spec.grasps)
+    return out

@@ -1,0 +1,494 @@
+"""The success gate: rates, where episodes go wrong, what is left of them, and the same starts on both backends."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from mjstack.cli import run
+from mjstack.config import load_config
+from mjstack.gates import gate as gate_module
+from mjstack.gates import watch as watch_module
+from mjstack.gates.batch_record import FAILING, BatchRecord
+from mjstack.gates.episode import Episode, run_episode
+from mjstack.gates.gate import GateContext
+from mjstack.gates.regions import Region, find_regions, radial_yaw_deg
+from mjstack.gates.success import run_success, success_config
+from mjstack.gates.success_record import PICTURE, REGIONS, STEM, clear_success
+from mjstack.gates.watch import FailureWatch, Sign
+from mjstack.jobs.gates import check_machine
+from mjstack.math import wilson_interval
+from mjstack.report.record import GateResult, Status
+from mjstack.scene.index import CUBES
+from mjstack.sim import Simulation
+from mjstack.tasks.stack import StackRule
+
+PHASES = list(load_config().controller.phases)
+
+
+@pytest.fixture(scope="module")
+def passed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a native run of six SO-101 worlds in a small region."""
+    folder = tmp_path_factory.mktemp("success") / "run"
+    args = ["gates=[success]", "sim=native", "nworld=6", "gate.success.region=[0.03,0.03]", "gate.success.cell_episodes=2"]
+    assert run([*args, f"hydra.run.dir={folder}"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def warp(passed: Path) -> Path:
+    """The folder of a run on Warp's CPU device from the native run's layouts."""
+    folder = passed.parent / "warp"
+    start = ["reset=layout", f"layout={passed}/layouts_seed0.csv"]
+    assert run(["gates=[success]", "sim=mjwarp", "sim.device=cpu", "nworld=6", *start, f"hydra.run.dir={folder}"]) == 0
+    return folder
+
+
+def gate_of(folder: Path) -> dict:
+    (gate,) = json.loads((folder / "report.json").read_text())["gates"]
+    return gate
+
+
+def record_of(folder: Path) -> BatchRecord:
+    record = BatchRecord.read(folder, 0, STEM)
+    assert record is not None
+    return record
+
+
+def play(context: GateContext, folder: Path | None = None) -> GateResult:
+    context.folder = folder
+    (result,) = run_success(context)
+    return result
+
+
+def test_small_region_passes(passed: Path) -> None:
+    gate = gate_of(passed)
+    assert (gate["name"], gate["status"]) == ("success", "pass")
+    metrics = gate["metrics"]
+    assert (metrics["episodes"], metrics["accepted"], metrics["distinct_starts"], metrics["unreachable"]) == (6, 6, 6, 0)
+    assert (metrics["success_rate_low95"], metrics["success_rate_high95"]) == wilson_interval(6, 6)
+    assert gate["thresholds"]["success_rate_min"] == 0.99
+    assert "cubes within 0.03 x 0.03 m" in metrics["starts"]
+    assert sorted(path.name for path in passed.iterdir()) == [
+        ".hydra",
+        "layouts_seed0.csv",
+        "report.json",
+        "report.md",
+        "run.log",
+        "success.png",
+        "success_regions.csv",
+        "success_seed0.npz",
+    ]
+    assert "![success.png](success.png)" in (passed / "report.md").read_text()
+    scene = load_config().scene
+    with np.load(passed / "success_seed0.npz") as held:
+        off = np.abs(held["start_places"][..., :2] - [scene.red_xy, scene.blue_xy])
+        assert 0.015 < off.max() <= 0.03
+        assert (held["sign"] == 0).all()
+        assert (held["failed"] == 0).all()
+        assert held["phase_names"].tolist() == PHASES
+
+
+def test_rebot_passes(new_context: Callable[..., GateContext], tmp_path: Path) -> None:
+    context = new_context("sim=native", "nworld=4", robot="rebot")
+    result = play(context, tmp_path)
+    assert result.status is Status.passed
+    assert (result.metrics["accepted"], result.metrics["episodes"], result.metrics["distinct_starts"]) == (4, 4, 4)
+    assert not (tmp_path / FAILING).exists()
+    assert context.pictures == [PICTURE]
+    assert context.cfg.reset == load_config(["robot=rebot"]).reset  # other gates start as they did
+
+
+def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
+    """A gripper that never closes: the grasp is empty, is tried again, and is empty again."""
+    folder = tmp_path / "broken"
+    args = ["gates=[success]", "sim=native", "nworld=2", "robot.gripper_closed=[0.7]", f"hydra.run.dir={folder}"]
+    assert run(args) == 1
+    gate = gate_of(folder)
+    assert gate["status"] == "fail"
+    assert "0 of 2 episodes accepted (0 %, 95 % interval 0 to 65.76 %), 99 % wanted" in gate["reason"]
+    assert "2 retried, 0 of them accepted" in gate["reason"]
+    assert f"job=replay run={folder} world=0" in gate["reason"]
+    assert {name: gate["metrics"][f"failed.{name}"] for name in ("LIFT", "CARRY", "STACKED")} == dict.fromkeys(
+        ("LIFT", "CARRY", "STACKED"), 2
+    )
+    (table,) = [table for table in gate["tables"] if "first sign of failure" in table["header"]]
+    assert table["rows"] == [["grasp_red: grasp empty, and not tried again", "2", "0, 1"]]
+    rows = list(csv.DictReader((folder / FAILING).read_text().splitlines()))
+    assert [(row["world"], row["sign"], row["phase"], row["retries"]) for row in rows] == [
+        (str(world), "EMPTY", "grasp_red", "1") for world in range(2)
+    ]
+    assert all("LIFT" in row["rules"].split() for row in rows)
+    assert any("no region has 20 episodes" in line for line in gate["details"])
+    # It stands alone: where nothing fails, the same folder keeps nothing of this.
+    clear_success(folder, keep=None)
+    assert sorted(path.name for path in folder.iterdir()) == [".hydra", FAILING, "report.json", "report.md", "run.log"]
+
+
+@pytest.fixture
+def hasty() -> Callable[..., GateContext]:
+    """Contexts of episodes that are over, and have failed, after a second."""
+    phases = [f"controller.phases.{name}.seconds=0.1" for name in PHASES]
+
+    def make(*overrides: str) -> GateContext:
+        quick = ["gates=[success]", "sim=native", "nworld=2", "gate.acceptance.window=5", *phases]
+        return GateContext(cfg=load_config([*quick, *overrides]))
+
+    return make
+
+
+def test_seeds_add_up_and_the_rate_decides(hasty: Callable[..., GateContext], tmp_path: Path) -> None:
+    """The threshold is on the rate itself; what fails is named all the same."""
+    context = hasty("gates=[batch,success]", "gate.success.seeds=2")
+    lines: list[str] = []
+    context.say = lines.append
+    result = play(context, tmp_path)
+    assert result.status is Status.failed
+    failing = "4 of 4 episodes (0:0, 0:1, 1:0, 1:1) failed: "
+    assert "0 of 4 episodes accepted" in result.reason
+    assert failing in result.reason
+    assert result.reason.endswith(f"job=replay run={tmp_path} world=success:0:0")
+    assert result.metrics["distinct_starts"] == 4
+    assert [line.split(":")[0] for line in lines] == ["success, seed 0", "success, seed 1"]
+    seeds = next(table for table in result.tables if table.title == "Seeds")
+    assert [row[:3] for row in seeds.rows] == [["0", "2", "0"], ["1", "2", "0"]]
+    (signs,) = [table for table in result.tables if "first sign" in table.header[0]]
+    assert sum(int(row[1]) for row in signs.rows) == 4  # every failed episode is in one line, with a sign or without
+    rows = list(csv.DictReader((tmp_path / "success_failing_worlds.csv").read_text().splitlines()))
+    assert [(row["seed"], row["world"]) for row in rows] == [("0", "0"), ("0", "1"), ("1", "0"), ("1", "1")]
+    assert not (tmp_path / FAILING).exists()  # that is the batch gate's
+
+    result = play(hasty("gate.success.rate=0"))
+    assert result.status is Status.passed
+    assert "2 of 2 episodes (0, 1) failed: " in result.reason
+
+
+def test_both_backends_start_and_end_alike(passed: Path, warp: Path) -> None:
+    native, other = record_of(passed), record_of(warp)
+    assert (native.backend, other.backend) == ("native", "mjwarp")
+    with np.load(passed / "success_seed0.npz") as ours, np.load(warp / "success_seed0.npz") as theirs:
+        assert theirs["start_qpos"].dtype == np.float32
+        assert np.abs(ours["start_qpos"] - theirs["start_qpos"]).max() < 1e-7
+        assert np.array_equal(ours["start_places"][..., :2].astype(np.float32), theirs["start_places"][..., :2])
+    assert np.array_equal(native.failed, other.failed)
+    assert np.abs(native.values["xy_err_m"] - other.values["xy_err_m"]).max() < 0.003
+    metrics = gate_of(warp)["metrics"]
+    assert metrics["starts"] == f"layout={passed}/layouts_seed0.csv"
+    assert "Warp" in metrics["backend"]
+
+
+def test_replay_plays_the_gates_world(passed: Path, warp: Path, tmp_path: Path) -> None:
+    """Region, controller and file are the run's own: a native world ends bit for bit where it did, MJWarp's too."""
+    out = tmp_path / "out"
+    assert run(["job=replay", f"run={passed}", "world=5", f"hydra.run.dir={out}"]) == 0
+    gate = gate_of(out)
+    assert gate["reason"].endswith("; as recorded, and it ends bit for bit where it did")
+    assert len(gate["details"]) == len(StackRule) + 1
+    assert gate["details"][-1] == "first sign of failure: none; grasps tried again: 0"
+    both = tmp_path / "both"
+    assert run(["job=replay", f"run={warp}", "world=3", f"hydra.run.dir={both}"]) == 0
+    first, second = json.loads((both / "report.json").read_text())["gates"]
+    assert (first["name"], second["name"]) == ("replay_mjwarp", "replay_native")
+    assert first["reason"].endswith("; as recorded, and it ends bit for bit where it did")
+    assert second["reason"].endswith("that run's mjwarp world had the same verdict")
+    with np.load(both / "trajectory.npz") as held, np.load(warp / "success_seed0.npz") as theirs:
+        assert np.array_equal(held["start_qpos"].astype(np.float32), theirs["start_qpos"][3])
+
+
+@pytest.mark.parametrize(
+    ("world", "says"), [("batch:1", "a gate that run had, success"), ("1:1", "seed 0"), ("6", "a world from 0 to 5")]
+)
+def test_replay_refuses_worlds_that_were_not(
+    world: str, says: str, passed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["job=replay", f"run={passed}", f"world={world}"]) == 2
+    assert says in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+BAD = [
+    (["gate.success.region=[0.5,0.02]"], "gate.success.region=[0.5, 0.02]: expected half-widths that leave both cubes on"),
+    (["gate.success.region=[0.1,0.1]"], "gate.success.region=[0.1, 0.1]: expected a region that the arm reaches"),
+    (["gate.success.region=[-0.01,0.1]"], "gate.success.region"),
+    (["gate.success.region=[0.01]"], "2 numbers"),
+    (["gate.success.region=[0.01,0.01]", "~gate.success.reset.cubes"], "no term of gate.success.reset has a region"),
+    (["gate.success.reset.cubes.params.gap=0.3"], "gate.success.reset.cubes.params.xy"),
+    (["gate.success.rate=1.01"], "gate.success.rate=1.01: expected a share from 0 to 1"),
+    (["gate.success.rate=nan"], "gate.success.rate=nan"),
+    (["gate.success.seeds=0"], "gate.success.seeds=0: expected an integer of at least 1"),
+    (["gate.success.seeds=2", "seed=4294967295"], "seeds are 32-bit"),
+    (["gate.success.cell=0"], "gate.success.cell"),
+    (["gate.success.yaw_cell_deg=91"], "gate.success.yaw_cell_deg"),
+    (["reset=layout", "layout={run}/layouts_seed0.csv", "gate.success.seeds=2"], "start alike under every seed"),
+    (["reset=layout", "layout={run}/layouts_seed0.csv", "gate.success.region=[0.01,0.01]"], "null, because reset=layout"),
+    (["reset=layout", "layout={run}/layouts_seed0.csv", "nworld=7"], "at least 7 worlds, it has 6"),
+]
+
+
+@pytest.mark.parametrize(("args", "says"), BAD, ids=[" ".join(args) for args, _ in BAD])
+def test_bad_input_is_one_line_and_writes_nothing(
+    args: list[str],
+    says: str,
+    passed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["gates=[success]", "sim=native", "nworld=2", *(arg.format(run=passed) for arg in args)]) == 2
+    err = capsys.readouterr().err.strip()
+    assert err.startswith("mjstack: ")
+    assert len(err.splitlines()) == 1
+    assert says in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_region_is_the_gates_alone() -> None:
+    """Without the gate, its region is not tried; with it, no other start changes."""
+    check_machine(load_config(["sim=native", "gates=[batch]", "gate.success.region=[0.1,0.1]"]))
+    cfg = load_config(["gate.success.region=[0.01,0.02]"])
+    assert success_config(cfg).reset["cubes"].params["xy"] == [0.01, 0.02]
+    assert cfg.gate.success.reset["cubes"].params["xy"] == [0.05, 0.05]
+    assert (success_config(cfg).controller.name, cfg.controller.name) == ("scripted", "planned")
+
+
+class Stop(Exception):
+    """Something that nobody foresaw."""
+
+
+def test_what_stops_the_second_seed_keeps_the_first(
+    hasty: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def stops(*args: object, **kwargs: object) -> Episode:
+        if (tmp_path / "success_seed0.npz").exists():
+            raise Stop("the second seed")
+        return run_episode(*args, **kwargs)
+
+    monkeypatch.setattr(gate_module, "run_episode", stops)
+    result = play(hasty("gate.success.seeds=3", "gate.success.rate=0"), tmp_path)
+    assert result.status is Status.failed
+    assert "0 of 2 episodes accepted" in result.reason
+    assert "seeds 1 to 2 not played: the second seed" in result.reason
+    left = {REGIONS, PICTURE, FAILING, "success_seed0.npz", "layouts_seed0.csv", "layouts_seed1.csv"}
+    assert {path.name for path in tmp_path.iterdir()} <= left
+    assert {FAILING, "success_seed0.npz", "layouts_seed0.csv"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_full_disk_takes_no_verdict_back(
+    hasty: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    result = play(hasty("gate.success.rate=0"), tmp_path)
+    assert result.status is Status.passed
+    told = [line for line in result.details if "No space left on device" in line]
+    for name in ("layouts_seed0.csv", "no record of its episodes", REGIONS):
+        assert any(name in line for line in told)
+    assert [path.name for path in tmp_path.iterdir()] == [PICTURE]
+
+
+def test_an_earlier_runs_files_go_but_not_the_layouts_that_are_read(tmp_path: Path) -> None:
+    names = ["success_seed0.npz", "success_seed12.npz", "layouts_seed0.csv", "layouts_seed1.csv", REGIONS, PICTURE]
+    for name in [*names, "report.json"]:
+        (tmp_path / name).write_text("old")
+    clear_success(tmp_path, keep=tmp_path / "." / "layouts_seed1.csv")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["layouts_seed1.csv", "report.json"]
+
+
+def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Made-up episodes of 300 worlds, in which anything may happen at any time; the recount goes world by world."""
+    cfg = load_config()
+    n, frames, rng = 300, 90, np.random.default_rng(3)
+    steps = rng.random((frames, n)) < 0.12
+    phase = np.minimum(np.cumsum(steps, axis=0), len(PHASES) - 1)
+    again = rng.random((frames, n)) < 0.3  # out of the grasp and back to the start
+    for world in range(n):
+        for frame in range(1, frames):
+            if PHASES[phase[frame - 1, world]] == "grasp_red" and steps[frame, world] and again[frame, world]:
+                phase[frame:, world] -= phase[frame, world]
+                break
+    forces = (rng.random((frames, n, 2, 2)) < 0.93) * 3.0
+    placed = rng.random((frames, n)) < 0.8
+    overflow = (rng.random((frames, n)) < 0.0005).cumsum(axis=0) > 0
+    qpos = np.where(rng.random((frames, n, 1)) < 0.0005, np.inf, 1.0) * np.ones((1, 1, 3))
+
+    watch, now = FailureWatch(cfg), SimpleNamespace(frame=0)
+    device = torch.device("cpu")
+    sim = SimpleNamespace(qpos=torch.zeros(n, 3), qvel=torch.zeros(n, 3), overflow=torch.zeros(n, dtype=torch.int32))
+    env = SimpleNamespace(nworld=n, device=device, sim=sim)
+    controller = SimpleNamespace(phase=torch.zeros(n, dtype=torch.int64))
+    evidence = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.frame]))
+    monkeypatch.setattr(watch_module, "jaw_forces", lambda _, name: torch.from_numpy(forces[now.frame, :, CUBES.index(name)]))
+    watch.start(env)
+    for frame in range(frames):
+        now.frame = frame
+        controller.phase.copy_(torch.from_numpy(phase[frame]))
+        sim.qpos.copy_(torch.from_numpy(qpos[frame]))
+        sim.overflow.copy_(torch.from_numpy(overflow[frame]))
+        watch.update(env, controller, evidence)
+
+    found = [tuple(row) for row in torch.stack((watch.sign, watch.phase, watch.frame), dim=1).tolist()]
+    names = [[PHASES[number] for number in phase[:, world]] for world in range(n)]
+    wanted = [
+        recount(
+            names[world], (forces[:, world, 0] > 0).all(1), placed[:, world], overflow[:, world] | np.isinf(qpos[:, world, 0])
+        )
+        for world in range(n)
+    ]
+    assert found == wanted
+    assert {sign for sign, _, _ in wanted} == {int(sign) for sign in Sign}  # else this would show less than it seems to
+
+
+def recount(phases: list[str], held: np.ndarray, placed: np.ndarray, lost: np.ndarray) -> tuple[int, int, int]:
+    """The first sign of one world of the stack task, its phase, and the frame."""
+    gone = 0
+    for frame, name in enumerate(phases):
+        before = phases[frame - 1] if frame else name
+        onward = PHASES.index(name) > PHASES.index(before)
+        gone = gone + 1 if name in ("lift_red", "above_blue", "place_stack") and not held[frame] else 0
+        if lost[frame]:
+            return Sign.PHYSICS, PHASES.index(name), frame
+        if before == "grasp_red" and onward and not held[frame - 1]:
+            return Sign.EMPTY, PHASES.index(before), frame
+        if gone >= 3:
+            return Sign.DROPPED, PHASES.index(name), frame
+        if before == "release" and onward and not placed[frame - 1]:
+            return Sign.MISSED, PHASES.index(before), frame
+        if name in ("retreat", "done") and placed[frame - 1] and not placed[frame]:
+            return Sign.LEFT, PHASES.index(name), frame
+    return Sign.NONE, -1, -1
+
+
+def test_signs_in_real_episodes(new_context: Callable[..., GateContext]) -> None:
+    """Worlds that somebody interferes with: each shows its own sign, in its phase, and one is undisturbed."""
+    base = new_context("sim=native", "nworld=6")
+    context = base.with_config(success_config(base.cfg))
+    red, _ = context.index.cube_qpos
+    at = {name: context.phase_start(name) for name in PHASES}
+
+    def interfere(frame: int, sim: Simulation) -> None:
+        if frame == at["lift_red"] + 30:
+            sim.qpos[1, red + 1] -= 0.1  # out of the hand
+        if frame == at["grasp_red"] + 60:
+            sim.qpos[2, red + 1] -= 0.03  # out of the jaws: tried again, and found
+        if frame == at["release"] + 30:
+            sim.qpos[3, red] += 0.018  # it still stands on blue, too far off
+        if frame == at["done"] + 5:
+            sim.qpos[4, red : red + 3] += torch.tensor([0.1, 0.0, -0.044])  # down on the table
+        if frame == at["above_blue"]:
+            sim.qvel[5] = torch.nan
+
+    watch = FailureWatch(context.cfg)
+    sim = context.batch_simulation(6)
+    episode = context.run(sim, context.cfg.reset, watch=watch, on_frame=interfere)
+    failed, retries = episode.verdict.failed.tolist(), episode.retries.tolist()
+    sim.close()
+    signs = [Sign(sign).name for sign in watch.sign.tolist()]
+    phases = [PHASES[number] if number >= 0 else "" for number in watch.phase.tolist()]
+    assert list(zip(signs, phases, strict=True)) == [
+        ("NONE", ""),
+        ("DROPPED", "lift_red"),
+        ("NONE", ""),
+        ("MISSED", "release"),
+        ("LEFT", "done"),
+        ("PHYSICS", "above_blue"),
+    ]
+    assert [bits == 0 for bits in failed] == [True, False, True, False, False, False]
+    assert failed[5] & StackRule.FINITE
+    assert retries == [0, 0, 1, 0, 0, 0]
+    assert watch.frame.tolist()[4] == at["done"] + 6
+
+
+def test_box_phases_are_read_too() -> None:
+    """Two cubes, one after the other: each is carried between its grasp and the next opening."""
+    cfg = load_config()
+    phase = cfg.controller.phases["done"]
+    made = type(phase)
+    steps = [
+        ("open", None),
+        ("closed", "red"),
+        ("closed", None),
+        ("open", None),
+        ("closed", "blue"),
+        ("closed", None),
+        ("open", None),
+    ]
+    cfg.controller.phases = {str(k): made(gripper=grip, grasps=cube, seconds=1.0) for k, (grip, cube) in enumerate(steps)}
+    watch = FailureWatch(cfg)
+    assert watch._tables == ([-1, 0, -1, -1, 1, -1, -1], [-1, -1, 0, -1, -1, 1, -1])
+    assert watch._release == 6
+
+
+def test_radial_yaw() -> None:
+    """A cube that faces the base is at 0 wherever it stands, and a quarter turn changes nothing."""
+    angle = np.linspace(-3.0, 3.0, 13)
+    places = np.stack((0.3 * np.cos(angle), 0.3 * np.sin(angle), angle), axis=1)
+    for quarter in (-2, -1, 0, 1):
+        found = radial_yaw_deg(places + np.array([0.0, 0.0, quarter * np.pi / 2]))
+        assert np.minimum(found, 90.0 - found).max() < 1e-9
+        assert ((found >= 0.0) & (found < 90.0)).all()
+    assert radial_yaw_deg(np.array([0.0, 0.3, np.radians(90.0 + 37.0)])) == pytest.approx(37.0)
+    assert radial_yaw_deg(np.array([0.3, 0.0, -1e-18])) == 0.0
+
+
+def test_worst_regions_of_made_up_episodes() -> None:
+    """Red fails in one corner, blue at some angles; a cell with too few episodes has no rate."""
+    rng = np.random.default_rng(1)
+    n = 4000
+    places = np.empty((n, 2, 3))
+    places[:, 0, :2] = rng.uniform([0.30, -0.14], [0.36, -0.10], (n, 2))
+    places[:, 1, :2] = rng.uniform([0.30, 0.06], [0.36, 0.10], (n, 2))
+    places[..., 2] = rng.uniform(-np.pi, np.pi, (n, 2))
+    places[:5, 0, :2] = 0.41, -0.05
+    corner = (places[:, 0, 0] >= 0.34) & (places[:, 0, 0] < 0.36) & (places[:, 0, 1] < -0.12)
+    turned = (radial_yaw_deg(places[:, 1]) >= 30.0) & (radial_yaw_deg(places[:, 1]) < 45.0)
+    accepted = ~(corner & (rng.random(n) < 0.9)) & ~(turned & (rng.random(n) < 0.5))
+    found = find_regions(places, accepted, cell=0.02, yaw_cell_deg=15.0, episodes=20, cubes=("red", "blue"))
+    assert [region.rate for region in found] == sorted(region.rate for region in found)
+    assert all(region.episodes >= 20 for region in found)
+    assert not any(region.cube == "red" and region.x_min_m == 0.4 for region in found)
+    assert (found[0].cube, found[0].x_min_m, found[0].y_min_m) == ("red", 0.34, -0.14)
+    assert found[0].where.startswith("red: x 0.340 to 0.360 m, y -0.140 to -0.120 m")
+    alone = [region for region in found if region.cube == "blue" and region.x_min_m is None]
+    assert (alone[0].yaw_min_deg, alone[0].yaw_max_deg) == (30.0, 45.0)
+    assert alone[0].where == "blue: turned 30 to 45 deg"
+    assert len(alone) == 6
+    assert sum(region.episodes for region in alone) == n
+    assert sum(region.accepted for region in alone) == accepted.sum()
+    placed = [region for region in found if region.cube == "red" and region.yaw_min_deg is None]
+    assert len(placed) == 6
+    whole = next(region for region in placed if (region.x_min_m, region.y_min_m) == (0.34, -0.14))
+    assert (whole.episodes, whole.accepted) == (int(corner.sum()), int((corner & accepted).sum()))
+    assert (whole.rate_low95, whole.rate_high95) == wilson_interval(whole.accepted, whole.episodes)
+    assert len(set(found)) == len(found)
+    assert isinstance(found[0], Region)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("robot", ["so101", "rebot"])
+def test_frames_with_the_tracker_are_one_graph(robot: str, new_context: Callable[..., GateContext], tmp_path: Path) -> None:
+    base = new_context("sim=mjwarp", "sim.device=cuda:0", "nworld=64", "graph=require", robot=robot)
+    context = base.with_config(success_config(base.cfg))
+    sim = context.batch_simulation(64)
+    watch = FailureWatch(context.cfg)
+    episode = context.run(sim, context.cfg.reset, watch=watch)
+    assert episode.captured
+    failed = episode.verdict.failed != 0
+    assert int(failed.sum()) <= 3
+    assert not bool(((watch.sign != 0) & ~failed).sum() > 3)
+    assert int(watch._now) == episode.frames
+    sim.close()
+    result = play(new_context("sim=mjwarp", "sim.device=cuda:0", "nworld=64", robot=robot), tmp_path)
+    assert result.metrics["accepted"] >= 61
