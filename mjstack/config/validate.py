@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import re
 
-from mjstack.config.schema import Config, ReachabilityJobCfg, ScalingJobCfg, SolverCfg, StudyJobCfg
+from mjstack.config.schema import CollectJobCfg, Config, ReachabilityJobCfg, ScalingJobCfg, SolverCfg, StudyJobCfg
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput")
-JOBS = ("gates", "replay", "scaling", "study", "reachability")
+JOBS = ("gates", "replay", "scaling", "study", "reachability", "collect")
 CONDIMS = (1, 3, 4, 6)
 SCALING_BACKENDS = ("mjwarp", "native")
 SECTIONS = ("physics", "episode", "env_step")
@@ -53,6 +53,11 @@ def validate(cfg: Config) -> None:
     if isinstance(cfg.job, ReachabilityJobCfg):
         _positive("job.step", cfg.job.step, "m")
         _not_negative("job.margin", cfg.job.margin, "m")
+    if isinstance(cfg.job, CollectJobCfg):
+        _positive_int("job.episodes", cfg.job.episodes)
+        _positive("job.buffer_gib", cfg.job.buffer_gib, "GiB")
+        if cfg.job.folder is not None and not cfg.job.folder.strip():
+            raise ConfigError("job.folder", "''", "a folder, or null for outputs/collect/<hash>")
 
 
 def _timing(cfg: Config) -> None:
