@@ -64,7 +64,8 @@ def measure_arrangements(
     state, tape = episode.states[first - 1], episode.commands
     assert tape is not None
     columns = torch.as_tensor(context.index.ctrl, device=sim.device)
-    commands = [tape.command(f) for f in range(first, min(first + frames, tape.frames))]
+    tape.rewind()
+    commands = [tape.command() for _ in range(min(first + frames, tape.frames))][first:]
     bare, substeps = sim.bare_step(), cfg.timing.substeps
 
     def plain() -> None:

@@ -56,6 +56,17 @@ def quat_z_row(quat: torch.Tensor) -> torch.Tensor:
     return torch.cat((2.0 * torch.addcmul(xy * z, turned, w), 1.0 - 2.0 * xy.square().sum(-1, keepdim=True)), dim=-1)
 
 
+def quat_to_matrix(quat: torch.Tensor) -> torch.Tensor:
+    """Rotation matrix of a unit quaternion: its columns are the body's axes in the world, shape ``(..., 3, 3)``."""
+    w, v = quat[..., :1], quat[..., 1:]
+    outer = 2.0 * v[..., :, None] * v[..., None, :]
+    x, y, z = (2.0 * w * v).unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3))
+    # 2 w^2 - 1 on the diagonal.
+    return outer + cross + torch.diag_embed((2.0 * w.square() - 1.0).expand(*w.shape[:-1], 3))
+
+
 def lowest_corner(pos: torch.Tensor, quat: torch.Tensor, half: float) -> torch.Tensor:
     """Height [m] of the lowest corner of a cube.
 

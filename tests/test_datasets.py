@@ -41,6 +41,7 @@ SPEC = DatasetSpec(
         "action": vector("shoulder", "jaw"),
         "next.reward": vector("reward", unit="1"),
         "next.done": vector("done", dtype="bool", unit="1"),
+        "count": vector("count", dtype="int32", unit="1"),
     },
     config_sha256="c" * 64,
     values={"xy_err": "float64", "peak": "int64", "settled": "bool", "note": "string"},
@@ -57,8 +58,9 @@ def episode(world: int, *, frames: int = 0, seed: int = 7, task: str = "stack", 
         "action": random.normal(size=(frames, 2)).astype(np.float32),
         "next.reward": random.random(frames),
         "next.done": np.arange(frames) == frames - 1,
+        "count": np.arange(frames)[::-1],
     }
-    values = {"xy_err": 1e-3 * world, "peak": world, "settled": world % 2 == 0, "note": f"w{world}"}
+    values = {"xy_err": 1e-3 * world, "peak": np.int32(world), "settled": np.bool_(world % 2 == 0), "note": f"w{world}"}
     return replace(
         EpisodeData(arrays=arrays, task=task, success=world % 3 != 0, seed=seed, world=world, values=values), **changed
     )
@@ -487,6 +489,13 @@ BAD_EPISODES = {
     ),
     r"no value 'xy_err'": replace(episode(1), values={}),
     r"value 'xy' is not in the DatasetSpec": replace(episode(1), values={**episode(1).values, "xy": 1.0}),
+    r"xy_err is 'small', expected float64": replace(episode(1), values={**episode(1).values, "xy_err": "small"}),
+    r"peak is 1.5, expected int64": replace(episode(1), values={**episode(1).values, "peak": 1.5}),
+    r"peak is 9223372036854775808, expected int64": replace(episode(1), values={**episode(1).values, "peak": 2**63}),
+    r"settled is 1, expected bool": replace(episode(1), values={**episode(1).values, "settled": 1}),
+    r"note is 3, expected string": replace(episode(1), values={**episode(1).values, "note": 3}),
+    r"success is 'yes', expected bool": replace(episode(1), success="yes"),
+    r"count has numbers too large for int32": with_array("count", np.full(23, 2**31)),
     r"found an empty task": episode(1, task=" "),
 }
 

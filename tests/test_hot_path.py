@@ -62,7 +62,13 @@ PATHS: dict[str, list[str] | None] = {
     ],
     "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
     "control/planner.py": ["CommandTape.command"],
-    "kinematics/batched_ik.py": ["BatchedIk.solve", "BatchedIk.aperture"],
+    "kinematics/batched_ik.py": [
+        "BatchedIk.solve",
+        "BatchedIk.aperture",
+        "BatchedIk.directions",
+        "BatchedIk._launch",
+        "BatchedIk._take",
+    ],
     "scene/index.py": ["Columns.read", "Columns.write", "Columns.write_masked"],
     "sim/mjwarp.py": [
         f"MjwarpSimulation.{n}"

@@ -48,7 +48,8 @@ class LayoutCfg:
     """Where a scene's objects stand for one robot, and the buffer sizes its contacts need.
 
     ``random_xy`` is how far ``reset=randomized`` moves each cube off its place in x and y. ``nconmax`` and ``njmax`` are for
-    the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions.
+    the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions. A scene with a box has a ``home`` of its own, clear
+    of it.
     """
 
     table_center: list[float] = MISSING
@@ -56,6 +57,11 @@ class LayoutCfg:
     red_xy: list[float] = MISSING
     blue_xy: list[float] = MISSING
     random_xy: list[float] = MISSING
+    box_center: list[float] | None = None
+    red_slot: list[float] | None = None
+    blue_slot: list[float] | None = None
+    grasp_offset: float = 0.0
+    home: list[float] | None = None
     nconmax: int = MISSING
     njmax: int = MISSING
     env_nconmax: int = MISSING
@@ -107,8 +113,26 @@ class ModelCfg:
 
 
 @dataclass(kw_only=True, slots=True)
+class BoxCfg:
+    """A receiving box on the table: a floor and four walls, fixed to the world.
+
+    ``center`` and ``half`` are of its inside, in x and y. Walls stand on the table around the floor; ``height`` is their rim's
+    above the table.
+    """
+
+    center: list[float] = MISSING
+    half: list[float] = MISSING
+    floor: float = MISSING
+    wall: float = MISSING
+    height: float = MISSING
+    friction: list[float] = MISSING
+    floor_solref: list[float] = MISSING
+    wall_solref: list[float] = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
 class SceneCfg:
-    """Table and cubes."""
+    """Table and cubes, and perhaps a box."""
 
     name: str = MISSING
     table_center: list[float] = MISSING
@@ -120,9 +144,10 @@ class SceneCfg:
     cube_half: float = MISSING
     cube_mass: float = MISSING
     cube_friction: list[float] = MISSING
-    # Where a box stands: the cubes' places in it, and how far above a cube's centre it is held.
-    red_slot: list[float] | None = None
-    blue_slot: list[float] | None = None
+    # A box, the cubes' places in it, and how far above a cube's centre it is held.
+    box: BoxCfg | None = None
+    red_slot: list[float] | None = MISSING  # OmegaConf cannot merge an interpolation into null
+    blue_slot: list[float] | None = MISSING
     grasp_offset: float = 0.0
 
 
@@ -228,7 +253,8 @@ class TerminationTermCfg(TermCfg):
 
 @dataclass(kw_only=True, slots=True)
 class TaskCfg:
-    """What has to be achieved, sampled at frame ends. The rules' thresholds are in `AcceptanceCfg`.
+    """What has to be achieved, sampled at frame ends. The rules' thresholds are in `AcceptanceCfg` and
+    `BoxAcceptanceCfg`.
 
     ``evidence`` names the subclass of ``Evidence`` that judges a scripted episode. ``instruction`` says in words what is to be
     done, for datasets; null: the task's name.
@@ -294,7 +320,7 @@ class ControllerCfg:
 
 @dataclass(kw_only=True, slots=True)
 class AcceptanceCfg:
-    """Thresholds of the episode acceptance."""
+    """Thresholds of the stack task's acceptance."""
 
     lift_phases: list[str] = MISSING
     carry_phase: str = MISSING
@@ -310,6 +336,23 @@ class AcceptanceCfg:
     rest_speed: float = MISSING
     rest_position: float = MISSING
     rest_rotation_deg: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class BoxAcceptanceCfg:
+    """Thresholds of the box task's acceptance."""
+
+    force: float = MISSING
+    grasp_frames: int = MISSING
+    lift_height: float = MISSING
+    lift_frames: int = MISSING
+    carry_frames: int = MISSING
+    carry_distance: float = MISSING
+    open_fraction: float = MISSING
+    inside: float = MISSING
+    rest_speed: float = MISSING
+    window: int = MISSING
+    jaw_clearance: float = MISSING
 
 
 @dataclass(kw_only=True, slots=True)
@@ -370,6 +413,7 @@ class GateCfg:
     """Thresholds of every gate."""
 
     acceptance: AcceptanceCfg = field(default_factory=AcceptanceCfg)
+    box: BoxAcceptanceCfg = field(default_factory=BoxAcceptanceCfg)
     parity: ParityCfg = field(default_factory=ParityCfg)
     capacity: CapacityCfg = field(default_factory=CapacityCfg)
     batch: BatchGateCfg = field(default_factory=BatchGateCfg)

@@ -5,7 +5,16 @@ from __future__ import annotations
 import math
 import re
 
-from mjstack.config.schema import CollectJobCfg, Config, ReachabilityJobCfg, ScalingJobCfg, SolverCfg, StudyJobCfg
+from mjstack.config.schema import (
+    BoxCfg,
+    CollectJobCfg,
+    Config,
+    ReachabilityJobCfg,
+    ScalingJobCfg,
+    SceneCfg,
+    SolverCfg,
+    StudyJobCfg,
+)
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput")
@@ -15,6 +24,7 @@ SCALING_BACKENDS = ("mjwarp", "native")
 SECTIONS = ("physics", "episode", "env_step")
 ANCHORS = ("red", "blue", "on_blue", "over_red", "over_blue", "red_slot", "blue_slot")
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
+BOX_ROLES = ("approach", "descend", "close", "lift", "carry", "hold", "open", "retreat", "settle")  # phases of each cube
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
 _WORLD = re.compile(r"(\d+:)?\d+")
 
@@ -163,6 +173,38 @@ def _scene(cfg: Config) -> None:
     apart = math.dist(scene.red_xy, scene.blue_xy)
     if not apart >= 2.0 * math.sqrt(2.0) * scene.cube_half:
         raise ConfigError("scene.red_xy", scene.red_xy, f"a cube that does not touch the blue one at {scene.blue_xy}")
+    if scene.box is not None:
+        _box(scene, scene.box)
+
+
+def _box(scene: SceneCfg, box: BoxCfg) -> None:
+    for key, size in (("center", 2), ("half", 2), ("friction", 3), ("floor_solref", 2), ("wall_solref", 2)):
+        _length(f"scene.box.{key}", getattr(box, key), size)
+    for name in ("floor", "wall", "height"):
+        _positive(f"scene.box.{name}", getattr(box, name), "m")
+    for key in ("half", "friction"):
+        for number in getattr(box, key):
+            _positive(f"scene.box.{key}", number)
+    if not box.height > box.floor:
+        raise ConfigError("scene.box.height", box.height, f"more than the floor's thickness, {box.floor:g} m")
+    for key in ("floor_solref", "wall_solref"):
+        first, second = getattr(box, key)
+        if not (min(first, second) > 0.0 or max(first, second) < 0.0):
+            expected = "a time constant [s] and a damping ratio, or stiffness and damping as two negative numbers"
+            raise ConfigError(f"scene.box.{key}", getattr(box, key), expected)
+    outer = [half + box.wall for half in box.half]
+    for axis in (0, 1):
+        if not abs(box.center[axis] - scene.table_center[axis]) + outer[axis] <= scene.table_half[axis] + 1e-9:
+            raise ConfigError("scene.box.center", box.center, "a box that is on the table with all its walls")
+    for key in ("red_xy", "blue_xy"):
+        xy = getattr(scene, key)
+        if not any(abs(xy[i] - box.center[i]) >= outer[i] + scene.cube_half for i in (0, 1)):
+            raise ConfigError(f"scene.{key}", xy, "a cube beside the box")
+    for key in ("red_slot", "blue_slot"):
+        slot = getattr(scene, key)
+        _length(f"scene.{key}", slot or [], 2)
+        if not all(abs(slot[i] - box.center[i]) <= box.half[i] - scene.cube_half for i in (0, 1)):
+            raise ConfigError(f"scene.{key}", slot, "a place in the box")
 
 
 def _controller(cfg: Config) -> None:
@@ -170,6 +212,8 @@ def _controller(cfg: Config) -> None:
         key = f"controller.phases.{name}"
         if phase.anchor is not None and phase.anchor not in ANCHORS:
             raise UnknownName(f"{key}.anchor:", phase.anchor, ANCHORS)
+        if phase.anchor in ("red_slot", "blue_slot") and getattr(cfg.scene, phase.anchor) is None:
+            raise ConfigError(f"{key}.anchor", phase.anchor, f"an anchor of scene {cfg.scene.name}, which has no box")
         if phase.gripper not in ("open", "closed"):
             raise ConfigError(f"{key}.gripper", phase.gripper, "open or closed")
         _positive(f"{key}.seconds", phase.seconds, "s")
@@ -203,9 +247,14 @@ def _controller(cfg: Config) -> None:
 
 def _gates(cfg: Config) -> None:
     gate, phases = cfg.gate, cfg.controller.phases
-    named = [("gate.acceptance.carry_phase", gate.acceptance.carry_phase)]
-    named += [("gate.acceptance.lift_phases", name) for name in gate.acceptance.lift_phases]
-    named += [("gate.parity.states", name) for name in gate.parity.states.values()]
+    named = [("gate.parity.states", name) for name in gate.parity.states.values()]
+    if cfg.task.evidence.endswith(".StackEvidence"):
+        named += [("gate.acceptance.carry_phase", gate.acceptance.carry_phase)]
+        named += [("gate.acceptance.lift_phases", name) for name in gate.acceptance.lift_phases]
+    if cfg.task.evidence.endswith(".BoxEvidence"):
+        if cfg.scene.box is None:
+            raise ConfigError("scene", cfg.scene.name, "a scene with a box, for task.evidence BoxEvidence", "Set scene=box")
+        named += [("task.evidence", f"{role}_{cube}") for cube in ("red", "blue") for role in BOX_ROLES]
     named += [("gate.throughput.from_phase", gate.throughput.from_phase)]
     for key, name in named:
         if name not in phases:
@@ -217,6 +266,16 @@ def _gates(cfg: Config) -> None:
         _positive_int(f"gate.acceptance.{name}", getattr(gate.acceptance, name))
     for name in ("carry_distance", "xy_err", "support_gap", "rest_speed", "rest_position", "rest_rotation_deg"):
         _positive(f"gate.acceptance.{name}", getattr(gate.acceptance, name))
+    for name in ("grasp_frames", "lift_frames", "carry_frames"):
+        _positive_int(f"gate.box.{name}", getattr(gate.box, name))
+    for name in ("force", "lift_height", "carry_distance", "rest_speed", "jaw_clearance"):
+        _positive(f"gate.box.{name}", getattr(gate.box, name))
+    if not 1 <= gate.box.window <= frames:
+        raise ConfigError("gate.box.window", gate.box.window, f"1 to {frames} frames (the episode)")
+    if not 0.0 < gate.box.open_fraction <= 1.0:
+        raise ConfigError("gate.box.open_fraction", gate.box.open_fraction, "a number above 0 and up to 1")
+    if not (math.isfinite(gate.box.inside) and gate.box.inside >= 0.0):
+        raise ConfigError("gate.box.inside", gate.box.inside, "a number that is not negative [m]")
     _positive_int("gate.batch.seeds", gate.batch.seeds)
     if cfg.seed + gate.batch.seeds > 1 << 32:
         raise ConfigError("gate.batch.seeds", gate.batch.seeds, f"at most {(1 << 32) - cfg.seed}, because seeds are 32-bit")

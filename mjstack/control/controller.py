@@ -32,22 +32,38 @@ class Controller(Protocol):
 
 
 class Recorded:
-    """Commands that were given in an episode, to be given again."""
+    """What a controller gave in an episode, to be given again; itself a controller that only repeats."""
 
-    def __init__(self, frames: int, nworld: int, nu: int, device: torch.device) -> None:
-        """Allocates; NaN until it is written."""
-        self.frames = frames
-        self._commands = torch.full((frames, nworld, nu), torch.nan, dtype=torch.float32, device=device)
+    def __init__(self, source: Controller, nu: int) -> None:
+        """Allocates for the worlds and frames of a controller; NaN until it is written.
+
+        Args:
+            source: The controller.
+            nu: Width of its commands.
+        """
+        self.phases, self.frames = source.phases, source.frames
+        self.phase, self.error, self.retries = torch.zeros_like(source.phase), source.error, source.retries
+        nworld, device = source.phase.shape[0], source.phase.device
+        self._commands = torch.full((self.frames, nworld, nu), torch.nan, dtype=torch.float32, device=device)
+        self._phases = torch.zeros((self.frames, nworld), dtype=torch.int16, device=device)
         self._next = torch.zeros(1, dtype=torch.int64, device=device)
 
-    def append(self, command: torch.Tensor) -> None:
-        """Takes the next frame's, shape ``(nworld, nu)``. No host read."""
+    def append(self, command: torch.Tensor, phase: torch.Tensor) -> None:
+        """Takes the next frame's command, ``(nworld, nu)``, and phase, ``(nworld,)``. No host read."""
         self._commands.index_copy_(0, self._next, command[None].float())
+        self._phases.index_copy_(0, self._next, phase[None].to(torch.int16))
         self._next.add_(1)
 
-    def command(self, frame: int) -> torch.Tensor:
-        """Those of one frame, shape ``(nworld, nu)``."""
-        return self._commands[frame]
+    def rewind(self) -> None:
+        """From here on it repeats."""
+        self._next.zero_()
+
+    def command(self) -> torch.Tensor:
+        """Commands of the next frame, shape ``(nworld, nu)``."""
+        out = self._commands.index_select(0, self._next)[0]
+        self.phase.copy_(self._phases.index_select(0, self._next)[0])
+        self._next.add_(1)
+        return out
 
 
 class TapeController:

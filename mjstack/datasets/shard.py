@@ -10,7 +10,7 @@ import numpy as np
 
 from mjstack.datasets import layout
 from mjstack.datasets.arrow import require_pyarrow
-from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData
+from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData, typed_row
 from mjstack.datasets.staging import Staging
 from mjstack.datasets.statistics import episode_statistics
 
@@ -80,11 +80,10 @@ class Shard:
         # In float64, which holds every type's values exactly, but int64's beyond 2^53.
         numbers = np.concatenate([columns[name].T for name in self._schema.names], dtype=np.float64)
         place = layout.shard_indices(self.number)
-        row: dict[str, Any] = {"episode_index": number, "tasks": [episode.task], "length": length}
+        row: dict[str, Any] = {"episode_index": number, "length": length}
         row |= {f"data/{name}": index for name, index in place.items()}
         row |= {"dataset_from_index": self._frames, "dataset_to_index": self._frames + length}
-        row |= {"success": bool(episode.success), "seed": int(episode.seed), "world": int(episode.world)}
-        row |= {name: episode.values[name] for name in self._spec.values}
+        row |= typed_row(self._spec, episode)
         row |= {f"meta/episodes/{name}": index for name, index in place.items()}
         for name, value in row.items():
             self.rows.setdefault(name, []).append(value)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import numbers
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +14,13 @@ import numpy as np
 from mjstack.errors import ArgumentError, DatasetError, suggest
 
 DTYPES = ("float32", "float64", "int32", "int64", "bool")
-VALUE_DTYPES = ("float64", "int64", "bool", "string")
+# What a value of an episode may be, and what it is kept as.
+VALUE_DTYPES: dict[str, tuple[tuple[type, ...], Callable[[Any], Any]]] = {
+    "float64": ((numbers.Real,), float),
+    "int64": ((numbers.Integral,), int),
+    "bool": ((bool, np.bool_), bool),
+    "string": ((str,), str),
+}
 # What the writer itself adds to every frame, with its type; LeRobot expects these names.
 INDICES = {
     "timestamp": "float32",
@@ -115,9 +122,6 @@ def typed_arrays(spec: DatasetSpec, episode: EpisodeData) -> dict[str, np.ndarra
     """
     where = f"episode of seed {episode.seed}, world {episode.world}"
     _check_names(where, "feature", episode.arrays, spec.features)
-    _check_names(where, "value", episode.values, spec.values)
-    if not episode.task.strip():
-        raise DatasetError(f"{where}: found an empty task, expected its text. Give EpisodeData.task")
     frames, typed = None, {}
     for name, feature in spec.features.items():
         array = np.asarray(episode.arrays[name])
@@ -130,6 +134,8 @@ def typed_arrays(spec: DatasetSpec, episode: EpisodeData) -> dict[str, np.ndarra
             raise DatasetError(f"{where}: {name} is {rows.dtype}, expected {feature.dtype}. Convert it, or change the feature")
         with np.errstate(over="ignore"):
             typed[name] = np.ascontiguousarray(rows, dtype=feature.dtype)
+        if feature.dtype.startswith("int") and not np.array_equal(typed[name], rows):
+            raise DatasetError(f"{where}: {name} has numbers too large for {feature.dtype}, expected its range. Use int64")
         bad = np.flatnonzero(~np.isfinite(typed[name]).all(axis=1))
         if len(bad):
             raise DatasetError(
@@ -137,6 +143,31 @@ def typed_arrays(spec: DatasetSpec, episode: EpisodeData) -> dict[str, np.ndarra
                 f"{feature.dtype}. Leave the episode out"
             )
     return typed
+
+
+def typed_row(spec: DatasetSpec, episode: EpisodeData) -> dict[str, Any]:
+    """The columns that an episode brings to its row, in the dataset's types.
+
+    Raises:
+        DatasetError: A value is missing, unknown or of another type.
+    """
+    where = f"episode of seed {episode.seed}, world {episode.world}"
+    _check_names(where, "value", episode.values, spec.values)
+    if not episode.task.strip():
+        raise DatasetError(f"{where}: found an empty task, expected its text. Give EpisodeData.task")
+    row: dict[str, Any] = {"tasks": [episode.task]}
+    own: dict[str, tuple[str, Any]] = {
+        "success": ("bool", episode.success),
+        "seed": ("int64", episode.seed),
+        "world": ("int64", episode.world),
+    }
+    for name, (dtype, value) in (own | {k: (dtype, episode.values[k]) for k, dtype in spec.values.items()}).items():
+        kinds, convert = VALUE_DTYPES[dtype]
+        fits = isinstance(value, kinds) and (dtype == "bool" or not isinstance(value, bool))
+        if not fits or (dtype == "int64" and not -(2**63) <= value < 2**63):
+            raise DatasetError(f"{where}: {name} is {value!r}, expected {dtype}. Convert it, or change the DatasetSpec")
+        row[name] = convert(value)
+    return row
 
 
 def _check_feature(name: str, feature: Feature) -> None:

@@ -17,7 +17,7 @@ from mjstack.datasets import layout
 from mjstack.datasets.arrow import require_pyarrow
 from mjstack.datasets.opening import check_same, lock_folder, read_info, read_shards, read_tasks, uncommitted
 from mjstack.datasets.shard import Shard
-from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_arrays
+from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_arrays, typed_row
 from mjstack.datasets.staging import Staging, interrupts_deferred
 from mjstack.datasets.statistics import RunningStatistics
 from mjstack.errors import ArgumentError, DatasetError, UnwrittenError
@@ -99,6 +99,7 @@ class DatasetWriter:
         """
         self._check_open()
         for episode in episodes:
+            typed_row(self.spec, episode)
             typed_arrays(self.spec, episode)
         for episode in episodes:
             arrays = typed_arrays(self.spec, episode)

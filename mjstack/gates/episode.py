@@ -136,6 +136,7 @@ def run_episode(
     worlds: Sequence[int] | None = None,
     meter: EnergyMeter | None = None,
     keep_commands: bool = False,
+    repeat: Recorded | None = None,
 ) -> Episode:
     """Plays the scripted task once in every world and judges it.
 
@@ -152,17 +153,20 @@ def run_episode(
         worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start_worlds`.
         meter: Takes in the energy of the frames from the third on, when all are replayed.
         keep_commands: Record all commands, on the device.
+        repeat: Give these commands instead of the controller's.
     """
     env, controller = start_worlds(sim, index, cfg, reset, planner, advance, worlds)
     frames = controller.frames
-    nu = env.action_manager.action_dim
-    recorded = Recorded(frames, sim.nworld, nu, sim.device) if keep_commands else None
+    recorded = Recorded(controller, env.action_manager.action_dim) if keep_commands else None
+    if repeat is not None:
+        repeat.rewind()
+        controller = repeat
     evidence = evidence_class(cfg)(cfg, index, planner.phases, sim.nworld, sim.device)
 
     def work() -> None:
         command = controller.command()
         if recorded is not None:
-            recorded.append(command)
+            recorded.append(command, controller.phase)
         env.action_manager.take(command)
         env.advance()
         evidence.update(sim, controller.phase)

@@ -142,6 +142,7 @@ def measure_episode(
     played: list[TimedEpisode] = [before] if before is not None and not mjwarp else []
     bare: list[float] = []
     ratios: list[float] = []
+    controlled: list[float] = []  # what the controller adds to frames that only repeat its commands
     estimate = 0.0 if frame_seconds is None else frame_seconds * frames
     if before is not None:
         estimate = max(estimate, before.seconds)
@@ -160,6 +161,9 @@ def measure_episode(
             section.problem = section.problem or problem
             bare.append(seconds)
             ratios.append(episode.seconds / seconds)
+        if keep:
+            again = run_episode(sim, context.index, cfg, context.planner, cfg.reset, repeat=episode.commands)
+            controlled.append(episode.seconds / again.seconds - 1.0)
         estimate = time.perf_counter() - turn_began
         context.tell("episode, repetitions", len(played), watch.repetitions)
     if not played and before is not None:
@@ -190,6 +194,9 @@ def measure_episode(
     if ratios:
         section.figures |= spread("bare_seconds", bare) | spread("bare_ratio", ratios)
         section.headline += f" ({statistics.median(ratios):.3f} x bare steps)"
+        if controlled:
+            section.figures |= spread("controller_over_frame", controlled)
+            section.headline += f", controller {100.0 * statistics.median(controlled):+.1f} %"
     elif mjwarp:
         section.facts["bare_ratio"] = "not measured: no time for an episode and as many bare steps"
     if len(played) > sum(p is before for p in played):
@@ -272,10 +279,13 @@ def _play_bare(context: GateContext, sim: MjwarpSimulation, recorded: Recorded |
     if sim.device.type == "cuda" and cfg.graph is not GraphMode.off and not step.captured:
         return math.nan, "the bare steps could not be captured"
     _, controller = start_worlds(sim, context.index, cfg, cfg.reset, context.planner)
+    if recorded is not None:
+        recorded.rewind()
+        controller = recorded
 
     def play() -> None:
-        for frame in range(controller.frames):
-            sim.ctrl.copy_(controller.command() if recorded is None else recorded.command(frame))
+        for _ in range(controller.frames):
+            sim.ctrl.copy_(controller.command())
             for _ in range(substeps):
                 step()
 

@@ -23,16 +23,17 @@ _OTHER_GATES = ("parity", "capacity", "batch", "throughput")
 _JOINTS, _JOINT_SPEEDS = "of the joints", "of the joints, per second"
 # Of the observation terms; one that is not here, such as a user's own, has the unit "unknown".
 _UNITS: dict[str, str | tuple[str, ...]] = {
-    "joint_pos": _JOINTS,
-    "joint_pos_relative": _JOINTS,
-    "joint_vel": _JOINT_SPEEDS,
-    "aperture_pos": "m",
-    "aperture_to_object": "m",
-    "object_to_object": "m",
-    "object_pose": ("m",) * 3 + ("1",) * 4,
-    "object_velocity": ("m/s",) * 3 + ("rad/s",) * 3,
-    "jaw_force": "N",
-    "last_action": _JOINTS,
+    "mjstack.mdp.observation.joint_pos": _JOINTS,
+    "mjstack.mdp.observation.joint_pos_relative": _JOINTS,
+    "mjstack.mdp.observation.joint_vel": _JOINT_SPEEDS,
+    "mjstack.mdp.observation.aperture_pos": "m",
+    "mjstack.mdp.observation.aperture_to_object": "m",
+    "mjstack.mdp.observation.object_to_object": "m",
+    "mjstack.mdp.observation.object_pose": ("m",) * 3 + ("1",) * 4,
+    "mjstack.mdp.observation.object_velocity": ("m/s",) * 3 + ("rad/s",) * 3,
+    "mjstack.mdp.observation.jaw_force": "N",
+    "mjstack.mdp.observation.last_action": _JOINTS,
+    "mjstack.tasks.box_terms.ToSlot": "m",
 }
 
 
@@ -124,8 +125,7 @@ def _group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
 
 
 def _term_units(func: str, width: int, joints: tuple[str, ...]) -> Sequence[str]:
-    module, _, name = func.rpartition(".")
-    unit = _UNITS.get(name, "unknown") if module == "mjstack.mdp.observation" else "unknown"
+    unit = _UNITS.get(func, "unknown")
     if unit == _JOINTS:
         return joints
     if unit == _JOINT_SPEEDS:

@@ -16,6 +16,8 @@ from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.reported import Record, check_showing, run_reported
 from mjstack.sim import resolve_backend
 
+_SCRIPTED = ("stack", "box")  # tasks
+
 
 def check_machine(cfg: Config) -> None:
     """Raises for what this machine cannot do, before anything is written."""
@@ -29,10 +31,9 @@ def check_machine(cfg: Config) -> None:
 def check_task(cfg: Config) -> None:
     """Raises if the scripted task cannot be played as configured, on this machine."""
     resolve_backend(cfg)
-    if cfg.task.name != "stack":
-        raise ConfigError(
-            "task", cfg.task.name, "task=stack, whose scripted episode the gates verify", "Train it: mjstack.make_env"
-        )
+    if cfg.task.name not in _SCRIPTED:
+        expected = f"one of {', '.join(_SCRIPTED)}, whose scripted episode the gates verify"
+        raise ConfigError("task", cfg.task.name, expected, "Train it: mjstack.make_env")
     ScriptedPlanner(cfg)  # reads the robot, and reaches every nominal target
     build_env(cfg, nworld=1, backend=Backend.native, device="cpu").close()  # builds and checks every term
 

@@ -221,8 +221,9 @@ def _write(context: GateContext, folder: Path, levels: list[ReachLevel], regions
         f"round, at every level; points are {1e3 * job.step:g} mm apart. Regions keep cubes of any yaw on the table.",
         f"Reached: inverse kinematics of {', '.join(robot.ik_joints)} brings the aperture centre within "
         f"{1e3 * context.cfg.controller.ik_tolerance:g} mm. Collisions are not looked at.",
-        f"Tilt: the smallest angle between the axis of {robot.arm_joints[-1]} and straight down that a solution has. A controller "
-        "that goes on from where it is need not find that solution, and may stop at a joint limit short of a reached point.",
+        f"Tilt: the smallest angle between the axis of {robot.arm_joints[-1]} and straight down that a solution has. A "
+        "controller that goes on from where it is need not find that solution, and may stop at a joint limit short of a "
+        "reached point.",
         "Reached does not mean grasped: how many worlds succeed, the batch gate tells.",
     ]
     write_atomic(folder / "reachability.csv", to_csv(found))

@@ -1,4 +1,4 @@
-"""Builds a scene around a robot: floor, table, two cubes, timestep and solver settings, all set before compilation."""
+"""Builds a scene around a robot: floor, table, two cubes and perhaps a box, timestep and solver, all set before compilation."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 import mujoco
 
-from mjstack.config.schema import Cone, Config, SceneCfg, SolverCfg, TimingCfg
+from mjstack.config.schema import BoxCfg, Cone, Config, SceneCfg, SolverCfg, TimingCfg
 from mjstack.robots import robot_spec
 
 RED, BLUE = "red_cube", "blue_cube"
+WORLD = "world"  # MuJoCo's name of the body that never moves
+CUBES_SENSOR = f"{RED}/{BLUE}"
 _CONES = {Cone.elliptic: mujoco.mjtCone.mjCONE_ELLIPTIC, Cone.pyramidal: mujoco.mjtCone.mjCONE_PYRAMIDAL}
 _NETFORCE = 3  # the contact sensor's reduction to one force and torque, in the world frame
 
@@ -38,7 +40,7 @@ def build_scene(
 
     Args:
         spec: The robot; it is changed in place.
-        scene: Table and cubes.
+        scene: Table and cubes, and perhaps a box.
         timing: Physics timestep.
         solver: Solver settings; ``None`` keeps the robot file's own.
         jaw_bodies: Bodies of the gripper, whose contact force on each cube a sensor measures.
@@ -74,6 +76,8 @@ def build_scene(
         condim=3,
         rgba=[0.72, 0.66, 0.58, 1],
     )
+    if scene.box is not None:
+        _add_box(spec, scene.box, table_top(scene))
     z = table_top(scene) + scene.cube_half
     for name, xy, rgba in ((RED, scene.red_xy, [0.80, 0.16, 0.14, 1]), (BLUE, scene.blue_xy, [0.14, 0.34, 0.78, 1])):
         body = world.add_body(name=name, pos=[*xy, z])
@@ -89,7 +93,11 @@ def build_scene(
         )
     for cube in (RED, BLUE):
         for jaw in jaw_bodies:
-            _add_jaw_sensor(spec, jaw, cube)
+            _add_force_sensor(spec, jaw_sensor(jaw, cube), jaw, cube)
+    if scene.box is not None:
+        for cube in (RED, BLUE):
+            _add_force_sensor(spec, support_sensor(cube), WORLD, cube)
+        _add_force_sensor(spec, CUBES_SENSOR, RED, BLUE)
     if visuals:
         world.add_light(pos=[0.2, -0.6, 1.6], dir=[0.1, 0.4, -1.0], diffuse=[0.6, 0.6, 0.6])
         spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
@@ -105,15 +113,46 @@ def jaw_sensor(jaw: str, cube: str) -> str:
     return f"{jaw}/{cube}"
 
 
-def _add_jaw_sensor(spec: mujoco.MjSpec, jaw: str, cube: str) -> None:
+def support_sensor(cube: str) -> str:
+    """Name of the sensor of the force between a cube and what is fixed to the world: floor, table and box."""
+    return f"{WORLD}/{cube}"
+
+
+def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
+    """Adds a box to the world, its floor and walls on a surface at height top [m]. Every geom's name begins with ``box_``."""
+    x, y = box.center
+    half_x, half_y = box.half
+    thick, up = 0.5 * box.wall, 0.5 * box.height
+    # The walls across x close the corners.
+    parts = {
+        "floor": ([x, y, top + 0.5 * box.floor], [half_x, half_y, 0.5 * box.floor], box.floor_solref),
+        "near": ([x - half_x - thick, y, top + up], [thick, half_y + box.wall, up], box.wall_solref),
+        "far": ([x + half_x + thick, y, top + up], [thick, half_y + box.wall, up], box.wall_solref),
+        "right": ([x, y - half_y - thick, top + up], [half_x, thick, up], box.wall_solref),
+        "left": ([x, y + half_y + thick, top + up], [half_x, thick, up], box.wall_solref),
+    }
+    for name, (pos, size, solref) in parts.items():
+        spec.worldbody.add_geom(
+            name=f"box_{name}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=pos,
+            size=size,
+            friction=box.friction,
+            condim=3,
+            solref=solref,
+            rgba=[0.50, 0.55, 0.52, 1],
+        )
+
+
+def _add_force_sensor(spec: mujoco.MjSpec, name: str, first: str, second: str) -> None:
     """Measures the net contact force [N] between two bodies: 3 numbers, world frame."""
     spec.add_sensor(
-        name=jaw_sensor(jaw, cube),
+        name=name,
         type=mujoco.mjtSensor.mjSENS_CONTACT,
         objtype=mujoco.mjtObj.mjOBJ_BODY,
-        objname=jaw,
+        objname=first,
         reftype=mujoco.mjtObj.mjOBJ_BODY,
-        refname=cube,
+        refname=second,
         intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NETFORCE, 1],
     )
 

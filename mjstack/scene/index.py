@@ -11,7 +11,7 @@ import torch
 
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import UnknownName
-from mjstack.scene.build import BLUE, RED, jaw_sensor
+from mjstack.scene.build import BLUE, CUBES_SENSOR, RED, jaw_sensor, support_sensor
 
 CUBES = (RED, BLUE)
 
@@ -95,6 +95,7 @@ class SceneIndex:
         bodies: Body index of those objects.
         geoms: Geom indices of those objects.
         jaw_force: First sensordata address of each jaw's force on an object (3 numbers), by the object's name.
+        support_force: Likewise of the world's and the other cube's force on it; only a scene with a box measures them.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
@@ -119,6 +120,11 @@ class SceneIndex:
         for cube in CUBES:
             sensors = [find(model, "sensor", jaw_sensor(jaw, cube)) for jaw in robot.jaw_bodies]
             self.jaw_force[cube] = [int(model.sensor_adr[s]) for s in sensors]
+        self.support_force: dict[str, list[int]] = {}
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, CUBES_SENSOR) >= 0:
+            for cube in CUBES:
+                sensors = [find(model, "sensor", name) for name in (support_sensor(cube), CUBES_SENSOR)]
+                self.support_force[cube] = [int(model.sensor_adr[s]) for s in sensors]
 
     def on(self, device: torch.device, dtype: torch.dtype) -> RobotTensors:
         """The robot's part on a device. Made once: a captured step may not copy from the host."""

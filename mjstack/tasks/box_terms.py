@@ -1,0 +1,135 @@
+"""Observations and rewards of the box task."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from mjstack.errors import ParameterError, UnknownName
+from mjstack.managers.base import EnvView, shared
+from mjstack.math import lowest_corner, quat_to_matrix
+from mjstack.mdp.geometry import aperture_center, jaw_forces, pose_w
+from mjstack.scene import BLUE, RED, table_top
+from mjstack.tasks.box import CubesAndBox
+
+
+class ToSlot:
+    """From a cube's centre to where it rests at its place in the box [m], shape ``(nworld, 3)``."""
+
+    def __init__(self, env: EnvView, *, object: str) -> None:
+        """Finds the place.
+
+        Args:
+            env: The environment.
+            object: One of the cubes.
+
+        Raises:
+            MjstackError: There is no such cube, or no box.
+        """
+        env.index.object_address(object)
+        scene, box, slots = env.cfg.scene, env.cfg.scene.box, {RED: env.cfg.scene.red_slot, BLUE: env.cfg.scene.blue_slot}
+        slot = slots.get(object)
+        if object not in slots:
+            raise UnknownName("cube", object, slots)
+        if box is None or slot is None:
+            raise ParameterError("object", object, "a scene with a box", "Set scene=box")
+        place = [*slot, table_top(scene) + box.floor + scene.cube_half]
+        self._object = object
+        self._place = torch.tensor(place, dtype=env.sim.qpos.dtype, device=env.device)
+
+    def __call__(self, env: EnvView) -> torch.Tensor:
+        """The offset."""
+        return self._place - pose_w(env, self._object)[:, :3]
+
+
+class Place:
+    """Nearness of a cube to its place in the box, while it is off the table: ``1 - tanh(distance / scale)``."""
+
+    def __init__(self, env: EnvView, *, object: str, scale: float) -> None:
+        """Finds the place.
+
+        Args:
+            env: The environment.
+            object: One of the cubes.
+            scale: Distance over which the reward falls [m].
+
+        Raises:
+            MjstackError: There is no such cube, no box, or the scale is out of range.
+        """
+        if not 0.0 < scale < math.inf:
+            raise ParameterError("scale", scale, "a positive number")
+        self._to_slot, self._object, self._scale = ToSlot(env, object=object), object, scale
+
+    def __call__(self, env: EnvView) -> torch.Tensor:
+        """The reward, shape ``(nworld,)``."""
+        near = 1.0 - torch.tanh(torch.linalg.vector_norm(self._to_slot(env), dim=1) / self._scale)
+        pose = pose_w(env, self._object)
+        low = lowest_corner(pose[:, :3], pose[:, 3:], env.cfg.scene.cube_half) - table_top(env.cfg.scene)
+        return near * (low > 0.005)
+
+
+class InBox:
+    """What part of the cubes is in the box, 0 to 1."""
+
+    def __init__(self, env: EnvView) -> None:
+        """Reads the box's place."""
+        self._cubes = CubesAndBox(env.cfg, env.index, env.device)
+
+    def __call__(self, env: EnvView) -> torch.Tensor:
+        """The part, shape ``(nworld,)``."""
+        return cubes_inside(env, self._cubes).float().mean(1)
+
+
+class ReachNext:
+    """Nearness of the aperture centre to the first cube that is not in the box yet, red first; 1 once both are."""
+
+    def __init__(self, env: EnvView, *, scale: float) -> None:
+        """Reads the box's place.
+
+        Args:
+            env: The environment.
+            scale: Distance over which the reward falls [m].
+
+        Raises:
+            MjstackError: There is no box, or the scale is out of range.
+        """
+        if not 0.0 < scale < math.inf:
+            raise ParameterError("scale", scale, "a positive number")
+        self._cubes, self._scale = CubesAndBox(env.cfg, env.index, env.device), scale
+
+    def __call__(self, env: EnvView) -> torch.Tensor:
+        """The reward, shape ``(nworld,)``."""
+        red, blue = cubes_inside(env, self._cubes).unbind(1)
+        aim = torch.where(red[:, None], pose_w(env, BLUE)[:, :3], pose_w(env, RED)[:, :3])
+        near = 1.0 - torch.tanh(torch.linalg.vector_norm(aim - aperture_center(env), dim=1) / self._scale)
+        return torch.where(red & blue, 1.0, near)
+
+
+class GraspNext:
+    """1 while both jaws press on the first cube that is not in the box yet, red first, or once both are; else 0."""
+
+    def __init__(self, env: EnvView, *, force: float = 0.05) -> None:
+        """Reads the box's place.
+
+        Args:
+            env: The environment.
+            force: What each jaw must exceed [N].
+        """
+        self._cubes, self._force = CubesAndBox(env.cfg, env.index, env.device), force
+
+    def __call__(self, env: EnvView) -> torch.Tensor:
+        """The reward, shape ``(nworld,)``."""
+        red, blue = cubes_inside(env, self._cubes).unbind(1)
+        holds = [(jaw_forces(env, name) > self._force).all(1) for name in (RED, BLUE)]
+        return (torch.where(red, holds[1], holds[0]) | (red & blue)).to(torch.float32)
+
+
+def cubes_inside(env: EnvView, cubes: CubesAndBox) -> torch.Tensor:
+    """Whether each cube is in the box, shape ``(nworld, 2)``, bool. Not to be written into."""
+
+    def compute() -> torch.Tensor:
+        pose = cubes.pose(env.sim)
+        return cubes.inside(*cubes.bounds(pose[..., :3], quat_to_matrix(pose[..., 3:])))
+
+    return shared((id(env), cubes_inside), compute)
