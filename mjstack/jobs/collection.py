@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -16,6 +17,7 @@ from mjstack.control.phases import build_phases
 from mjstack.datasets import DatasetWriter, EpisodeData, layout
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.errors import ConfigError
+from mjstack.gates.episode import NOMINAL
 from mjstack.gates.gate import GateContext, failing_rules
 from mjstack.jobs.collect_record import CollectedBatch, read_batches, write_batches
 from mjstack.jobs.demonstration import ACTION, STATE, Played, frame_layout, frames_block, play_demonstrations
@@ -52,7 +54,8 @@ class Collection:
         """Finds out what a frame holds, and what an earlier call has left."""
         cfg = context.cfg
         self._context, self._cfg, self._job = context, cfg, cast(CollectJobCfg, cfg.job)
-        env = build_env(demonstration_config(cfg), nworld=1, model=context.model, backend=Backend.native, device="cpu")
+        shown = replace(demonstration_config(cfg), reset=NOMINAL)  # what a frame holds, no start changes
+        env = build_env(shown, nworld=1, model=context.model, backend=Backend.native, device="cpu")
         self._most, self._dim = most_worlds(cfg, env), sum(frame_layout(env).values())
         provenance = run_provenance(cfg, context)
         del provenance["date"], provenance["config_sha256"]  # they differ between calls that make the same episodes
