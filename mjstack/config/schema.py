@@ -256,10 +256,12 @@ class TaskCfg:
     """What has to be achieved, sampled at frame ends. The rules' thresholds are in `AcceptanceCfg` and
     `BoxAcceptanceCfg`.
 
-    ``evidence`` names the subclass of ``Evidence`` that judges a scripted episode.
+    ``evidence`` names the subclass of ``Evidence`` that judges a scripted episode. ``instruction`` says in words what is to be
+    done, for datasets; null: the task's name.
     """
 
     name: str = MISSING
+    instruction: str | None = None
     control_hz: float = MISSING
     episode_frames: int = MISSING
     goal_height: float = MISSING
@@ -491,6 +493,21 @@ class ReachabilityJobCfg(JobCfg):
 
     step: float = MISSING
     margin: float = MISSING
+
+
+@dataclass(kw_only=True, slots=True)
+class CollectJobCfg(JobCfg):
+    """Demonstrations of the scripted expert, as a dataset.
+
+    ``episodes`` is how many the dataset is to have; a call adds what is missing. ``folder`` null: ``outputs/collect/<hash>``,
+    by what episodes depend on. Frames are kept on the device until their batch is over: ``buffer_gib`` is the most that they
+    may take, and fewer worlds are played at a time where more would not fit.
+    """
+
+    episodes: int = MISSING
+    keep_failures: bool = MISSING
+    folder: str | None = None
+    buffer_gib: float = MISSING
 
 
 @dataclass(kw_only=True, slots=True)

@@ -17,7 +17,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
-from mjstack.config.schema import Config, ReachabilityJobCfg, ScalingJobCfg, StudyJobCfg
+from mjstack.config.schema import CollectJobCfg, Config, ReachabilityJobCfg, ScalingJobCfg, StudyJobCfg
 from mjstack.config.terms import type_terms
 from mjstack.config.validate import validate
 from mjstack.errors import MjstackError, UnknownName, suggest
@@ -31,6 +31,7 @@ ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjsta
 ConfigStore.instance().store(group="job", name="study_schema", node=StudyJobCfg, provider="mjstack")
 ConfigStore.instance().store(group="job", name="scaling_schema", node=ScalingJobCfg, provider="mjstack")
 ConfigStore.instance().store(group="job", name="reachability_schema", node=ReachabilityJobCfg, provider="mjstack")
+ConfigStore.instance().store(group="job", name="collect_schema", node=CollectJobCfg, provider="mjstack")
 
 
 class CompositionError(MjstackError):

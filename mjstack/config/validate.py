@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 from mjstack.config.schema import (
     BoxCfg,
+    CollectJobCfg,
     Config,
     ReachabilityJobCfg,
     ScalingJobCfg,
@@ -19,7 +20,7 @@ from mjstack.config.schema import (
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput", "success")
-JOBS = ("gates", "replay", "scaling", "study", "reachability")
+JOBS = ("gates", "replay", "scaling", "study", "reachability", "collect")
 CONDIMS = (1, 3, 4, 6)
 SCALING_BACKENDS = ("mjwarp", "native")
 SECTIONS = ("physics", "episode", "env_step")
@@ -65,6 +66,11 @@ def validate(cfg: Config) -> None:
     if isinstance(cfg.job, ReachabilityJobCfg):
         _positive("job.step", cfg.job.step, "m")
         _not_negative("job.margin", cfg.job.margin, "m")
+    if isinstance(cfg.job, CollectJobCfg):
+        _positive_int("job.episodes", cfg.job.episodes)
+        _positive("job.buffer_gib", cfg.job.buffer_gib, "GiB")
+        if cfg.job.folder is not None and not cfg.job.folder.strip():
+            raise ConfigError("job.folder", "''", "a folder, or null for outputs/collect/<hash>")
 
 
 def reads_layout(reset: Mapping[str, TermCfg]) -> bool:

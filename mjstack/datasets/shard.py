@@ -90,6 +90,12 @@ class Shard:
         self.statistics.append(episode_statistics(numbers))
         self._frames += length
 
+    def discard(self) -> None:
+        """Removes what has not taken its place."""
+        if self._parquet is not None:
+            self._parquet.is_open = False  # it would complete its file when it is collected, and that is closed by then
+        self.staging.discard()
+
     def finish(self, tasks: list[str] | None) -> None:
         """Completes the data file, and stages what says what is in it.
 

@@ -202,7 +202,7 @@ class DatasetWriter:
             yield
         except BaseException as error:
             self._open = False
-            self._shard.staging.discard()
+            self._shard.discard()
             del self.committed[kept:]
             self.frames, self._shard = frames, self._next_shard()
             if isinstance(error, OSError):

@@ -90,3 +90,8 @@ def scripted_config(cfg: Config, **changes: object) -> Config:
         task=replace(cfg.task, success=None),
         **changes,  # type: ignore[arg-type]
     )
+
+
+def demonstration_config(cfg: Config) -> Config:
+    """Likewise for episodes that are kept: observations, rewards and success are computed as configured."""
+    return replace(scripted_config(cfg), observation=cfg.observation, reward=cfg.reward, task=cfg.task)

@@ -112,14 +112,26 @@ def start_worlds(
         env.world.copy_(torch.tensor(worlds))
     env.reset(seed=cfg.seed)
     sim.forward()
-    if cfg.controller.name == SCRIPTED:
+    return env, make_controller(env, planner, advance)
+
+
+def make_controller(env: Env, planner: ScriptedPlanner, advance: Advance | None = None) -> Controller:
+    """The configured controller, for worlds that have started.
+
+    Args:
+        env: The environment, whose action terms are the controller's.
+        planner: Plans the commands.
+        advance: Told about progress.
+    """
+    sim = env.sim
+    if env.cfg.controller.name == SCRIPTED:
         from mjstack.control.scripted import ScriptedController  # loads Warp, which a planned native run does not need
 
-        return env, ScriptedController(env, planner.nominal)
-    cubes = torch.cat([sim.qpos[:, a : a + 2] for a in index.cube_qpos], dim=1)
+        return ScriptedController(env, planner.nominal)
+    cubes = torch.cat([sim.qpos[:, a : a + 2] for a in env.index.cube_qpos], dim=1)
     progress = None if advance is None else (lambda done: advance("planning", done, sim.nworld))
     tape = planner.plan(cubes.double().cpu().numpy(), progress).to(sim.device, sim.ctrl.dtype)
-    return env, TapeController(tape, planner.phases, sim.nworld, sim.device)
+    return TapeController(tape, planner.phases, sim.nworld, sim.device)
 
 
 def run_episode(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
-from mjstack.jobs import gates, reachability, replay, scaling, study
+from mjstack.jobs import collect, gates, reachability, replay, scaling, study
 from mjstack.jobs.outcome import JobOutcome
 
 __all__ = ["JOBS", "JobOutcome", "check_job", "job_folder", "run_job"]
@@ -37,6 +37,7 @@ JOBS = {
     "replay": Job(replay.check_replay, replay.run_replay_job, keys=replay.KEYS),
     "scaling": Job(scaling.check_scaling, scaling.run_scaling_job, folder=scaling.scaling_folder),
     "reachability": Job(reachability.check_reachability, reachability.run_reachability_job),
+    "collect": Job(collect.check_collect, collect.run_collect_job, folder=collect.collect_folder),
     "study": Job(study.check_study, study.run_study_job),
 }
 

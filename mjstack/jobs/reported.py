@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import sys
@@ -84,16 +85,25 @@ def run_reported(cfg: Config, folder: Path, overrides: list[str], title: str, wo
             report.write(folder)
         console.print("interrupted; the finished gates are in the report")
     except OSError as error:
-        outcome.status = Status.failed
+        outcome.status = _mark_failed(report)
         Console(stderr=True).print(f"mjstack: {folder} cannot be written: {error.strerror}. Free space, or set hydra.run.dir.")
     except MjstackError as error:
-        outcome.status = Status.failed
+        outcome.status = _mark_failed(report)
+        with contextlib.suppress(OSError):
+            if report is not None:
+                report.write(folder)
         log.error("%s", error)
         Console(stderr=True, soft_wrap=True).print(f"mjstack: {escape(str(error))}")
     if report is not None:
         outcome.gates = report.gates
         _print_summary(console, report, folder)
     return outcome
+
+
+def _mark_failed(report: Report | None) -> Status:
+    if report is not None:
+        report.status = Status.failed
+    return Status.failed
 
 
 def _record(report: Report, result: GateResult, folder: Path, bar: ProgressBar) -> None:

@@ -126,6 +126,7 @@ class ObservationManager:
 
     Attributes:
         group_dims: Width of each group.
+        term_dims: Width of each term, history included, by group and name, in the order of the columns.
         groups: The tensors, by group. They are written anew at every step.
     """
 
@@ -137,6 +138,7 @@ class ObservationManager:
         """
         self._groups = {name: _Group(name, group, env) for name, group in cfg.items()}
         self.group_dims = {name: group.dim for name, group in self._groups.items()}
+        self.term_dims = {name: {term: p.dim for term, p in group.parts.items()} for name, group in self._groups.items()}
         self.groups = {
             name: torch.full((env.nworld, dim), math.nan, dtype=torch.float32, device=env.device)
             for name, dim in self.group_dims.items()

@@ -1,0 +1,273 @@
+"""A dataset of demonstrations that grows: worlds are played in batches, their episodes committed, until enough are there."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+
+from mjstack.config.schema import Backend, CollectJobCfg, Config
+from mjstack.control.phases import build_phases
+from mjstack.datasets import DatasetWriter, EpisodeData, layout
+from mjstack.envs import Env, build_env, demonstration_config
+from mjstack.errors import ConfigError
+from mjstack.gates.episode import NOMINAL
+from mjstack.gates.gate import GateContext, failing_rules
+from mjstack.jobs.collect_record import CollectedBatch, read_batches, write_batches
+from mjstack.jobs.demonstration import ACTION, STATE, Played, frame_layout, frames_block, play_demonstrations
+from mjstack.jobs.demonstration_spec import make_spec
+from mjstack.jobs.reported import run_provenance
+from mjstack.math import wilson_interval
+from mjstack.report.collect import ColumnRange, to_markdown
+from mjstack.report.record import GateResult, Status, Value, write_atomic
+from mjstack.sim import Simulation
+from mjstack.tasks.evidence import describe_rules
+
+DATASET = "dataset"  # within the job's folder
+_SPARE = 1.05  # worlds played over episodes that are missing: some fail
+_GIVE_UP = 3  # batches in a row without an episode
+_SEEDS = 1 << 32
+
+
+class Collection:
+    """A dataset, and what it takes to add to it.
+
+    A batch is one seed in as many worlds as are needed and fit; the next batch has the next seed, in later calls too. So a pair
+    of seed and world is one episode, whatever nworld was. A batch is committed as a whole, and noted beside the dataset.
+
+    Attributes:
+        home: The job's folder.
+        path: The dataset.
+        spec: What it holds.
+        batches: All that were finished, earlier calls' too.
+        committed: Episodes of the dataset.
+        frames: Likewise.
+    """
+
+    def __init__(self, context: GateContext, home: Path) -> None:
+        """Finds out what a frame holds, and what an earlier call has left."""
+        cfg = context.cfg
+        self._context, self._cfg, self._job = context, cfg, cast(CollectJobCfg, cfg.job)
+        shown = replace(demonstration_config(cfg), reset=NOMINAL)  # what a frame holds, no start changes
+        env = build_env(shown, nworld=1, model=context.model, backend=Backend.native, device="cpu")
+        self._most, self._dim = most_worlds(cfg, env), sum(frame_layout(env).values())
+        provenance = run_provenance(cfg, context)
+        del provenance["date"], provenance["config_sha256"]  # they differ between calls that make the same episodes
+        self.spec = make_spec(env, cfg, provenance)
+        env.close()
+        self.home, self.path = home, home / DATASET
+        self.batches = read_batches(home) if (self.path / layout.INFO).exists() else []
+        self.committed = self.frames = self._before = 0
+        self._seconds = {"simulation": 0.0, "copy": 0.0, "writing": 0.0}  # of this call
+        self._sim: Simulation | None = None
+        self._block: torch.Tensor | None = None
+
+    def play(self) -> str:
+        """Plays and writes until the episodes are there.
+
+        Returns:
+            What keeps it from that; empty if nothing does.
+
+        Raises:
+            DatasetError: The folder is somebody else's.
+            UnwrittenError: The dataset cannot be written any further; what was committed is kept.
+        """
+        writer = DatasetWriter(self.path, self.spec)
+        self._count(writer)
+        self._before = self.committed
+        try:
+            with writer:
+                return self._play(writer)
+        finally:
+            self._count(writer)
+            self._close_worlds()
+
+    def _play(self, writer: DatasetWriter) -> str:
+        seed = max([self._cfg.seed - 1, *(seed for seed, _ in writer.committed), *(b.seed for b in self.batches)]) + 1
+        empty = 0
+        while (missing := self._job.episodes - len(writer.committed)) > 0:
+            if seed >= _SEEDS:
+                return (
+                    f"the next seed would be {seed}, expected at most {_SEEDS - 1}: begin another dataset with a smaller seed"
+                )
+            batch = self._add_batch(writer, seed, missing)
+            self.batches.append(batch)
+            write_batches(self.home, self.batches)
+            self._count(writer)
+            self._context.say(
+                f"collect, seed {seed}: {batch.accepted} of {batch.worlds} worlds accepted, "
+                f"{self.committed} of {self._job.episodes} episodes there"
+            )
+            empty = 0 if batch.kept else empty + 1
+            if empty == _GIVE_UP:
+                why = "; ".join(f"{text} in {count} of {batch.worlds} worlds" for text, count in batch.broken.items())
+                return f"{_GIVE_UP} seeds in a row brought no episode, the last because of: {why}"
+            seed += 1
+        return ""
+
+    def _add_batch(self, writer: DatasetWriter, seed: int, missing: int) -> CollectedBatch:
+        """Plays one seed, and commits the episodes that are to be kept, as far as they are missing."""
+        keep_all = self._job.keep_failures
+        sim, block = self._worlds(missing if keep_all else math.ceil(_SPARE * missing))
+        played = play_demonstrations(self._context, sim, seed, block)
+        failing = failing_rules(self._context.evidence.rules, played.failed)
+        batch = CollectedBatch(
+            seed=seed,
+            worlds=sim.nworld,
+            accepted=int((played.failed == 0).sum()),
+            retries=int(played.retries.sum()),
+            broken={rule.text: len(worlds) for rule, worlds in failing.items()},
+            simulation_s=played.seconds,
+        )
+        worlds = np.flatnonzero(keep_all | (played.failed == 0)).tolist()
+        began = time.perf_counter()
+        for world, arrays in played.episodes(worlds if keep_all else worlds[:missing]):
+            copied = time.perf_counter()
+            batch.copy_s += copied - began
+            if played.failed[world] and not all(np.isfinite(array).all() for array in arrays.values()):
+                batch.not_finite += 1
+            elif batch.kept < missing:
+                writer.add([self._episode(played, world, arrays)])
+                batch.kept += 1
+                self._context.tell(f"episodes of seed {seed}", batch.kept, min(len(worlds), missing))
+            began = time.perf_counter()
+            batch.writing_s += began - copied
+        writer.flush()
+        batch.writing_s += time.perf_counter() - began
+        for name in self._seconds:
+            self._seconds[name] += getattr(batch, f"{name}_s")
+        return batch
+
+    def _episode(self, played: Played, world: int, arrays: dict[str, np.ndarray]) -> EpisodeData:
+        """A world's frames and what is known of it. `next.success` is true in the last frame of an accepted episode alone."""
+        bits = int(played.failed[world])
+        last = np.arange(len(arrays[STATE])) == len(arrays[STATE]) - 1
+        return EpisodeData(
+            arrays={**arrays, "next.done": last, "next.success": last & (bits == 0)},
+            task=self._cfg.task.instruction or self._cfg.task.name,
+            success=bits == 0,
+            seed=played.seed,
+            world=world,
+            values={
+                "retries": int(played.retries[world]),
+                "failed_rules": describe_rules(self._context.evidence.rules, bits),
+                "config_sha256": self.spec.config_sha256,
+            },
+        )
+
+    def _worlds(self, wanted: int) -> tuple[Simulation, torch.Tensor]:
+        """As many worlds as are wanted and allowed, with room for their frames.
+
+        MJWarp's are kept where there are more than that: fewer are hardly faster, and new ones have to be set up.
+        """
+        n = min(wanted, self._most)
+        sim, block = self._sim, self._block
+        if sim is None or block is None or not (sim.nworld == n or (sim.backend == "mjwarp" and sim.nworld > n)):
+            self._close_worlds()
+            sim = self._sim = self._context.batch_simulation(n)
+            block = self._block = frames_block(sim, build_phases(self._cfg)[-1].stop, self._dim)
+        return sim, block
+
+    def _close_worlds(self) -> None:
+        if self._sim is not None:
+            self._sim.close()
+        self._sim = self._block = None
+
+    def _count(self, writer: DatasetWriter) -> None:
+        self.committed, self.frames = len(writer.committed), writer.frames
+
+    def result(self, status: Status, problem: str, seconds: float) -> GateResult:
+        """What there is now, as a result of the report.
+
+        Args:
+            status: How it ended.
+            problem: Why, where it did not pass.
+            seconds: Wall time of this call [s].
+        """
+        asked, new = self._job.episodes, self.committed - self._before
+        size = sum(path.stat().st_size for path in self.path.rglob("*") if path.is_file()) / 1e6
+        metrics: dict[str, Value] = {
+            "dataset": str(self.path),
+            "config_sha256": self.spec.config_sha256,
+            "episodes": self.committed,
+            "episodes_of_this_call": new,
+            "frames": self.frames,
+            "megabytes": size,
+        }
+        reason = f"{self.committed:,} of {asked:,} episodes ({self.frames:,} frames, {size:.1f} MB)"
+        details = []
+        if self.batches:
+            worlds, accepted = (sum(getattr(batch, key) for batch in self.batches) for key in ("worlds", "accepted"))
+            rate, (low, high) = accepted / worlds, wilson_interval(accepted, worlds)
+            metrics |= {
+                "seeds": f"{min(b.seed for b in self.batches)} to {max(b.seed for b in self.batches)}",
+                "worlds_played": worlds,
+                "accepted": accepted,
+                "success_rate": rate,
+                "success_rate_low95": low,
+                "success_rate_high95": high,
+                "retries": sum(batch.retries for batch in self.batches),
+            }
+            reason += f"; the expert succeeded in {accepted:,} of {worlds:,} worlds ({100.0 * rate:.4g} %)"
+            broken: dict[str, int] = {}
+            for batch in self.batches:
+                for text, count in batch.broken.items():
+                    broken[text] = broken.get(text, 0) + count
+            details += [f"{text}: {count} of {worlds} worlds" for text, count in broken.items()]
+            if lost := sum(batch.not_finite for batch in self.batches):
+                details.append(f"{lost} failed episodes with a number that is not finite are not in the dataset")
+        if new:
+            metrics |= {f"{name}_s": value for name, value in self._seconds.items()} | {"episodes_per_s": new / seconds}
+            times = ", ".join(f"{name} {value:.1f} s" for name, value in self._seconds.items())
+            reason += f"; {times}, {new / seconds:.3g} episodes/s in all"
+        return GateResult(
+            name="collect",
+            status=status,
+            reason=f"{problem}; {reason}" if problem else reason,
+            seconds=seconds,
+            thresholds={"episodes": asked},
+            metrics=metrics,
+            details=details,
+        )
+
+    def write_table(self, folder: Path, result: GateResult) -> bool:
+        """Writes dataset.md, and says whether there was anything to write of."""
+        if not self.committed:
+            return False
+        statistics = json.loads((self.path / layout.STATS).read_text())
+        ranges = [
+            ColumnRange(name=f"{name} {joint}", unit=unit, low=low, mean=mean, high=high)
+            for name in (STATE, ACTION)
+            for joint, unit, low, mean, high in zip(
+                self.spec.features[name].names,
+                self.spec.features[name].units,
+                *(statistics[name][key] for key in ("min", "mean", "max")),
+                strict=True,
+            )
+        ]
+        title = f"{self._cfg.robot.title}, task {self._cfg.task.name}: demonstrations"
+        write_atomic(folder / "dataset.md", to_markdown(title, result.metrics, ranges, str(self.path)))
+        return True
+
+
+def most_worlds(cfg: Config, env: Env) -> int:
+    """Worlds whose frames fit into the buffer, at most nworld.
+
+    Args:
+        cfg: The job's configuration.
+        env: An environment of its demonstrations, with any number of worlds.
+
+    Raises:
+        ConfigError: Not even one world's do.
+    """
+    gib = cast(CollectJobCfg, cfg.job).buffer_gib
+    world = 4.0 * build_phases(cfg)[-1].stop * sum(frame_layout(env).values()) / 2**30
+    if gib < world:
+        raise ConfigError("job.buffer_gib", gib, f"at least {world:.2g}, which the frames of one world take")
+    return min(cfg.nworld, int(gib / world))

@@ -1,0 +1,143 @@
+"""Plays one batch of demonstrations: the scripted episode with what was seen, done and earned in every frame."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from mjstack.envs import Env, demonstration_config
+from mjstack.gates.episode import make_controller
+from mjstack.gates.gate import GateContext
+from mjstack.sim import Simulation
+
+STATE, ACTION, REWARD = "observation.state", "action", "next.reward"
+_CHUNK_BYTES = 128 * 2**20  # copied to the host at once
+
+
+def frame_layout(env: Env) -> dict[str, int]:
+    """How many numbers a frame has of each kind, in the order in which `FrameRecorder` keeps them."""
+    n = len(env.index.ctrl)
+    groups = {f"observation.{name}": dim for name, dim in env.observation_manager.group_dims.items()}
+    return {STATE: n, **groups, ACTION: n, REWARD: 1}
+
+
+class FrameRecorder:
+    """All frames of all worlds in one block on the device. Fixed shapes, no host read: a captured graph may hold it.
+
+    A frame is what the policy would have seen before its action, the joint commands that went to the actuators, and the reward
+    for where they led.
+
+    Attributes:
+        values: The frames, shape ``(frames, nworld, dim)``, float32.
+        layout: How many numbers of each kind there are, in order.
+    """
+
+    def __init__(self, env: Env, values: torch.Tensor) -> None:
+        """Takes the block, which is written from its first frame on."""
+        self.values, self.layout = values, frame_layout(env)
+        self._env = env
+        self._robot = env.index.on(env.device, env.sim.qpos.dtype)
+        self._seen = torch.zeros((env.nworld, self.layout[STATE] + sum(env.observation_manager.group_dims.values())))
+        self._seen = self._seen.to(env.device)
+        self._next = torch.zeros(1, dtype=torch.int64, device=env.device)
+
+    def before(self) -> None:
+        """Takes in the state that the next action is for."""
+        groups = self._env.observation_manager.groups.values()
+        torch.cat([self._robot.qpos.read(self._env.sim.qpos).float(), *groups], dim=1, out=self._seen)
+
+    def after(self) -> None:
+        """Takes in the action that was made and its reward, and goes on to the next frame."""
+        env = self._env
+        command = self._robot.ctrl.read(env.sim.ctrl).float()
+        frame = torch.cat((self._seen, command, env.reward_manager.reward[:, None]), dim=1)
+        self.values.index_copy_(0, self._next, frame[None])
+        self._next.add_(1)
+
+
+@dataclass(eq=False, kw_only=True, slots=True)
+class Played:
+    """A batch of episodes.
+
+    Attributes:
+        seed: What it was played with.
+        frames: All frames, on the device.
+        failed: Bits of the task's rules, shape ``(nworld,)``, int32.
+        retries: Grasps that were tried again, shape ``(nworld,)``.
+        seconds: Wall time, from the reset to the verdict [s].
+    """
+
+    seed: int
+    frames: FrameRecorder
+    failed: np.ndarray
+    retries: np.ndarray
+    seconds: float
+
+    def episodes(self, worlds: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """Some worlds' frames on the host, by kind, each ``(frames, dim)``; copied in chunks.
+
+        Args:
+            worlds: Which, by their place in the batch.
+        """
+        values = self.frames.values
+        size = max(1, _CHUNK_BYTES // (values[:, 0].numel() * values.element_size()))
+        ends = np.cumsum(list(self.frames.layout.values()))[:-1]
+        for first in range(0, len(worlds), size):
+            chunk = torch.tensor(worlds[first : first + size], device=values.device)
+            rows = values.index_select(1, chunk).transpose(0, 1).contiguous().cpu().numpy()
+            for world, row in zip(worlds[first:], rows, strict=False):
+                yield world, dict(zip(self.frames.layout, np.split(row, ends, axis=1), strict=True))
+
+
+def frames_block(sim: Simulation, frames: int, dim: int) -> torch.Tensor:
+    """Room for the frames of a batch, on its device."""
+    return torch.zeros((frames, sim.nworld, dim), dtype=torch.float32, device=sim.device)
+
+
+def play_demonstrations(context: GateContext, sim: Simulation, seed: int, values: torch.Tensor) -> Played:
+    """Plays the configured controller once in every world, and judges it by the task's acceptance.
+
+    Nothing ends an episode: worlds go on to its end, so all have as many frames. On CUDA a frame is one graph.
+
+    Args:
+        context: Configuration, scene and planner.
+        sim: The worlds.
+        seed: What they start by.
+        values: Room for the frames, shape ``(frames, nworld, dim)``; see `frames_block`.
+    """
+    began = time.perf_counter()
+    cfg = replace(context.cfg, seed=seed)
+    env = Env(sim, context.index, demonstration_config(cfg), check_faults=False)  # the acceptance names lost worlds
+    env.reset(seed=seed)
+    sim.forward()
+    controller = make_controller(env, context.planner, context.advance)
+    evidence = context.evidence(cfg, context.index, context.planner.phases, sim.nworld, sim.device)
+    recorder = FrameRecorder(env, values)
+
+    def work() -> None:
+        command = controller.command()
+        recorder.before()
+        env.action_manager.take(command)
+        env.advance()
+        evidence.update(sim, controller.phase)
+        recorder.after()
+
+    play = env.captured(work, "a frame of a demonstration")
+    for frame in range(controller.frames):
+        play()
+        if frame % 10 == 9:
+            sim.synchronize()  # so that the bar shows work done, not work queued
+        context.tell(f"frames of seed {seed}", frame + 1, controller.frames)
+    sim.synchronize()
+    play.drop()
+    return Played(
+        seed=seed,
+        frames=recorder,
+        failed=evidence.verdict(sim).failed.cpu().numpy(),
+        retries=controller.retries.cpu().numpy(),
+        seconds=time.perf_counter() - began,
+    )

@@ -1,0 +1,536 @@
+"""Demonstrations of the scripted expert: what a frame holds, which episodes count, and that nothing is lost or there twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from mjstack.cli import run
+from mjstack.config import load_config
+from mjstack.config.schema import Backend, Config
+from mjstack.datasets import DatasetWriter, Feature, read_dataset
+from mjstack.datasets.shard import Shard
+from mjstack.envs import build_env, demonstration_config
+from mjstack.errors import ConfigError
+from mjstack.gates.episode import Episode, run_episode
+from mjstack.gates.gate import GateContext
+from mjstack.jobs import collection
+from mjstack.jobs.collect import collect_folder, run_collect_job
+from mjstack.jobs.collect_record import FILE
+from mjstack.jobs.demonstration import FrameRecorder, Played
+from mjstack.jobs.demonstration_spec import config_hash, episode_config, first_difference, make_spec
+from mjstack.managers.reset import required_fields
+from mjstack.report.collect import LOADING
+from mjstack.sim import make_simulation
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+COMMAND = ["job=collect", "sim=native", "job.folder=outputs/demos"]
+JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
+
+
+def episodes_of(dataset: Path) -> list[dict]:
+    table = pq.read_table(dataset / "meta/episodes")
+    return table.drop_columns([name for name in table.column_names if name.startswith("stats/")]).to_pylist()
+
+
+def frames_of(dataset: Path, number: int) -> dict[str, np.ndarray]:
+    table = pq.read_table(dataset / "data", filters=[("episode_index", "==", number)])
+    return {name: np.array(table[name].to_pylist()) for name in table.column_names}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def report_of(folder: Path) -> dict:
+    return json.loads((folder / "report.json").read_text())
+
+
+def gate_episode(cfg: Config) -> Episode:
+    """What the gates' own loop makes of the same worlds."""
+    context = GateContext(cfg=cfg)
+    sim = make_simulation(context.model, cfg, cfg.nworld, backend=Backend.native, fields=required_fields(cfg.reset))
+    try:
+        return run_episode(sim, context.index, cfg, context.planner, cfg.reset, keep_commands=True)
+    finally:
+        sim.close()
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """Four real episodes. The stacks' offsets are 6.7, 0.2, 1.1 and 2.2 mm: by the threshold two of them fail, and are kept."""
+    folder = tmp_path_factory.mktemp("collect")
+    args = [*COMMAND, "nworld=4", "job.episodes=4", "job.keep_failures=true", "gate.acceptance.xy_err=0.0017"]
+    before = os.getcwd()
+    os.chdir(folder)
+    try:
+        code = run(args)
+    finally:
+        os.chdir(before)
+    home = folder / "outputs" / "demos"
+    cfg = load_config(args)
+    return SimpleNamespace(
+        code=code, args=args, cfg=cfg, cwd=folder, home=home, dataset=home / "dataset", judged=gate_episode(cfg)
+    )
+
+
+def test_the_dataset_keeps_its_promises(demos: SimpleNamespace) -> None:
+    assert demos.code == 0
+    stored = read_dataset(demos.dataset)
+    assert len(stored.episodes["length"]) == 4
+    assert report_of(demos.home)["status"] == "pass"
+
+
+def test_names_and_units(demos: SimpleNamespace) -> None:
+    info = json.loads((demos.dataset / "meta/info.json").read_text())
+    features, units = info["features"], info["mjstack"]["units"]
+    assert info["fps"] == 50
+    assert features["observation.state"]["names"] == features["action"]["names"] == [f"{name}.pos" for name in JOINTS]
+    assert units["observation.state"] == units["action"] == ["rad"] * 6
+    policy = dict(zip(features["observation.policy"]["names"], units["observation.policy"], strict=True))
+    assert len(policy) == 24
+    assert policy["joint_pos.0"] == policy["last_action.5"] == "rad"
+    assert policy["joint_vel.3"] == "10 rad/s"
+    assert policy["aperture_to_red.2"] == "m"
+    privileged = dict(zip(features["observation.privileged"]["names"], units["observation.privileged"], strict=True))
+    assert (privileged["red_pose.2"], privileged["red_pose.3"], privileged["jaw_force.1"]) == ("m", "1", "10 N")
+    assert (privileged["red_velocity.0"], privileged["red_velocity.5"]) == ("m/s", "rad/s")
+    assert {"next.reward", "next.done", "next.success", "timestamp"} <= set(features)
+    config = info["mjstack"]["provenance"][0]["config"]
+    assert config_hash(config) == info["mjstack"]["config_sha256"] == config_hash(episode_config(demos.cfg))
+
+
+@pytest.mark.parametrize("robot", ["so101", "rebot"])
+@pytest.mark.parametrize("task", ["stack", "box"])
+def test_every_number_has_a_name_and_a_unit(robot: str, task: str) -> None:
+    cfg = load_config([*COMMAND, f"robot={robot}", f"task={task}", "reset=jitter"])
+    env = build_env(demonstration_config(cfg), nworld=1, backend=Backend.native, device="cpu")
+    spec = make_spec(env, cfg, {})
+    for group, dim in env.observation_manager.group_dims.items():
+        assert spec.features[f"observation.{group}"].dim == dim
+        assert "unknown" not in spec.features[f"observation.{group}"].units
+    fingers = {"so101": ["rad"], "rebot": ["m", "m"]}[robot]
+    assert list(spec.features["action"].units) == ["rad"] * len(cfg.robot.arm_joints) + fingers
+    env.close()
+
+
+def test_names_of_a_history_and_of_a_strange_term() -> None:
+    history = "+observation.policy.terms.aperture_to_red.history=2"
+    strange = "+observation.policy.terms.count={func: mjstack.mdp.reward.success}"
+    cfg = load_config([*COMMAND, history, strange])
+    env = build_env(demonstration_config(cfg), nworld=1, backend=Backend.native, device="cpu")
+    feature: Feature = make_spec(env, cfg, {}).features["observation.policy"]
+    first = feature.names.index("aperture_to_red.0.t-1")
+    assert feature.names[first : first + 4] == (
+        "aperture_to_red.0.t-1",
+        "aperture_to_red.1.t-1",
+        "aperture_to_red.2.t-1",
+        "aperture_to_red.0",
+    )
+    assert feature.units[feature.names.index("count")] == "unknown"
+    env.close()
+
+
+def test_actions_are_what_the_gates_command(demos: SimpleNamespace) -> None:
+    """And they are what went to the actuators: the same episode in the gates' own loop."""
+    given = demos.judged.commands
+    given.rewind()
+    commands = torch.stack([given.command() for _ in range(600)], dim=1).numpy()
+    for number, row in enumerate(episodes_of(demos.dataset)):
+        assert np.array_equal(frames_of(demos.dataset, number)["action"].astype(np.float32), commands[row["world"]])
+
+
+def test_success_is_the_evidence(demos: SimpleNamespace) -> None:
+    failed = demos.judged.verdict.failed.numpy()
+    assert 0 < (failed == 0).sum() < 4  # some of each, or nothing is shown
+    rows = episodes_of(demos.dataset)
+    assert [row["world"] for row in rows] == [0, 1, 2, 3]
+    for number, row in enumerate(rows):
+        good = failed[row["world"]] == 0
+        frames = frames_of(demos.dataset, number)
+        assert row["success"] == good
+        assert (row["failed_rules"] == "") == good
+        assert frames["next.success"].tolist() == [False] * 599 + [bool(good)]
+        assert frames["next.done"].tolist() == [False] * 599 + [True]
+        assert frames["timestamp"] == pytest.approx(np.arange(600) / 50.0)
+        assert (row["seed"], row["length"]) == (0, 600)
+        assert row["config_sha256"] == config_hash(episode_config(demos.cfg))
+
+
+def test_a_frame_is_the_state_before_its_action(demos: SimpleNamespace) -> None:
+    """The actions, played in the environment, bring the same observations before and the same rewards after each of them."""
+    env = build_env(demonstration_config(demos.cfg), nworld=4, backend=Backend.native, device="cpu")
+    episodes = [frames_of(demos.dataset, number) for number in range(4)]
+
+    def stored(name: str, frame: int) -> np.ndarray:
+        return np.stack([episode[name][frame] for episode in episodes]).astype(np.float32)
+
+    obs, _ = env.reset(seed=0)
+    env.sim.forward()
+    robot = env.index.on(env.device, env.sim.qpos.dtype)
+    for frame in range(600):
+        assert np.array_equal(stored("observation.state", frame), robot.qpos.read(env.sim.qpos).float().numpy()), frame
+        for group in ("policy", "privileged"):
+            assert np.array_equal(stored(f"observation.{group}", frame), obs[group].numpy()), (group, frame)
+        obs, reward, terminated, truncated, _ = env.step(torch.from_numpy(stored("action", frame)))
+        assert not (terminated | truncated).any()
+        assert np.array_equal(stored("next.reward", frame), reward.numpy()), frame
+    assert np.ptp([episode["next.reward"].sum() for episode in episodes]) > 0.0
+    env.close()
+
+
+def test_what_is_left_beside_the_dataset(demos: SimpleNamespace) -> None:
+    (gate,) = report_of(demos.home)["gates"]
+    metrics, accepted = gate["metrics"], int((demos.judged.verdict.failed == 0).sum())
+    assert (metrics["episodes"], metrics["frames"], metrics["accepted"], metrics["worlds_played"]) == (4, 2400, accepted, 4)
+    assert metrics["success_rate_low95"] < metrics["success_rate"] < metrics["success_rate_high95"]
+    assert metrics["simulation_s"] > metrics["copy_s"] > 0.0
+    assert metrics["megabytes"] == pytest.approx(sum(map(len, contents(demos.dataset).values())) / 1e6)
+    assert any(line.startswith(f"not stacked: {4 - accepted} of 4 worlds") for line in gate["details"])
+    text = (demos.home / "dataset.md").read_text()
+    state = frames_of(demos.dataset, 0)["observation.state"]
+    (line,) = [line for line in text.splitlines() if line.startswith("| observation.state gripper.pos | rad |")]
+    low, _, high = (float(cell) for cell in line.split("|")[3:6])
+    assert low - 1e-4 <= state[:, 5].min() < state[:, 5].max() <= high + 1e-4
+    assert LOADING.format(folder="outputs/demos/dataset") in text
+
+
+def test_readme_lines_load_it(demos: SimpleNamespace) -> None:
+    (block,) = re.findall(r"```python\n([^`]*?pq\.read_table[^`]*?)```", README.read_text())
+    assert block == LOADING.format(folder="outputs/demos/dataset")
+    done = subprocess.run([sys.executable, "-c", block], cwd=demos.cwd, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    state, action = done.stdout.splitlines()
+    assert state.startswith("observation.state (600, 6) ['shoulder_pan.pos'")
+    assert action.startswith("action (600, 6) ['shoulder_pan.pos'")
+    assert action.endswith("'rad']")
+
+
+def test_the_same_command_again_does_nothing(demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(demos.cwd)
+    monkeypatch.setattr(collection, "play_demonstrations", None)
+    before = contents(demos.dataset / "data")
+    assert run(demos.args) == 0
+    assert contents(demos.dataset / "data") == before
+    assert "4 of 4 episodes" in report_of(demos.home)["gates"][0]["reason"]
+
+
+def test_another_configuration_is_refused(
+    demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(demos.cwd)
+    before = contents(demos.cwd)
+    assert run([*demos.args, "job.episodes=5", "reward.lift.weight=2.5"]) == 2
+    err = capsys.readouterr().err.strip()
+    assert err == (
+        "mjstack: outputs/demos/dataset has episodes of another configuration: reward.lift.weight=2.0, expected 2.5. Set "
+        "job.folder to another folder, or reward.lift.weight to 2.0."
+    )
+    assert contents(demos.cwd) == before
+
+
+def test_a_dataset_that_is_being_written_is_refused(
+    demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(demos.cwd)
+    env = build_env(demonstration_config(demos.cfg), nworld=1, backend=Backend.native, device="cpu")
+    with DatasetWriter(demos.dataset, make_spec(env, demos.cfg, {"config": episode_config(demos.cfg)})):
+        assert run([*demos.args, "job.episodes=5"]) == 2
+    assert "is open in another writer" in capsys.readouterr().err
+    env.close()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "outputs" / "demos"
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["job.episodes=0"], "job.episodes=0"),
+        (["job.buffer_gib=1e-6"], "job.buffer_gib=1e-06: expected at least"),
+        (["reset=nominal"], "reset=[home]: expected starts that differ"),
+        (["video=true"], "video=true: expected false with job=collect"),
+        (["task=reach"], "task=reach"),
+        (["+observation.state={terms: {q: {func: mjstack.mdp.observation.joint_pos}}}"], "observation.state=a group"),
+        (["job.folder=taken"], "taken is a file"),
+        (["job.folder=earlier"], "earlier has a run of job=gates"),
+    ],
+)
+def test_bad_input_is_one_line(args: list[str], words: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cwd = Path.cwd()
+    (cwd / "taken").write_text("")
+    (cwd / "earlier" / ".hydra").mkdir(parents=True)
+    (cwd / "earlier" / ".hydra" / "config.yaml").write_text("job: {name: gates}\n")
+    before = contents(cwd)
+    assert run([*COMMAND, *args]) == 2
+    err = capsys.readouterr().err.strip()
+    assert words in err
+    assert len(err.splitlines()) == 1
+    assert contents(cwd) == before
+
+
+def test_what_the_hash_is_of() -> None:
+    def home(*overrides: str) -> Path:
+        return collect_folder(load_config(["job=collect", "sim=native", *overrides]))
+
+    base = home()
+    assert base.parent == Path("outputs/collect")
+    assert home("job.episodes=7", "nworld=3", "gates=[batch]", "graph=off", "batch.njmax=300", "job.buffer_gib=1") == base
+    assert home("gate.throughput.frames=3", "~termination.success") == base
+    others = ["robot=rebot", "task=box", "model=menagerie", "timing=fine", "controller=planned", "reset=jitter", "seed=1"]
+    others += ["+observation.policy.noise=false", "reward.lift.weight=3", "gate.acceptance.xy_err=0.01"]
+    others += ["job.keep_failures=true", "controller.phases.done.seconds=2.0"]
+    assert len({base, *(home(other) for other in others)}) == 1 + len(others)
+    on_cpu = collect_folder(load_config(["job=collect", "sim=mjwarp", "sim.device=cpu"]))
+    assert on_cpu != base  # the backend changes episodes in their last digits, the device does not count
+
+
+def test_first_difference() -> None:
+    assert first_difference({"a": {"b": 1, "c": [1]}}, {"a": {"b": 1, "c": [1]}}) is None
+    assert first_difference({"a": {"b": 1, "c": [1]}}, {"a": {"b": 1, "c": [2]}}) == ("a.c", [1], [2])
+    assert first_difference({"a": 1, "d": {"e": 2}}, {"a": 1}) == ("d.e", 2, "nothing")
+
+
+PRETEND = """
+import numpy as np
+from types import SimpleNamespace
+from mjstack.jobs import collection
+from mjstack.jobs.demonstration import Played
+
+
+def pretended(fails, after=None):
+    def play(context, sim, seed, values):
+        layout = {"observation.state": 6, "observation.policy": 24, "observation.privileged": 46, "action": 6, "next.reward": 1}
+        for world in range(sim.nworld):
+            values[:, world] = 1e-3 * seed + 1e-6 * world
+        failed = np.array([8 if fails(seed, world) else 0 for world in range(sim.nworld)], dtype=np.int32)
+        if after is not None:
+            after(seed, values)
+        frames = SimpleNamespace(values=values, layout=layout)
+        return Played(seed=seed, frames=frames, failed=failed, retries=np.zeros(sim.nworld, dtype=np.int32), seconds=0.5)
+
+    return play
+"""
+namespace: dict = {}
+exec(PRETEND, namespace)  # the same lines run in a process that is killed
+pretended: Callable[..., Callable[..., Played]] = namespace["pretended"]
+
+
+def collect(*overrides: str) -> int:
+    """Runs the job as the command line does once it has checked everything, and returns its exit status."""
+    cfg = load_config([*COMMAND, *overrides])
+    home = collect_folder(cfg)
+    home.mkdir(parents=True, exist_ok=True)
+    return run_collect_job(cfg, home, []).exit_code
+
+
+def pairs(dataset: Path) -> list[tuple[int, int]]:
+    return [(row["seed"], row["world"]) for row in episodes_of(dataset)]
+
+
+def test_seeds_go_on_until_the_episodes_are_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: world == 1))
+    assert collect("nworld=4", "job.episodes=7", "seed=5") == 0
+    found = pairs(folder / "dataset")
+    # What is missing decides how many worlds: 7, then 4, then 1 and one to spare.
+    assert found == [(5, 0), (5, 2), (5, 3), (6, 0), (6, 2), (6, 3), (7, 0)]
+    batches = json.loads((folder / FILE).read_text())
+    assert [(batch["worlds"], batch["accepted"], batch["kept"]) for batch in batches] == [(4, 3, 3), (4, 3, 3), (2, 1, 1)]
+    frames = frames_of(folder / "dataset", 5)
+    assert frames["action"] == pytest.approx(1e-3 * 6 + 1e-6 * 3)
+    # More are wanted: seed 8 is next, whatever nworld is.
+    assert collect("nworld=16", "job.episodes=9", "seed=5") == 0
+    assert pairs(folder / "dataset") == [*found, (8, 0), (8, 2)]
+    assert not any(row["failed_rules"] for row in episodes_of(folder / "dataset"))
+    metrics = report_of(folder)["gates"][0]["metrics"]
+    assert (metrics["worlds_played"], metrics["accepted"], metrics["episodes_of_this_call"]) == (13, 9, 2)
+    read_dataset(folder / "dataset")
+
+
+def test_failures_are_kept_and_marked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def break_two(seed: int, values: torch.Tensor) -> None:
+        values[3, 2:3] = torch.nan  # a world that diverged: of no use
+
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: world in (1, 2), break_two))
+    assert collect("nworld=4", "job.episodes=5", "job.keep_failures=true") == 0
+    rows = episodes_of(folder / "dataset")
+    assert [(row["seed"], row["world"], row["success"]) for row in rows] == [
+        (0, 0, True),
+        (0, 1, False),
+        (0, 3, True),
+        (1, 0, True),
+        (1, 1, False),
+    ]
+    assert [row["failed_rules"] for row in rows] == ["", "red not lifted", "", "", "red not lifted"]
+    details = report_of(folder)["gates"][0]["details"]
+    assert any(line.startswith("1 failed episodes with a number that is not finite") for line in details)
+
+
+def test_an_expert_that_never_succeeds_is_given_up(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: True))
+    args = ["nworld=2", "job.episodes=3"]
+    assert collect(*args) == 1
+    (gate,) = report_of(folder)["gates"]
+    assert gate["reason"].startswith(
+        "3 seeds in a row brought no episode, the last because of: red not lifted in 2 of 2 worlds"
+    )
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    assert collect(*args) == 0
+    assert pairs(folder / "dataset") == [(3, 0), (3, 1), (4, 0)]
+    assert report_of(folder)["gates"][0]["metrics"]["success_rate"] == pytest.approx(4 / 10)
+
+
+def test_ctrl_c_keeps_finished_batches(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(seed: int, values: torch.Tensor) -> None:
+        if seed == 1:
+            raise KeyboardInterrupt
+
+    args = ["nworld=2", "job.episodes=5"]
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False, stop))
+    assert collect(*args) == 130
+    assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
+    found = report_of(folder)
+    assert found["status"] == "interrupted"
+    assert found["gates"][0]["reason"].startswith("interrupted; 2 of 5 episodes")
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    assert collect(*args) == 0
+    assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
+
+
+def test_a_full_disk_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    add = Shard.add
+
+    def full(self: Shard, *args: object) -> None:
+        if self.number == 1 and len(self) == 1:
+            raise OSError(28, "No space left on device")
+        add(self, *args)  # type: ignore[arg-type]
+
+    args = ["nworld=2", "job.episodes=5"]
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    monkeypatch.setattr(Shard, "add", full)
+    assert collect(*args) == 1
+    err = capsys.readouterr().err.strip()
+    assert len(err.splitlines()) == 1
+    assert "No space left on device" in err
+    assert "2 committed episodes are kept" in err
+    assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
+    assert report_of(folder)["status"] == "fail"
+    monkeypatch.setattr(Shard, "add", add)
+    assert collect(*args) == 0
+    assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
+
+
+def test_a_kill_loses_no_finished_batch(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed while the second batch is written, when one of its episodes is on the disk already."""
+    kill = """
+import os, signal
+from mjstack.cli import run
+from mjstack.datasets.shard import Shard
+
+collection.play_demonstrations = pretended(lambda seed, world: False)
+add = Shard.add
+
+def killed(self, *args):
+    add(self, *args)
+    if self.number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+Shard.add = killed
+run(ARGS)
+"""
+    args = ["nworld=2", "job.episodes=5"]
+    program = f"{PRETEND}\nARGS = {[*COMMAND, *args]!r}\n{kill}"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.returncode == -signal.SIGKILL
+    left = contents(folder / "dataset" / "data")
+    before = {name: data for name, data in left.items() if "/." not in name}
+    assert len(before) == 1 < len(left)
+    assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
+    assert report_of(folder)["status"] == "interrupted"
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    assert run([*COMMAND, *args]) == 0
+    assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
+    assert before.items() <= contents(folder / "dataset" / "data").items()
+    read_dataset(folder / "dataset")
+
+
+def test_damaged_notes_are_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    assert collect("nworld=2", "job.episodes=1") == 0
+    (folder / FILE).write_text("[{]")
+    capsys.readouterr()
+    assert run([*COMMAND, "nworld=2", "job.episodes=2"]) == 2
+    assert f"{FILE} cannot be read (JSONDecodeError)" in capsys.readouterr().err
+
+
+def test_the_buffer_bounds_the_worlds() -> None:
+    cfg = load_config([*COMMAND, "nworld=100"])
+    env = build_env(demonstration_config(cfg), nworld=1, backend=Backend.native, device="cpu")
+    world = 4 * 600 * (6 + 24 + 46 + 6 + 1)  # bytes: state, both groups, action, reward
+    for worlds in (1, 3, 7):
+        cfg.job.buffer_gib = (worlds + 0.5) * world / 2**30  # type: ignore[attr-defined]
+        assert collection.most_worlds(cfg, env) == worlds
+    cfg.job.buffer_gib = 1.0  # type: ignore[attr-defined]
+    assert collection.most_worlds(cfg, env) == 100
+    cfg.job.buffer_gib = 0.9 * world / 2**30  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match=r"job.buffer_gib"):
+        collection.most_worlds(cfg, env)
+    env.close()
+
+
+def test_frames_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = torch.randn(5, 7, 4)
+    frames = cast(FrameRecorder, SimpleNamespace(values=values, layout={"a": 3, "b": 1}))
+    none = np.zeros(7, dtype=np.int32)
+    played = Played(seed=0, frames=frames, failed=none, retries=none, seconds=0.0)
+    for size in (1, 2 * 5 * 4 * 4, 10**6):  # one world, two and all at once
+        monkeypatch.setattr("mjstack.jobs.demonstration._CHUNK_BYTES", size)
+        found = dict(played.episodes([6, 0, 3]))
+        assert list(found) == [6, 0, 3]
+        for world, arrays in found.items():
+            assert np.array_equal(arrays["a"], values[:, world, :3].numpy())
+            assert np.array_equal(arrays["b"], values[:, world, 3:].numpy())
+
+
+def test_mjwarp_demonstrations(folder: Path) -> None:
+    assert run([*COMMAND, "sim=mjwarp", "sim.device=cpu", "nworld=1", "job.episodes=1", "robot=rebot"]) == 0
+    stored = read_dataset(folder / "dataset")
+    assert stored.episodes["success"] == [True]
+    frames = frames_of(folder / "dataset", 0)
+    # The servos follow, once they are on their way: a joint is close to what the frame before commanded.
+    assert np.abs(frames["observation.state"][101:, :6] - frames["action"][100:-1, :6]).max() < 0.1
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+def test_demonstrations_on_cuda(folder: Path) -> None:
+    """Captured frames are the eager ones, as far as two runs on CUDA agree, and the last frame is one of rest on the stack."""
+    short = ["job.episodes=8", "nworld=16", "sim=mjwarp", "sim.device=cuda:0"]
+    assert run([*COMMAND, *short, "graph=require"]) == 0
+    assert run(["job=collect", "job.folder=outputs/eager", *short, "graph=off"]) == 0
+    captured, eager = folder / "dataset", folder.parent / "eager" / "dataset"
+    assert len(episodes_of(captured)) == 8
+    both = sorted(set(pairs(captured)) & set(pairs(eager)))
+    assert len(both) >= 6
+    for pair in both:
+        a, b = (frames_of(dataset, pairs(dataset).index(pair)) for dataset in (captured, eager))
+        for name in ("observation.state", "action", "observation.policy"):
+            assert np.allclose(a[name][:100], b[name][:100], atol=2e-3), name
+        assert a["next.success"][-1]
+    read_dataset(captured)
