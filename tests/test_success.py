@@ -139,7 +139,8 @@ def hasty() -> Callable[..., GateContext]:
     phases = [f"controller.phases.{name}.seconds=0.1" for name in PHASES]
 
     def make(*overrides: str) -> GateContext:
-        quick = ["gates=[success]", "sim=native", "nworld=2", "gate.acceptance.window=5", *phases]
+        windows = ["gate.acceptance.window=5", "gate.box.window=5"]
+        quick = ["gates=[success]", "sim=native", "nworld=2", *windows, *phases]
         return GateContext(cfg=load_config([*quick, *overrides]))
 
     return make
