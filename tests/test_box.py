@@ -15,7 +15,7 @@ from box_checker import BoxRecording, lowest_geometry
 from mjstack import make_env
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
-from mjstack.control.scripted import ScriptedPlanner
+from mjstack.control.planner import ScriptedPlanner
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
 from mjstack.gates.episode import NOMINAL, run_episode

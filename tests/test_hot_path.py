@@ -75,6 +75,10 @@ PATHS: dict[str, list[str] | None] = {
     "tasks/box_terms.py": [*(f"{n}.__call__" for n in ("ToSlot", "Place", "InBox", "ReachNext", "GraspNext")), "cubes_inside"],
     "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
     "control/planner.py": ["CommandTape.command"],
+    "control/controller.py": ["Recorded.append", "Recorded.command", "TapeController.command"],
+    "control/scripted.py": [
+        *(f"ScriptedController.{n}" for n in ("command", "_advance", "_judge_grasp", "_look", "_turn", "_off_center"))
+    ],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",
         "BatchedIk.aperture",

@@ -273,7 +273,7 @@ class TaskCfg:
 class PhaseCfg:
     """One phase of the scripted grasp.
 
-    ``anchor`` is one of `mjstack.control.phases.build_anchors`, such as ``red`` (a cube's centre), or null (the last target
+    ``anchor`` is one of `mjstack.scene.phases.build_anchors`, such as ``red`` (a cube's centre), or null (the last target
     holds). The target lies ``h_scale`` approach heights plus ``offset`` above it, and ``scene.grasp_offset`` too where the cube
     is ``in_hand``.
 

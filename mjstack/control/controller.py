@@ -6,8 +6,8 @@ from typing import Protocol
 
 import torch
 
-from mjstack.control.phases import Phase
 from mjstack.control.planner import CommandTape
+from mjstack.scene.phases import Phase
 
 
 class Controller(Protocol):

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.control.phases import FIXED, anchor_of, build_phases
 from mjstack.control.planning_pool import PARALLEL_FROM, WORLDS_PER_PROCESS, Plan, plan_in_parallel
 from mjstack.errors import Unreachable
 from mjstack.kinematics.mink_ik import ApertureIk
+from mjstack.scene.phases import FIXED, anchor_of, build_phases
 from mjstack.sim.native import available_cores
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.control.phases import FIXED, anchor_of, build_phases
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.base import EnvView
 from mjstack.mdp.geometry import aperture_center, jaw_forces, pose_w, robot
 from mjstack.scene.index import CUBES
+from mjstack.scene.phases import FIXED, anchor_of, build_phases
 
 LOADED = 1e-5  # N: a jaw that presses with more touches the cube (protocol of the box task)
 _QUARTER = 0.5 * math.pi

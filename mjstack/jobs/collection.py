@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Backend, CollectJobCfg, Config
-from mjstack.control.phases import build_phases
 from mjstack.datasets import DatasetWriter, EpisodeData, layout
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.errors import ConfigError
@@ -26,6 +25,7 @@ from mjstack.jobs.reported import run_provenance
 from mjstack.math import wilson_interval
 from mjstack.report.collect import ColumnRange, to_markdown
 from mjstack.report.record import GateResult, Status, Value, write_atomic
+from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation
 from mjstack.tasks.evidence import describe_rules
 

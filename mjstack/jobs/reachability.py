@@ -12,9 +12,6 @@ from typing import cast
 import numpy as np
 
 from mjstack.config.schema import Config, ReachabilityJobCfg
-from mjstack.control.phases import BLUE as AT_BLUE
-from mjstack.control.phases import RED as AT_RED
-from mjstack.control.phases import anchor_of
 from mjstack.errors import ConfigError
 from mjstack.gates.gate import GateContext
 from mjstack.jobs.outcome import JobOutcome
@@ -24,6 +21,9 @@ from mjstack.kinematics.reach import PointReach
 from mjstack.report.reachability import CubeRegion, ReachLevel, ReachMap, save_map, to_csv, to_markdown, to_npz
 from mjstack.report.record import GateResult, Status, write_atomic
 from mjstack.scene import BLUE, RED, table_top
+from mjstack.scene.phases import BLUE as AT_BLUE
+from mjstack.scene.phases import RED as AT_RED
+from mjstack.scene.phases import anchor_of
 from mjstack.sim import resolve_backend
 
 log = logging.getLogger(__name__)

@@ -11,7 +11,6 @@ import torch
 
 from mjstack.config.schema import Config
 from mjstack.config.validate import BOX_ROLES
-from mjstack.control.phases import Phase
 from mjstack.errors import ConfigError, ParameterError
 from mjstack.managers.base import EnvView
 from mjstack.math import quat_to_matrix
@@ -19,6 +18,7 @@ from mjstack.mdp.geometry import gripper_opening
 from mjstack.report.record import Value
 from mjstack.scene import LowestPoint, SceneIndex, table_top
 from mjstack.scene.index import CUBES, Columns
+from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS, Simulation
 from mjstack.tasks.box_findings import explain_box
 from mjstack.tasks.evidence import Evidence, Rule, Verdict

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.control.phases import Phase
 from mjstack.errors import TermError
 from mjstack.managers.base import resolve_func
 from mjstack.report.record import Value
 from mjstack.scene import SceneIndex
+from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import Simulation
 
 

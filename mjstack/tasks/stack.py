@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.control.phases import Phase
 from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView
 from mjstack.math import lowest_corner, quat_angle
 from mjstack.mdp.geometry import gripper_opening
 from mjstack.report.record import Value
 from mjstack.scene import SceneIndex, table_top
+from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS, Simulation
 from mjstack.tasks.evidence import Evidence, Rule, Verdict
 from mjstack.tasks.stack_findings import explain_stack
