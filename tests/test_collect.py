@@ -116,7 +116,7 @@ def test_names_and_units(demos: SimpleNamespace) -> None:
 @pytest.mark.parametrize("robot", ["so101", "rebot"])
 @pytest.mark.parametrize("task", ["stack", "box"])
 def test_every_number_has_a_name_and_a_unit(robot: str, task: str) -> None:
-    cfg = load_config([*COMMAND, f"robot={robot}", f"task={task}", "reset=jitter"])
+    cfg = load_config([*COMMAND, f"robot={robot}", f"task={task}"])
     env = build_env(demonstration_config(cfg), nworld=1, backend=Backend.native, device="cpu")
     spec = make_spec(env, cfg, {})
     for group, dim in env.observation_manager.group_dims.items():
