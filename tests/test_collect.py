@@ -116,7 +116,7 @@ def test_names_and_units(demos: SimpleNamespace) -> None:
 @pytest.mark.parametrize("robot", ["so101", "rebot"])
 @pytest.mark.parametrize("task", ["stack", "box"])
 def test_every_number_has_a_name_and_a_unit(robot: str, task: str) -> None:
-    cfg = load_config([*COMMAND, f"robot={robot}", f"task={task}", "reset=jitter"])
+    cfg = load_config([*COMMAND, f"robot={robot}", f"task={task}"])
     env = build_env(demonstration_config(cfg), nworld=1, backend=Backend.native, device="cpu")
     spec = make_spec(env, cfg, {})
     for group, dim in env.observation_manager.group_dims.items():
@@ -292,7 +292,7 @@ def test_what_the_hash_is_of() -> None:
     base = home()
     assert base.parent == Path("outputs/collect")
     assert home("job.episodes=7", "nworld=3", "gates=[batch]", "graph=off", "batch.njmax=300", "job.buffer_gib=1") == base
-    assert home("gate.throughput.frames=3", "~termination.success") == base
+    assert home("gate.throughput.frames=3", "gate.success.seeds=2", "~termination.success") == base
     others = ["robot=rebot", "task=box", "model=menagerie", "timing=fine", "controller=planned", "reset=jitter", "seed=1"]
     others += ["+observation.policy.noise=false", "reward.lift.weight=3", "gate.acceptance.xy_err=0.01"]
     others += ["job.keep_failures=true", "controller.phases.done.seconds=2.0"]

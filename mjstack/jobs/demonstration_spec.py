@@ -19,7 +19,7 @@ from mjstack.sim import resolve_backend
 
 # Changing one of these changes no episode. The action terms are the controller's, and nothing ends an episode early.
 _NO_MATTER = ("action", "termination", "batch", "sim", "job", "nworld", "gates", "graph", "view", "video", "run", "world")
-_OTHER_GATES = ("parity", "capacity", "batch", "throughput")
+_OTHER_GATES = ("parity", "capacity", "batch", "throughput", "success")
 _JOINTS, _JOINT_SPEEDS = "of the joints", "of the joints, per second"
 # Of the observation terms; one that is not here, such as a user's own, has the unit "unknown".
 _UNITS: dict[str, str | tuple[str, ...]] = {
