@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from mjstack.config.schema import Config
-from mjstack.control import planner, planning_pool
+from mjstack.control import planner as planner_module
+from mjstack.control import planning_pool
 from mjstack.control.planner import ScriptedPlanner
 from mjstack.control.planning_pool import Plan
 from mjstack.errors import Unreachable, WorkerLost
@@ -166,8 +167,8 @@ def test_processes_by_cores_and_distinct_worlds(
         yield from ((world, *plan) for world in worlds)
 
     monkeypatch.setattr(planner, "plan_world", lambda *_: plan)
-    monkeypatch.setattr(planner, "plan_in_parallel", parallel)
-    monkeypatch.setattr(planner, "available_cores", lambda: cores)
+    monkeypatch.setattr(planner_module, "plan_in_parallel", parallel)
+    monkeypatch.setattr(planner_module, "available_cores", lambda: cores)
     xy = layouts(context, distinct)[np.arange(nworld) % distinct]
     tape = planner.plan(xy)
     assert made == ([] if processes == 1 else [processes])

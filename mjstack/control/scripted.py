@@ -8,6 +8,9 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config
+from mjstack.control.planner import ScriptedPlanner
+from mjstack.envs import Env
+from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.base import EnvView
 from mjstack.mdp.geometry import aperture_center, jaw_forces, pose_w, robot
@@ -79,6 +82,7 @@ class ScriptedController:
         self.phase, self._time, self._rate = zeros(dtype=torch.int64), zeros(), zeros()
         self.retries, self.error = zeros(dtype=torch.int32), zeros()
         self.unreachable = zeros(dtype=torch.bool)
+        self._again = zeros(dtype=torch.bool)  # the phase was entered to try a grasp once more
         self._seen = zeros(3, 2)  # x and y of red, of blue, and of a fixed place
         self._from, self._to = zeros(3), zeros(3)
         n_grip = len(cfg.robot.gripper_joints)
@@ -93,8 +97,11 @@ class ScriptedController:
         self._advance(fresh)
         length = self._length.index_select(0, self.phase)
         u = (self._time / length).clamp(max=1.0)
-        s = (u * u * (3.0 - 2.0 * u))[:, None]
-        target = torch.lerp(self._from, self._to, s)
+        s = _smoothstep(u)[:, None]
+        # After an empty grasp straight up first, and only then to where the cube is now: it may stand beside the jaws.
+        up, over = _smoothstep((2.0 * u).clamp(max=1.0)), _smoothstep((2.0 * u - 1.0).clamp(min=0.0))
+        share = torch.where(self._again[:, None], torch.stack((over, over, up), dim=1), s)
+        target = torch.lerp(self._from, self._to, share)
         grip = torch.lerp(self._grip_from, self._grip_to, s)
         posture = self._nominal.index_select(0, self.phase)
         start = torch.where(fresh[:, None], posture, self._command)
@@ -120,6 +127,7 @@ class ScriptedController:
         entering = over | fresh
         self._time.copy_(torch.where(entering, left_over * ~fresh, self._time)).add_(self._rate)
         self.retries += retry
+        self._again.copy_(torch.where(entering, retry, self._again))
         self.phase.copy_(phase)
         for buffer in (self.retries, self.error, self.unreachable):
             buffer.masked_fill_(fresh, 0)
@@ -229,3 +237,29 @@ class ScriptedController:
         self._needed = table([self.phases[-1].start - phase.start for phase in self.phases])
         self._hurry = cfg.controller.hurry
         self._rest = cfg.gate.acceptance.window + math.ceil(cfg.controller.rest_seconds / cfg.timing.frame_dt)
+
+
+def _smoothstep(u: torch.Tensor) -> torch.Tensor:
+    return u * u * (3.0 - 2.0 * u)
+
+
+def make_expert(env: Env) -> ScriptedController:
+    """The scripted controller of an environment of one's own: call ``command()`` once before every ``env.step``.
+
+    Worlds may end and start anew whenever they like; each goes through its own phases from its own reset on.
+
+    Args:
+        env: The environment, built with ``action=joint_absolute``.
+
+    Raises:
+        ArgumentError: Its actions are not absolute joint commands.
+        Unreachable: The nominal layout is out of the arm's reach.
+    """
+    if env.cfg.action != env.cfg.controller.action:
+        raise ArgumentError(
+            "env",
+            f"action terms {', '.join(env.cfg.action)}, which are not absolute joint commands",
+            "those of the scripted controller",
+            "Build it with action=joint_absolute",
+        )
+    return ScriptedController(env, ScriptedPlanner(env.cfg).nominal)
