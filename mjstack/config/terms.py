@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import asdict, fields
 from enum import EnumMeta
+from functools import cache
 from typing import Any, cast, get_type_hints
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mjstack.config.schema import (
@@ -57,15 +58,30 @@ def _typed(key: str, node: Any, kind: type) -> Any:
     for name in node:
         if name not in names:
             raise UnknownName(f"{key}: key", str(name), names)
-    for name, value in node.items():
-        try:
-            OmegaConf.merge(OmegaConf.structured(kind), {name: value})
-        except OmegaConfBaseException as error:
-            hint = get_type_hints(kind)[name]
-            wanted = " or ".join(hint.__members__) if isinstance(hint, EnumMeta) else fields(kind)[names.index(name)].type
-            raise ConfigError(f"{key}.{name}", value, str(wanted)) from error
-    merged = OmegaConf.merge(OmegaConf.structured(kind), node)
+    try:
+        merged = OmegaConf.merge(_schema(kind), node)
+    except OmegaConfBaseException:
+        _find_misfit(key, node, kind)  # names the key; where none is to blame alone, the error stays as it is
+        raise
     missing = sorted(OmegaConf.missing_keys(merged))
     if missing:
         raise TermError(key, f"'{missing[0]}' is missing: set {key}.{missing[0]}")
     return cast(Any, OmegaConf.to_object(merged))
+
+
+@cache
+def _schema(kind: type) -> DictConfig:
+    """A dataclass as OmegaConf has it, made once: terms are many."""
+    return OmegaConf.structured(kind)
+
+
+def _find_misfit(key: str, node: dict[str, Any], kind: type) -> None:
+    """Raises a `ConfigError` for the first value whose type does not fit."""
+    names = [field.name for field in fields(kind)]
+    for name, value in node.items():
+        try:
+            OmegaConf.merge(_schema(kind), {name: value})
+        except OmegaConfBaseException as error:
+            hint = get_type_hints(kind)[name]
+            wanted = " or ".join(hint.__members__) if isinstance(hint, EnumMeta) else fields(kind)[names.index(name)].type
+            raise ConfigError(f"{key}.{name}", value, str(wanted)) from error
