@@ -225,7 +225,7 @@ def test_the_same_command_again_does_nothing(demos: SimpleNamespace, monkeypatch
     before = contents(demos.dataset / "data")
     assert run(demos.args) == 0
     assert contents(demos.dataset / "data") == before
-    assert "4 of 4 episodes" in report_of(demos.home)["gates"][0]["reason"]
+    assert "4 episodes, 4 asked for" in report_of(demos.home)["gates"][0]["reason"]
 
 
 def test_another_configuration_is_refused(

@@ -132,6 +132,8 @@ def test_acceptance_figures(so101_cfg: Config) -> None:
 
 
 BAD = [
+    (["job=collect", "job.episode=3"], "Did you mean 'job.episodes'?"),
+    (["job=scaling", "job.retri=true"], "Did you mean 'job.retry'?"),
     (["robot=so100"], "Did you mean 'so101'?"),
     (["robots=so101"], "Did you mean 'robot'?"),
     (["timing=coarse"], "Available: default, fine"),

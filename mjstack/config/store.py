@@ -106,10 +106,10 @@ def _compose(overrides: Sequence[str]) -> DictConfig:
     try:
         return compose(CONFIG_NAME, overrides=list(overrides))
     except (HydraException, OmegaConfBaseException) as error:
-        raise _translate(error) from error
+        raise _translate(error, overrides) from error
 
 
-def _translate(error: Exception) -> MjstackError:
+def _translate(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     """One line from Hydra's and OmegaConf's chained, multi-line errors."""
     if isinstance(error, MissingConfigException) and error.options is not None and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
@@ -119,9 +119,9 @@ def _translate(error: Exception) -> MjstackError:
     text = str(cause).splitlines()[0] if str(cause) else type(cause).__name__
     deleted = re.match(r"Could not delete from config\. '([^']+)' does not exist", text)
     if deleted:
-        return _unknown_key(error, deleted.group(1))
+        return _unknown_key(error, deleted.group(1), overrides)
     if isinstance(cause, ConfigKeyError | AttributeError) or "not in struct" in text or "not in 'Config'" in text:
-        return _unknown_key(error, str(key or getattr(cause, "key", "") or ""))
+        return _unknown_key(error, str(key or getattr(cause, "key", "") or ""), overrides)
     converted = re.search(r"Value '(.*)' of type '\w+' could not be converted to (\w+)", text)
     if converted and key:
         return CompositionError(f"{key}={converted.group(1)}: expected {_KINDS.get(converted.group(2), converted.group(2))}.")
@@ -155,11 +155,16 @@ def _translate(error: Exception) -> MjstackError:
     return CompositionError(f"{key}: {text}." if key else f"{text.rstrip('.')}.")
 
 
-def _unknown_key(error: Exception, key: str) -> MjstackError:
+def _unknown_key(error: Exception, key: str, overrides: Sequence[str]) -> MjstackError:
     match = re.search(r"Could not override '([^']+)'", str(error)) or re.search(r"(?:attribute|argument) '(\w+)'", str(error))
     key = match.group(1) if match else key
     with own_hydra():
-        base = OmegaConf.to_container(compose(CONFIG_NAME), resolve=False)
+        # The job that was asked for has keys of its own.
+        jobs = [o for o in overrides if re.fullmatch(r"job=\w+", o)]
+        try:
+            base = OmegaConf.to_container(compose(CONFIG_NAME, overrides=jobs), resolve=False)
+        except (HydraException, OmegaConfBaseException):
+            base = OmegaConf.to_container(compose(CONFIG_NAME), resolve=False)
     keys = _flat_keys(base)
     leaf = key.rpartition(".")[2]
     if key.partition(".")[0] in _TERM_GROUPS:

@@ -200,7 +200,7 @@ class Collection:
             "frames": self.frames,
             "megabytes": size,
         }
-        reason = f"{self.committed:,} of {asked:,} episodes ({self.frames:,} frames, {size:.1f} MB)"
+        reason = f"{self.committed:,} episodes, {asked:,} asked for ({self.frames:,} frames, {size:.1f} MB)"
         details = []
         if self.batches:
             worlds, accepted = (sum(getattr(batch, key) for batch in self.batches) for key in ("worlds", "accepted"))

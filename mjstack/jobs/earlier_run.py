@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from omegaconf import OmegaConf
+
 from mjstack.config.schema import Config
 from mjstack.config.store import load_saved
 from mjstack.errors import MjstackError, RunError
@@ -43,13 +45,17 @@ class EarlierRun:
             if not path.is_file():
                 raise RunError(f"run={name}: has no {path.relative_to(folder)}, {expected}. Name another folder.")
         try:
+            job = OmegaConf.select(OmegaConf.load(saved), "job.name")
+        except Exception:  # what is wrong with the file, `load_saved` says
+            job = None
+        if job not in (None, "gates"):
+            raise RunError(f"run={name}: is a run of job={job}, expected one of job=gates. Name that run's folder.")
+        try:
             cfg = load_saved(saved)
         except MjstackError as error:
             raise RunError(
                 f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error} Use the one that ran it."
             ) from error
-        if cfg.job.name != "gates":
-            raise RunError(f"run={name}: is a run of job={cfg.job.name}, expected one of job=gates. Name that run's folder.")
         try:
             provenance = json.loads(report.read_text())["provenance"]
             if not isinstance(provenance, dict):

@@ -228,7 +228,7 @@ def _write(context: GateContext, folder: Path, levels: list[ReachLevel], regions
         f"{1e3 * context.cfg.controller.ik_tolerance:g} mm. Collisions are not looked at.",
         "Tilt: the smallest angle between the gripper's approach axis and straight down that a solution has. A controller that "
         "goes on from where it is need not find that solution, and may stop at a joint limit short of a point that is reached.",
-        "Reached does not mean grasped: how many worlds succeed, the batch gate tells.",
+        "Reached does not mean grasped: how many worlds succeed, the gate success tells.",
     ]
     write_atomic(folder / "reachability.csv", to_csv(found))
     write_atomic(folder / "reachability.npz", to_npz(found))
