@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjstack.config.schema import Config
-from mjstack.control import planner, planning_pool
+from mjstack.control import planning_pool
 from mjstack.control.planner import ScriptedPlanner
 from mjstack.control.planning_pool import Plan
 from mjstack.errors import Unreachable, WorkerLost
