@@ -8,13 +8,13 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config
+from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.base import EnvView
-from mjstack.mdp.geometry import aperture_center, jaw_forces, pose_w, robot
+from mjstack.mdp.geometry import LOADED, aperture_center, jaw_forces, pose_w, robot
 from mjstack.scene.index import CUBES
 from mjstack.scene.phases import FIXED, anchor_of, build_phases
 
-LOADED = 1e-5  # N: a jaw that presses with more touches the cube (protocol of the box task)
 _QUARTER = 0.5 * math.pi
 _MOST_OFF = 0.02  # m: a cube that is farther from the aperture centre is not in the hand
 _STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
@@ -26,8 +26,9 @@ class ScriptedController:
     """Phase, time and targets of every world as tensors; targets from where its cubes are; batched inverse kinematics.
 
     A phase moves the aperture centre by smoothstep from the last phase's target to its own. Where it says ``look``, the cube's
-    place is measured when it begins. A grasp without load on both jaws at its end is tried once more, from the phase ``retry``,
-    if the rest can be done in time: such a world then goes faster than the others, at most ``controller.hurry`` times.
+    place is measured when it begins. A grasp without load on both jaws at its end is tried again, from the phase ``retry``,
+    once in an episode and if the rest can be done in time: such a world then goes faster than the others, at most
+    ``controller.hurry`` times.
 
     A world that the environment has reset starts over by itself.
 
@@ -49,9 +50,15 @@ class ScriptedController:
                 ``(phases, nu)``.
 
         Raises:
-            MjstackError: A phase has an anchor that the scene lacks.
+            MjstackError: The scene lacks a phase's anchor, the environment takes other actions, or worlds have moved on.
         """
         cfg, device, n = env.cfg, env.device, env.nworld
+        if list(cfg.action.values()) != list(cfg.controller.action.values()):
+            raise ArgumentError(
+                "env", f"actions {', '.join(cfg.action)}", "those of controller.action", "Set action=joint_absolute"
+            )
+        if bool((env.frame != 0).any()):  # it begins where the environment's episodes do
+            raise ArgumentError("env", "worlds that have moved on", "worlds at their start", "Call env.reset() before")
         self._env, self._cfg = env, cfg
         self.phases = build_phases(cfg)
         self.frames = self.phases[-1].stop
@@ -228,4 +235,5 @@ class ScriptedController:
         # From the start of a phase to that of the last one, where the arm rests.
         self._needed = table([self.phases[-1].start - phase.start for phase in self.phases])
         self._hurry = cfg.controller.hurry
-        self._rest = cfg.gate.acceptance.window + math.ceil(cfg.controller.rest_seconds / cfg.timing.frame_dt)
+        window = cfg.gate.acceptance.window if cfg.scene.box is None else cfg.gate.box.window
+        self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.frame_dt)
