@@ -221,7 +221,9 @@ def _box(scene: SceneCfg, box: BoxCfg) -> None:
 
 
 def _controller(cfg: Config) -> None:
-    for name, phase in cfg.controller.phases.items():
+    names, watches = list(cfg.controller.phases), cfg.controller.name == "scripted" or "success" in cfg.gates
+    looked: set[str] = set()
+    for number, (name, phase) in enumerate(cfg.controller.phases.items()):
         key = f"controller.phases.{name}"
         if phase.anchor is not None and phase.anchor not in ANCHORS:
             raise UnknownName(f"{key}.anchor:", phase.anchor, ANCHORS)
@@ -238,6 +240,19 @@ def _controller(cfg: Config) -> None:
                 raise ConfigError(f"{key}.{part}", getattr(phase, part), "red, blue or null")
         if phase.retry is not None and phase.retry not in cfg.controller.phases:
             raise UnknownName(f"{key}.retry: phase", phase.retry, cfg.controller.phases)
+        cube = {"on_blue": "blue", "over_red": "red", "over_blue": "blue"}.get(phase.anchor or "", phase.anchor)
+        if cube in ("red", "blue"):
+            if phase.look:
+                looked.add(cube)
+            elif watches and cube not in looked:
+                expected = f"true here or in a phase before, because controller=scripted does not know yet where {cube} is"
+                raise ConfigError(f"{key}.look", "false", expected)
+        if phase.retry is not None and phase.grasps is None:
+            raise ConfigError(
+                f"{key}.retry", phase.retry, f"null, or {key}.grasps=red or blue, whose empty grasp is tried again"
+            )
+        if phase.retry is not None and names.index(phase.retry) > number:
+            raise ConfigError(f"{key}.retry", phase.retry, "this phase or one before it")
         frames = phase.seconds / cfg.timing.frame_dt
         if abs(frames - round(frames)) > 1e-6:
             raise ConfigError(f"{key}.seconds", phase.seconds, f"a multiple of the frame, {cfg.timing.frame_dt:g} s")
@@ -248,12 +263,13 @@ def _controller(cfg: Config) -> None:
     _positive("controller.ik_tolerance", cfg.controller.ik_tolerance, "m")
     _positive_int("controller.ik_iterations", cfg.controller.ik_iterations)
     _positive_int("controller.frame_iterations", cfg.controller.frame_iterations)
-    for key in ("posture_gain", "approach_gain", "align", "rest_seconds"):
-        value = getattr(cfg.controller, key)
-        if not (math.isfinite(value) and value >= 0.0):
-            raise ConfigError(f"controller.{key}", value, "a number that is not negative")
-    if cfg.controller.align > 1.0:
-        raise ConfigError("controller.align", cfg.controller.align, "a share from 0 to 1")
+    for key in ("posture_gain", "approach_gain", "align"):
+        if not 0.0 <= getattr(cfg.controller, key) <= 1.0:
+            raise ConfigError(f"controller.{key}", getattr(cfg.controller, key), "a share from 0 to 1")
+    if max(cfg.controller.posture_gain, cfg.controller.approach_gain) > 0.0 and cfg.controller.frame_iterations < 4:
+        expected = "at least 4 with a posture_gain or an approach_gain, which the last iterations make up for"
+        raise ConfigError("controller.frame_iterations", cfg.controller.frame_iterations, expected)
+    _not_negative("controller.rest_seconds", cfg.controller.rest_seconds, "s")
     if not (math.isfinite(cfg.controller.hurry) and cfg.controller.hurry >= 1.0):
         raise ConfigError("controller.hurry", cfg.controller.hurry, "a number of at least 1")
 

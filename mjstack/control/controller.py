@@ -62,12 +62,12 @@ class Recorded:
         """Commands of the next frame, shape ``(nworld, nu)``."""
         out = self._commands.index_select(0, self._next)[0]
         self.phase.copy_(self._phases.index_select(0, self._next)[0])
-        self._next.add_(1)
+        self._next.add_(1).clamp_(max=self.frames - 1)  # past the end the last one holds
         return out
 
 
 class TapeController:
-    """Plays a command tape: every world is in the same phase."""
+    """Plays a command tape once, from the start that it was planned for: every world is in the same phase."""
 
     def __init__(self, tape: CommandTape, phases: list[Phase], nworld: int, device: torch.device) -> None:
         """Takes the tape, which must be on the device."""
@@ -83,5 +83,5 @@ class TapeController:
         """Commands of the next frame, shape ``(nworld, nu)``."""
         out = self.tape.command(self._next)
         self.phase.copy_(self._phase_at.index_select(0, self._next).expand_as(self.phase))
-        self._next.add_(1)
+        self._next.add_(1).clamp_(max=self.frames - 1)  # past the end the last one holds
         return out

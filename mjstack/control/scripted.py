@@ -13,11 +13,10 @@ from mjstack.envs import Env
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.base import EnvView
-from mjstack.mdp.geometry import aperture_center, jaw_forces, pose_w, robot
+from mjstack.mdp.geometry import LOADED, aperture_center, jaw_forces, pose_w, robot
 from mjstack.scene.index import CUBES
 from mjstack.scene.phases import FIXED, anchor_of, build_phases
 
-LOADED = 1e-5  # N: a jaw that presses with more touches the cube (protocol of the box task)
 _QUARTER = 0.5 * math.pi
 _MOST_OFF = 0.02  # m: a cube that is farther from the aperture centre is not in the hand
 _STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
@@ -29,8 +28,9 @@ class ScriptedController:
     """Phase, time and targets of every world as tensors; targets from where its cubes are; batched inverse kinematics.
 
     A phase moves the aperture centre by smoothstep from the last phase's target to its own. Where it says ``look``, the cube's
-    place is measured when it begins. A grasp without load on both jaws at its end is tried once more, from the phase ``retry``,
-    if the rest can be done in time: such a world then goes faster than the others, at most ``controller.hurry`` times.
+    place is measured when it begins. A grasp without load on both jaws at its end is tried again, from the phase ``retry``,
+    once for each cube and if the rest can be done in time: such a world then goes faster than the others, at most
+    ``controller.hurry`` times.
 
     A world that the environment has reset starts over by itself.
 
@@ -52,9 +52,15 @@ class ScriptedController:
                 ``(phases, nu)``.
 
         Raises:
-            MjstackError: A phase has an anchor that the scene lacks.
+            MjstackError: The scene lacks a phase's anchor, the environment takes other actions, or worlds have moved on.
         """
         cfg, device, n = env.cfg, env.device, env.nworld
+        if list(cfg.action.values()) != list(cfg.controller.action.values()):
+            raise ArgumentError(
+                "env", f"actions {', '.join(cfg.action)}", "those of controller.action", "Set action=joint_absolute"
+            )
+        if bool((env.frame != 0).any()):  # it begins where the environment's episodes do
+            raise ArgumentError("env", "worlds that have moved on", "worlds at their start", "Call env.reset() before")
         self._env, self._cfg = env, cfg
         self.phases = build_phases(cfg)
         self.frames = self.phases[-1].stop
@@ -82,6 +88,7 @@ class ScriptedController:
         self.phase, self._time, self._rate = zeros(dtype=torch.int64), zeros(), zeros()
         self.retries, self.error = zeros(dtype=torch.int32), zeros()
         self.unreachable = zeros(dtype=torch.bool)
+        self._tried = zeros(len(CUBES), dtype=torch.bool)  # whose grasp has been tried again
         self._again = zeros(dtype=torch.bool)  # the phase was entered to try a grasp once more
         self._seen = zeros(3, 2)  # x and y of red, of blue, and of a fixed place
         self._from, self._to = zeros(3), zeros(3)
@@ -131,6 +138,7 @@ class ScriptedController:
         self.phase.copy_(phase)
         for buffer in (self.retries, self.error, self.unreachable):
             buffer.masked_fill_(fresh, 0)
+        self._tried.masked_fill_(fresh[:, None], False)
 
         self._look(entering)
         rows = entering[:, None]
@@ -148,11 +156,15 @@ class ScriptedController:
         """Worlds that try their grasp again, ``(nworld,)`` bool, and how fast they go on, ``(nworld,)``."""
         held = torch.stack([(jaw_forces(self._env, name) > LOADED).all(1) for name in CUBES], dim=1)
         grasps = self._grasps.index_select(0, self.phase)
-        empty = over & (grasps >= 0) & ~held.gather(1, grasps.clamp(min=0)[:, None])[:, 0]
+        cube = grasps.clamp(min=0)[:, None]
+        empty = over & (grasps >= 0) & ~held.gather(1, cube)[:, 0]
         again = self._retry_to.index_select(0, self.phase)
         time_left = (self.frames - self._rest - self._env.frame).clamp(min=1)
         rate = (self._needed.index_select(0, again) / time_left).clamp(min=1.0)
-        return empty & (self.retries == 0) & (self._can_retry.index_select(0, self.phase)) & (rate <= self._hurry), rate
+        first = ~self._tried.gather(1, cube)[:, 0] & self._can_retry.index_select(0, self.phase)
+        retry = empty & first & (rate <= self._hurry)
+        self._tried |= retry[:, None] & (grasps[:, None] == self._cubes)
+        return retry, rate
 
     def _off_center(self) -> torch.Tensor:
         """From a held cube's centre to the aperture centre [m], shape ``(nworld, 3)``; zero where a phase does not ask."""
@@ -231,12 +243,14 @@ class ScriptedController:
         )
         self._grasps = table([cubes[spec.grasps] for spec in specs], torch.int64)
         self._centers = table([cubes[spec.centers] for spec in specs], torch.int64)
+        self._cubes = torch.arange(len(CUBES), device=device)
         self._can_retry = table([spec.retry is not None for spec in specs], torch.bool)
         self._retry_to = table([names.index(spec.retry) if spec.retry else 0 for spec in specs], torch.int64)
         # From the start of a phase to that of the last one, where the arm rests.
         self._needed = table([self.phases[-1].start - phase.start for phase in self.phases])
         self._hurry = cfg.controller.hurry
-        self._rest = cfg.gate.acceptance.window + math.ceil(cfg.controller.rest_seconds / cfg.timing.frame_dt)
+        window = cfg.gate.acceptance.window if cfg.scene.box is None else cfg.gate.box.window
+        self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.frame_dt)
 
 
 def _smoothstep(u: torch.Tensor) -> torch.Tensor:
@@ -252,14 +266,7 @@ def make_expert(env: Env) -> ScriptedController:
         env: The environment, built with ``action=joint_absolute``.
 
     Raises:
-        ArgumentError: Its actions are not absolute joint commands.
+        ArgumentError: Its actions are not absolute joint commands, or its worlds have moved on since their reset.
         Unreachable: The nominal layout is out of the arm's reach.
     """
-    if env.cfg.action != env.cfg.controller.action:
-        raise ArgumentError(
-            "env",
-            f"action terms {', '.join(env.cfg.action)}, which are not absolute joint commands",
-            "those of the scripted controller",
-            "Build it with action=joint_absolute",
-        )
     return ScriptedController(env, ScriptedPlanner(env.cfg).nominal)

@@ -81,6 +81,7 @@ def find_regions(
         mine = places[:, number]
         at = np.floor(mine[:, :2] / cell + _EDGE).astype(np.int64)
         turn = np.floor(radial_yaw_deg(mine) / yaw_cell_deg + _EDGE).astype(np.int64)[:, None]
+        turn[turn * yaw_cell_deg >= 90.0] = 0  # on the edge of 90, which is 0
         unbound = np.full_like(turn, -1)
         for keys, placed in (
             (np.hstack((at, unbound)), True),

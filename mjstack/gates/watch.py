@@ -10,12 +10,11 @@ import torch
 from mjstack.config.schema import Config, PhaseCfg
 from mjstack.control.controller import Controller
 from mjstack.envs import Env
-from mjstack.mdp.geometry import jaw_forces
+from mjstack.mdp.geometry import LOADED, jaw_forces
 from mjstack.scene.index import CUBES
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.tasks.evidence import Evidence
 
-LOADED = 1e-5  # N: a jaw that presses with more touches the cube, as the scripted controller and the box task see it
 GONE_FRAMES = 3  # in a row without load on both jaws: less may be a touch in passing
 
 
@@ -68,7 +67,7 @@ class FailureWatch:
     Attributes:
         sign: Number of the `Sign`, shape ``(nworld,)``, int64.
         phase: Number of the phase in which it was seen, -1 without one, shape ``(nworld,)``, int64.
-        frame: The frame likewise.
+        frame: The frame in whose end it was seen, likewise; where a phase ended with it, the first one after that phase.
     """
 
     sign: torch.Tensor

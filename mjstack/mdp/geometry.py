@@ -15,6 +15,7 @@ def robot(env: EnvView) -> RobotTensors:
 
 
 POSES = ("home", "start")
+LOADED = 1e-5  # N: a jaw that presses with more touches the cube (as in gate.box.force)
 
 
 def named_pose(env: EnvView, pose: str) -> torch.Tensor:

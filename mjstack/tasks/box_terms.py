@@ -115,7 +115,12 @@ class GraspNext:
         Args:
             env: The environment.
             force: What each jaw must exceed [N].
+
+        Raises:
+            MjstackError: There is no box, or the force is out of range.
         """
+        if not 0.0 <= force < math.inf:
+            raise ParameterError("force", force, "a number that is not negative")
         self._cubes, self._force = CubesAndBox(env.cfg, env.index, env.device), force
 
     def __call__(self, env: EnvView) -> torch.Tensor:
