@@ -162,7 +162,13 @@ def measure_episode(
             bare.append(seconds)
             ratios.append(episode.seconds / seconds)
         if keep:
-            again = run_episode(sim, context.index, cfg, context.planner, cfg.reset, repeat=episode.commands)
+            # Both record, so that they differ by the controller alone.
+            again = run_episode(
+                sim, context.index, cfg, context.planner, cfg.reset, repeat=episode.commands, keep_commands=True
+            )
+            lost = int((again.verdict.failed != 0).sum())
+            if lost:
+                section.problem = section.problem or f"{lost} worlds failed when their commands were repeated"
             controlled.append(episode.seconds / again.seconds - 1.0)
         estimate = time.perf_counter() - turn_began
         context.tell("episode, repetitions", len(played), watch.repetitions)
