@@ -402,8 +402,12 @@ def test_ctrl_c_waits_for_the_episode(tmp_path: Path, monkeypatch: pytest.Monkey
         add(self, *args)
 
     monkeypatch.setattr(Shard, "add", interrupted)
-    with pytest.raises(KeyboardInterrupt), DatasetWriter(tmp_path, SPEC) as writer:
-        writer.add([episode(world) for world in range(3)])
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs start with it ignored
+    try:
+        with pytest.raises(KeyboardInterrupt), DatasetWriter(tmp_path, SPEC) as writer:
+            writer.add([episode(world) for world in range(3)])
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert read_dataset(tmp_path).episodes["world"] == [0, 1]
 
 
