@@ -407,7 +407,7 @@ def test_ctrl_c_keeps_finished_batches(folder: Path, monkeypatch: pytest.MonkeyP
     assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
     found = report_of(folder)
     assert found["status"] == "interrupted"
-    assert found["gates"][0]["reason"].startswith("interrupted; 2 of 5 episodes")
+    assert found["gates"][0]["reason"].startswith("interrupted; 2 episodes, 5 asked for")
     monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
     assert collect(*args) == 0
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
