@@ -11,7 +11,7 @@ import numpy as np
 from mjstack.errors import name_worlds
 from mjstack.gates.batch_record import FAILING, BatchRecord, write_failing
 from mjstack.gates.episode import Episode
-from mjstack.gates.gate import GateContext, TimedEpisode, failing_rules
+from mjstack.gates.gate import GateContext, TimedEpisode, failing_rules, play_seeds
 from mjstack.math import wilson_interval
 from mjstack.report.markdown import format_percent
 from mjstack.report.record import GateResult, Status, Value
@@ -79,31 +79,23 @@ def run_batch(context: GateContext) -> list[GateResult]:
     cfg = context.cfg
     t = cfg.gate.batch
     tally = _Tally(t.seeds > 1, context.evidence.rules)
-    problems: list[str] = []
     details: list[str] = []
     sim = context.batch_simulation(cfg.nworld)
     sizes = getattr(sim, "sizes", None)
     metrics: dict[str, Value] = {
         "sizes": f"{sizes.as_overrides()} ({sizes.source})" if sizes else "native MuJoCo has no fixed buffers"
     }
+
+    def keep(record: BatchRecord) -> None:
+        details.extend(_keep(context, record, tally))
+        accepted = int((record.failed == 0).sum())
+        if t.seeds > 1:
+            metrics[f"seed{record.seed}.accepted"] = accepted
+            so_far = f"{tally.worlds - len(tally.failed)} of {tally.worlds}"
+            context.say(f"batch, seed {record.seed}: {accepted} of {cfg.nworld} worlds accepted, {so_far} so far")
+
     try:
-        for seed in range(cfg.seed, cfg.seed + t.seeds):
-            try:
-                record = _play(context, sim, seed, tally)
-            except Exception as error:
-                if not tally.seeds:
-                    raise
-                log.exception("seed %d broke", seed)  # the seeds before it still count
-                what = (str(error) or type(error).__name__).splitlines()[0]
-                left = f"seed {seed}" if seed == cfg.seed + t.seeds - 1 else f"seeds {seed} to {cfg.seed + t.seeds - 1}"
-                problems.append(f"{left} not played: {what} (run.log has the traceback)")
-                break
-            details += _keep(context, record, tally)
-            accepted = int((record.failed == 0).sum())
-            if t.seeds > 1:
-                metrics[f"seed{seed}.accepted"] = accepted
-                so_far = f"{tally.worlds - len(tally.failed)} of {tally.worlds}"
-                context.say(f"batch, seed {seed}: {accepted} of {cfg.nworld} worlds accepted, {so_far} so far")
+        problems = play_seeds(cfg.seed, t.seeds, lambda seed: _play(context, sim, seed, tally), keep)
         description = sim.description
     finally:
         sim.close()

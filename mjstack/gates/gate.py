@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
@@ -22,7 +23,10 @@ from mjstack.sim import BatchSizes, Simulation, make_simulation, resolve_backend
 from mjstack.sim.sizes import apply_configured
 from mjstack.tasks.evidence import Evidence, Rule, Verdict, describe_rules, evidence_class
 
+log = logging.getLogger(__name__)
+
 Say = Callable[[str], None]
+Record = TypeVar("Record")
 
 
 def _silent(_: str) -> None:
@@ -201,6 +205,32 @@ def judge_one(rules: type[Rule], verdict: Verdict) -> tuple[Status, str, dict]:
 def measured_values(verdict: Verdict) -> dict[str, np.ndarray]:
     """What the acceptance measured, by name with unit, on the host; each of shape ``(nworld,)``."""
     return {name: value.double().cpu().numpy() for name, value in verdict.values.items()}
+
+
+def play_seeds(first: int, count: int, play: Callable[[int], Record], keep: Callable[[Record], None]) -> list[str]:
+    """Plays seed after seed. One that breaks ends it, and those before it still count; the very first one's error is raised.
+
+    Args:
+        first: The first seed.
+        count: How many.
+        play: Plays one.
+        keep: Takes in what it gave, before the next one can break or be stopped.
+
+    Returns:
+        What was not played, and why: one line, or none.
+    """
+    for seed in range(first, first + count):
+        try:
+            record = play(seed)
+        except Exception as error:
+            if seed == first:
+                raise
+            log.exception("seed %d broke", seed)
+            what = (str(error) or type(error).__name__).splitlines()[0]
+            left = f"seed {seed}" if seed == first + count - 1 else f"seeds {seed} to {first + count - 1}"
+            return [f"{left} not played: {what} (run.log has the traceback)"]
+        keep(record)
+    return []
 
 
 def failing_rules(rules: type[Rule], failed: np.ndarray) -> dict[Rule, list[int]]:

@@ -15,7 +15,7 @@ from mjstack.envs import Env
 from mjstack.errors import MjstackError, name_worlds
 from mjstack.gates.batch_record import FAILING, write_failing
 from mjstack.gates.episode import SCRIPTED
-from mjstack.gates.gate import GateContext, failing_rules
+from mjstack.gates.gate import GateContext, failing_rules, play_seeds
 from mjstack.gates.regions import Region, find_regions
 from mjstack.gates.success_record import BOTH, PICTURE, REGIONS, Start, SuccessRecord, layout_name
 from mjstack.gates.watch import FailureWatch, describe_sign
@@ -129,7 +129,6 @@ def run_success(context: GateContext) -> list[GateResult]:
     own = context.with_config(success_config(context.cfg))
     cfg, t = own.cfg, own.cfg.gate.success
     tally = _Tally(t.seeds > 1, own.evidence.rules, [phase.name for phase in own.planner.phases])
-    problems: list[str] = []
     details: list[str] = []
     sim = own.batch_simulation(cfg.nworld)
     sizes = getattr(sim, "sizes", None)
@@ -137,22 +136,15 @@ def run_success(context: GateContext) -> list[GateResult]:
         "backend": sim.description,
         "sizes": f"{sizes.as_overrides()} ({sizes.source})" if sizes else "native MuJoCo has no fixed buffers",
     }
+
+    def keep(record: SuccessRecord) -> None:
+        _keep(own, record, tally, details)
+        if t.seeds > 1:
+            accepted, so_far = int(record.accepted.sum()), f"{tally.good} of {tally.episodes}"
+            context.say(f"success, seed {record.batch.seed}: {accepted} of {cfg.nworld} episodes accepted, {so_far} so far")
+
     try:
-        for seed in range(cfg.seed, cfg.seed + t.seeds):
-            try:
-                record = _play(own, sim, seed, tally, details)
-            except Exception as error:
-                if not tally.seeds:
-                    raise
-                log.exception("seed %d broke", seed)  # the seeds before it still count
-                what = (str(error) or type(error).__name__).splitlines()[0]
-                left = f"seed {seed}" if seed == cfg.seed + t.seeds - 1 else f"seeds {seed} to {cfg.seed + t.seeds - 1}"
-                problems.append(f"{left} not played: {what} (run.log has the traceback)")
-                break
-            _keep(own, record, tally, details)
-            if t.seeds > 1:
-                accepted, so_far = int(record.accepted.sum()), f"{tally.good} of {tally.episodes}"
-                context.say(f"success, seed {seed}: {accepted} of {cfg.nworld} episodes accepted, {so_far} so far")
+        problems = play_seeds(cfg.seed, t.seeds, lambda seed: _play(own, sim, seed, tally, details), keep)
     finally:
         sim.close()
     result = _judge(own, tally, metrics, problems, details)
