@@ -76,9 +76,7 @@ PATHS: dict[str, list[str] | None] = {
     "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
     "control/planner.py": ["CommandTape.command"],
     "control/controller.py": ["Recorded.append", "Recorded.command", "TapeController.command"],
-    "control/scripted.py": [
-        *(f"ScriptedController.{n}" for n in ("command", "_advance", "_judge_grasp", "_look", "_turn", "_off_center"))
-    ],
+    "control/scripted.py": [*(f"ScriptedController.{n}" for n in ("command", "_advance", "_judge_grasp", "_look", "_turn"))],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",
         "BatchedIk.aperture",

@@ -278,8 +278,8 @@ class PhaseCfg:
     is ``in_hand``.
 
     The rest is for a controller that watches (``controller=scripted``): ``look`` measures the anchor's cube anew when the phase
-    begins, ``centers`` names a held cube whose own centre goes to the target, however it lies in the hand, ``grasps`` names the
-    cube that both jaws must press on when the phase ends, and ``retry`` the phase to go back to if they do not.
+    begins, ``grasps`` names the cube that both jaws must press on when it ends, and ``retry`` the phase to go back to if they
+    do not.
     """
 
     anchor: str | None = None
@@ -289,7 +289,6 @@ class PhaseCfg:
     gripper: str = MISSING
     seconds: float = MISSING
     look: bool = False
-    centers: str | None = None
     grasps: str | None = None
     retry: str | None = None
 

@@ -235,9 +235,8 @@ def _controller(cfg: Config) -> None:
         for part in ("h_scale", "offset"):
             if not math.isfinite(getattr(phase, part)):
                 raise ConfigError(f"{key}.{part}", getattr(phase, part), "a finite number")
-        for part in ("grasps", "centers"):
-            if getattr(phase, part) not in (None, "red", "blue"):
-                raise ConfigError(f"{key}.{part}", getattr(phase, part), "red, blue or null")
+        if phase.grasps not in (None, "red", "blue"):
+            raise ConfigError(f"{key}.grasps", phase.grasps, "red, blue or null")
         if phase.retry is not None and phase.retry not in cfg.controller.phases:
             raise UnknownName(f"{key}.retry: phase", phase.retry, cfg.controller.phases)
         cube = {"on_blue": "blue", "over_red": "red", "over_blue": "blue"}.get(phase.anchor or "", phase.anchor)

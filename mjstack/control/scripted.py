@@ -13,12 +13,11 @@ from mjstack.envs import Env
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.base import EnvView
-from mjstack.mdp.geometry import LOADED, aperture_center, jaw_forces, pose_w, robot
+from mjstack.mdp.geometry import LOADED, jaw_forces, pose_w, robot
 from mjstack.scene.index import CUBES
 from mjstack.scene.phases import FIXED, anchor_of, build_phases
 
 _QUARTER = 0.5 * math.pi
-_MOST_OFF = 0.02  # m: a cube that is farther from the aperture centre is not in the hand
 _STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
 _ROLL_STEP = 0.05  # rad per frame
 _DONE = 1e-3  # frames: a phase is over this much before its last frame would be
@@ -145,7 +144,7 @@ class ScriptedController:
         table, source = self._target.index_select(0, phase), self._source.index_select(0, phase)
         place = self._seen.gather(1, source[:, None, None].expand(-1, 1, 2))[:, 0]
         to = torch.cat((table[:, :2] + place, table[:, 2:]), dim=1)
-        to = torch.where(self._holds.index_select(0, phase)[:, None], self._to, to + self._off_center())
+        to = torch.where(self._holds.index_select(0, phase)[:, None], self._to, to)
         self._from.copy_(torch.where(rows, torch.where(fresh[:, None], to, self._to), self._from))
         self._to.copy_(torch.where(rows, to, self._to))
         closing = torch.where(fresh[:, None], self._home_grip, self._grip_to)
@@ -165,15 +164,6 @@ class ScriptedController:
         retry = empty & first & (rate <= self._hurry)
         self._tried |= retry[:, None] & (grasps[:, None] == self._cubes)
         return retry, rate
-
-    def _off_center(self) -> torch.Tensor:
-        """From a held cube's centre to the aperture centre [m], shape ``(nworld, 3)``; zero where a phase does not ask."""
-        at, held = aperture_center(self._env).float(), self._centers.index_select(0, self.phase)
-        out = torch.zeros_like(at)
-        for number, name in enumerate(CUBES):
-            off = (at - pose_w(self._env, name)[:, :3].float()).clamp(-_MOST_OFF, _MOST_OFF)
-            out = torch.where((held == number)[:, None], off, out)
-        return out
 
     def _turn(self, command: torch.Tensor, fresh: torch.Tensor) -> None:
         """Rolls the open jaws towards a face of the cube that a phase looks at, by a little per frame.
@@ -242,7 +232,6 @@ class ScriptedController:
             [look >= 0 and spec.gripper == "open" for look, spec in zip(looks, specs, strict=True)], torch.bool
         )
         self._grasps = table([cubes[spec.grasps] for spec in specs], torch.int64)
-        self._centers = table([cubes[spec.centers] for spec in specs], torch.int64)
         self._cubes = torch.arange(len(CUBES), device=device)
         self._can_retry = table([spec.retry is not None for spec in specs], torch.bool)
         self._retry_to = table([names.index(spec.retry) if spec.retry else 0 for spec in specs], torch.int64)
