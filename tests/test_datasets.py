@@ -654,10 +654,11 @@ def test_missing_and_cut_files_are_named(file: str, tmp_path: Path) -> None:
 
 
 def test_the_guides_lines_read_it_in_another_process(tmp_path: Path) -> None:
-    """The guide's reading lines, and nothing else, on a dataset of the same folder and names."""
+    """The guide's reading lines, and nothing else, on a dataset in the folder that they name."""
     (lines,) = [block for block in re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.S) if "DatasetWriter" not in block]
     assert "mjstack" not in re.sub(r'info\["mjstack"\]', "", lines)
-    write(tmp_path / "outputs" / "demos", range(3))
+    (folder,) = re.findall(r'^folder = Path\("(.+)"\)$', lines, re.M)
+    write(tmp_path / folder, range(3))
     done = subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     first, second = done.stdout.splitlines()
