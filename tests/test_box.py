@@ -22,8 +22,9 @@ from mjstack.gates.episode import NOMINAL, run_episode
 from mjstack.gates.gate import GateContext
 from mjstack.math import quat_to_matrix
 from mjstack.scene import BLUE, RED, LowestPoint, SceneIndex, build_model
+from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation, make_simulation
-from mjstack.tasks.box import BoxRule, BoxSuccess
+from mjstack.tasks.box import BoxEvidence, BoxRule, BoxSuccess
 from mjstack.tasks.box_terms import GraspNext, InBox, Place, ReachNext, ToSlot
 from mjstack.tasks.evidence import describe_rules
 
@@ -202,6 +203,8 @@ def test_terms_know_the_box(robot: str) -> None:
     wanted = np.subtract(places[BLUE], env.sim.model.body(BLUE).pos)
     np.testing.assert_allclose(ToSlot(env, object=BLUE)(env)[0], wanted, atol=1e-6)
     assert InBox(env)(env).tolist() == [0.0, 0.5, 1.0, 0.0]
+    evidence = BoxEvidence(env.cfg, env.index, build_phases(env.cfg), 4, env.device)
+    assert evidence.placed(env.sim).tolist() == [[False, False], [True, False], [True, True], [False, False]]
     place = Place(env, object=RED, scale=0.1)(env)
     assert place.tolist() == pytest.approx([0.0, 1.0, 1.0, 1.0 - math.tanh(1.0)], abs=1e-6)
     reach = ReachNext(env, scale=0.1)(env)

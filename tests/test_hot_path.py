@@ -62,13 +62,14 @@ PATHS: dict[str, list[str] | None] = {
     "tasks/stack.py": [
         *(f"CubePair.{n}" for n in ("pose", "speed", "clearance", "offset", "stacked", "supported")),
         "StackEvidence.update",
+        "StackEvidence.placed",
         "StackSuccess.__call__",
         "StackSuccess.reset",
     ],
     "tasks/box.py": [
         *(f"CubesAndBox.{n}" for n in ("pose", "bounds", "speed", "beyond", "over", "inside", "off_slot")),
         *(f"CubesAndBox.{n}" for n in ("pressed", "supported", "opening", "_forces")),
-        *(f"BoxEvidence.{n}" for n in ("update", "_extend")),
+        *(f"BoxEvidence.{n}" for n in ("update", "placed", "_extend")),
         "BoxSuccess.__call__",
         "BoxSuccess.reset",
     ],
@@ -77,6 +78,7 @@ PATHS: dict[str, list[str] | None] = {
     "control/planner.py": ["CommandTape.command"],
     "control/controller.py": ["Recorded.append", "Recorded.command", "TapeController.command"],
     "control/scripted.py": [*(f"ScriptedController.{n}" for n in ("command", "_advance", "_judge_grasp", "_look", "_turn"))],
+    "gates/watch.py": ["FailureWatch.update", "_of"],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",
         "BatchedIk.aperture",

@@ -301,7 +301,7 @@ def _play_bare(context: GateContext, sim: MjwarpSimulation, recorded: Recorded |
     if bad:
         return seconds, f"{bad} worlds overflowed or diverged with bare steps"
     judge = context.evidence(cfg, context.index, context.planner.phases, sim.nworld, sim.device)
-    fallen = int((~judge.placed(sim)).sum())
+    fallen = int((~judge.placed(sim).all(1)).sum())
     return seconds, f"{fallen} worlds did not do the task with bare steps" if fallen else ""
 
 

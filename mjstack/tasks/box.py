@@ -310,9 +310,9 @@ class BoxEvidence(Evidence):
         return Verdict(failed, values)
 
     def placed(self, sim: Simulation) -> torch.Tensor:
-        """Whether both cubes are in the box right now."""
+        """Whether each cube is in the box right now."""
         pose = self._cubes.pose(sim)
-        return self._cubes.inside(*self._cubes.bounds(pose[..., :3], quat_to_matrix(pose[..., 3:]))).all(1)
+        return self._cubes.inside(*self._cubes.bounds(pose[..., :3], quat_to_matrix(pose[..., 3:])))
 
     @classmethod
     def thresholds(cls, cfg: Config) -> dict[str, Value]:

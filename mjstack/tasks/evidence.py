@@ -74,7 +74,7 @@ class Evidence(ABC):
 
     @abstractmethod
     def placed(self, sim: Simulation) -> torch.Tensor:
-        """Whether the cubes are where they belong right now, shape ``(nworld,)``, bool."""
+        """Whether each cube is where it belongs right now, red first, shape ``(nworld, 2)``, bool. No host read."""
 
     @classmethod
     @abstractmethod

@@ -203,8 +203,10 @@ class StackEvidence(Evidence):
         )
 
     def placed(self, sim: Simulation) -> torch.Tensor:
-        """Whether red is on blue right now."""
-        return self._cubes.stacked(*self._cubes.offset(self._cubes.pose(sim)))
+        """Whether red is on blue, and blue on the table, right now."""
+        cubes, pose = self._cubes, self._cubes.pose(sim)
+        on_blue = cubes.stacked(*cubes.offset(pose))
+        return torch.stack((on_blue, cubes.supported(pose, cubes.clearance(pose))), dim=1)
 
     @classmethod
     def thresholds(cls, cfg: Config) -> dict[str, Value]:
