@@ -223,6 +223,19 @@ def test_terms_know_the_box(robot: str) -> None:
     env.close()
 
 
+def test_a_place_counts_off_the_table_whatever_the_boxs_floor() -> None:
+    """Red over its place, its lowest corner 0.5 mm below and above half the floor, and at rest on the floor; all else alike."""
+    for floor in (0.004, 0.006):
+        env = small_env("reset=nominal", f"scene.box.floor={floor}")
+        for world, height in enumerate((0.5 * floor - 0.0005, 0.5 * floor + 0.0005, floor)):
+            put(env, RED, [*env.cfg.scene.red_slot, TOP["so101"] + height + 0.022], [world])
+        below, above, resting = Place(env, object=RED, scale=0.1)(env).tolist()
+        assert below == 0.0
+        assert above == pytest.approx(1.0 - math.tanh((0.5 * floor - 0.0005) / 0.1), abs=1e-6)
+        assert resting == pytest.approx(1.0, abs=1e-6)
+        env.close()
+
+
 def test_success_needs_rest_in_the_box_an_open_gripper_and_the_whole_window(robot: str) -> None:
     """World 0 has all of it. In 1 blue is on the table, in 2 the gripper is closed, in 3 red moves now and then, in 4 a jaw
     touches blue in the first frame, in 5 a corner of red is above the rim."""
