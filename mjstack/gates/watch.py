@@ -77,7 +77,7 @@ class FailureWatch:
     def __init__(self, cfg: Config) -> None:
         """Reads the phases."""
         specs = list(cfg.controller.phases.values())
-        self._tables = _grasped(specs), _carried(specs)
+        self._tables = _grasped(specs), carried_cubes(specs)
         self._releases = _releases(self._tables[1])
 
     def start(self, env: Env) -> None:
@@ -141,7 +141,7 @@ def _grasped(specs: Sequence[PhaseCfg]) -> list[int]:
     return [_number(spec.grasps) for spec in specs]
 
 
-def _carried(specs: Sequence[PhaseCfg]) -> list[int]:
+def carried_cubes(specs: Sequence[PhaseCfg]) -> list[int]:
     """Number of the cube that is in the hand all through each phase, or -1."""
     out, cube = [], -1
     for spec in specs:
