@@ -185,6 +185,8 @@ def measure_episode(
             if lost:
                 section.problem = section.problem or f"{lost} worlds failed when their commands were repeated"
             controlled.append(episode.seconds / again.seconds - 1.0)
+            del again
+        del episode  # with its commands, before the next turn records as many
         estimate = time.perf_counter() - turn_began
         context.tell("episode, repetitions", len(played), watch.repetitions)
     if not played and before is not None:
