@@ -69,11 +69,12 @@ PATHS: dict[str, list[str] | None] = {
     "tasks/box.py": [
         *(f"CubesAndBox.{n}" for n in ("pose", "bounds", "speed", "beyond", "over", "inside", "off_slot")),
         *(f"CubesAndBox.{n}" for n in ("pressed", "supported", "opening", "_forces")),
-        *(f"BoxEvidence.{n}" for n in ("update", "placed", "_extend")),
+        *(f"BoxEvidence.{n}" for n in ("update", "placed")),
         "BoxSuccess.__call__",
         "BoxSuccess.reset",
     ],
     "tasks/box_terms.py": [*(f"{n}.__call__" for n in ("ToSlot", "Place", "InBox", "ReachNext", "GraspNext")), "cubes_inside"],
+    "tasks/runs.py": None,
     "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
     "control/planner.py": ["CommandTape.command"],
     "control/controller.py": ["Recorded.append", "Recorded.command", "TapeController.command"],

@@ -21,6 +21,7 @@ from mjstack.gates.gate import GateContext, TimedEpisode
 from mjstack.gates.power import EnergyMeter
 from mjstack.gates.timing import WARM_UP, Timing, capture_problem, frames_that_fit, spread, step_graph, timed
 from mjstack.gates.watch import carried_cubes
+from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED
 from mjstack.report.record import Value
 from mjstack.scene.index import CUBES
@@ -344,8 +345,7 @@ def _play_bare(context: GateContext, sim: MjwarpSimulation, recorded: Recorded |
 
 def _lost(sim: Simulation) -> torch.Tensor:
     """Worlds that overflowed or diverged, shape ``(nworld,)``, bool."""
-    finite = torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1)
-    return ((sim.overflow & LOST_PHYSICS) != 0) | ~finite
+    return not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
 
 
 def _physics_captured(sim: Simulation, substeps: int) -> dict[str, Value]:

@@ -10,6 +10,7 @@ import torch
 from mjstack.config.schema import Config, PhaseCfg
 from mjstack.control.controller import Controller
 from mjstack.envs import Env
+from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED, jaw_forces
 from mjstack.scene.index import CUBES
 from mjstack.sim.simulation import LOST_PHYSICS
@@ -100,9 +101,7 @@ class FailureWatch:
         loaded = torch.stack([(jaw_forces(env, name) > LOADED).all(1) for name in CUBES], dim=1)
         placed = evidence.placed(sim)
 
-        # 0 times a number that is not finite is NaN, which is no longer 0.
-        finite = ((sim.qpos * 0.0).sum(1) + (sim.qvel * 0.0).sum(1)) == 0.0
-        lost = ~finite | ((sim.overflow & LOST_PHYSICS) != 0)
+        lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
         entered = phase > self._at
         grasped = self._grasped.index_select(0, self._at)
         empty = entered & (grasped >= 0) & ~_of(self._loaded, grasped)

@@ -10,6 +10,7 @@ from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.base import EnvView, shared
 from mjstack.math import quat_to_matrix
 from mjstack.mdp.geometry import above_table, aperture_center, jaw_forces, pose_w
+from mjstack.mdp.reward import require_positive
 from mjstack.scene import BLUE, RED, table_top
 from mjstack.tasks.box import CubesAndBox
 
@@ -61,8 +62,7 @@ class Place:
         Raises:
             MjstackError: There is no such cube, no box, or the scale is out of range.
         """
-        if not 0.0 < scale < math.inf:
-            raise ParameterError("scale", scale, "a positive number")
+        require_positive("scale", scale)
         self._to_slot, self._object, self._scale = ToSlot(env, object=object), object, scale
         assert env.cfg.scene.box is not None  # there would be no place
         self._off_table = 0.5 * env.cfg.scene.box.floor
@@ -98,8 +98,7 @@ class ReachNext:
         Raises:
             MjstackError: There is no box, or the scale is out of range.
         """
-        if not 0.0 < scale < math.inf:
-            raise ParameterError("scale", scale, "a positive number")
+        require_positive("scale", scale)
         self._cubes, self._scale = CubesAndBox(env.cfg, env.index, env.device), scale
 
     def __call__(self, env: EnvView) -> torch.Tensor:
