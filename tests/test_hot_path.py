@@ -78,7 +78,10 @@ PATHS: dict[str, list[str] | None] = {
     "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
     "control/planner.py": ["CommandTape.command"],
     "control/controller.py": ["Recorded.append", "Recorded.command", "TapeController.command"],
-    "control/scripted.py": [*(f"ScriptedController.{n}" for n in ("command", "_advance", "_judge_grasp", "_look", "_turn"))],
+    "control/scripted.py": [
+        *(f"ScriptedController.{n}" for n in ("command", "_advance", "_aim", "_judge_grasp", "_look", "_turn"))
+    ],
+    "control/tilt.py": ["CarryTilt.wish"],
     "gates/watch.py": ["FailureWatch.update", "_of"],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",
