@@ -7,6 +7,7 @@ calling it. So every job is composed and checked here first, and Hydra only runs
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from mjstack.config.help import help_text
 from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, own_hydra, to_config
 from mjstack.errors import MjstackError
 from mjstack.jobs import JobOutcome, check_job, job_folder, run_job
@@ -29,7 +31,8 @@ from mjstack.report.record import Status
 
 INTERRUPTED = 130
 _OTHER_CONFIG = {"--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp"}
-_FLAGS_WITHOUT_RUN = {"--help", "-h", "--hydra-help", "--info", "-i", "--version", "--shell-completion", "-sc"}
+_HELP = {"--help", "-h"}
+_FLAGS_WITHOUT_RUN = {"--hydra-help", "--info", "-i", "--version", "--shell-completion", "-sc"}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -40,6 +43,9 @@ def main(argv: Sequence[str] | None = None) -> None:
 def run(args: list[str]) -> int:
     """Runs a command line and returns its exit status."""
     errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+    if _HELP & set(args):
+        print(help_text(min(max(shutil.get_terminal_size((120, 24)).columns, 60), 120)))
+        return 0
     if _FLAGS_WITHOUT_RUN & set(args) or any(a.startswith(("--info", "--hydra-help")) for a in args):
         return _run_hydra(args, [])
     sweep = bool({"-m", "--multirun"} & set(args))

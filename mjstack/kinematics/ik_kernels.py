@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import warp as wp
-
-wp.config.log_level = wp.LOG_ERROR  # before the first use, which starts Warp
+from mjstack.sim.start import wp
 
 HINGE = 0
 SLIDE = 1
