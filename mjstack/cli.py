@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from mjstack import __version__
 from mjstack.config.help import help_text
 from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, own_hydra, to_config
 from mjstack.errors import MjstackError
@@ -32,7 +33,7 @@ from mjstack.report.record import Status
 INTERRUPTED = 130
 _OTHER_CONFIG = {"--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp"}
 _HELP = {"--help", "-h"}
-_FLAGS_WITHOUT_RUN = {"--hydra-help", "--info", "-i", "--version", "--shell-completion", "-sc"}
+_FLAGS_WITHOUT_RUN = {"--hydra-help", "--info", "-i", "--shell-completion", "-sc"}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -44,7 +45,10 @@ def run(args: list[str]) -> int:
     """Runs a command line and returns its exit status."""
     errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
     if _HELP & set(args):
-        print(help_text(min(max(shutil.get_terminal_size((120, 24)).columns, 60), 120)))
+        _print_help()
+        return 0
+    if "--version" in args:
+        print(f"mjstack {__version__}")
         return 0
     if _FLAGS_WITHOUT_RUN & set(args) or any(a.startswith(("--info", "--hydra-help")) for a in args):
         return _run_hydra(args, [])
@@ -75,6 +79,14 @@ def run(args: list[str]) -> int:
     if sweep and outcomes:
         _print_sweep(outcomes)
     return max([status, *(outcome.exit_code for outcome in outcomes)])
+
+
+def _print_help() -> None:
+    """Prints what `--help` says, to a reader that may not want all of it, such as ``| head``."""
+    try:
+        print(help_text(min(max(shutil.get_terminal_size((120, 24)).columns, 60), 120)), flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes there once more at its end
 
 
 def _run_hydra(args: list[str], outcomes: list[JobOutcome]) -> int:

@@ -16,6 +16,7 @@ from pathlib import Path
 import mjstack.conf
 import pytest
 
+from mjstack import __version__
 from mjstack.cli import run
 from mjstack.config import load_config
 
@@ -128,6 +129,19 @@ def test_help_says_what_there_is_to_choose(
     assert "--cfg job" in said
     assert "schema" not in said
     assert len(out.splitlines()) < 100
+    assert everything(folder) == []
+
+
+def test_help_may_be_cut_off_by_its_reader() -> None:
+    command = f"{sys.executable} {SCRIPT} --help | head -1; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("mjstack: ")
+
+
+def test_version(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out == f"mjstack {__version__}\n"
     assert everything(folder) == []
 
 

@@ -30,6 +30,7 @@ _FLAGS = (
     ("--cfg job -p gate.batch", "print a part of it; job=collect --cfg job -p job has the keys of a job"),
     ("-m", "a sweep over comma-separated values"),
     ("--hydra-help", "Hydra's own flags"),
+    ("--version", "mjstack's version"),
 )
 _STATUSES = "Exit status: 0 passed, 1 a gate failed, 2 bad configuration or input, 130 interrupted."
 
