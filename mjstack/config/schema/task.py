@@ -58,9 +58,9 @@ class ControllerCfg:
 
     ``knots``, ``ik_tolerance`` and ``ik_iterations`` are mink's, which plans. A controller that watches makes
     ``frame_iterations`` of batched inverse kinematics per frame; ``posture_gain`` pulls redundant joints to mink's nominal
-    plan and ``approach_gain`` leans the gripper as it must where the cube is let go; ``align`` is the share by which the jaws
-    turn towards a cube's nearest face; a retry may go up to ``hurry`` times as fast, and must be over ``rest_seconds`` before
-    the window of rest.
+    plan and ``approach_gain`` tilts the gripper as the cube's place needs it; ``align`` is the share by which the jaws turn
+    towards a cube's nearest face; a retry may go up to ``hurry`` times as fast, and must be over ``rest_seconds`` before the
+    window of rest.
     """
 
     name: str = MISSING
