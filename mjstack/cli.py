@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from mjstack import __version__
+import mjstack
 from mjstack.config.help import help_text
 from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, own_hydra, to_config
 from mjstack.errors import MjstackError
@@ -48,7 +48,7 @@ def run(args: list[str]) -> int:
         _print_help()
         return 0
     if "--version" in args:
-        print(f"mjstack {__version__}")
+        print(f"mjstack {mjstack.__version__}")
         return 0
     if _FLAGS_WITHOUT_RUN & set(args) or any(a.startswith(("--info", "--hydra-help")) for a in args):
         return _run_hydra(args, [])

@@ -513,6 +513,19 @@ def test_a_start_at_its_target_stays(arm: Arm, device: str) -> None:
     assert (distance <= 1e-6).all()
 
 
+def test_an_approach_that_is_not_finite_stays_in_its_world(arm: Arm, device: str) -> None:
+    start, target = arm.at_home(4), arm.aperture(arm.anywhere(4, 33))
+    ik = arm.solver(4, device, approach_gain=0.3)
+    given, goal, down = tensors(device, start, target, np.tile([0.0, 0.0, -1.0], (4, 1)))
+    clean = ik.solve(given, goal, approach=down)[0].clone()
+    down[2, 1] = torch.nan
+    command, distance = ik.solve(given, goal, approach=down)
+    assert torch.isnan(distance).tolist() == [False, False, True, False]
+    assert ik.unreachable[2]
+    np.testing.assert_allclose(command[2].cpu().numpy(), start[2], atol=1e-6)
+    assert torch.equal(command[[0, 1, 3]], clean[[0, 1, 3]])
+
+
 def test_not_finite_input_stays_in_its_world(arm: Arm, device: str) -> None:
     start, target = arm.at_home(8), arm.aperture(arm.anywhere(8, 8))
     ik = arm.solver(8, device)

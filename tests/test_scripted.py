@@ -11,6 +11,7 @@ import torch
 from mjstack import make_env
 from mjstack.config import load_config
 from mjstack.control.scripted import ScriptedController, make_expert
+from mjstack.control.tilt import _keeps, _places
 from mjstack.envs import Env, scripted_config
 from mjstack.errors import ArgumentError
 from mjstack.gates.gate import GateContext
@@ -166,6 +167,21 @@ def test_a_cube_arrives_as_it_stood() -> None:
     assert tilt["place_stack"].max() < 10.0
     assert tilt["retreat"].max() < 1.0
     env.close()
+
+
+def test_tilt_follows_the_phases() -> None:
+    """In the box task red's tilt is kept until blue is looked for; a place without an anchor is where the target was before."""
+    phases = load_config(["task=box"]).controller.phases
+    names, specs = list(phases), list(phases.values())
+    kept = [name for name, keeps in zip(names, _keeps(specs), strict=True) if keeps]
+    roles = ("lift", "carry", "hold", "open", "retreat", "settle")
+    assert kept == [f"{role}_{cube}" for cube in ("red", "blue") for role in roles] + ["done"]
+    assert [names[place] for place in _places(specs)] == ["hold_red"] * 6 + ["hold_blue"] * 13
+    phases["hold_red"].anchor = None
+    assert [names[place] for place in _places(specs)][:7] == ["carry_red"] * 6 + ["hold_blue"]
+    for spec in specs:
+        spec.grasps = None
+    assert [names[place] for place in _places(specs)] == ["retreat_blue"] * 19
 
 
 def test_no_retry_without_time(stage: Stage) -> None:

@@ -16,7 +16,7 @@ from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.base import EnvView
 from mjstack.mdp.geometry import LOADED, jaw_forces, pose_w, robot
 from mjstack.scene.index import CUBES
-from mjstack.scene.phases import FIXED, anchor_of, build_phases
+from mjstack.scene.phases import FIXED, anchor_of, build_phases, grasped_cubes
 
 _QUARTER = 0.5 * math.pi
 _STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
@@ -223,7 +223,6 @@ class ScriptedController:
     def _build_tables(self, cfg: Config, device: torch.device) -> None:
         """What each phase says, as tensors."""
         names, specs = list(cfg.controller.phases), list(cfg.controller.phases.values())
-        cubes = {"red": 0, "blue": 1, None: -1}
         anchors = [anchor_of(cfg, name) for name in names]
         grips = {"open": cfg.robot.gripper_open, "closed": cfg.robot.gripper_closed}
         frames = [phase.stop - phase.start for phase in self.phases]
@@ -241,7 +240,7 @@ class ScriptedController:
         self._aligns = table(
             [look >= 0 and spec.gripper == "open" for look, spec in zip(looks, specs, strict=True)], torch.bool
         )
-        self._grasps = table([cubes[spec.grasps] for spec in specs], torch.int64)
+        self._grasps = table(grasped_cubes(specs), torch.int64)
         self._cubes = torch.arange(len(CUBES), device=device)
         self._can_retry = table([spec.retry is not None for spec in specs], torch.bool)
         self._retry_to = table([names.index(spec.retry) if spec.retry else 0 for spec in specs], torch.int64)

@@ -12,6 +12,7 @@ from mjstack.config.schema import Config, PhaseCfg
 from mjstack.errors import ConfigError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.scene.index import find
+from mjstack.scene.phases import carried_cubes
 
 
 class CarryTilt:
@@ -19,7 +20,8 @@ class CarryTilt:
 
     An arm that grasps near its base can point straight down, and far from it must lean. A cube grasped upright would arrive
     there tilted by the difference, on an edge, and may fall. So another arm, a thought one, follows the place at which the
-    cube will be let go, a few iterations per frame, and says how it leans there.
+    cube will be let go, a few iterations per frame, and says how it leans there. The open hand keeps its tilt until it looks
+    for the next cube, so that it does not turn the one that it lets go.
 
     The wish is turned about the vertical with the arm's first joint: it is the angle to the vertical that is kept.
     """
@@ -43,10 +45,9 @@ class CarryTilt:
         )
         self._sign = _turns_about_vertical(model, cfg)
         specs = list(c.phases.values())
-        carries = _carries(specs)
-        self._carries = torch.tensor(carries, device=device)
+        self._keeps = torch.tensor(_keeps(specs), device=device)
         self._grasps = torch.tensor([spec.grasps is not None for spec in specs], device=device)
-        self.place = torch.tensor(_places(carries), device=device)
+        self.place = torch.tensor(_places(specs), device=device)
         self._there = nominal.new_zeros((ik.nworld, nominal.shape[1]))
         self._kept, self._kept_turn = nominal.new_zeros((ik.nworld, 3)), nominal.new_zeros(ik.nworld)
 
@@ -66,11 +67,11 @@ class CarryTilt:
         nominal = self._nominal.index_select(0, self.place.index_select(0, phase))
         start = torch.where(fresh[:, None], nominal, self._there)
         self._there.copy_(self._there_ik.solve(start, there)[0])
-        grasps, carries = self._grasps.index_select(0, phase), self._carries.index_select(0, phase)
+        grasps, keeps = self._grasps.index_select(0, phase), self._keeps.index_select(0, phase)
         self._kept.copy_(torch.where(grasps[:, None], self._ik.approach(command), self._kept))
         self._kept_turn.copy_(torch.where(grasps, command[:, 0], self._kept_turn))
-        x, y, z = torch.where(carries[:, None], self._kept, self._there_ik.approach(self._there)).unbind(1)
-        turn = self._sign * (command[:, 0] - torch.where(carries, self._kept_turn, self._there[:, 0]))
+        x, y, z = torch.where(keeps[:, None], self._kept, self._there_ik.approach(self._there)).unbind(1)
+        turn = self._sign * (command[:, 0] - torch.where(keeps, self._kept_turn, self._there[:, 0]))
         cos, sin = torch.cos(turn), torch.sin(turn)
         return torch.stack((cos * x - sin * y, sin * x + cos * y, z), dim=1)
 
@@ -86,17 +87,20 @@ def _turns_about_vertical(model: mujoco.MjModel, cfg: Config) -> float:
     return math.copysign(1.0, up)
 
 
-def _carries(specs: Sequence[PhaseCfg]) -> list[bool]:
-    """Whether a cube is in the hand all through each phase."""
-    out, held = [], False
+def _keeps(specs: Sequence[PhaseCfg]) -> list[bool]:
+    """Whether the tilt of the last grasp is kept in each phase."""
+    out, kept = [], False
     for spec in specs:
-        held = held and spec.gripper == "closed"
-        out.append(held and spec.grasps is None)
-        held = held or spec.grasps is not None
+        kept = kept and not (spec.look and spec.gripper == "open")
+        out.append(kept and spec.grasps is None)
+        kept = kept or spec.grasps is not None
     return out
 
 
-def _places(carries: Sequence[bool]) -> list[int]:
-    """For each phase the one at whose end the next cube, or the held one, is let go; after all of them, the last."""
+def _places(specs: Sequence[PhaseCfg]) -> list[int]:
+    """For each phase the one at whose target the next cube, or the held one, is let go; after all of them, the last."""
+    carries = [cube >= 0 for cube in carried_cubes(specs)]
     ends = [k for k, held in enumerate(carries) if held and not any(carries[k + 1 : k + 2])] or [len(carries) - 1]
-    return [next((end for end in ends if end >= k), ends[-1]) for k in range(len(carries))]
+    # Without an anchor the target before holds.
+    at = {end: max(k for k in range(end + 1) if k == 0 or specs[k].anchor is not None) for end in ends}
+    return [at[next((end for end in ends if end >= k), ends[-1])] for k in range(len(carries))]

@@ -20,11 +20,11 @@ from mjstack.gates.episode import SCRIPTED, State, restore, run_episode, snapsho
 from mjstack.gates.gate import GateContext, TimedEpisode
 from mjstack.gates.power import EnergyMeter
 from mjstack.gates.timing import WARM_UP, Timing, capture_problem, frames_that_fit, spread, step_graph, timed
-from mjstack.gates.watch import carried_cubes
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED
 from mjstack.report.record import Value
 from mjstack.scene.index import CUBES
+from mjstack.scene.phases import carried_cubes
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Simulation, device_memory
 
 if TYPE_CHECKING:

@@ -7,12 +7,13 @@ from enum import IntEnum
 
 import torch
 
-from mjstack.config.schema import Config, PhaseCfg
+from mjstack.config.schema import Config
 from mjstack.control.controller import Controller
 from mjstack.envs import Env
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED, jaw_forces
 from mjstack.scene.index import CUBES
+from mjstack.scene.phases import carried_cubes, grasped_cubes
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.tasks.evidence import Evidence
 
@@ -78,7 +79,7 @@ class FailureWatch:
     def __init__(self, cfg: Config) -> None:
         """Reads the phases."""
         specs = list(cfg.controller.phases.values())
-        self._tables = _grasped(specs), carried_cubes(specs)
+        self._tables = grasped_cubes(specs), carried_cubes(specs)
         self._releases = _releases(self._tables[1])
 
     def start(self, env: Env) -> None:
@@ -129,27 +130,6 @@ class FailureWatch:
 def _of(table: torch.Tensor, cube: torch.Tensor) -> torch.Tensor:
     """Each world's column, shape ``(nworld,)``; the first one where there is none (-1)."""
     return table.gather(1, cube.clamp(min=0)[:, None])[:, 0]
-
-
-def _number(cube: str | None) -> int:
-    return -1 if cube is None else CUBES.index(f"{cube}_cube")
-
-
-def _grasped(specs: Sequence[PhaseCfg]) -> list[int]:
-    """Number of the cube that each phase grasps, or -1."""
-    return [_number(spec.grasps) for spec in specs]
-
-
-def carried_cubes(specs: Sequence[PhaseCfg]) -> list[int]:
-    """Number of the cube that is in the hand all through each phase, or -1."""
-    out, cube = [], -1
-    for spec in specs:
-        if spec.gripper == "open":
-            cube = -1
-        out.append(cube if spec.grasps is None else -1)
-        if spec.grasps is not None:
-            cube = _number(spec.grasps)
-    return out
 
 
 def _releases(carried: Sequence[int]) -> list[int]:

@@ -32,8 +32,9 @@ class BatchedIk:
     CUDA graph can hold it. What it returns are its own buffers, overwritten by the next call.
 
     The arms have more joints than a point needs. What the spare ones do is open by default: each solve takes the shortest way.
-    With ``posture_gain`` they go towards a posture, with ``approach_gain`` they turn the gripper's approach axis down, in both
-    cases as far as the centre stays on its target, and a step at a time: what is left after one solve goes on in the next.
+    With ``posture_gain`` they go towards a posture, with ``approach_gain`` they turn the gripper's approach axis down or to a
+    given direction, in both cases as far as the centre stays on its target, and a step at a time: what is left after one
+    solve goes on in the next.
 
     Commands are joint positions in the order of the robot's arm joints and then its gripper joints; everything is in the
     world frame. Joints on the way to the sites that have no command stay where the model has them at qpos0.
@@ -198,8 +199,8 @@ class BatchedIk:
 
         The ik joints end within the range of the joint and of its actuator, whatever they start from, and the result is never
         farther from the target than the start, put within that range; with a gain, not if that makes it more than 20 um. A
-        world whose command, target or posture is not finite keeps its command, and its distance is NaN; the others do not
-        notice.
+        world whose command, target, posture or approach is not finite keeps its command, and its distance is NaN; the others do
+        not notice.
 
         Args:
             command: Where to start [rad, m], shape ``(nworld, n_arm + n_gripper)``, float32 or float64.

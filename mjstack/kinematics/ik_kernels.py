@@ -155,7 +155,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
         given: wp.array2d[float],
         target: wp.array[wp.vec3],
         posture: wp.array2d[float],
-        upright: wp.array[wp.vec3],
+        wished: wp.array[wp.vec3],
         iterations: int,
         wishing: int,
         damping: float,
@@ -172,6 +172,8 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
         w = wp.tid()
         goal = target[w]
         finite = wp.isfinite(goal)
+        if wishing > 0:
+            finite = finite and wp.isfinite(wished[w])
         for j in range(given.shape[1]):
             finite = finite and wp.isfinite(given[w, j])
             command[w, j] = given[w, j]
@@ -242,7 +244,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                         jacobian[i] = share * direction
                 wish = Values()
                 if iteration < wishing:
-                    lever = wp.cross(wp.transform_vector(trunk, approach), upright[w])
+                    lever = wp.cross(wp.transform_vector(trunk, approach), wished[w])
                     for i in range(END):
                         if wp.static(shape.moved[i]):
                             wish[i] = posture_gain * (home[i] - q[i])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from mjstack.config.schema import Config, SceneCfg
+from mjstack.config.schema import Config, PhaseCfg, SceneCfg
 from mjstack.errors import ConfigError
 
 RED, BLUE, FIXED = 0, 1, 2
+_NUMBERS = {"red": RED, "blue": BLUE, None: -1}
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,3 +81,20 @@ def anchor_of(cfg: Config, phase: str) -> Anchor | None:
     found = anchors[spec.anchor]
     above = spec.h_scale * cfg.robot.approach_height + spec.offset + (cfg.scene.grasp_offset if spec.in_hand else 0.0)
     return Anchor(found.source, found.xy, found.z + above)
+
+
+def grasped_cubes(specs: Sequence[PhaseCfg]) -> list[int]:
+    """Number of the cube that each phase grasps, or -1."""
+    return [_NUMBERS[spec.grasps] for spec in specs]
+
+
+def carried_cubes(specs: Sequence[PhaseCfg]) -> list[int]:
+    """Number of the cube that is in the hand all through each phase, or -1."""
+    out, cube = [], -1
+    for spec in specs:
+        if spec.gripper == "open":
+            cube = -1
+        out.append(cube if spec.grasps is None else -1)
+        if spec.grasps is not None:
+            cube = _NUMBERS[spec.grasps]
+    return out

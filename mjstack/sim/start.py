@@ -36,7 +36,7 @@ def call_without_line(work: Callable[[], None], line: bytes) -> None:
             os.dup2(stderr, 2)
             os.close(stderr)
             kept.seek(0)
-            with open(2, "wb", closefd=False) as out:
+            with suppress(OSError), open(2, "wb", closefd=False) as out:  # a full or broken stderr stops nobody
                 out.writelines(text for text in kept.read().splitlines(keepends=True) if text.rstrip() != line)
 
 
