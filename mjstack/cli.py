@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def run(args: list[str]) -> int:
     """Runs a command line and returns its exit status."""
     errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
-    if _HELP & set(args):
+    if any(arg.partition("=")[0] in _HELP for arg in args):
         _print_help()
         return 0
     if "--version" in args:

@@ -27,7 +27,6 @@ from mjstack.gates.watch import FailureWatch, Sign
 from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
-from mjstack.scene.index import CUBES
 from mjstack.sim import Simulation
 from mjstack.tasks.stack import StackRule
 
@@ -327,10 +326,10 @@ def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> Non
     watch, now = FailureWatch(cfg), SimpleNamespace(frame=0)
     device = torch.device("cpu")
     sim = SimpleNamespace(qpos=torch.zeros(n, 3), qvel=torch.zeros(n, 3), overflow=torch.zeros(n, dtype=torch.int32))
-    env = SimpleNamespace(nworld=n, device=device, sim=sim)
+    env = SimpleNamespace(nworld=n, device=device, sim=sim, index=None)
     controller = SimpleNamespace(phase=torch.zeros(n, dtype=torch.int64))
     evidence = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.frame]))
-    monkeypatch.setattr(watch_module, "jaw_forces", lambda _, name: torch.from_numpy(forces[now.frame, :, CUBES.index(name)]))
+    monkeypatch.setattr(watch_module, "cubes_in_hand", lambda *_: torch.from_numpy(forces[now.frame] > 0.0).all(2))
     watch.start(env)
     for frame in range(frames):
         now.frame = frame
@@ -423,10 +422,10 @@ def test_each_cube_of_the_box_has_its_own_release(monkeypatch: pytest.MonkeyPatc
 
     watch, now = FailureWatch(cfg), SimpleNamespace(frame=0)
     sim = SimpleNamespace(qpos=torch.zeros(5, 3), qvel=torch.zeros(5, 3), overflow=torch.zeros(5, dtype=torch.int32))
-    env = SimpleNamespace(nworld=5, device=torch.device("cpu"), sim=sim)
+    env = SimpleNamespace(nworld=5, device=torch.device("cpu"), sim=sim, index=None)
     controller = SimpleNamespace(phase=torch.zeros(5, dtype=torch.int64))
     evidence = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.frame]))
-    monkeypatch.setattr(watch_module, "jaw_forces", lambda *_: torch.ones(5, 2))
+    monkeypatch.setattr(watch_module, "cubes_in_hand", lambda *_: torch.ones(5, 2, dtype=torch.bool))
     watch.start(env)
     for frame in range(len(placed)):
         now.frame = frame

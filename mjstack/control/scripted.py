@@ -14,7 +14,7 @@ from mjstack.envs import Env
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.base import EnvView
-from mjstack.mdp.geometry import LOADED, jaw_forces, pose_w, robot
+from mjstack.mdp.geometry import cubes_in_hand, pose_w, robot
 from mjstack.scene.index import CUBES
 from mjstack.scene.phases import FIXED, anchor_of, build_phases, grasped_cubes
 
@@ -163,7 +163,7 @@ class ScriptedController:
 
     def _judge_grasp(self, over: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Worlds that try their grasp again, ``(nworld,)`` bool, and how fast they go on, ``(nworld,)``."""
-        held = torch.stack([(jaw_forces(self._env, name) > LOADED).all(1) for name in CUBES], dim=1)
+        held = cubes_in_hand(self._env.index, self._env.sim)
         grasps = self._grasps.index_select(0, self.phase)
         cube = grasps.clamp(min=0)[:, None]
         empty = over & (grasps >= 0) & ~held.gather(1, cube)[:, 0]

@@ -43,7 +43,7 @@ class CarryTilt:
         self._there_ik = BatchedIk(
             model, cfg.robot, ik.nworld, device, iterations=c.frame_iterations, approach_gain=c.approach_gain
         )
-        self._sign = _turns_about_vertical(model, cfg)
+        self._sign = turn_sign(model, cfg)
         specs = list(c.phases.values())
         self._keeps = torch.tensor(_keeps(specs), device=device)
         self._grasps = torch.tensor([spec.grasps is not None for spec in specs], device=device)
@@ -76,14 +76,18 @@ class CarryTilt:
         return torch.stack((cos * x - sin * y, sin * x + cos * y, z), dim=1)
 
 
-def _turns_about_vertical(model: mujoco.MjModel, cfg: Config) -> float:
-    """1.0 where the arm's first joint turns to the left, seen from above; -1.0 where to the right."""
+def turn_sign(model: mujoco.MjModel, cfg: Config) -> float:
+    """1.0 where the arm's first joint turns to the left, seen from above; -1.0 where to the right.
+
+    Raises:
+        ConfigError: It does not turn about the vertical.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     up = float(data.xaxis[find(model, "joint", cfg.robot.arm_joints[0])][2])
     if abs(up) < 0.999:
         expected = f"0, because joint {cfg.robot.arm_joints[0]} does not turn about the vertical"
-        raise ConfigError("controller.approach_gain", cfg.controller.approach_gain, expected)
+        raise ConfigError("robot.approach_gain", cfg.robot.approach_gain, expected)
     return math.copysign(1.0, up)
 
 

@@ -11,7 +11,7 @@ from mjstack.config.schema import Config
 from mjstack.control.controller import Controller
 from mjstack.envs import Env
 from mjstack.math import not_finite
-from mjstack.mdp.geometry import LOADED, jaw_forces
+from mjstack.mdp.geometry import cubes_in_hand
 from mjstack.scene.index import CUBES
 from mjstack.scene.phases import carried_cubes, grasped_cubes
 from mjstack.sim.simulation import LOST_PHYSICS
@@ -99,7 +99,7 @@ class FailureWatch:
     def update(self, env: Env, controller: Controller, evidence: Evidence) -> None:
         """Takes in the end of a frame. Fixed shapes, no host read."""
         sim, phase = env.sim, controller.phase
-        loaded = torch.stack([(jaw_forces(env, name) > LOADED).all(1) for name in CUBES], dim=1)
+        loaded = cubes_in_hand(env.index, sim)
         placed = evidence.placed(sim)
 
         lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)

@@ -98,7 +98,7 @@ class Collection:
                 )
             sim, block = self._worlds(missing if self._job.keep_failures else math.ceil(_SPARE * missing))
             played = play_demonstrations(self._context, sim, seed, block)
-            if config_hash(episode_config(self._cfg)) != self.spec.config_sha256:
+            if not self._unchanged():
                 return f"the file of reset=layout changed while seed {seed} was played: restore it, or begin another dataset"
             batch = self._add_batch(writer, played, missing)
             self.batches.append(batch)
@@ -114,6 +114,13 @@ class Collection:
                 return f"{_GIVE_UP} seeds in a row brought no episode, the last because of: {why}"
             seed += 1
         return ""
+
+    def _unchanged(self) -> bool:
+        """Whether a layout file still has the content that the dataset is of."""
+        try:
+            return config_hash(episode_config(self._cfg)) == self.spec.config_sha256
+        except ConfigError:  # it cannot be read any more
+            return False
 
     def _add_batch(self, writer: DatasetWriter, played: Played, missing: int) -> CollectedBatch:
         """Commits the episodes of a seed that are to be kept, as far as they are missing."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from mjstack.config.schema import Backend, Config
 from mjstack.config.validate import reads_layout
 from mjstack.control.planner import ScriptedPlanner
+from mjstack.control.tilt import turn_sign
 from mjstack.envs import build_env
 from mjstack.errors import ConfigError
 from mjstack.gates.batch_record import clear_records
@@ -51,7 +52,10 @@ def check_task(cfg: Config) -> None:
         expected = f"one of {', '.join(_SCRIPTED)}, whose scripted episode the gates verify"
         raise ConfigError("task", cfg.task.name, expected, "Train it: mjstack.make_env")
     ScriptedPlanner(cfg)  # reads the robot, and reaches every nominal target
-    build_env(cfg, nworld=1, backend=Backend.native, device="cpu").close()  # builds and checks every term
+    env = build_env(cfg, nworld=1, backend=Backend.native, device="cpu")  # builds and checks every term
+    if cfg.controller.approach_gain > 0.0:
+        turn_sign(env.sim.model, cfg)
+    env.close()
 
 
 def run_gates_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import io
+import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -226,6 +227,16 @@ def one_pass() -> Iterator[None]:
         yield
     finally:
         running.values = outer
+
+
+def require_positive(name: str, value: float) -> None:
+    """Refuses a parameter that is not a positive number.
+
+    Raises:
+        ParameterError: It is not.
+    """
+    if not 0.0 < value < math.inf:
+        raise ParameterError(name, value, "a positive number")
 
 
 def shared(key: Any, compute: Callable[[], torch.Tensor]) -> torch.Tensor:

@@ -8,7 +8,8 @@ from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView, shared
 from mjstack.math import lowest_corner
 from mjstack.scene import table_top
-from mjstack.scene.index import RobotTensors
+from mjstack.scene.index import CUBES, RobotTensors, SceneIndex
+from mjstack.sim.simulation import Simulation
 
 
 def robot(env: EnvView) -> RobotTensors:
@@ -73,5 +74,14 @@ def above_table(env: EnvView, name: str) -> torch.Tensor:
 def jaw_forces(env: EnvView, name: str) -> torch.Tensor:
     """Size of the contact force [N] of each jaw on an object, at the last physics step, shape ``(nworld, 2)``."""
     env.index.object_address(name)
-    parts = [env.sim.sensordata[:, a : a + 3] for a in env.index.jaw_force[name]]
+    return _jaw_forces(env.index, env.sim, name)
+
+
+def cubes_in_hand(index: SceneIndex, sim: Simulation) -> torch.Tensor:
+    """Whether both jaws press on each cube, at the last physics step, shape ``(nworld, 2)``, bool."""
+    return torch.stack([(_jaw_forces(index, sim, name) > LOADED).all(1) for name in CUBES], dim=1)
+
+
+def _jaw_forces(index: SceneIndex, sim: Simulation, name: str) -> torch.Tensor:
+    parts = [sim.sensordata[:, a : a + 3] for a in index.jaw_force[name]]
     return torch.linalg.vector_norm(torch.stack(parts, dim=1), dim=2)

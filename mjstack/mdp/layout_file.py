@@ -143,7 +143,7 @@ def _is_number(cell: str) -> bool:
         float(cell)
     except ValueError:
         return False
-    return True
+    return "_" not in cell  # which Python allows between digits
 
 
 def _number(path: str, line: int, name: str, cell: str) -> float:
@@ -173,7 +173,7 @@ def _order(path: str, worlds: np.ndarray, lines: list[int]) -> np.ndarray:
 
 def _shown(text: str) -> str:
     """On one line, and not long, whatever is in a cell."""
-    text = " ".join(text.split())
+    text = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 
-from mjstack.errors import ParameterError
-from mjstack.managers.base import EnvView
+from mjstack.managers.base import EnvView, require_positive
 from mjstack.mdp.geometry import above_table, aperture_center, jaw_forces, joint_velocities, pose_w
 
 
@@ -59,13 +56,3 @@ def action_rate(env: EnvView) -> torch.Tensor:
 def joint_vel(env: EnvView) -> torch.Tensor:
     """Squared joint velocities [rad^2/s^2], summed."""
     return joint_velocities(env).square().sum(1)
-
-
-def require_positive(name: str, value: float) -> None:
-    """Refuses a parameter that is not a positive number.
-
-    Raises:
-        ParameterError: It is not.
-    """
-    if not 0.0 < value < math.inf:
-        raise ParameterError(name, value, "a positive number")

@@ -7,10 +7,9 @@ import math
 import torch
 
 from mjstack.errors import ParameterError, UnknownName
-from mjstack.managers.base import EnvView, shared
+from mjstack.managers.base import EnvView, require_positive, shared
 from mjstack.math import quat_to_matrix
 from mjstack.mdp.geometry import above_table, aperture_center, jaw_forces, pose_w
-from mjstack.mdp.reward import require_positive
 from mjstack.scene import BLUE, RED, table_top
 from mjstack.tasks.box import CubesAndBox
 
