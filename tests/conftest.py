@@ -50,24 +50,25 @@ def _outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 
 @pytest.fixture(scope="session")
-def stage() -> Callable[[str], GateContext]:
-    """Configuration, model, index and planner of a robot, each made once in the session."""
-    made: dict[str, GateContext] = {}
+def stage() -> Callable[..., GateContext]:
+    """Configuration, model, index and planner of a robot under some overrides, each made once in the session."""
+    made: dict[tuple[str, ...], GateContext] = {}
 
-    def get(robot: str) -> GateContext:
-        if robot not in made:
-            made[robot] = GateContext(cfg=load_config([f"robot={robot}"]))
-        return made[robot]
+    def get(robot: str, *overrides: str) -> GateContext:
+        key = (f"robot={robot}", *overrides)
+        if key not in made:
+            made[key] = GateContext(cfg=load_config(key))
+        return made[key]
 
     return get
 
 
 @pytest.fixture(scope="session")
-def new_context(stage: Callable[[str], GateContext]) -> Callable[..., GateContext]:
-    """A gate context of its own for some overrides that change neither scene nor plan: both are shared."""
+def new_context(stage: Callable[..., GateContext]) -> Callable[..., GateContext]:
+    """A gate context of its own for some overrides that change neither scene nor, but for its phases, plan: both are shared."""
 
     def make(*overrides: str, robot: str = "so101") -> GateContext:
-        shared = stage(robot)
+        shared = stage(robot, *(override for override in overrides if override.startswith("controller.phases.")))
         context = GateContext(cfg=load_config([f"robot={robot}", *overrides]))
         context.__dict__["model"], context.__dict__["planner"] = shared.model, shared.planner
         return context

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from environments import brisk
 from omegaconf import OmegaConf
 
 from mjstack.cli import run
@@ -186,7 +187,7 @@ def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
 
 def test_mjwarp_world_is_played_on_both_engines(replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
     folder = tmp_path / "warp"
-    args = ["gates=[batch]", "sim=mjwarp", "sim.device=cpu", "nworld=2", "gate.acceptance.xy_err=1e-6"]
+    args = ["gates=[batch]", "sim=mjwarp", "sim.device=cpu", "nworld=2", "gate.acceptance.xy_err=1e-6", *brisk()]
     assert run([*args, f"hydra.run.dir={folder}"]) == 1
     status, report = replay(folder, "world=1")
     assert status == 1

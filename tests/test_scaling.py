@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from environments import rushed
 from matplotlib.axes import Axes
 
 from mjstack.cli import run
@@ -27,11 +28,6 @@ from mjstack.report.table import to_csv
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
 TINY = ["job=scaling", "job.repetitions=1", "job.native_frames=2", "job.native_env_frames=1", "gate.throughput.start_worlds=1"]
-HASTY = [
-    "gate.acceptance.window=5",
-    "gate.box.window=5",
-    *(f"controller.phases.{name}.seconds=0.1" for name in load_config().controller.phases),
-]
 
 
 @pytest.fixture
@@ -83,7 +79,7 @@ def test_cases_resume_and_leave_table_and_plot(folder: Path, capsys: pytest.Capt
 
 
 def test_failing_case_is_a_gap_and_runs_again_if_asked(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    args = [*TINY, *HASTY, "sim.device=cpu", "job.nworlds=[1]", "job.backends=[mjwarp,native]", "batch.njmax=40"]
+    args = [*TINY, *rushed(), "sim.device=cpu", "job.nworlds=[1]", "job.backends=[mjwarp,native]", "batch.njmax=40"]
     args += ["gate.throughput.frames=2", "gate.throughput.env_frames=1"]
     assert run(args) == 1
     rows = table(folder)
