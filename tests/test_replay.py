@@ -177,7 +177,8 @@ def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
     replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
     folder = tmp_path / "random"
-    run(["gates=[batch]", "sim=native", "nworld=3", "reset=randomized", "robot=rebot", f"hydra.run.dir={folder}"])
+    args = ["gates=[batch]", "sim=native", "nworld=3", "reset=randomized", "robot=rebot", *brisk("rebot")]
+    run([*args, f"hydra.run.dir={folder}"])
     _, report = replay(folder, "world=2", "sim=native")
     assert report["gates"][0]["reason"].endswith("as recorded, and it ends bit for bit where it did")
     with np.load(tmp_path / "out" / "trajectory.npz") as held:
