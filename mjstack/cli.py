@@ -7,6 +7,7 @@ calling it. So every job is composed and checked here first, and Hydra only runs
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -21,6 +22,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from mjstack import __version__
+from mjstack.config.help import help_text
 from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, own_hydra, to_config
 from mjstack.errors import MjstackError
 from mjstack.jobs import JobOutcome, check_job, job_folder, run_job
@@ -29,7 +32,8 @@ from mjstack.report.record import Status
 
 INTERRUPTED = 130
 _OTHER_CONFIG = {"--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp"}
-_FLAGS_WITHOUT_RUN = {"--help", "-h", "--hydra-help", "--info", "-i", "--version", "--shell-completion", "-sc"}
+_HELP = {"--help", "-h"}
+_FLAGS_WITHOUT_RUN = {"--hydra-help", "--info", "-i", "--shell-completion", "-sc"}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -40,6 +44,12 @@ def main(argv: Sequence[str] | None = None) -> None:
 def run(args: list[str]) -> int:
     """Runs a command line and returns its exit status."""
     errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+    if _HELP & set(args):
+        _print_help()
+        return 0
+    if "--version" in args:
+        print(f"mjstack {__version__}")
+        return 0
     if _FLAGS_WITHOUT_RUN & set(args) or any(a.startswith(("--info", "--hydra-help")) for a in args):
         return _run_hydra(args, [])
     sweep = bool({"-m", "--multirun"} & set(args))
@@ -69,6 +79,14 @@ def run(args: list[str]) -> int:
     if sweep and outcomes:
         _print_sweep(outcomes)
     return max([status, *(outcome.exit_code for outcome in outcomes)])
+
+
+def _print_help() -> None:
+    """Prints what `--help` says, to a reader that may not want all of it, such as ``| head``."""
+    try:
+        print(help_text(min(max(shutil.get_terminal_size((120, 24)).columns, 60), 120)), flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes there once more at its end
 
 
 def _run_hydra(args: list[str], outcomes: list[JobOutcome]) -> int:

@@ -1,4 +1,4 @@
-"""Batched rotations on torch tensors, and the interval of a rate.
+"""Batched rotations and a test for finite numbers on torch tensors, and the interval of a rate.
 
 Quaternions are (w, x, y, z), the last dimension is the vector's own.
 """
@@ -79,6 +79,20 @@ def lowest_corner(pos: torch.Tensor, quat: torch.Tensor, half: float) -> torch.T
         World z of the lowest corner, shape ``(...)``.
     """
     return pos[..., 2] - half * quat_z_row(quat).abs().sum(-1)
+
+
+def not_finite(*parts: torch.Tensor) -> torch.Tensor:
+    """Rows in which a number is NaN or infinite.
+
+    Args:
+        parts: Tensors of shape ``(n, d)``, at least one; each may have its own d.
+
+    Returns:
+        Shape ``(n,)``, bool.
+    """
+    # 0 times a number that is not finite is NaN, which a sum keeps. It takes fewer kernels than to ask each number.
+    first, *others = ((part * 0.0).sum(1) for part in parts)
+    return sum(others, first) != 0.0
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:

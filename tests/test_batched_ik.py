@@ -298,6 +298,40 @@ def test_the_approach_axis_turns_down_as_far_as_the_target_allows(
     assert np.quantile(slopes, 0.9) < 0.01
 
 
+def test_the_approach_axis_turns_where_it_is_wished(robot: str, arm: Arm, device: str, workspace: Callable) -> None:
+    """Each world to a direction of its own, which a posture nearby is known to have at the same target."""
+    start, _ = workspace(robot)
+    start = start[arm.free(start, 0.5)][:300]
+    goal = start.copy()
+    for world in range(len(start)):
+        spare = arm.spare(start[world])
+        way = spare[np.argmax(np.linalg.norm(spare, axis=1))]
+        goal[world, arm.moved] += 0.3 * way / np.linalg.norm(way)
+    target, wished = arm.aperture(goal), arm.directions(goal)[1]
+    (direction,) = tensors(device, wished)
+    ik = arm.solver(len(start), device, iterations=200, approach_gain=0.3)
+    command, distance = (a.cpu().double().numpy() for a in ik.solve(*tensors(device, start, target), approach=direction))
+    before, after = (np.degrees(np.arccos(np.clip((arm.directions(c)[1] * wished).sum(1), -1, 1))) for c in (start, command))
+    print(
+        f"{robot}: off by {np.median(before):.1f} degrees before, {np.quantile(after, 0.95):.3f} after in 95 % of {len(start)}"
+    )
+    assert len(start) > 50
+    assert np.median(before) > 3.0
+    assert (after < 1.0).mean() > 0.95
+    assert (distance <= 0.0001).all()
+    down = ik.solve(*tensors(device, start, target))[0].cpu().double().numpy()  # not where it was wished before
+    assert np.mean(arm.directions(down)[1][:, 2]) < np.mean(wished[:, 2]) - 0.1
+
+
+def test_a_wished_approach_needs_a_gain_and_a_direction_per_world(arm: Arm) -> None:
+    start = torch.tensor(arm.at_home(4))
+    down = torch.tensor([[0.0, 0.0, -1.0]])
+    with pytest.raises(ArgumentError, match="approach_gain is 0"):
+        arm.solver(4, "cpu").solve(start, start[:, :3], approach=down.expand(4, -1))
+    with pytest.raises(ArgumentError, match="approach: found shape"):
+        arm.solver(4, "cpu", approach_gain=0.1).solve(start, start[:, :3], approach=down)
+
+
 def test_a_start_at_its_target_still_goes_to_the_posture(robot: str, arm: Arm, device: str, workspace: Callable) -> None:
     """Though no later iterate is nearer to the target than the first one."""
     start, _ = workspace(robot)

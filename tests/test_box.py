@@ -23,8 +23,9 @@ from mjstack.gates.episode import NOMINAL, run_episode
 from mjstack.gates.gate import GateContext
 from mjstack.math import quat_to_matrix
 from mjstack.scene import BLUE, RED, LowestPoint, SceneIndex, build_model
+from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation, make_simulation
-from mjstack.tasks.box import BoxRule, BoxSuccess
+from mjstack.tasks.box import BoxEvidence, BoxRule, BoxSuccess
 from mjstack.tasks.box_terms import GraspNext, InBox, Place, ReachNext, ToSlot
 from mjstack.tasks.evidence import describe_rules
 
@@ -203,6 +204,8 @@ def test_terms_know_the_box(robot: str) -> None:
     wanted = np.subtract(places[BLUE], env.sim.model.body(BLUE).pos)
     np.testing.assert_allclose(ToSlot(env, object=BLUE)(env)[0], wanted, atol=1e-6)
     assert InBox(env)(env).tolist() == [0.0, 0.5, 1.0, 0.0]
+    evidence = BoxEvidence(env.cfg, env.index, build_phases(env.cfg), 4, env.device)
+    assert evidence.placed(env.sim).tolist() == [[False, False], [True, False], [True, True], [False, False]]
     place = Place(env, object=RED, scale=0.1)(env)
     assert place.tolist() == pytest.approx([0.0, 1.0, 1.0, 1.0 - math.tanh(1.0)], abs=1e-6)
     reach = ReachNext(env, scale=0.1)(env)
@@ -219,6 +222,19 @@ def test_terms_know_the_box(robot: str) -> None:
             env.sim.sensordata[worlds, address] = 1.0
     assert grasp(env).tolist() == [1.0, 0.0, 1.0, 0.0]
     env.close()
+
+
+def test_a_place_counts_off_the_table_whatever_the_boxs_floor() -> None:
+    """Red over its place, its lowest corner 0.5 mm below and above half the floor, and at rest on the floor; all else alike."""
+    for floor in (0.004, 0.006):
+        env = small_env("reset=nominal", f"scene.box.floor={floor}")
+        for world, height in enumerate((0.5 * floor - 0.0005, 0.5 * floor + 0.0005, floor)):
+            put(env, RED, [*env.cfg.scene.red_slot, TOP["so101"] + height + 0.022], [world])
+        below, above, resting = Place(env, object=RED, scale=0.1)(env).tolist()
+        assert below == 0.0
+        assert above == pytest.approx(1.0 - math.tanh((0.5 * floor - 0.0005) / 0.1), abs=1e-6)
+        assert resting == pytest.approx(1.0, abs=1e-6)
+        env.close()
 
 
 def test_success_needs_rest_in_the_box_an_open_gripper_and_the_whole_window(robot: str) -> None:

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 
+import mjstack.conf
 import pytest
 
+from mjstack import __version__
 from mjstack.cli import run
+from mjstack.config import load_config
 
+CONF = Path(next(iter(mjstack.conf.__path__)))
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
 PROVENANCE = {"versions", "device", "driver", "cpu_count", "git_commit", "config_sha256", "model_sha256"}
 
@@ -101,6 +107,47 @@ def test_bad_input_in_a_process_of_its_own(args: list[str], folder: Path) -> Non
     assert len(lines) == 1, done.stderr
     assert lines[0].startswith("mjstack: ")
     assert done.stdout == ""
+    assert everything(folder) == []
+
+
+def test_help_says_what_there_is_to_choose(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "79")
+    assert run(["robot=rebot", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 79
+    said = " ".join(out.split())
+    for group in CONF.iterdir():
+        for choice in group.glob("*.yaml"):
+            assert re.search(rf" {group.name} [^:]*: .*\b{choice.stem}\b", said), (group.name, choice.stem)
+    keys = {name for name, value in asdict(load_config()).items() if not isinstance(value, dict)}
+    for name in keys:
+        assert re.search(rf"^  {name} ", out, re.MULTILINE), name
+    assert "robot the arm: so101, rebot" in said  # the default first
+    assert "(256)" in said
+    assert "--cfg job" in said
+    assert "schema" not in said
+    assert len(out.splitlines()) < 100
+    assert everything(folder) == []
+
+
+def test_help_may_be_cut_off_by_its_reader() -> None:
+    command = f"{sys.executable} {SCRIPT} --help | head -1; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("mjstack: ")
+
+
+def test_version(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out == f"mjstack {__version__}\n"
+    assert everything(folder) == []
+
+
+def test_a_part_of_the_configuration_is_shown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["job=collect", "job.episodes=7", "--cfg", "job", "-p", "job"]) == 0
+    assert "episodes: 7\n" in capsys.readouterr().out
     assert everything(folder) == []
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -362,6 +363,65 @@ def test_seeds_go_on_until_the_episodes_are_there(folder: Path, monkeypatch: pyt
     metrics = report_of(folder)["gates"][0]["metrics"]
     assert (metrics["worlds_played"], metrics["accepted"], metrics["episodes_of_this_call"]) == (13, 9, 2)
     read_dataset(folder / "dataset")
+
+
+LAYOUT = """world,red_x_m,red_y_m,red_yaw_rad,blue_x_m,blue_y_m,blue_yaw_rad
+0,0.33,-0.13,0,0.33,0.06,0
+1,0.31,-0.10,0.3,0.34,0.08,-0.5
+"""
+FROM_LAYOUT = ["reset=layout", "+reset.noise={func: mjstack.mdp.reset.JointNoise, params: {arm: 0.01}}", "nworld=2"]
+
+
+def test_a_layout_counts_by_its_content(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    first, moved = Path("worlds.csv"), Path("elsewhere.csv")
+    first.write_text(LAYOUT)
+    args = [*COMMAND, *FROM_LAYOUT]
+    assert run([*args, "layout=worlds.csv", "job.episodes=2"]) == 0
+    first.rename(moved)
+    assert run([*args, "layout=elsewhere.csv", "job.episodes=4"]) == 0
+    assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1)]
+    assert len(json.loads((folder / "dataset/meta/info.json").read_text())["mjstack"]["provenance"]) == 1
+    moved.write_text(LAYOUT.replace("0.31", "0.32"))
+    before = contents(Path.cwd())
+    capsys.readouterr()
+    assert run([*args, "layout=elsewhere.csv", "job.episodes=6"]) == 2
+    was, now = (hashlib.sha256(text.encode()).hexdigest() for text in (LAYOUT, moved.read_text()))
+    assert capsys.readouterr().err.strip() == (
+        f"mjstack: outputs/demos/dataset has episodes of another configuration: layout=sha256:{was}, expected sha256:{now}. "
+        "Set job.folder to another folder, or layout to a file with that content."
+    )
+    assert contents(Path.cwd()) == before
+
+
+def test_a_layout_that_only_the_term_names_counts_too(folder: Path) -> None:
+    homes = set()
+    for path, text in (("a.csv", LAYOUT), ("b.csv", LAYOUT), ("b.csv", LAYOUT + "\n")):
+        Path(path).write_text(text)
+        homes.add(collect_folder(load_config(["job=collect", "reset=layout", f"reset.layout.params.path={path}"])))
+    assert len(homes) == 2
+
+
+def test_a_layout_that_changes_while_it_is_played(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    layout = Path("worlds.csv")
+    layout.write_text(LAYOUT)
+
+    def edit(seed: int, values: torch.Tensor) -> None:
+        if seed == 1:
+            layout.write_text(LAYOUT + "\n")
+
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False, edit))
+    assert collect(*FROM_LAYOUT, "layout=worlds.csv", "job.episodes=4") == 1
+    (result,) = report_of(folder)["gates"]
+    assert result["status"] == "fail"
+    assert result["reason"].startswith("the file of reset=layout changed while seed 1 was played: ")
+    assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    layout.write_text(LAYOUT)
+    assert collect(*FROM_LAYOUT, "layout=worlds.csv", "job.episodes=4") == 0
+    assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1)]
 
 
 def test_failures_are_kept_and_marked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ import torch
 from environments import assert_rows, configure, mask_of, on_shared_sim, returned
 
 from mjstack import make_env
+from mjstack.config import load_config
 from mjstack.config.schema import (
     Backend,
     Config,
@@ -150,6 +151,10 @@ def test_configured_seed_out_of_range(seed: int) -> None:
 
 def test_overrides_as_a_string() -> None:
     fails(ArgumentError, lambda: make_env("task=reach"), "overrides", "'task=reach'", "['task=reach', 'robot=rebot']")
+
+
+def test_overrides_as_a_configuration() -> None:
+    fails(ArgumentError, lambda: make_env(load_config([])), "overrides", "a Config", "['task=reach', 'robot=rebot']")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -62,21 +62,27 @@ PATHS: dict[str, list[str] | None] = {
     "tasks/stack.py": [
         *(f"CubePair.{n}" for n in ("pose", "speed", "clearance", "offset", "stacked", "supported")),
         "StackEvidence.update",
+        "StackEvidence.placed",
         "StackSuccess.__call__",
         "StackSuccess.reset",
     ],
     "tasks/box.py": [
         *(f"CubesAndBox.{n}" for n in ("pose", "bounds", "speed", "beyond", "over", "inside", "off_slot")),
         *(f"CubesAndBox.{n}" for n in ("pressed", "supported", "opening", "_forces")),
-        *(f"BoxEvidence.{n}" for n in ("update", "_extend")),
+        *(f"BoxEvidence.{n}" for n in ("update", "placed")),
         "BoxSuccess.__call__",
         "BoxSuccess.reset",
     ],
     "tasks/box_terms.py": [*(f"{n}.__call__" for n in ("ToSlot", "Place", "InBox", "ReachNext", "GraspNext")), "cubes_inside"],
+    "tasks/runs.py": None,
     "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
     "control/planner.py": ["CommandTape.command"],
     "control/controller.py": ["Recorded.append", "Recorded.command", "TapeController.command"],
-    "control/scripted.py": [*(f"ScriptedController.{n}" for n in ("command", "_advance", "_judge_grasp", "_look", "_turn"))],
+    "control/scripted.py": [
+        *(f"ScriptedController.{n}" for n in ("command", "_advance", "_aim", "_judge_grasp", "_look", "_turn"))
+    ],
+    "control/tilt.py": ["CarryTilt.wish"],
+    "gates/watch.py": ["FailureWatch.update", "_of"],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",
         "BatchedIk.aperture",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def state(env: Env) -> dict[str, torch.Tensor]:
 
 def from_file(path: Path, *overrides: str, robot: str = "so101") -> Config:
     cfg = configure("reset=layout", *overrides, robot=robot)
-    cfg.nworld, cfg.reset["layout"].params["path"] = N, str(path)
+    cfg.nworld, cfg.layout, cfg.reset["layout"].params["path"] = N, str(path), str(path)
     return cfg
 
 
@@ -217,25 +218,56 @@ def column(name: str, value: str) -> Callable[[Rows], Rows]:
 
 
 BAD: dict[str, tuple[Callable[[Rows], Rows], str]] = {
-    "missing column": (lambda rows: [{k: v for k, v in row.items() if k != "blue_y_m"} for row in rows], "blue_y_m is missing"),
-    "unknown column": (column("red_friktion", "1"), "Did you mean 'red_friction'?"),
-    "no number": (change(1, red_x_m="left"), "column red_x_m, line 3 has 'left'"),
-    "empty cell": (change(1, red_x_m=""), "column red_x_m, line 3 has ''"),
-    "not finite": (change(2, red_yaw_rad="nan"), "column red_yaw_rad, line 4 has 'nan'"),
-    "world twice": (change(2, world="1"), "each world once, 1 is in lines 3 and 4"),
-    "world missing": (change(3, world="7"), "world 3 is missing"),
-    "half a world": (change(3, world="0.5"), "line 5 has 0.5"),
-    "too few": (lambda rows: rows[:3], "at least 4 worlds, it has 3. Add rows, or set nworld=3"),
-    "none": (lambda rows: [], "at least one world"),
-    "off the table": (change(1, red_x_m="0.2", red_yaw_rad="0.785"), "red_cube of world 1 at (0.200,"),
-    "over the edge": (change(0, blue_y_m="0.3"), "mm over its edge"),
-    "touching": (change(3, blue_x_m="0.33", blue_y_m="-0.09", blue_yaw_rad="0.8"), "in world 3 red_cube and blue_cube touch"),
-    "in the arm": (change(2, red_x_m="0.215", red_y_m="0"), "touch nothing but the table; in world 2"),
-    "out of reach": (change(1, red_x_m="0.47", red_y_m="-0.2"), "red_cube of world 1 at (0.470, -0.200) m"),
-    "too light": (column("red_mass_kg", "0.05"), "red_mass_kg within 0.056 and 0.104; world 0 has 0.05"),
-    "too slippery": (column("blue_friction", "0.7"), "blue_friction within 0.8 and 1.4"),
-    "too strong": (column("gain_elbow_flex", "1.2"), "gain_elbow_flex within 0.9 and 1.1"),
-    "beyond a joint": (column("joint_elbow_flex", "1.8"), "joint_elbow_flex within"),
+    "missing column": (
+        lambda rows: [{k: v for k, v in row.items() if k != "blue_y_m"} for row in rows],
+        ", line 1: expected columns world, red_x_m, red_y_m, red_yaw_rad, blue_x_m, blue_y_m, blue_yaw_rad; blue_y_m is",
+    ),
+    "unknown column": (
+        column("red_friktion", "1"),
+        ", line 1: expected no column 'red_friktion'. Did you mean 'red_friction'?",
+    ),
+    "nameless column": (column("", "1"), ", line 1: expected a name in every cell of the header, cell 8 is empty."),
+    "no number": (change(1, red_x_m="left"), ", line 3, column red_x_m: expected a finite number, 'left' is none."),
+    "two lines in a cell": (
+        change(1, red_x_m="le\nft"),
+        ", line 3, column red_x_m: expected a finite number, 'le ft' is none.",
+    ),
+    "decimal comma": (change(1, red_x_m="0,33"), ", line 3, column red_x_m: expected a finite number, '0,33' is none."),
+    "empty cell": (change(1, red_x_m=""), ", line 3, column red_x_m: expected a finite number, the cell is empty."),
+    "not finite": (change(2, red_yaw_rad="nan"), ", line 4, column red_yaw_rad: expected a finite number, 'nan' is none."),
+    "world twice": (change(2, world="1"), ", line 4, column world: expected each world once, 1 is in line 3 already."),
+    "world missing": (change(3, world="7"), ", column world: expected worlds 0 to 3 in its 4 rows; world 3 is missing."),
+    "half a world": (change(3, world="0.5"), ", line 5, column world: expected an integer of at least 0, it is 0.5."),
+    "too few": (lambda rows: rows[:3], ": expected at least 4 worlds, it has 3. Add rows, or set nworld=3."),
+    "none": (lambda rows: [], ": expected at least one world below the header."),
+    "off the table": (
+        change(1, red_x_m="0.2", red_yaw_rad="0.785"),
+        ", line 3, column red_x_m: expected 0.222 to 0.478, so that red_cube is on the table, turned as it is; 0.2 is 21.1 mm",
+    ),
+    "over the edge": (
+        change(0, blue_y_m="0.3"),
+        ", line 2, column blue_y_m: expected -0.269 to 0.189, so that blue_cube is on",
+    ),
+    "touching": (
+        change(3, blue_x_m="0.33", blue_y_m="-0.09", blue_yaw_rad="0.8"),
+        ", line 5, columns red_x_m, red_y_m, blue_x_m, blue_y_m: expected cubes that touch nothing but the table; red_cube and "
+        "blue_cube touch in world 3. Move them apart.",
+    ),
+    "in the arm": (
+        change(2, red_x_m="0.215", red_y_m="0"),
+        ", line 4, columns red_x_m, red_y_m: expected cubes that touch nothing but the table; ",
+    ),
+    "out of reach": (
+        change(1, red_x_m="0.47", red_y_m="-0.2"),
+        ", line 3, columns red_x_m, red_y_m: expected a place that the arm reaches; with red_cube at (0.470, -0.200) m",
+    ),
+    "too light": (column("red_mass_kg", "0.05"), ", line 2, column red_mass_kg: expected 0.056 to 0.104, it is 0.05."),
+    "too slippery": (column("blue_friction", "0.7"), ", line 2, column blue_friction: expected 0.8 to 1.4, it is 0.7."),
+    "too strong": (column("gain_elbow_flex", "1.2"), ", line 2, column gain_elbow_flex: expected 0.9 to 1.1, it is 1.2."),
+    "beyond a joint": (
+        column("joint_elbow_flex", "1.8"),
+        ", line 2, column joint_elbow_flex: expected -1.69 to 1.69, it is 1.8.",
+    ),
 }
 
 
@@ -253,20 +285,32 @@ def test_a_bad_file_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         on_shared_sim("native", N, cfg)
     message = str(caught.value)
-    assert message.startswith(f"reset.layout.params.path={tmp_path}/worlds.csv: expected ")
-    assert says in message
+    assert message.startswith(f"layout={tmp_path}/worlds.csv{says}")
     assert "\n" not in message
+    assert re.search(r"\. [A-Z].*\.$", message)  # what to do
     assert caught.value.exit_code == 2
+
+
+HEADER = "world,red_x_m,red_y_m,red_yaw_rad,blue_x_m,blue_y_m,blue_yaw_rad\n"
 
 
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (b"", "world, red_x_m"),
-        (b"\xff\xfe\x00", "no text"),
-        (b"world,red_x_m,red_x_m\n", "column 'red_x_m' once, it is there 2 times"),
-        (b"world,red_x_m,red_y_m,red_yaw_rad,blue_x_m,blue_y_m,blue_yaw_rad\n0,1\n", "7 cells in line 2, it has 2"),
-        (None, "cannot be read (No such file or directory)"),
+        (b"", f": expected a CSV file with a header and one row per world; it is empty. Write the header {HEADER.strip()} and"),
+        (b"\xef\xbb\xbf \n\n", "; it is empty."),
+        (b"\xff\xfe\x00", "; it is no text."),
+        (b"world,red_x_m,red_x_m\n", ", line 1: expected column red_x_m once, it is there 2 times."),
+        (f"{HEADER}0,1\n".encode(), ", line 2: expected 7 cells separated by commas, as in the header; it has 2."),
+        (
+            f"{HEADER}0,0,33,-0,13,0,0,33,0,06,0\n".encode(),
+            ", line 2: expected 7 cells separated by commas, as in the header; it ",
+        ),
+        (f'{HEADER}0,"1\n1,1\n'.encode(), ", line 2: expected 7 cells separated by commas"),
+        (HEADER.replace(",", ";").encode(), ", line 1: expected a header with commas between the columns, it has semicolons."),
+        (HEADER.replace(",", "\t").encode(), ", line 1: expected a header with commas between the columns, it has tabs."),
+        (b"0,0.33,-0.13,0,0.33,0.06,0\n", ", line 1: expected a header, there are numbers. Put world,red_x_m,"),
+        (None, ": expected an existing file, there is none in /"),
     ],
 )
 def test_no_layout_file_at_all(content: bytes | None, says: str, tmp_path: Path) -> None:
@@ -275,8 +319,17 @@ def test_no_layout_file_at_all(content: bytes | None, says: str, tmp_path: Path)
         path.write_bytes(content)
     with pytest.raises(ConfigError) as caught:
         on_shared_sim("native", N, from_file(path))
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
+    message = str(caught.value)
+    assert message.startswith(f"layout={path}")
+    assert says in message
+    assert "\n" not in message
+
+
+def test_a_file_that_the_term_alone_names_is_called_by_its_key(tmp_path: Path) -> None:
+    cfg = from_file(tmp_path / "worlds.csv")
+    cfg.layout = None
+    with pytest.raises(ConfigError, match=r"^reset\.layout\.params\.path=.*/worlds\.csv: expected an existing file"):
+        on_shared_sim("native", N, cfg)
 
 
 def test_values_within_the_configured_ranges_alone(tmp_path: Path) -> None:
@@ -291,7 +344,7 @@ def test_values_within_the_configured_ranges_alone(tmp_path: Path) -> None:
     ("args", "says"),
     [
         (["layout=worlds.csv"], "Add reset=layout"),
-        (["reset=layout"], "Set layout=worlds.csv"),
+        (["reset=layout"], "layout=null: expected a file with one row per world"),
         (["reset=layout", "layout=worlds.csv", "nworld=5"], "at least 5 worlds, it has 4. Add rows, or set nworld=4"),
     ],
 )

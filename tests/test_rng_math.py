@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mjstack.math import lowest_corner, quat_angle, quat_from_yaw, quat_mul, quat_z_row
+from mjstack.math import lowest_corner, not_finite, quat_angle, quat_from_yaw, quat_mul, quat_z_row
 from mjstack.rng import philox, uniform
 
 KNOWN = [
@@ -111,6 +111,13 @@ def test_z_row_is_mujocos(quats: np.ndarray) -> None:
         mujoco.mju_quat2Mat(mat, q)
         row[:] = mat[6:]
     np.testing.assert_allclose(quat_z_row(torch.from_numpy(quats)).numpy(), expected, atol=1e-14)
+
+
+def test_one_number_that_is_not_finite_marks_its_row() -> None:
+    first, second = torch.full((5, 3), 1e30), torch.zeros(5, 2, dtype=torch.float64)
+    first[1, 2], first[2, 0], second[3, 1] = torch.nan, torch.inf, -torch.inf
+    assert not_finite(first, second).tolist() == [False, True, True, True, False]
+    assert not_finite(second).tolist() == [False, False, False, True, False]
 
 
 def test_lowest_corner_against_eight_corners(quats: np.ndarray) -> None:

@@ -144,6 +144,30 @@ def test_each_cube_may_be_tried_again() -> None:
     env.close()
 
 
+def test_a_cube_arrives_as_it_stood() -> None:
+    """From near the base, where the gripper could point down, to far from it, where it must lean; and the other way round."""
+    env = make_env(["task=stack", "action=joint_absolute", "sim=native"], nworld=2)
+    env.reset(seed=0)
+    red, blue = env.index.cube_qpos
+    for world, (near, far) in enumerate([(red, blue), (blue, red)]):
+        for address, x in ((near, 0.29), (far, 0.375)):
+            env.sim.qpos[world, address] = x
+    expert = make_expert(env)
+    ends = {phase.stop - 1: phase.name for phase in expert.phases}
+    lean, tilt = {}, {}
+    for frame in range(expert.frames):
+        env.step(expert.command())
+        if name := ends.get(frame):
+            lean[name] = torch.rad2deg(torch.acos(-expert._ik.approach(expert._command)[:, 2]))
+            x, y = env.sim.qpos[:, red + 4 : red + 6].unbind(1)
+            tilt[name] = torch.rad2deg(torch.acos(1.0 - 2.0 * (x * x + y * y)))
+    # If it pointed down wherever it can: 23 degrees both, and cubes tilted by 23 and 22.
+    assert (lean["place_stack"] - lean["grasp_red"]).abs().max() < 6.0
+    assert tilt["place_stack"].max() < 10.0
+    assert tilt["retreat"].max() < 1.0
+    env.close()
+
+
 def test_no_retry_without_time(stage: Stage) -> None:
     env, controller = driven(stage("so101"), "controller.hurry=1.2", nworld=1)
     grasp = [phase.name for phase in controller.phases].index("grasp_red")

@@ -320,7 +320,7 @@ def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> Non
                 phase[frame:, world] -= phase[frame, world]
                 break
     forces = (rng.random((frames, n, 2, 2)) < 0.93) * 3.0
-    placed = rng.random((frames, n)) < 0.8
+    placed = rng.random((frames, n, 2)) < 0.8
     overflow = (rng.random((frames, n)) < 0.0005).cumsum(axis=0) > 0
     qpos = np.where(rng.random((frames, n, 1)) < 0.0005, np.inf, 1.0) * np.ones((1, 1, 3))
 
@@ -341,12 +341,8 @@ def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> Non
 
     found = [tuple(row) for row in torch.stack((watch.sign, watch.phase, watch.frame), dim=1).tolist()]
     names = [[PHASES[number] for number in phase[:, world]] for world in range(n)]
-    wanted = [
-        recount(
-            names[world], (forces[:, world, 0] > 0).all(1), placed[:, world], overflow[:, world] | np.isinf(qpos[:, world, 0])
-        )
-        for world in range(n)
-    ]
+    held, lost = (forces[:, :, 0] > 0).all(2), overflow | np.isinf(qpos[:, :, 0])
+    wanted = [recount(names[world], held[:, world], placed[:, world, 0], lost[:, world]) for world in range(n)]
     assert found == wanted
     assert {sign for sign, _, _ in wanted} == {int(sign) for sign in Sign}  # else this would show less than it seems to
 
@@ -411,24 +407,35 @@ def test_signs_in_real_episodes(new_context: Callable[..., GateContext]) -> None
     assert watch.frame.tolist()[4] == at["done"] + 6
 
 
-def test_box_phases_are_read_too() -> None:
-    """Two cubes, one after the other: each is carried between its grasp and the next opening."""
-    cfg = load_config()
-    phase = cfg.controller.phases["done"]
-    made = type(phase)
-    steps = [
-        ("open", None),
-        ("closed", "red"),
-        ("closed", None),
-        ("open", None),
-        ("closed", "blue"),
-        ("closed", None),
-        ("open", None),
-    ]
-    cfg.controller.phases = {str(k): made(gripper=grip, grasps=cube, seconds=1.0) for k, (grip, cube) in enumerate(steps)}
-    watch = FailureWatch(cfg)
-    assert watch._tables == ([-1, 0, -1, -1, 1, -1, -1], [-1, -1, 0, -1, -1, 1, -1])
-    assert watch._release == 6
+def test_each_cube_of_the_box_has_its_own_release(monkeypatch: pytest.MonkeyPatch) -> None:
+    """World by world: all well; red misses, blue does not; red is let go well and leaves under blue's approach; blue misses;
+    blue leaves at the end."""
+    cfg = load_config(["task=box"])
+    names = list(cfg.controller.phases)
+    at = {name: 2 * number for number, name in enumerate(names)}  # two frames a phase
+    placed = np.zeros((2 * len(names), 5, 2), dtype=bool)
+    placed[at["open_red"] + 1 :, :, 0] = True
+    placed[at["open_blue"] + 1 :, :, 1] = True
+    placed[:, 1, 0] = False
+    placed[at["approach_blue"] + 1 :, 2, 0] = False
+    placed[:, 3, 1] = False
+    placed[at["done"] + 1 :, 4, 1] = False
+
+    watch, now = FailureWatch(cfg), SimpleNamespace(frame=0)
+    sim = SimpleNamespace(qpos=torch.zeros(5, 3), qvel=torch.zeros(5, 3), overflow=torch.zeros(5, dtype=torch.int32))
+    env = SimpleNamespace(nworld=5, device=torch.device("cpu"), sim=sim)
+    controller = SimpleNamespace(phase=torch.zeros(5, dtype=torch.int64))
+    evidence = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.frame]))
+    monkeypatch.setattr(watch_module, "jaw_forces", lambda *_: torch.ones(5, 2))
+    watch.start(env)
+    for frame in range(len(placed)):
+        now.frame = frame
+        controller.phase.fill_(frame // 2)
+        watch.update(env, controller, evidence)
+    signs = [Sign(sign) for sign in watch.sign.tolist()]
+    assert signs == [Sign.NONE, Sign.MISSED, Sign.LEFT, Sign.MISSED, Sign.LEFT]
+    assert [names[number] for number in watch.phase[1:].tolist()] == ["open_red", "approach_blue", "open_blue", "done"]
+    assert watch.frame[1:].tolist() == [at["retreat_red"], at["approach_blue"] + 1, at["retreat_blue"], at["done"] + 1]
 
 
 def test_radial_yaw() -> None:

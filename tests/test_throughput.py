@@ -19,7 +19,7 @@ from mjstack.config.schema import GraphMode
 from mjstack.envs import build_env
 from mjstack.gates import env_step, power, sections
 from mjstack.gates.env_step import measure_env_step
-from mjstack.gates.episode import State, run_episode
+from mjstack.gates.episode import State, restore, run_episode
 from mjstack.gates.gate import GateContext
 from mjstack.gates.power import EnergyMeter
 from mjstack.gates.throughput import run_throughput
@@ -271,6 +271,33 @@ def test_start_states_repeat_without_the_batch_gate(new_context: Callable[..., G
     kept = State(state.qpos.copy(), state.qvel, state.ctrl)
     context.carry_start = kept
     assert sections._carry_start(context, sim) is kept
+
+
+def test_worlds_with_an_empty_grasp_start_as_copies(
+    new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Red beside the jaws in two of five worlds, then in all of them."""
+    context = new_context("sim=native", "nworld=5", *SHORT, "gate.throughput.sections=[physics]")
+    sim = context.batch_simulation(5)
+    state, red = sections._carry_start(context, sim), context.index.cube_qpos[0]
+    starts: list[State] = []
+
+    def keep(sim: Simulation, given: State) -> None:
+        starts.append(given)
+        restore(sim, given)
+
+    monkeypatch.setattr(sections, "restore", keep)
+    for lost, left in (([1, 4], [0, 2, 2, 3, 2]), (list(range(5)), [])):
+        state.qpos[lost, red + 1] -= 0.1
+        context.carry_start = State(state.qpos.copy(), state.qvel, state.ctrl)
+        result, _ = run_throughput(context)
+        assert result.metrics["physics.worlds_with_cube_in_hand"] == 5 - len(lost)
+        if left:
+            assert np.array_equal(starts[-1].qpos, state.qpos[left])
+            assert speeds(result, "physics")
+    assert result.status is Status.failed
+    assert "physics: no figure: no world has the cube in hand as lift_red begins" in result.reason
+    assert speeds(result, "physics") == []
 
 
 class Witness:

@@ -15,8 +15,9 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.singleton import Singleton
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
+from mjstack.config.help import list_groups
 from mjstack.config.schema import CollectJobCfg, Config, ReachabilityJobCfg, ScalingJobCfg, StudyJobCfg
 from mjstack.config.terms import type_terms
 from mjstack.config.validate import validate
@@ -28,10 +29,10 @@ _TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 _KINDS = {"Integer": "an integer", "Float": "a number", "Boolean": "true or false"}
 
 ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
-ConfigStore.instance().store(group="job", name="study_schema", node=StudyJobCfg, provider="mjstack")
-ConfigStore.instance().store(group="job", name="scaling_schema", node=ScalingJobCfg, provider="mjstack")
-ConfigStore.instance().store(group="job", name="reachability_schema", node=ReachabilityJobCfg, provider="mjstack")
-ConfigStore.instance().store(group="job", name="collect_schema", node=CollectJobCfg, provider="mjstack")
+ConfigStore.instance().store(name="study_schema", node=StudyJobCfg, provider="mjstack")
+ConfigStore.instance().store(name="scaling_schema", node=ScalingJobCfg, provider="mjstack")
+ConfigStore.instance().store(name="reachability_schema", node=ReachabilityJobCfg, provider="mjstack")
+ConfigStore.instance().store(name="collect_schema", node=CollectJobCfg, provider="mjstack")
 
 
 class CompositionError(MjstackError):
@@ -113,7 +114,7 @@ def _translate(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     """One line from Hydra's and OmegaConf's chained, multi-line errors."""
     if isinstance(error, MissingConfigException) and error.options is not None and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        return UnknownName(f"{group}={name}:", name, [o for o in error.options if not o.endswith("_schema")])
+        return UnknownName(f"{group}={name}:", name, error.options)
     cause = error.__cause__ if isinstance(error, ConfigCompositionException) and error.__cause__ else error
     key = getattr(cause, "full_key", None)
     text = str(cause).splitlines()[0] if str(cause) else type(cause).__name__
@@ -125,31 +126,18 @@ def _translate(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     converted = re.search(r"Value '(.*)' of type '\w+' could not be converted to (\w+)", text)
     if converted and key:
         return CompositionError(f"{key}={converted.group(1)}: expected {_KINDS.get(converted.group(2), converted.group(2))}.")
+    if isinstance(cause, MissingMandatoryValue) and str(key).startswith("gate."):
+        return CompositionError(
+            "gate: expected no choice, because the thresholds of all gates are in use. gates=[...] chooses what runs, "
+            "gate.batch.seeds=10 sets a value."
+        )
     if key and "not a ListConfig" in text:
         return CompositionError(f"{key}: expected a list, such as {key}=[...].")
     if "Ambiguous value for argument" in text:
         return CompositionError(f"{text.rstrip('.')}: several values are a sweep. Add -m, or give one value.")
     match = re.search(r"Could not override '([^']+)'\. No match in the defaults list", str(error))
     if match:
-        groups = [
-            "robot",
-            "model",
-            "scene",
-            "timing",
-            "solver",
-            "batch",
-            "sim",
-            "action",
-            "observation",
-            "reset",
-            "termination",
-            "reward",
-            "task",
-            "controller",
-            "gate",
-            "job",
-        ]
-        return UnknownName("configuration group", match.group(1), groups)
+        return UnknownName("configuration group", match.group(1), [group.name for group in list_groups()])
     if isinstance(error, OverrideParseException):
         return CompositionError(f"override '{error.override}' cannot be read: {text.rstrip('.')}.")
     return CompositionError(f"{key}: {text}." if key else f"{text.rstrip('.')}.")
@@ -174,6 +162,8 @@ def _unknown_key(error: Exception, key: str, overrides: Sequence[str]) -> Mjstac
         nearest = max(same_leaf, key=lambda k: difflib.SequenceMatcher(None, key, k).ratio())
         return CompositionError(f"configuration key '{key}' does not exist. Did you mean '{nearest}'?")
     siblings = [k for k in keys if k.rpartition(".")[0] == key.rpartition(".")[0]]
+    if "." not in key:
+        siblings += [group.name for group in list_groups() if group.name not in siblings]  # not every group is a key
     near = difflib.get_close_matches(leaf, [k.rpartition(".")[2] for k in siblings], n=1, cutoff=0.6)
     if near:
         nearest = key.removesuffix(leaf) + near[0]

@@ -32,7 +32,12 @@ class Controller(Protocol):
 
 
 class Recorded:
-    """What a controller gave in an episode, to be given again; itself a controller that only repeats."""
+    """What a controller gave in an episode, to be given again; itself a controller that only repeats.
+
+    All worlds are given again at once, on bare steps say, so all are kept: ``frames * nworld * (4 * nu + 2)`` bytes on the
+    device, 0.85 GB for 2,000 frames of 16,384 worlds with six commands. A single world needs no tape: ``job=replay`` plays it
+    from its seed.
+    """
 
     def __init__(self, source: Controller, nu: int) -> None:
         """Allocates for the worlds and frames of a controller; NaN until it is written.

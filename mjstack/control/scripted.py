@@ -9,6 +9,7 @@ import torch
 
 from mjstack.config.schema import Config
 from mjstack.control.planner import ScriptedPlanner
+from mjstack.control.tilt import CarryTilt
 from mjstack.envs import Env
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
@@ -30,6 +31,8 @@ class ScriptedController:
     place is measured when it begins. A grasp without load on both jaws at its end is tried again, from the phase ``retry``,
     once for each cube and if the rest can be done in time: such a world then goes faster than the others, at most
     ``controller.hurry`` times.
+
+    Where the robot has an ``approach_gain``, the gripper leans at the grasp as it must where the cube is let go (`CarryTilt`).
 
     A world that the environment has reset starts over by itself.
 
@@ -79,6 +82,7 @@ class ScriptedController:
         tensors = robot(env)
         self._n_arm = env.index.n_arm
         self._nominal = torch.as_tensor(nominal, dtype=torch.float32, device=device)
+        self._tilt = CarryTilt(env.sim.model, cfg, self._ik, self._nominal) if c.approach_gain > 0.0 else None
         self._home_grip = tensors.home[self._n_arm :].float()
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
@@ -114,7 +118,10 @@ class ScriptedController:
         start[:, self._n_arm :] = grip
         if self._cfg.controller.align > 0.0:
             self._turn(start, fresh)
-        command, distance = self._ik.solve(start, target, posture if self._uses_posture else None)
+        approach = None
+        if self._tilt is not None:
+            approach = self._tilt.wish(start, self.phase, self._aim(self._tilt.place.index_select(0, self.phase)), fresh)
+        command, distance = self._ik.solve(start, target, posture if self._uses_posture else None, approach)
         self._command.copy_(command)
         last = self._time >= length - _DONE
         self.error.copy_(torch.where(last, torch.maximum(self.error, distance), self.error))
@@ -139,17 +146,20 @@ class ScriptedController:
             buffer.masked_fill_(fresh, 0)
         self._tried.masked_fill_(fresh[:, None], False)
 
-        self._look(entering)
+        self._look(entering, fresh)
         rows = entering[:, None]
-        table, source = self._target.index_select(0, phase), self._source.index_select(0, phase)
-        place = self._seen.gather(1, source[:, None, None].expand(-1, 1, 2))[:, 0]
-        to = torch.cat((table[:, :2] + place, table[:, 2:]), dim=1)
-        to = torch.where(self._holds.index_select(0, phase)[:, None], self._to, to)
+        to = torch.where(self._holds.index_select(0, phase)[:, None], self._to, self._aim(phase))
         self._from.copy_(torch.where(rows, torch.where(fresh[:, None], to, self._to), self._from))
         self._to.copy_(torch.where(rows, to, self._to))
         closing = torch.where(fresh[:, None], self._home_grip, self._grip_to)
         self._grip_from.copy_(torch.where(rows, closing, self._grip_from))
         self._grip_to.copy_(torch.where(rows, self._grip.index_select(0, phase), self._grip_to))
+
+    def _aim(self, phase: torch.Tensor) -> torch.Tensor:
+        """Target of each world's phase, from where its cubes were last seen [m], shape ``(nworld, 3)``."""
+        table, source = self._target.index_select(0, phase), self._source.index_select(0, phase)
+        seen = self._seen.gather(1, source[:, None, None].expand(-1, 1, 2))[:, 0]
+        return torch.cat((table[:, :2] + seen, table[:, 2:]), dim=1)
 
     def _judge_grasp(self, over: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Worlds that try their grasp again, ``(nworld,)`` bool, and how fast they go on, ``(nworld,)``."""
@@ -198,11 +208,11 @@ class ScriptedController:
         after = self._ik.directions(command)[0][0].double().cpu()
         return column, math.copysign(1.0, float(before[0] * after[1] - before[1] * after[0]))
 
-    def _look(self, entering: torch.Tensor) -> None:
-        """Measures the cubes that the phases which begin ask for."""
+    def _look(self, entering: torch.Tensor, fresh: torch.Tensor) -> None:
+        """Measures the cubes that the phases which begin ask for; all of them where an episode begins."""
         wanted = self._looks.index_select(0, self.phase)
         for number, name in enumerate(CUBES):
-            now = entering & (wanted == number)
+            now = fresh | entering & (wanted == number)
             seen = self._seen[:, number]
             pose = pose_w(self._env, name).float()
             seen.copy_(torch.where(now[:, None], pose[:, :2], seen))

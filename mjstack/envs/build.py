@@ -36,8 +36,10 @@ def make_env(
     Raises:
         MjstackError: An override or a term cannot be used; the message says which and what to do.
     """
-    if isinstance(overrides, str) or not all(isinstance(override, str) for override in overrides):
-        raise ArgumentError("overrides", repr(overrides), "a list of strings, such as ['task=reach', 'robot=rebot']")
+    several = isinstance(overrides, Sequence) and not isinstance(overrides, str)
+    if not several or not all(isinstance(override, str) for override in overrides):
+        found = repr(overrides) if isinstance(overrides, str | Sequence) else f"a {type(overrides).__name__}"
+        raise ArgumentError("overrides", found, "a list of strings, such as ['task=reach', 'robot=rebot']")
     given = {"nworld": nworld, "seed": seed, "sim.device": device}
     return build_env(load_config([*overrides, *(f"{k}={v}" for k, v in given.items() if v is not None)]))
 

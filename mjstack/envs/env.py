@@ -20,6 +20,7 @@ from mjstack.managers.observation import ObservationManager
 from mjstack.managers.reset import ResetManager
 from mjstack.managers.reward import RewardManager
 from mjstack.managers.termination import TerminationManager
+from mjstack.math import not_finite
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
 
@@ -307,8 +308,7 @@ class Env:
     def _judge(self) -> None:
         """What looks at the new state, and the resets."""
         self.frame += 1
-        # 0 times a number that is not finite is NaN, which is no longer 0.
-        broken = ((self.sim.qpos * 0.0).sum(1) + (self.sim.qvel * 0.0).sum(1)) != 0.0
+        broken = not_finite(self.sim.qpos, self.sim.qvel)
         if self._success is not None:
             torch.logical_and(self._success(self), ~broken, out=self.success)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjstack.errors import FaultError, name_worlds
+from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS, Overflow, Simulation, describe_overflow
 
 if TYPE_CHECKING:
@@ -55,11 +56,10 @@ class FaultLatch:
         env = self._env
         self._overflow |= env.sim.overflow & self._lost
         bad_action, reward = env.action_manager.not_finite, env.reward_manager.reward
-        seen = torch.zeros_like(reward)
-        for group in env.observation_manager.groups.values():
-            seen = seen + (group * 0.0).sum(1)
+        groups = env.observation_manager.groups.values()
+        seen = not_finite(*groups) if groups else self._nobody
         state = self._nobody if self._state_ends else broken
-        self._faults |= torch.stack((bad_action, state, reward * 0.0 != 0.0, (seen != 0.0) & ~broken), dim=1)
+        self._faults |= torch.stack((bad_action, state, reward * 0.0 != 0.0, seen & ~broken), dim=1)
         bad_action.zero_()
 
     def clear(self) -> None:

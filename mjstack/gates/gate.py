@@ -103,6 +103,7 @@ class GateContext:
 
     def with_config(self, cfg: Config) -> GateContext:
         """A context for another configuration of the same scene and plan, which it shares; sizes and pictures are its own."""
+        # Other starts and another controller have other peaks: sizes of the batch, or of random actions, would say nothing.
         other = replace(self, cfg=cfg, measured=None, measured_env=None, pictures=[])
         other.__dict__.update(model=self.model, planner=self.planner)
         return other

@@ -20,7 +20,11 @@ from mjstack.gates.episode import SCRIPTED, State, restore, run_episode, snapsho
 from mjstack.gates.gate import GateContext, TimedEpisode
 from mjstack.gates.power import EnergyMeter
 from mjstack.gates.timing import WARM_UP, Timing, capture_problem, frames_that_fit, spread, step_graph, timed
+from mjstack.gates.watch import carried_cubes
+from mjstack.math import not_finite
+from mjstack.mdp.geometry import LOADED
 from mjstack.report.record import Value
+from mjstack.scene.index import CUBES
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Simulation, device_memory
 
 if TYPE_CHECKING:
@@ -75,6 +79,7 @@ class Stopwatch:
 def measure_physics(context: GateContext, sim: Simulation, watch: Stopwatch, meter: EnergyMeter) -> Section:
     """Physics steps under a held command: every repetition starts from the same states, the cube in hand.
 
+    A world whose grasp is empty there, because it is about to be tried again, starts as a copy of one that holds the cube.
     Whatever else is in a step of the simulation (counting contacts, latching overflow) is in the figure.
     """
     t, substeps = context.cfg.gate.throughput, context.cfg.timing.substeps
@@ -85,11 +90,20 @@ def measure_physics(context: GateContext, sim: Simulation, watch: Stopwatch, met
 
     state = _carry_start(context, sim)
     restore(sim, state)
+    section, bad = Section(name="physics"), _lost(sim)
+    held = _in_hand(context, sim)
+    if held is not None:
+        section.facts["worlds_with_cube_in_hand"] = len(held)
+        if not len(held):
+            section.problem = f"no world has the cube in hand as {t.from_phase} begins (gate.throughput.from_phase)"
+            return section
+        if len(held) < sim.nworld:
+            state = _copied(state, held)
+            restore(sim, state)
     graph = step_graph(sim, substeps)
     first = [timed(sim, lambda: play(1)) for _ in range(2 if graph is None else WARM_UP)]
     frames = frames_that_fit(t.frames, watch.seconds, watch.repetitions * first[-1])
     timing = Timing(nworld=sim.nworld, frames=frames, substeps=substeps)
-    bad = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
     meter.clear()
     for repetition in range(watch.repetitions):
         restore(sim, state)
@@ -97,9 +111,9 @@ def measure_physics(context: GateContext, sim: Simulation, watch: Stopwatch, met
         bad |= _lost(sim) | (sim.step_count != frames * substeps)
         context.tell("physics, repetitions", repetition + 1, watch.repetitions)
     captured = graph is not None and graph.captured
-    section = Section(name="physics", frame_seconds=timing.median / frames)
+    section.frame_seconds = timing.median / frames
     section.figures = timing.step_metrics() | meter.metrics()
-    section.facts = {
+    section.facts |= {
         "frames_per_repetition": frames,
         "repetitions": watch.repetitions,
         "warm_up_s": 0.0 if graph is None else graph.warm_up_seconds,
@@ -114,6 +128,8 @@ def measure_physics(context: GateContext, sim: Simulation, watch: Stopwatch, met
         section.problem = f"{int(bad.sum())} worlds overflowed, diverged or were not stepped"
     step_ms = 1e3 * timing.median / (frames * substeps)
     section.headline = f"{timing.world_steps_per_s:,.0f} world-steps/s, {step_ms:.3g} ms per step of {sim.nworld} worlds"
+    if held is not None and len(held) < sim.nworld:
+        section.headline += f" ({sim.nworld - len(held)} with an empty grasp replaced by copies of others)"
     return section
 
 
@@ -170,6 +186,8 @@ def measure_episode(
             if lost:
                 section.problem = section.problem or f"{lost} worlds failed when their commands were repeated"
             controlled.append(episode.seconds / again.seconds - 1.0)
+            del again
+        del episode  # with its commands, before the next turn records as many
         estimate = time.perf_counter() - turn_began
         context.tell("episode, repetitions", len(played), watch.repetitions)
     if not played and before is not None:
@@ -269,8 +287,28 @@ def _carry_start(context: GateContext, sim: Simulation) -> State:
         context.tell("frames to the start", frame + 1, first)
     state = snapshot(some)
     env.close()
-    worlds = np.arange(sim.nworld) % count
-    return State(state.qpos[worlds], state.qvel[worlds], state.ctrl[worlds])
+    return _rows(state, np.arange(sim.nworld) % count)
+
+
+def _in_hand(context: GateContext, sim: Simulation) -> np.ndarray | None:
+    """Numbers of the worlds in which both jaws press on the cube of the measured phase; None if it carries none."""
+    phases = context.cfg.controller.phases
+    cube = carried_cubes(list(phases.values()))[list(phases).index(context.cfg.gate.throughput.from_phase)]
+    if cube < 0:
+        return None
+    forces = torch.stack([sim.sensordata[:, a : a + 3] for a in context.index.jaw_force[CUBES[cube]]], dim=1)
+    return np.flatnonzero((torch.linalg.vector_norm(forces, dim=2) > LOADED).all(1).cpu().numpy())
+
+
+def _copied(state: State, worlds: np.ndarray) -> State:
+    """These worlds as they are, the others as copies of them in turn."""
+    rows = worlds[np.arange(len(state.qpos)) % len(worlds)]
+    rows[worlds] = worlds
+    return _rows(state, rows)
+
+
+def _rows(state: State, rows: np.ndarray) -> State:
+    return State(state.qpos[rows], state.qvel[rows], state.ctrl[rows])
 
 
 def _play_bare(context: GateContext, sim: MjwarpSimulation, recorded: Recorded | None = None) -> tuple[float, str]:
@@ -301,14 +339,13 @@ def _play_bare(context: GateContext, sim: MjwarpSimulation, recorded: Recorded |
     if bad:
         return seconds, f"{bad} worlds overflowed or diverged with bare steps"
     judge = context.evidence(cfg, context.index, context.planner.phases, sim.nworld, sim.device)
-    fallen = int((~judge.placed(sim)).sum())
+    fallen = int((~judge.placed(sim).all(1)).sum())
     return seconds, f"{fallen} worlds did not do the task with bare steps" if fallen else ""
 
 
 def _lost(sim: Simulation) -> torch.Tensor:
     """Worlds that overflowed or diverged, shape ``(nworld,)``, bool."""
-    finite = torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1)
-    return ((sim.overflow & LOST_PHYSICS) != 0) | ~finite
+    return not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
 
 
 def _physics_captured(sim: Simulation, substeps: int) -> dict[str, Value]:

@@ -10,6 +10,7 @@ import torch
 from mjstack.config.schema import Config, PhaseCfg
 from mjstack.control.controller import Controller
 from mjstack.envs import Env
+from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED, jaw_forces
 from mjstack.scene.index import CUBES
 from mjstack.sim.simulation import LOST_PHYSICS
@@ -57,9 +58,9 @@ class FailureWatch:
     - PHYSICS: the state is not finite, or a buffer overflowed.
     - EMPTY: a phase that grasps is over, both jaws did not press on its cube in its last frame, and the world goes on.
     - DROPPED: between that phase and the next opening of the gripper, both jaws have not pressed on the cube for three frames.
-    - MISSED: the first phase after the last one that carries, in which the gripper opens, is over, and the cubes are not where
-      they belong.
-    - LEFT: later, cubes that were where they belong are so no more.
+    - MISSED: a cube's release, the first phase after the last one that carries it, is over, and the cube is not where it
+      belongs. Cubes that no phase carries have none.
+    - LEFT: later, a cube that was where it belongs is so no more. That may be in a phase of the other cube.
 
     A grasp that is tried again is no sign. A sign need not lead to failure, nor has every failure one: cubes that are in place
     but move break their rule alone.
@@ -77,9 +78,8 @@ class FailureWatch:
     def __init__(self, cfg: Config) -> None:
         """Reads the phases."""
         specs = list(cfg.controller.phases.values())
-        self._tables = _grasped(specs), _carried(specs)
-        carrying = [number for number, cube in enumerate(self._tables[1]) if cube >= 0]
-        self._release = carrying[-1] + 1 if carrying else len(specs)
+        self._tables = _grasped(specs), carried_cubes(specs)
+        self._releases = _releases(self._tables[1])
 
     def start(self, env: Env) -> None:
         """Allocates for the environment's worlds."""
@@ -91,8 +91,9 @@ class FailureWatch:
         self._grasped, self._carried = (torch.tensor(table, device=device) for table in self._tables)
         self.sign, self.phase, self.frame = full(0), full(-1), full(-1)
         self._now, self._at = full(0, size=1), full(0)
+        self._release = torch.tensor(self._releases, device=device)
         self._loaded = torch.zeros((n, len(CUBES)), dtype=torch.bool, device=device)
-        self._placed, self._gone = full(0, torch.bool), full(0, torch.int32)
+        self._placed, self._gone = torch.zeros_like(self._loaded), full(0, torch.int32)
 
     def update(self, env: Env, controller: Controller, evidence: Evidence) -> None:
         """Takes in the end of a frame. Fixed shapes, no host read."""
@@ -100,24 +101,22 @@ class FailureWatch:
         loaded = torch.stack([(jaw_forces(env, name) > LOADED).all(1) for name in CUBES], dim=1)
         placed = evidence.placed(sim)
 
-        # 0 times a number that is not finite is NaN, which is no longer 0.
-        finite = ((sim.qpos * 0.0).sum(1) + (sim.qvel * 0.0).sum(1)) == 0.0
-        lost = ~finite | ((sim.overflow & LOST_PHYSICS) != 0)
+        lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
         entered = phase > self._at
         grasped = self._grasped.index_select(0, self._at)
         empty = entered & (grasped >= 0) & ~_of(self._loaded, grasped)
         carried = self._carried.index_select(0, phase)
         self._gone.add_(1).mul_((carried >= 0) & ~_of(loaded, carried))
         dropped = self._gone >= GONE_FRAMES
-        missed = entered & (self._at == self._release) & ~self._placed
-        left = (phase > self._release) & self._placed & ~placed
+        missed = entered & ((self._at[:, None] == self._release) & ~self._placed).any(1)
+        left = ((phase[:, None] > self._release) & self._placed & ~placed).any(1)
 
         seen = torch.zeros_like(self.sign)
         signs = {Sign.LEFT: left, Sign.MISSED: missed, Sign.DROPPED: dropped, Sign.EMPTY: empty, Sign.PHYSICS: lost}
         for sign, found in signs.items():
-            seen.masked_fill_(found, int(sign))
+            seen.masked_fill_(found, sign)
         first = (self.sign == 0) & (seen > 0)
-        ended = (seen == int(Sign.EMPTY)) | (seen == int(Sign.MISSED))  # what the phase before has left
+        ended = (seen == Sign.EMPTY) | (seen == Sign.MISSED)  # what the phase before has left
         self.sign.copy_(torch.where(first, seen, self.sign))
         self.phase.copy_(torch.where(first, torch.where(ended, self._at, phase), self.phase))
         self.frame.copy_(torch.where(first, self._now, self.frame))
@@ -141,7 +140,7 @@ def _grasped(specs: Sequence[PhaseCfg]) -> list[int]:
     return [_number(spec.grasps) for spec in specs]
 
 
-def _carried(specs: Sequence[PhaseCfg]) -> list[int]:
+def carried_cubes(specs: Sequence[PhaseCfg]) -> list[int]:
     """Number of the cube that is in the hand all through each phase, or -1."""
     out, cube = [], -1
     for spec in specs:
@@ -151,3 +150,9 @@ def _carried(specs: Sequence[PhaseCfg]) -> list[int]:
         if spec.grasps is not None:
             cube = _number(spec.grasps)
     return out
+
+
+def _releases(carried: Sequence[int]) -> list[int]:
+    """Number of the phase in which each cube is let go for good; one that never comes for a cube that is not carried."""
+    last = {cube: number for number, cube in enumerate(carried)}
+    return [last[cube] + 1 if cube in last else len(carried) for cube in range(len(CUBES))]

@@ -20,7 +20,7 @@ from mjstack.errors import ConfigError, DatasetError, UnwrittenError
 from mjstack.gates.gate import GateContext
 from mjstack.jobs.collect_record import read_batches
 from mjstack.jobs.collection import DATASET, Collection, most_worlds
-from mjstack.jobs.demonstration_spec import config_hash, episode_config, first_difference, make_spec
+from mjstack.jobs.demonstration_spec import CONTENT, config_hash, episode_config, first_difference, make_spec
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
@@ -136,9 +136,12 @@ def _check_folder(home: Path, spec: DatasetSpec) -> None:
     difference = first_difference(theirs, spec.provenance["config"]) if theirs else None
     if difference is not None and info["mjstack"]["config_sha256"] != spec.config_sha256:
         key, found, expected = difference
+        remedy = f"{key} to {found}"
+        if str(found).startswith(CONTENT):
+            remedy = f"{key} to a file with that content"
         raise DatasetError(
             f"{home / DATASET} has episodes of another configuration: {key}={found}, expected {expected}. Set job.folder to "
-            f"another folder, or {key} to {found}"
+            f"another folder, or {remedy}"
         )
     check_same(home / DATASET, info, spec)
     read_batches(home)

@@ -20,7 +20,7 @@ from mjstack.gates.episode import NOMINAL
 from mjstack.gates.gate import GateContext, failing_rules
 from mjstack.jobs.collect_record import CollectedBatch, read_batches, write_batches
 from mjstack.jobs.demonstration import ACTION, STATE, Played, frame_layout, frames_block, play_demonstrations
-from mjstack.jobs.demonstration_spec import make_spec
+from mjstack.jobs.demonstration_spec import config_hash, episode_config, make_spec
 from mjstack.jobs.reported import run_provenance
 from mjstack.math import wilson_interval
 from mjstack.report.collect import ColumnRange, to_markdown
@@ -96,7 +96,11 @@ class Collection:
                 return (
                     f"the next seed would be {seed}, expected at most {_SEEDS - 1}: begin another dataset with a smaller seed"
                 )
-            batch = self._add_batch(writer, seed, missing)
+            sim, block = self._worlds(missing if self._job.keep_failures else math.ceil(_SPARE * missing))
+            played = play_demonstrations(self._context, sim, seed, block)
+            if config_hash(episode_config(self._cfg)) != self.spec.config_sha256:
+                return f"the file of reset=layout changed while seed {seed} was played: restore it, or begin another dataset"
+            batch = self._add_batch(writer, played, missing)
             self.batches.append(batch)
             write_batches(self.home, self.batches)
             self._count(writer)
@@ -111,15 +115,13 @@ class Collection:
             seed += 1
         return ""
 
-    def _add_batch(self, writer: DatasetWriter, seed: int, missing: int) -> CollectedBatch:
-        """Plays one seed, and commits the episodes that are to be kept, as far as they are missing."""
+    def _add_batch(self, writer: DatasetWriter, played: Played, missing: int) -> CollectedBatch:
+        """Commits the episodes of a seed that are to be kept, as far as they are missing."""
         keep_all = self._job.keep_failures
-        sim, block = self._worlds(missing if keep_all else math.ceil(_SPARE * missing))
-        played = play_demonstrations(self._context, sim, seed, block)
         failing = failing_rules(self._context.evidence.rules, played.failed)
         batch = CollectedBatch(
-            seed=seed,
-            worlds=sim.nworld,
+            seed=played.seed,
+            worlds=len(played.failed),
             accepted=int((played.failed == 0).sum()),
             retries=int(played.retries.sum()),
             broken={rule.text: len(worlds) for rule, worlds in failing.items()},
@@ -135,7 +137,7 @@ class Collection:
             elif batch.kept < missing:
                 writer.add([self._episode(played, world, arrays)])
                 batch.kept += 1
-                self._context.tell(f"episodes of seed {seed}", batch.kept, min(len(worlds), missing))
+                self._context.tell(f"episodes of seed {played.seed}", batch.kept, min(len(worlds), missing))
             began = time.perf_counter()
             batch.writing_s += began - copied
         writer.flush()

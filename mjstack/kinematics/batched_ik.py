@@ -111,7 +111,7 @@ class BatchedIk:
         self._device = wp.get_device(str(device))
         self.device = wp.device_to_torch(self._device)
         self._block_dim = block_dim
-        self._posture_gain = posture_gain
+        self._posture_gain, self._approach_gain = posture_gain, approach_gain
         # In the last iterations no gain counts, so they undo what it cost in distance: measured, 2 of 4, 3 of 8, 10 of 40.
         wishing = iterations - max(min(3, iterations // 2), iterations // 4) if gained else 0
         near = _NEAR if gained else -1.0
@@ -120,16 +120,17 @@ class BatchedIk:
             self._chain, shape = _build_chain(model, robot, joints, moved, low, high)
             self._wp_given, self._wp_command, self._wp_posture = (wp.zeros((nworld, self._n), dtype=float) for _ in range(3))
             self._wp_home = wp.array(np.tile(home, (nworld, 1)), dtype=float)
-            self._wp_target, self._wp_centre, self._wp_closing, self._wp_approach = (
-                wp.zeros(nworld, dtype=wp.vec3) for _ in range(4)
+            self._wp_target, self._wp_wished, self._wp_centre, self._wp_closing, self._wp_approach = (
+                wp.zeros(nworld, dtype=wp.vec3) for _ in range(5)
             )
+            self._wp_down = wp.full(nworld, wp.vec3(0.0, 0.0, -1.0), dtype=wp.vec3)
             self._wp_distance, self._wp_unreachable = wp.zeros(nworld, dtype=float), wp.zeros(nworld, dtype=wp.bool)
         self._kernel = solve_kernel(shape)
         self._given, self._target, self._posture, self._command, self._distance = (
             wp.to_torch(a) for a in (self._wp_given, self._wp_target, self._wp_posture, self._wp_command, self._wp_distance)
         )
-        self._centre, self._closing, self._approach = (
-            wp.to_torch(a) for a in (self._wp_centre, self._wp_closing, self._wp_approach)
+        self._wished, self._centre, self._closing, self._approach = (
+            wp.to_torch(a) for a in (self._wp_wished, self._wp_centre, self._wp_closing, self._wp_approach)
         )
         self.unreachable = wp.to_torch(self._wp_unreachable)
         wp.synchronize_device(self._device)  # the buffers are filled before torch's stream writes into them
@@ -187,7 +188,11 @@ class BatchedIk:
         return self.directions(command)[1]
 
     def solve(
-        self, command: torch.Tensor, target: torch.Tensor, posture: torch.Tensor | None = None
+        self,
+        command: torch.Tensor,
+        target: torch.Tensor,
+        posture: torch.Tensor | None = None,
+        approach: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Moves the robot's ik joints from a command towards a target; the other joints stay as given.
 
@@ -201,13 +206,14 @@ class BatchedIk:
             target: Where the aperture centre goes [m], shape ``(nworld, 3)``, float32 or float64.
             posture: Where ``posture_gain`` draws the ik joints [rad, m], shape ``(n_arm + n_gripper,)`` for all worlds or
                 ``(nworld, n_arm + n_gripper)``; the robot's home if None.
+            approach: Where ``approach_gain`` turns the approach axis, unit vectors, shape ``(nworld, 3)``; down if None.
 
         Returns:
             The new command, shape ``(nworld, n_arm + n_gripper)``, and the distance that is left [m], shape ``(nworld,)``,
             both float32.
 
         Raises:
-            ArgumentError: A shape is wrong, or there is a posture and no gain for it.
+            ArgumentError: A shape is wrong, or there is a posture or an approach and no gain for it.
         """
         self._take("command", self._given, command)
         self._take("target", self._target, target)
@@ -215,6 +221,12 @@ class BatchedIk:
             if self._posture_gain == 0.0:
                 raise ArgumentError("posture", "one", "None, because posture_gain is 0", "Build the solver with a posture_gain")
             self._take("posture", self._posture, posture.expand(self.nworld, -1) if posture.dim() == 1 else posture)
+        if approach is not None:
+            if self._approach_gain == 0.0:
+                raise ArgumentError(
+                    "approach", "one", "None, because approach_gain is 0", "Build the solver with an approach_gain"
+                )
+            self._take("approach", self._wished, approach)
         self._launch(
             self._kernel,
             [
@@ -222,6 +234,7 @@ class BatchedIk:
                 self._wp_given,
                 self._wp_target,
                 self._wp_home if posture is None else self._wp_posture,
+                self._wp_down if approach is None else self._wp_wished,
                 *self._settings,
                 self._wp_command,
                 self._wp_distance,

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import warp as wp
-
-wp.config.log_level = wp.LOG_ERROR  # before the first use, which starts Warp
+from mjstack.sim.start import wp
 
 HINGE = 0
 SLIDE = 1
@@ -16,7 +14,6 @@ SLIDE = 1
 # dead end at the limits (from home, over the reBot's whole reach, 97 % instead of 91 % are found); a near one converges fast.
 FAR_DAMPING = wp.constant(0.1)
 NAN = wp.constant(float("nan"))
-DOWN = wp.constant(wp.vec3(0.0, 0.0, -1.0))
 
 
 @wp.struct
@@ -158,6 +155,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
         given: wp.array2d[float],
         target: wp.array[wp.vec3],
         posture: wp.array2d[float],
+        upright: wp.array[wp.vec3],
         iterations: int,
         wishing: int,
         damping: float,
@@ -244,7 +242,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                         jacobian[i] = share * direction
                 wish = Values()
                 if iteration < wishing:
-                    lever = wp.cross(wp.transform_vector(trunk, approach), DOWN)
+                    lever = wp.cross(wp.transform_vector(trunk, approach), upright[w])
                     for i in range(END):
                         if wp.static(shape.moved[i]):
                             wish[i] = posture_gain * (home[i] - q[i])

@@ -186,6 +186,8 @@ def build_instance(label: str, cls: Callable[..., Any], env: EnvView, params: di
         instance = cls(env, **params)
     except ParameterError as error:
         raise _located(label, error) from error
+    except ConfigError:  # names its key itself
+        raise
     except MjstackError as error:
         raise TermError(label, str(error)) from error
     except Exception as error:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 
 from mjstack.errors import ParameterError
-from mjstack.managers.base import EnvView
+from mjstack.managers.base import EnvView, shared
+from mjstack.math import lowest_corner
+from mjstack.scene import table_top
 from mjstack.scene.index import RobotTensors
 
 
@@ -56,6 +58,16 @@ def pose_w(env: EnvView, name: str) -> torch.Tensor:
     """Position [m] and quaternion (wxyz) of an object, from qpos, which is never stale, shape ``(nworld, 7)``."""
     address, _ = env.index.object_address(name)
     return env.sim.qpos[:, address : address + 7]
+
+
+def above_table(env: EnvView, name: str) -> torch.Tensor:
+    """Height of a cube's lowest corner above the table [m], shape ``(nworld,)``. Not to be written into."""
+
+    def compute() -> torch.Tensor:
+        pose = pose_w(env, name)
+        return lowest_corner(pose[:, :3], pose[:, 3:], env.cfg.scene.cube_half) - table_top(env.cfg.scene)
+
+    return shared((id(env), above_table, name), compute)
 
 
 def jaw_forces(env: EnvView, name: str) -> torch.Tensor:

@@ -12,10 +12,10 @@ import mujoco
 import numpy as np
 import torch
 
-from mjstack.errors import ArgumentError, ParameterError
+from mjstack.errors import ArgumentError, ConfigError, ParameterError
 from mjstack.managers.base import EnvView, uses_fields
 from mjstack.mdp.geometry import joint_positions, named_pose, pose_w, robot
-from mjstack.mdp.layout_file import column_names, read_layout_file, short
+from mjstack.mdp.layout_file import LayoutTable, column_names, read_layout_file, short
 from mjstack.mdp.placement import reach_distances
 from mjstack.mdp.variation import FRICTION_FIELDS, GAIN_FIELDS, MASS_FIELDS, CubeMasses, ServoGains, SlidingFriction, bounds
 from mjstack.report.record import write_atomic
@@ -52,35 +52,56 @@ class FromLayout:
             gain: Smallest and largest factor of a servo's gains.
 
         Raises:
-            ParameterError: The file cannot be read, has too few worlds, or one that cannot be used.
+            ConfigError: The file that ``layout`` names cannot be read, has too few worlds, or one that cannot be used.
+            ParameterError: So it is with a file that only this term names, or a range is none.
         """
         if path is None:
-            raise ParameterError("path", "null", "a file with one row per world", "Set layout=worlds.csv")
+            raise ConfigError(
+                "layout", "null", "a file with one row per world, which reset=layout reads", "Set layout=worlds.csv"
+            )
+        try:
+            self._read(env, path, pose, mass, friction, gain)
+        except ParameterError as error:
+            name, value, expected, fix = error.facts
+            if name == "path" and path == env.cfg.layout:
+                raise ConfigError("layout", value, expected, fix) from error
+            raise
+
+    def _read(
+        self,
+        env: EnvView,
+        path: str,
+        pose: str,
+        mass: Sequence[float],
+        friction: Sequence[float],
+        gain: Sequence[float],
+    ) -> None:
         ranges = {"mass": bounds("mass", mass), "friction": bounds("friction", friction), "gain": bounds("gain", gain)}
         self._masses, self._friction = CubeMasses(env), SlidingFriction(env, ranges["friction"][0])
         self._gains = ServoGains(env)
         joints = [*env.cfg.robot.arm_joints, *env.cfg.robot.gripper_joints]
-        table = read_layout_file(path, column_names(list(env.index.objects), joints, self._friction.names))
+        file = read_layout_file(path, column_names(list(env.index.objects), joints, self._friction.names))
+        table = file.columns
         rows, needed = len(next(iter(table.values()))), max(env.nworld, env.cfg.nworld)
         if rows < needed:
             raise ParameterError("path", path, f"at least {needed} worlds, it has {rows}", f"Add rows, or set nworld={rows}")
         cubes = [short(name) for name in env.index.objects]
         nominal = self._masses.nominal.cpu().numpy()
         for cube, kilograms in zip(cubes, nominal, strict=True):
-            _check_range(path, table, f"{cube}_mass_kg", [kilograms * end for end in ranges["mass"]], "mass")
+            _check_range(file, f"{cube}_mass_kg", [kilograms * end for end in ranges["mass"]], "mass")
         for name in self._friction.names:
-            _check_range(path, table, f"{short(name)}_friction", ranges["friction"], "friction")
+            _check_range(file, f"{short(name)}_friction", ranges["friction"], "friction")
         for name, low, high in zip(joints, *_joint_limits(env), strict=True):
-            _check_range(path, table, f"gain_{name}", ranges["gain"], "gain")
-            _check_range(path, table, f"joint_{name}", (low, high))
+            _check_range(file, f"gain_{name}", ranges["gain"], "gain")
+            _check_range(file, f"joint_{name}", (low, high))
 
         command = np.tile(named_pose(env, pose).double().cpu().numpy(), (rows, 1))
         for k, name in enumerate(joints):
             command[:, k] = table.get(f"joint_{name}", command[:, k])
         places = np.stack([np.stack([table[f"{cube}_{part}"] for part in ("x_m", "y_m", "yaw_rad")], 1) for cube in cubes], 1)
-        _check_on_table(env, path, places)
-        _check_touching(env, path, places, command)
-        _check_reach(env, path, places)
+        _check_on_table(env, file, places)
+        _check_touching(env, file, places, command)
+        _check_reach(env, file, places)
 
         self._command = self._keep(env, command)
         half = 0.5 * places[..., 2]
@@ -192,32 +213,40 @@ def _joint_limits(env: EnvView) -> tuple[np.ndarray, np.ndarray]:
     return both[..., 0].max(axis=0), both[..., 1].min(axis=0)
 
 
-def _check_range(path: str, table: dict[str, np.ndarray], name: str, ends: Sequence[float], parameter: str = "") -> None:
-    if name not in table:
+def _check_range(file: LayoutTable, name: str, ends: Sequence[float], parameter: str = "") -> None:
+    if name not in file.columns:
         return
-    slack = _ROUNDING * max(abs(end) for end in ends)
-    outside = np.flatnonzero((table[name] < ends[0] - slack) | (table[name] > ends[1] + slack))
+    values, slack = file.columns[name], _ROUNDING * max(abs(end) for end in ends)
+    outside = np.flatnonzero((values < ends[0] - slack) | (values > ends[1] + slack))
     if outside.size:
         world = int(outside[0])
         fix = f"Correct it, or widen reset.layout.params.{parameter}" if parameter else "Correct it"
-        raise _wrong(path, f"{name} within {ends[0]:.6g} and {ends[1]:.6g}; world {world} has {table[name][world]:.6g}", fix)
+        raise file.misfit(world, [name], f"{ends[0]:.6g} to {ends[1]:.6g}, it is {values[world]:.6g}", fix)
 
 
-def _check_on_table(env: EnvView, path: str, places: np.ndarray) -> None:
+def _check_on_table(env: EnvView, file: LayoutTable, places: np.ndarray) -> None:
     """Every corner of every cube is above the table."""
     scene = env.cfg.scene
     yaw = places[..., 2]
     reach = scene.cube_half * (np.abs(np.cos(yaw)) + np.abs(np.sin(yaw)))[..., None]
     over = np.abs(places[..., :2] - scene.table_center[:2]) + reach - scene.table_half[:2]
-    worst = over.max(axis=-1)
-    if worst.max() > _ROUNDING:
-        world, cube = np.argwhere(worst > _ROUNDING)[0]
-        x, y = places[world, cube, :2]
-        name, by = list(env.index.objects)[cube], 1e3 * worst[world, cube]
-        raise _wrong(path, f"cubes on the table; {name} of world {world} at ({x:.3f}, {y:.3f}) m is {by:.1f} mm over its edge")
+    if over.max() > _ROUNDING:
+        world, cube, axis = np.argwhere(over > _ROUNDING)[0]
+        name = list(env.index.objects)[cube]
+        room = scene.table_half[axis] - reach[world, cube, 0]
+        # Rounded towards the table, so that what is said is accepted.
+        low = math.ceil(1e3 * (scene.table_center[axis] - room)) / 1e3
+        high = math.floor(1e3 * (scene.table_center[axis] + room)) / 1e3
+        raise file.misfit(
+            world,
+            [_place(name)[axis]],
+            f"{low:.3f} to {high:.3f}, so that {name} is on the table, turned as it is; {places[world, cube, axis]:.6g} is "
+            f"{1e3 * over[world, cube, axis]:.1f} mm over the edge",
+            "Move it",
+        )
 
 
-def _check_touching(env: EnvView, path: str, places: np.ndarray, command: np.ndarray) -> None:
+def _check_touching(env: EnvView, file: LayoutTable, places: np.ndarray, command: np.ndarray) -> None:
     """No cube touches anything but the table."""
     model, index = env.sim.model, env.index
     data = mujoco.MjData(model)
@@ -235,10 +264,13 @@ def _check_touching(env: EnvView, path: str, places: np.ndarray, command: np.nda
             pair = {first, second}
             if pair & owner.keys() and not pair & allowed:
                 names = [owner.get(g) or model.geom(g).name or model.body(model.geom_bodyid[g]).name for g in (first, second)]
-                raise _wrong(path, f"cubes that touch nothing but the table; in world {world} {' and '.join(names)} touch")
+                cubes_there = [name for name in names if name in index.objects]
+                moved = [column for name in cubes_there for column in _place(name)]
+                expected = f"cubes that touch nothing but the table; {' and '.join(names)} touch in world {world}"
+                raise file.misfit(world, moved, expected, "Move them apart" if len(cubes_there) > 1 else "Move it")
 
 
-def _check_reach(env: EnvView, path: str, places: np.ndarray) -> None:
+def _check_reach(env: EnvView, file: LayoutTable, places: np.ndarray) -> None:
     """The arm gets to every cube, and above it."""
     flat = places[..., :2].reshape(-1, 2)
     distances = reach_distances(env, flat)
@@ -246,14 +278,17 @@ def _check_reach(env: EnvView, path: str, places: np.ndarray) -> None:
     if bad.size:
         row, level = bad[0]
         world, cube = divmod(int(row), places.shape[1])
-        where = f"{list(env.index.objects)[cube]} of world {world} at ({flat[row, 0]:.3f}, {flat[row, 1]:.3f}) m"
-        point = ("the point at it", "the point above it")[level]
-        raise _wrong(
-            path,
-            f"cubes that the arm reaches; {where}: {point} is {1e3 * distances[row, level]:.1f} mm out of reach",
+        name = list(env.index.objects)[cube]
+        point = ("at it", "above it")[level]
+        raise file.misfit(
+            world,
+            _place(name),
+            f"a place that the arm reaches; with {name} at ({flat[row, 0]:.3f}, {flat[row, 1]:.3f}) m the point {point} is "
+            f"{1e3 * distances[row, level]:.1f} mm out of reach",
             "Move it closer; job=reachability draws a map",
         )
 
 
-def _wrong(path: str, expected: str, fix: str = "Move it") -> ParameterError:
-    return ParameterError("path", path, expected, fix)
+def _place(name: str) -> list[str]:
+    """The columns of a cube's place."""
+    return [f"{short(name)}_{axis}_m" for axis in "xy"]

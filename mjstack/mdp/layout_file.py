@@ -13,7 +13,8 @@ import numpy as np
 
 from mjstack.errors import ParameterError, suggest
 
-_FORM = "a CSV file with a header and one row per world, as mjstack.mdp.layout.write_layout leaves it"
+_FORM = "a CSV file with a header and one row per world"
+_LONGEST = 40  # characters of a cell in a message
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,67 +50,107 @@ def short(name: str) -> str:
     return name.removesuffix("_cube")
 
 
-def read_layout_file(path: str, columns: Columns) -> dict[str, np.ndarray]:
+@dataclass(frozen=True, slots=True)
+class LayoutTable:
+    """What a file holds.
+
+    Attributes:
+        path: The file, as it was named.
+        columns: Values by column name, each ``(worlds,)``, float64, with world w in row w.
+        lines: The line of each world in the file, ``(worlds,)``.
+    """
+
+    path: str
+    columns: dict[str, np.ndarray]
+    lines: np.ndarray
+
+    def misfit(self, world: int, columns: Sequence[str], expected: str, fix: str) -> ParameterError:
+        """The error that some cells of a world's line cannot be used."""
+        return _wrong(self.path, expected, fix, line=int(self.lines[world]), columns=columns)
+
+
+def read_layout_file(path: str, columns: Columns) -> LayoutTable:
     """Reads a file.
 
     Args:
         path: The file.
         columns: What it may have.
 
-    Returns:
-        A column per name, each ``(rows,)``, float64, with world w in row w.
-
     Raises:
         ParameterError: The file cannot be read, or a column, a cell or a world is wrong.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise _wrong(
-            path, f"{_FORM}; it cannot be read ({error.strerror})", "Name an existing file: layout=worlds.csv"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise _wrong(path, f"{_FORM}; it is no text", "Save it as UTF-8") from error
-    lines = csv.reader(io.StringIO(text, newline=""))
+    lines = csv.reader(io.StringIO(_read(path, columns), newline=""))
     try:
         header = [name.strip() for name in next(lines, [])]
         _check_header(path, header, columns)
         numbers, rows = [], []
+        end = lines.line_num
         for cells in lines:
+            line, end = end + 1, lines.line_num  # a cell in quotes may go over several lines
             if not any(cell.strip() for cell in cells):
                 continue
             if len(cells) != len(header):
-                raise _wrong(path, f"{len(header)} cells in line {lines.line_num}, it has {len(cells)}", "Correct the line")
-            numbers.append(lines.line_num)
-            rows.append([_number(path, lines.line_num, name, cell) for name, cell in zip(header, cells, strict=True)])
+                expected = f"{len(header)} cells separated by commas, as in the header; it has {len(cells)}"
+                raise _wrong(path, expected, "Correct the line; the decimal mark is a point", line=line)
+            numbers.append(line)
+            rows.append([_number(path, line, name, cell) for name, cell in zip(header, cells, strict=True)])
     except csv.Error as error:
-        raise _wrong(path, f"{_FORM}; line {lines.line_num} is no CSV ({error})", "Correct the line") from error
+        raise _wrong(path, f"comma-separated values, it is none ({error})", "Correct the line", line=lines.line_num) from error
     if not rows:
         raise _wrong(path, "at least one world below the header", "Add rows")
     table = dict(zip(header, np.array(rows).T, strict=True))
     order = _order(path, table.pop("world"), numbers)
-    return {name: column[order] for name, column in table.items()}
+    return LayoutTable(path, {name: column[order] for name, column in table.items()}, np.array(numbers)[order])
+
+
+def _read(path: str, columns: Columns) -> str:
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise _wrong(path, f"an existing file, there is none in {Path(path).absolute().parent}", "Correct the name") from error
+    except OSError as error:
+        raise _wrong(path, f"{_FORM}; it cannot be read ({error.strerror})", "Name a file: layout=worlds.csv") from error
+    except UnicodeDecodeError as error:
+        raise _wrong(path, f"{_FORM}; it is no text", "Save it as CSV in UTF-8") from error
+    if not text.strip():
+        raise _wrong(path, f"{_FORM}; it is empty", f"Write the header {','.join(columns.required)} and a row for each world")
+    return text
 
 
 def _check_header(path: str, header: list[str], columns: Columns) -> None:
     known = [*columns.required, *columns.optional]
-    for name in header:
+    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
+        if any(mark in cell for cell in header):
+            fix = "Save it with commas between cells, and with points as decimal marks"
+            raise _wrong(path, f"a header with commas between the columns, it has {name}", fix, line=1)
+    if all(_is_number(cell) for cell in header):
+        raise _wrong(path, "a header, there are numbers", f"Put {','.join(columns.required)} above them", line=1)
+    for number, name in enumerate(header, start=1):
+        if not name:
+            raise _wrong(path, f"a name in every cell of the header, cell {number} is empty", "Remove that column", line=1)
         if name not in known:
-            raise _wrong(path, f"no column '{name}'", suggest(name, known).rstrip("."))
+            raise _wrong(path, f"no column '{_shown(name)}'", suggest(name, known).rstrip("."), line=1)
         if header.count(name) > 1:
-            raise _wrong(path, f"column '{name}' once, it is there {header.count(name)} times", "Remove the others")
+            raise _wrong(path, f"column {name} once, it is there {header.count(name)} times", "Remove the others", line=1)
     lacking = [name for name in columns.required if name not in header]
     if lacking:
-        raise _wrong(path, f"columns {', '.join(columns.required)}; {', '.join(lacking)} is missing", "Add it")
+        expected = f"columns {', '.join(columns.required)}; {', '.join(lacking)} {'is' if len(lacking) == 1 else 'are'} missing"
+        raise _wrong(path, expected, "Add it" if len(lacking) == 1 else "Add them", line=1)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _number(path: str, line: int, name: str, cell: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = math.nan
+    value = float(cell) if _is_number(cell) else math.nan
     if not math.isfinite(value):
-        raise _wrong(path, f"a finite number in column {name}, line {line} has '{cell.strip()}'", "Correct it")
+        found = f"'{_shown(cell)}' is none" if cell.strip() else "the cell is empty"
+        raise _wrong(path, f"a finite number, {found}", "Correct it", line=line, columns=[name])
     return value
 
 
@@ -118,17 +159,26 @@ def _order(path: str, worlds: np.ndarray, lines: list[int]) -> np.ndarray:
     seen: dict[int, int] = {}
     for world, line in zip(worlds, lines, strict=True):
         if world != int(world) or world < 0:
-            raise _wrong(path, f"an integer of at least 0 in column world, line {line} has {world:g}", "Correct it")
+            raise _wrong(path, f"an integer of at least 0, it is {world:g}", "Correct it", line=line, columns=["world"])
         if int(world) in seen:
-            raise _wrong(path, f"each world once, {int(world)} is in lines {seen[int(world)]} and {line}", "Remove one")
+            expected = f"each world once, {int(world)} is in line {seen[int(world)]} already"
+            raise _wrong(path, expected, "Remove one of them", line=line, columns=["world"])
         seen[int(world)] = line
     missing = next((world for world in range(len(seen)) if world not in seen), None)
     if missing is not None:
-        raise _wrong(
-            path, f"worlds 0 to {len(seen) - 1} in its {len(seen)} rows; world {missing} is missing", "Number them anew"
-        )
+        expected = f"worlds 0 to {len(seen) - 1} in its {len(seen)} rows; world {missing} is missing"
+        raise _wrong(path, expected, "Number them anew", columns=["world"])
     return np.argsort(worlds)
 
 
-def _wrong(path: str, expected: str, fix: str) -> ParameterError:
-    return ParameterError("path", path, expected, fix)
+def _shown(text: str) -> str:
+    """On one line, and not long, whatever is in a cell."""
+    text = " ".join(text.split())
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+
+def _wrong(path: str, expected: str, fix: str, *, line: int | None = None, columns: Sequence[str] = ()) -> ParameterError:
+    where = path if line is None else f"{path}, line {line}"
+    if columns:
+        where += f", column{'s' if len(columns) > 1 else ''} {', '.join(columns)}"
+    return ParameterError("path", where, expected, fix)

@@ -7,10 +7,8 @@ import math
 import torch
 
 from mjstack.errors import ParameterError
-from mjstack.managers.base import EnvView, shared
-from mjstack.math import lowest_corner
-from mjstack.mdp.geometry import aperture_center, jaw_forces, joint_velocities, pose_w
-from mjstack.scene import table_top
+from mjstack.managers.base import EnvView
+from mjstack.mdp.geometry import above_table, aperture_center, jaw_forces, joint_velocities, pose_w
 
 
 def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> torch.Tensor:
@@ -22,7 +20,7 @@ def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> to
         scale: Distance over which the reward falls [m].
         height: How far above the object's centre the point is [m].
     """
-    _require_positive("scale", scale)
+    require_positive("scale", scale)
     offset = pose_w(env, object)[:, :3] - aperture_center(env)
     offset[:, 2] += height
     return 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
@@ -35,17 +33,17 @@ def grasp(env: EnvView, *, object: str, force: float = 0.05) -> torch.Tensor:
 
 def lift(env: EnvView, *, object: str, height: float) -> torch.Tensor:
     """Height of a cube's lowest corner above the table as a fraction of ``height`` [m], from 0 to 1."""
-    _require_positive("height", height)
-    return (_above_table(env, object) / height).clamp(0.0, 1.0)
+    require_positive("height", height)
+    return (above_table(env, object) / height).clamp(0.0, 1.0)
 
 
 def place(env: EnvView, *, a: str, b: str, scale: float) -> torch.Tensor:
     """Nearness of cube ``a`` to its place on cube ``b``, while it is off the table: ``1 - tanh(distance / scale)``."""
-    _require_positive("scale", scale)
+    require_positive("scale", scale)
     offset = pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
     offset[:, 2] += 2.0 * env.cfg.scene.cube_half
     near = 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
-    return near * (_above_table(env, a) > 0.005)
+    return near * (above_table(env, a) > 0.005)
 
 
 def success(env: EnvView) -> torch.Tensor:
@@ -63,14 +61,11 @@ def joint_vel(env: EnvView) -> torch.Tensor:
     return joint_velocities(env).square().sum(1)
 
 
-def _require_positive(name: str, value: float) -> None:
+def require_positive(name: str, value: float) -> None:
+    """Refuses a parameter that is not a positive number.
+
+    Raises:
+        ParameterError: It is not.
+    """
     if not 0.0 < value < math.inf:
         raise ParameterError(name, value, "a positive number")
-
-
-def _above_table(env: EnvView, name: str) -> torch.Tensor:
-    def compute() -> torch.Tensor:
-        pose = pose_w(env, name)
-        return lowest_corner(pose[:, :3], pose[:, 3:], env.cfg.scene.cube_half) - table_top(env.cfg.scene)
-
-    return shared((id(env), _above_table, name), compute)

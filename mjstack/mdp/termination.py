@@ -8,6 +8,7 @@ import torch
 
 from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView
+from mjstack.math import not_finite
 from mjstack.mdp.geometry import joint_positions, pose_w, robot
 from mjstack.scene import table_top
 from mjstack.sim import LOST_PHYSICS
@@ -72,7 +73,7 @@ class JointLimit:
 
 def non_finite(env: EnvView) -> torch.Tensor:
     """When a position or velocity is NaN or infinite: such a world cannot go on."""
-    return ~(torch.isfinite(env.sim.qpos).all(1) & torch.isfinite(env.sim.qvel).all(1))
+    return not_finite(env.sim.qpos, env.sim.qvel)
 
 
 def overflow(env: EnvView) -> torch.Tensor:

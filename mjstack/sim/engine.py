@@ -1,8 +1,6 @@
-"""MuJoCo Warp, imported in one place: Warp starts on import and would greet on every run."""
+"""MuJoCo Warp, imported in one place, when Warp has been configured."""
 
-import warp as wp
-
-wp.config.log_level = wp.LOG_ERROR
-import mujoco_warp as mjw  # noqa: E402
+import mjstack.sim.start  # noqa: F401, I001
+import mujoco_warp as mjw
 
 __all__ = ["mjw"]

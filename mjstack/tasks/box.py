@@ -13,7 +13,7 @@ from mjstack.config.schema import Config
 from mjstack.config.validate import BOX_ROLES
 from mjstack.errors import ConfigError, ParameterError
 from mjstack.managers.base import EnvView
-from mjstack.math import quat_to_matrix
+from mjstack.math import not_finite, quat_to_matrix
 from mjstack.mdp.geometry import gripper_opening
 from mjstack.report.record import Value
 from mjstack.scene import LowestPoint, SceneIndex, table_top
@@ -22,6 +22,7 @@ from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS, Simulation
 from mjstack.tasks.box_findings import explain_box
 from mjstack.tasks.evidence import Evidence, Rule, Verdict
+from mjstack.tasks.runs import extend_carry, extend_run
 
 COLORS = ("red", "blue")  # the order of every dimension over cubes
 
@@ -219,8 +220,7 @@ class BoxEvidence(Evidence):
         t, cubes = self._t, self._cubes
         going = self._frame < self._frames  # frames after the end count for nothing
         role = dict(zip(BOX_ROLES, (self._roles.index_select(0, phase) & going[:, None, None]).unbind(1), strict=True))
-        # 0 times a number that is not finite is NaN, which is no longer 0.
-        self._finite &= ((sim.qpos * 0.0).sum(1) + (sim.qvel * 0.0).sum(1)) == 0.0
+        self._finite &= ~not_finite(sim.qpos, sim.qvel)
         # Not by a product: what an earlier attempt left may be NaN.
         self._attempt.masked_fill_(role["approach"], 0.0)
 
@@ -231,15 +231,9 @@ class BoxEvidence(Evidence):
         loaded, free = pressed.all(-1), ~pressed.any(-1)
         airborne = loaded & (low[..., 2] - cubes.top >= t.lift_height) & ~cubes.supported(sim)
 
-        # A run that is not in its phase stays as it is: outside, nothing looks at it.
-        self._extend(self._grasp_run, self._grasp_best, loaded, role["close"])
-        self._extend(self._lift_run, self._lift_best, airborne, role["lift"] | role["carry"])
-        in_air = airborne & role["carry"]
-        starts = in_air & (self._carry_run == 0.0)
-        self._from.copy_(torch.where(starts[..., None], pos[..., :2], self._from))
-        self._carry_run.add_(1.0).mul_(in_air)
-        away = torch.linalg.vector_norm(pos[..., :2] - self._from, dim=-1)
-        self._carry_far.copy_(torch.where(in_air, torch.maximum(self._carry_far, away), 0.0))
+        extend_run(self._grasp_run, self._grasp_best, loaded, role["close"])
+        extend_run(self._lift_run, self._lift_best, airborne, role["lift"] | role["carry"])
+        extend_carry(self._carry_run, self._carry_far, self._from, pos[..., :2], airborne & role["carry"])
         far = torch.where(self._carry_run >= t.carry_frames, self._carry_far, 0.0)
         torch.maximum(self._carry_best, far, out=self._carry_best)
 
@@ -286,9 +280,6 @@ class BoxEvidence(Evidence):
             BoxRule.INSIDE: (self._rest_run >= t.window).all(1) & complete,
             BoxRule.JAW_CLEAR: (clearance >= t.jaw_clearance) & complete,
         }
-        failed = torch.zeros_like(sim.overflow)
-        for rule, ok in held.items():
-            failed |= int(rule) * (~ok).to(failed.dtype)
         values = {
             "beyond_m": beyond.amax(1),
             "corner_speed_m_per_s": speed.amax(1),
@@ -307,12 +298,12 @@ class BoxEvidence(Evidence):
             "settled_frames_{}": self._settled,
         }
         values |= {name.format(color): value[:, i] for name, value in kept.items() for i, color in enumerate(COLORS)}
-        return Verdict(failed, values)
+        return Verdict.of(held, values)
 
     def placed(self, sim: Simulation) -> torch.Tensor:
-        """Whether both cubes are in the box right now."""
+        """Whether each cube is in the box right now."""
         pose = self._cubes.pose(sim)
-        return self._cubes.inside(*self._cubes.bounds(pose[..., :3], quat_to_matrix(pose[..., 3:]))).all(1)
+        return self._cubes.inside(*self._cubes.bounds(pose[..., :3], quat_to_matrix(pose[..., 3:])))
 
     @classmethod
     def thresholds(cls, cfg: Config) -> dict[str, Value]:
@@ -342,12 +333,6 @@ class BoxEvidence(Evidence):
         """How well the cubes are placed."""
         red, blue, jaws = (1e3 * values[name] for name in ("slot_err_red_m", "slot_err_blue_m", "jaw_clearance_m"))
         return f"red {red:.1f} mm, blue {blue:.1f} mm off their places, jaws {jaws:.0f} mm above the rim"
-
-    @staticmethod
-    def _extend(run: torch.Tensor, best: torch.Tensor, holds: torch.Tensor, judged: torch.Tensor) -> None:
-        """Goes on with a run of frames in the judged ones, and keeps the longest."""
-        run.copy_(torch.where(judged, (run + 1.0) * holds, run))
-        torch.maximum(best, run, out=best)
 
 
 class BoxSuccess:

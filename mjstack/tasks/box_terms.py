@@ -8,8 +8,9 @@ import torch
 
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.base import EnvView, shared
-from mjstack.math import lowest_corner, quat_to_matrix
-from mjstack.mdp.geometry import aperture_center, jaw_forces, pose_w
+from mjstack.math import quat_to_matrix
+from mjstack.mdp.geometry import above_table, aperture_center, jaw_forces, pose_w
+from mjstack.mdp.reward import require_positive
 from mjstack.scene import BLUE, RED, table_top
 from mjstack.tasks.box import CubesAndBox
 
@@ -44,7 +45,11 @@ class ToSlot:
 
 
 class Place:
-    """Nearness of a cube to its place in the box, while it is off the table: ``1 - tanh(distance / scale)``."""
+    """Nearness of a cube to its place in the box, while it is off the table: ``1 - tanh(distance / scale)``.
+
+    Off the table is a cube whose lowest corner is higher than half the thickness of the box's floor, ``scene.box.floor``: also
+    one that rests in the box, however thin that floor is.
+    """
 
     def __init__(self, env: EnvView, *, object: str, scale: float) -> None:
         """Finds the place.
@@ -57,16 +62,15 @@ class Place:
         Raises:
             MjstackError: There is no such cube, no box, or the scale is out of range.
         """
-        if not 0.0 < scale < math.inf:
-            raise ParameterError("scale", scale, "a positive number")
+        require_positive("scale", scale)
         self._to_slot, self._object, self._scale = ToSlot(env, object=object), object, scale
+        assert env.cfg.scene.box is not None  # there would be no place
+        self._off_table = 0.5 * env.cfg.scene.box.floor
 
     def __call__(self, env: EnvView) -> torch.Tensor:
         """The reward, shape ``(nworld,)``."""
         near = 1.0 - torch.tanh(torch.linalg.vector_norm(self._to_slot(env), dim=1) / self._scale)
-        pose = pose_w(env, self._object)
-        low = lowest_corner(pose[:, :3], pose[:, 3:], env.cfg.scene.cube_half) - table_top(env.cfg.scene)
-        return near * (low > 0.005)
+        return near * (above_table(env, self._object) > self._off_table)
 
 
 class InBox:
@@ -94,8 +98,7 @@ class ReachNext:
         Raises:
             MjstackError: There is no box, or the scale is out of range.
         """
-        if not 0.0 < scale < math.inf:
-            raise ParameterError("scale", scale, "a positive number")
+        require_positive("scale", scale)
         self._cubes, self._scale = CubesAndBox(env.cfg, env.index, env.device), scale
 
     def __call__(self, env: EnvView) -> torch.Tensor:

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import ClassVar, cast
+from typing import ClassVar, TypeVar, cast
 
 import numpy as np
 import torch
@@ -29,6 +29,9 @@ class Rule(IntFlag):
         raise NotImplementedError
 
 
+AnyRule = TypeVar("AnyRule", bound=Rule)
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """What the evidence says, on the device.
@@ -40,6 +43,14 @@ class Verdict:
 
     failed: torch.Tensor
     values: dict[str, torch.Tensor]
+
+    @classmethod
+    def of(cls, held: Mapping[AnyRule, torch.Tensor], values: dict[str, torch.Tensor]) -> Verdict:
+        """From whether each rule held, ``(nworld,)`` bool."""
+        failed = torch.zeros_like(next(iter(held.values())), dtype=torch.int32)
+        for rule, ok in held.items():
+            failed |= int(rule) * (~ok).to(failed.dtype)
+        return cls(failed, values)
 
 
 class Evidence(ABC):
@@ -74,7 +85,7 @@ class Evidence(ABC):
 
     @abstractmethod
     def placed(self, sim: Simulation) -> torch.Tensor:
-        """Whether the cubes are where they belong right now, shape ``(nworld,)``, bool."""
+        """Whether each cube is where it belongs right now, red first, shape ``(nworld, 2)``, bool. No host read."""
 
     @classmethod
     @abstractmethod

@@ -12,13 +12,14 @@ import torch
 from mjstack.config.schema import Config
 from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView
-from mjstack.math import lowest_corner, quat_angle
+from mjstack.math import lowest_corner, not_finite, quat_angle
 from mjstack.mdp.geometry import gripper_opening
 from mjstack.report.record import Value
 from mjstack.scene import SceneIndex, table_top
 from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS, Simulation
 from mjstack.tasks.evidence import Evidence, Rule, Verdict
+from mjstack.tasks.runs import extend_carry, extend_run
 from mjstack.tasks.stack_findings import explain_stack
 
 
@@ -139,21 +140,13 @@ class StackEvidence(Evidence):
         in_lift, in_carry = (self._counts_for.index_select(0, phase) & going).unbind(1)
         in_window = (self._frame >= self._window[0]) & going
         finite, stacked, supported = self._ok.unbind(0)
-        # 0 times a number that is not finite is NaN, which is no longer 0.
-        finite &= ((sim.qpos * 0.0).sum(1) + (sim.qvel * 0.0).sum(1)) == 0.0
+        finite &= ~not_finite(sim.qpos, sim.qvel)
         pose = cubes.pose(sim)
         low = cubes.clearance(pose)
 
-        # A run that is not in its phase stays as it is: outside, nothing looks at it.
         airborne = low[:, 0] > t.airborne_height
-        self._lift_run.copy_(torch.where(in_lift, (self._lift_run + 1.0) * airborne, self._lift_run))
-        torch.maximum(self._lift_best, self._lift_run, out=self._lift_best)
-        red, in_air = pose[:, 0, :2], airborne & in_carry
-        starts = in_air & (self._carry_run == 0.0)
-        self._carry_from.copy_(torch.where(starts[:, None], red, self._carry_from))
-        self._carry_run.add_(1.0).mul_(in_air)
-        away = torch.linalg.vector_norm(red - self._carry_from, dim=1)
-        self._carry_far.copy_(torch.where(in_air, torch.maximum(self._carry_far, away), 0.0))
+        extend_run(self._lift_run, self._lift_best, airborne, in_lift)
+        extend_carry(self._carry_run, self._carry_far, self._carry_from, pose[:, 0, :2], airborne & in_carry)
         self._carried |= (self._carry_run >= t.carry_frames) & (self._carry_far >= t.carry_distance)
 
         xy_err, dz = cubes.offset(pose)
@@ -186,12 +179,9 @@ class StackEvidence(Evidence):
             StackRule.REST_POSITION: position <= t.rest_position,
             StackRule.REST_ROTATION: rotation <= math.radians(t.rest_rotation_deg),
         }
-        failed = torch.zeros_like(sim.overflow)
-        for rule, ok in held.items():
-            failed |= int(rule) * (~ok).to(failed.dtype)
         peak = self._speed.amax((1, 2))
-        return Verdict(
-            failed,
+        return Verdict.of(
+            held,
             {
                 "xy_err_m": self._xy_err,
                 "dz_m": self._dz,
@@ -203,8 +193,10 @@ class StackEvidence(Evidence):
         )
 
     def placed(self, sim: Simulation) -> torch.Tensor:
-        """Whether red is on blue right now."""
-        return self._cubes.stacked(*self._cubes.offset(self._cubes.pose(sim)))
+        """Whether red is on blue, and blue on the table, right now."""
+        cubes, pose = self._cubes, self._cubes.pose(sim)
+        on_blue = cubes.stacked(*cubes.offset(pose))
+        return torch.stack((on_blue, cubes.supported(pose, cubes.clearance(pose))), dim=1)
 
     @classmethod
     def thresholds(cls, cfg: Config) -> dict[str, Value]:

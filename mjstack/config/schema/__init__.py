@@ -1,0 +1,69 @@
+"""The configuration as dataclasses: one per group, and `Config`, which the library receives.
+
+Hydra merges `conf/` into these types, so that a misspelt key or a value of the wrong type is an error before anything runs.
+Lengths are in m, angles in rad, times in s. Values live in `conf/`, not here.
+"""
+
+from mjstack.config.schema.gate import (
+    AcceptanceCfg,
+    BatchGateCfg,
+    BoxAcceptanceCfg,
+    CapacityCfg,
+    GateCfg,
+    ParityCfg,
+    SuccessGateCfg,
+    ThroughputCfg,
+)
+from mjstack.config.schema.job import CollectJobCfg, JobCfg, ReachabilityJobCfg, ScalingJobCfg, StudyJobCfg
+from mjstack.config.schema.physics import Backend, BatchCfg, Cone, GraphMode, SimCfg, SolverCfg, TimingCfg
+from mjstack.config.schema.robot import LayoutCfg, ModelCfg, ModelSource, RobotCfg
+from mjstack.config.schema.root import Config
+from mjstack.config.schema.scene import BoxCfg, SceneCfg
+from mjstack.config.schema.task import ControllerCfg, PhaseCfg, TaskCfg
+from mjstack.config.schema.term import (
+    ActionTermCfg,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    TermCfg,
+    TerminationTermCfg,
+)
+
+__all__ = [
+    "AcceptanceCfg",
+    "ActionTermCfg",
+    "Backend",
+    "BatchCfg",
+    "BatchGateCfg",
+    "BoxAcceptanceCfg",
+    "BoxCfg",
+    "CapacityCfg",
+    "CollectJobCfg",
+    "Cone",
+    "Config",
+    "ControllerCfg",
+    "GateCfg",
+    "GraphMode",
+    "JobCfg",
+    "LayoutCfg",
+    "ModelCfg",
+    "ModelSource",
+    "ObservationGroupCfg",
+    "ObservationTermCfg",
+    "ParityCfg",
+    "PhaseCfg",
+    "ReachabilityJobCfg",
+    "RewardTermCfg",
+    "RobotCfg",
+    "ScalingJobCfg",
+    "SceneCfg",
+    "SimCfg",
+    "SolverCfg",
+    "StudyJobCfg",
+    "SuccessGateCfg",
+    "TaskCfg",
+    "TermCfg",
+    "TerminationTermCfg",
+    "ThroughputCfg",
+    "TimingCfg",
+]

@@ -1,0 +1,7 @@
+"""Checks values that types cannot: ranges, lengths, names, and how they fit together."""
+
+from mjstack.config.validate.gate import BOX_ROLES, PARITY_FIELDS
+from mjstack.config.validate.root import validate
+from mjstack.config.validate.term import places_cubes, reads_layout
+
+__all__ = ["BOX_ROLES", "PARITY_FIELDS", "places_cubes", "reads_layout", "validate"]

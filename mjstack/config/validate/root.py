@@ -1,0 +1,52 @@
+"""Checks the whole configuration: the top level, then room by room."""
+
+from __future__ import annotations
+
+import re
+
+from mjstack.config.schema import Config
+from mjstack.config.validate.gate import check_gates, check_success
+from mjstack.config.validate.job import check_job_keys
+from mjstack.config.validate.physics import check_solver_and_batch, check_timing
+from mjstack.config.validate.robot import check_robot
+from mjstack.config.validate.scene import check_scene
+from mjstack.config.validate.task import check_controller
+from mjstack.config.validate.term import reads_layout
+from mjstack.config.validate.values import positive_int
+from mjstack.errors import ConfigError, UnknownName
+
+GATES = ("baseline", "parity", "capacity", "batch", "throughput", "success")
+JOBS = ("gates", "replay", "scaling", "study", "reachability", "collect")
+_DEVICE = re.compile(r"auto|cpu|cuda:\d+")
+_WORLD = re.compile(r"((batch|success):)?(\d+:)?\d+")
+
+
+def validate(cfg: Config) -> None:
+    """Raises a `ConfigError` or `UnknownName` for the first value that cannot be used."""
+    positive_int("nworld", cfg.nworld)
+    if not 0 <= cfg.seed < 1 << 32:
+        raise ConfigError("seed", cfg.seed, "an integer from 0 to 4294967295")
+    if not cfg.gates:
+        raise ConfigError("gates", "[]", f"at least one of {', '.join(GATES)}")
+    for name in cfg.gates:
+        if name not in GATES:
+            raise UnknownName("gate", name, GATES)
+    if cfg.job.name not in JOBS:
+        raise UnknownName("job", cfg.job.name, JOBS)
+    if cfg.world is not None and not _WORLD.fullmatch(cfg.world):
+        raise ConfigError("world", cfg.world, "a world such as 17, or a seed and a world such as 3:17")
+    for key in ("run", "world"):
+        if getattr(cfg, key) is not None and cfg.job.name != "replay":
+            raise ConfigError(key, getattr(cfg, key), "null, because it is for job=replay alone", "Add job=replay")
+    if cfg.layout is not None and not reads_layout(cfg.reset):
+        raise ConfigError("layout", cfg.layout, "null, because no reset term reads it", "Add reset=layout")
+    if not _DEVICE.fullmatch(cfg.sim.device):
+        raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N")
+    check_timing(cfg)
+    check_solver_and_batch(cfg)
+    check_robot(cfg)
+    check_scene(cfg)
+    check_controller(cfg)
+    check_gates(cfg)
+    check_success(cfg)
+    check_job_keys(cfg.job)
