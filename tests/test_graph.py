@@ -43,7 +43,7 @@ def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
     nworld = 64
     if backend == "mjwarp":  # an eager substep takes 10 ms there, whatever nworld is
         nworld = 2
-        common += ["timing.physics_dt=0.005", "timing.substeps=4"]
+        common += ["timing.physics_dt=0.01", "timing.substeps=2"]
     eager, replayed = make(backend, "off", nworld, *common), make(backend, "require", nworld, *common)
     starts = []
     for a, b in ((eager.reset(seed=3), replayed.reset(seed=3)),):
