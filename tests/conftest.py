@@ -3,20 +3,36 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+import pickle
+from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import yaml
+from hydra import compose
+from omegaconf import DictConfig
 
-from mjstack.config import load_config
+from mjstack.config import load_config, store
 from mjstack.config.schema import Backend, Config
 from mjstack.gates.episode import run_episode
 from mjstack.gates.gate import GateContext
 from mjstack.sim import Simulation, make_simulation
 
 ROBOTS = ("so101", "rebot")
+# Files of 40 s and more start first, the longest at the front, so that both processes end together. The second process
+# begins with files that need few of MJWarp's kernels: with a cold cache both would compile the same ones.
+LONGEST = (
+    *("graph", "readme", "scaling", "collect", "capacity", "replay", "success", "cli"),
+    *("env_contract", "terms", "docs", "config", "study", "box", "reachability", "layout"),
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Orders files; within a file, and among the others, the order stays."""
+    place = {f"test_{name}": number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -28,25 +44,46 @@ def _outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     os.chdir(before)
 
 
-@pytest.fixture(scope="session")
-def stage() -> Callable[[str], GateContext]:
-    """Configuration, model, index and planner of a robot, each made once in the session."""
-    made: dict[str, GateContext] = {}
+@pytest.fixture(scope="session", autouse=True)
+def _composed_once() -> Iterator[None]:
+    """Hydra composes for half a second, and many tests want the same: they get copies of what the first one got.
 
-    def get(robot: str) -> GateContext:
-        if robot not in made:
-            made[robot] = GateContext(cfg=load_config([f"robot={robot}"]))
-        return made[robot]
+    OmegaConf's loader of YAML derives from `yaml.SafeLoader`; the one in C is the same and takes a tenth of the time.
+    """
+    made: dict[tuple[str, ...], bytes] = {}
+
+    def composed(name: str, overrides: Sequence[str] = ()) -> DictConfig:
+        key = (name, *overrides)
+        if key not in made:
+            made[key] = pickle.dumps(compose(name, overrides=list(overrides)))
+        return pickle.loads(made[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, "compose", composed)
+        patch.setattr(yaml, "SafeLoader", getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        yield
+
+
+@pytest.fixture(scope="session")
+def stage() -> Callable[..., GateContext]:
+    """Configuration, model, index and planner of a robot under some overrides, each made once in the session."""
+    made: dict[tuple[str, ...], GateContext] = {}
+
+    def get(robot: str, *overrides: str) -> GateContext:
+        key = (f"robot={robot}", *overrides)
+        if key not in made:
+            made[key] = GateContext(cfg=load_config(key))
+        return made[key]
 
     return get
 
 
 @pytest.fixture(scope="session")
-def new_context(stage: Callable[[str], GateContext]) -> Callable[..., GateContext]:
-    """A gate context of its own for some overrides that change neither scene nor plan: both are shared."""
+def new_context(stage: Callable[..., GateContext]) -> Callable[..., GateContext]:
+    """A gate context of its own for some overrides that change neither scene nor, but for its phases, plan: both are shared."""
 
     def make(*overrides: str, robot: str = "so101") -> GateContext:
-        shared = stage(robot)
+        shared = stage(robot, *(override for override in overrides if override.startswith("controller.phases.")))
         context = GateContext(cfg=load_config([f"robot={robot}", *overrides]))
         context.__dict__["model"], context.__dict__["planner"] = shared.model, shared.planner
         return context

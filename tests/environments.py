@@ -34,6 +34,20 @@ def configure(*overrides: str, robot: str = "so101") -> Config:
     return copy.deepcopy(_composed((f"robot={robot}", *overrides)))
 
 
+@cache
+def brisk(robot: str = "so101", task: str = "stack") -> tuple[str, ...]:
+    """Overrides that halve the phases' times: both arms still do both tasks, and stacking has the same peaks."""
+    phases = _composed((f"robot={robot}", f"task={task}")).controller.phases
+    return tuple(f"controller.phases.{name}.seconds={phase.seconds / 2}" for name, phase in phases.items())
+
+
+@cache
+def rushed() -> tuple[str, ...]:
+    """Overrides of an episode that is over, and has failed, after a second."""
+    phases = _composed(("robot=so101", "task=stack")).controller.phases
+    return ("gate.acceptance.window=5", "gate.box.window=5", *(f"controller.phases.{name}.seconds=0.1" for name in phases))
+
+
 def new_sim(backend: str, nworld: int, robot: str = "so101") -> Simulation:
     """A simulation with every field that a reset term of mjstack writes, and room for random actions."""
     cfg = _composed((f"robot={robot}", "reset=randomized"))

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from environments import brisk
 
 from mjstack.control.planner import CommandTape
 from mjstack.errors import RunError
@@ -216,11 +217,11 @@ def test_a_few_failures_may_be_allowed(new_context: Callable[..., GateContext]) 
 
 
 def test_no_trajectory_is_kept(new_context: Callable[..., GateContext], tmp_path: Path) -> None:
-    """A trajectory of qpos alone would take 96 kB a world on the host."""
+    """A trajectory of qpos alone would take 48 kB a world on the host."""
 
     def peak(nworld: int) -> int:
-        context = new_context("sim=native", f"nworld={nworld}")
-        assert context.model.nq * 8 * 600 == 96_000
+        context = new_context("sim=native", f"nworld={nworld}", *brisk())
+        assert context.model.nq * 8 * 300 == 48_000
         tracemalloc.start()
         play(context, tmp_path)
         try:
@@ -229,4 +230,4 @@ def test_no_trajectory_is_kept(new_context: Callable[..., GateContext], tmp_path
             tracemalloc.stop()
 
     peak(2)  # whatever is made once
-    assert (peak(12) - peak(2)) / 10 < 30_000
+    assert (peak(12) - peak(2)) / 10 < 15_000

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from box_checker import BoxRecording, lowest_geometry
+from environments import brisk
 
 from mjstack import make_env
 from mjstack.config import load_config
@@ -397,20 +398,21 @@ def test_mjwarp_fills_the_box(robot: str, device: str) -> None:
     """One world on Warp's CPU device; on CUDA, where a frame is a graph with the evidence in it, jittered ones."""
     if device != "cpu" and not torch.cuda.is_available():
         pytest.skip("no CUDA device here")
-    context = GateContext(cfg=load_config(["task=box", f"robot={robot}"]))
-    context.__dict__["planner"] = _planner(robot)
+    faster = brisk(robot, "box") if device == "cpu" else ()
+    context = GateContext(cfg=load_config(["task=box", f"robot={robot}", *faster]))
     nworld, reset = (1, NOMINAL) if device == "cpu" else (64, context.cfg.reset)
     sim = make_simulation(context.model, context.cfg, nworld, backend=Backend.mjwarp, device=device)
-    carry = context.phase_start("carry_red") + 75
+    carry = (context.phase_start("carry_red") + context.phase_start("hold_red")) // 2
+    last = context.planner.phases[-1].stop - 1
     supports: dict[int, list[bool]] = {}
 
     def feel(frame: int, sim: Simulation) -> None:
-        if frame in (20, carry, 1999):  # on the table, red in the air, in the box
+        if frame in (20, carry, last):  # on the table, red in the air, in the box
             felt = [sim.sensordata[:, context.index.support_force[name][0] :][:, :3].norm(dim=1) > 1e-5 for name in (RED, BLUE)]
             supports[frame] = [bool(pressed.all()) for pressed in felt]
 
     episode = run_episode(sim, context.index, context.cfg, context.planner, reset, on_frame=feel)
-    assert supports == {20: [True, True], carry: [False, True], 1999: [True, True]}
+    assert supports == {20: [True, True], carry: [False, True], last: [True, True]}
     for failed in episode.verdict.failed.tolist():
         assert failed == 0, describe_rules(BoxRule, failed)
     assert episode.captured == (device != "cpu")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from box_checker import BLUE, RED, BoxOutcome, BoxRecording, check_box_world
+from evidence_cases import STOPPED_EARLY, Altered, Cases
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend
@@ -24,6 +25,7 @@ from mjstack.sim import Simulation, make_simulation
 from mjstack.tasks.box import BoxEvidence, BoxRule
 from mjstack.tasks.evidence import Verdict, describe_rules
 
+CASES = Cases(BoxRule)
 HAIR = 2e-6  # [m], [m/s]: a good deal more than float32 rounds at these sizes
 NAMES = (RED_NAME, BLUE_NAME)
 
@@ -119,7 +121,7 @@ class World:
             xpos=self.xpos,
             xquat=self.xquat,
             step_count=self.step_count,
-            overflow=bool(self.overflow & ~(1 << 9 | 1 << 10)),  # those say that the solver stopped early
+            overflow=bool(self.overflow & ~STOPPED_EARLY),
             finite_elsewhere=bool(np.isfinite(np.delete(self.qpos, ours, axis=1)).all()),
         )
 
@@ -146,16 +148,12 @@ def feed(worlds: list[World], dtype: torch.dtype = torch.float64) -> Verdict:
     return evidence.verdict(sim)
 
 
-def names_of(bits: int) -> set[str]:
-    return {rule.name for rule in BoxRule if bits & rule}
-
-
 def reference(w: World) -> BoxOutcome:
     return check_box_world(w.recording, w.context.cfg, w.context.model)
 
 
 def assert_same(verdict: Verdict, k: int, expected: BoxOutcome) -> None:
-    assert names_of(int(verdict.failed[k])) == expected.failed
+    assert CASES.broken(verdict, k) == expected.failed
     for name, value in expected.values.items():
         assert float(verdict.values[name][k]) == pytest.approx(value, abs=1e-6, rel=1e-5, nan_ok=True), name
 
@@ -172,30 +170,11 @@ def test_recorded_episodes(robot: str, dtype: torch.dtype) -> None:
         assert_same(rec.verdict, k, expected)
 
 
-# Alterations of an accepted recording, each with the rules it has to break.
-
-Case = tuple[Callable[[World], None], set[str]]
-CASES: dict[str, Case] = {}
-
-
-def case(*rules: str) -> Callable[[Callable[[World], None]], Callable[[World], None]]:
-    def register(alter: Callable[[World], None]) -> Callable[[World], None]:
-        CASES[alter.__name__] = (alter, set(rules))
-        return alter
-
-    return register
-
-
 def both(name: str, rules: set[str], alter: Callable[[World, int, str], None]) -> None:
     """Registers an alteration for each cube; ``*`` in a rule is its colour."""
     for cube, color in ((RED, "red"), (BLUE, "blue")):
         broken = {rule.replace("*", color.upper()) for rule in rules}
-        CASES[f"{name}_{color}"] = (lambda w, cube=cube, color=color: alter(w, cube, color), broken)
-
-
-@case()
-def untouched(w: World) -> None:
-    pass
+        CASES.add(f"{name}_{color}", broken, lambda w, cube=cube, color=color: alter(w, cube, color))
 
 
 def _grasp_of_nine_frames(w: World, cube: int, color: str) -> None:
@@ -320,8 +299,8 @@ def _opened(by: float) -> Callable[[World, int, str], None]:
     return alter
 
 
-CASES["red_not_opened_far_enough"] = (lambda w: _opened(-1e-5)(w, RED, "red"), {"RELEASE_RED", "ORDER"})
-CASES["blue_not_opened_far_enough"] = (lambda w: _opened(-1e-5)(w, BLUE, "blue"), {"RELEASE_BLUE"})
+CASES.add("red_not_opened_far_enough", {"RELEASE_RED", "ORDER"}, lambda w: _opened(-1e-5)(w, RED, "red"))
+CASES.add("blue_not_opened_far_enough", {"RELEASE_BLUE"}, lambda w: _opened(-1e-5)(w, BLUE, "blue"))
 both("opened_just_far_enough", set(), _opened(1e-5))
 
 
@@ -329,8 +308,8 @@ def _stuck_to_a_jaw(w: World, cube: int, color: str) -> None:
     w.jaw(cube, 1)[w.frames(f"open_{color}", f"retreat_{color}", f"settle_{color}")] = [0.0, 0.1, 0.0]
 
 
-CASES["red_stuck_to_a_jaw"] = (lambda w: _stuck_to_a_jaw(w, RED, "red"), {"RELEASE_RED", "SETTLED_RED", "ORDER"})
-CASES["blue_stuck_to_a_jaw"] = (lambda w: _stuck_to_a_jaw(w, BLUE, "blue"), {"RELEASE_BLUE", "SETTLED_BLUE"})
+CASES.add("red_stuck_to_a_jaw", {"RELEASE_RED", "SETTLED_RED", "ORDER"}, lambda w: _stuck_to_a_jaw(w, RED, "red"))
+CASES.add("blue_stuck_to_a_jaw", {"RELEASE_BLUE", "SETTLED_BLUE"}, lambda w: _stuck_to_a_jaw(w, BLUE, "blue"))
 
 
 def _touched_before_the_end_of_settling(frames: int) -> Callable[[World, int, str], None]:
@@ -399,29 +378,29 @@ both("outside_51_frames_before_the_end", set(), _outside("done", -51, 1, 0.05))
 both("above_the_rim_at_the_end", {"INSIDE"}, _above_the_rim("done"))
 
 
-@case("INSIDE")
+@CASES.case("INSIDE")
 def red_knocked_in_the_last_frame(w: World) -> None:
     w.velocity(RED)[-1, 0] = 0.05
 
 
-@case("INSIDE")
+@CASES.case("INSIDE")
 def blue_touched_by_a_jaw_at_the_end(w: World) -> None:
     w.jaw(BLUE, 0)[-10] = [0.0, 0.0, 0.01]
 
 
-@case()
+@CASES.case()
 def red_pushed_while_blue_is_placed_but_at_rest_at_the_end(w: World) -> None:
     w.velocity(RED)[w.frames("hold_blue"), 0] = 0.2
     w.jaw(RED, 0)[w.frames("hold_blue")] = [1.0, 0.0, 0.0]
 
 
-@case("ORDER")
+@CASES.case("ORDER")
 def blue_between_the_jaws_before_red_is_released(w: World) -> None:
     for jaw in (0, 1):
         w.jaw(BLUE, jaw)[w.frames("hold_red")[-1]] = [0.0, 0.1, 0.0]
 
 
-@case()
+@CASES.case()
 def blue_touched_by_one_jaw_before_red_is_released(w: World) -> None:
     w.jaw(BLUE, 1)[w.frames("close_red", "lift_red")] = [0.0, 0.1, 0.0]
 
@@ -434,56 +413,36 @@ def _jaws_at(by: float) -> Callable[[World], None]:
     return alter
 
 
-CASES["jaws_just_too_low"] = (_jaws_at(-HAIR), {"JAW_CLEAR"})
-CASES["jaws_just_high_enough"] = (_jaws_at(HAIR), set())
+CASES.add("jaws_just_too_low", {"JAW_CLEAR"}, _jaws_at(-HAIR))
+CASES.add("jaws_just_high_enough", set(), _jaws_at(HAIR))
 
 
-@case()
+@CASES.case()
 def quaternions_of_either_sign(w: World) -> None:
     for cube in (RED, BLUE):
         w.pose(cube)[::2, 3:] *= -1.0
 
 
-@case("FINITE")
+@CASES.case("FINITE")
 def not_a_number_in_one_frame(w: World) -> None:
     w.velocity(RED)[5, 3] = math.nan
 
 
-@case("FINITE")
+@CASES.case("FINITE")
 def arm_not_a_number(w: World) -> None:
     w.qpos[7, 0] = math.nan
 
 
-@case("FINITE", "INSIDE")
+@CASES.case("FINITE", "INSIDE")
 def infinite_velocity_at_the_end(w: World) -> None:
     w.velocity(BLUE)[-1, 0] = math.inf
 
 
-@case("FINITE", "LIFT_RED", "CARRY_RED", "SETTLED_RED", "INSIDE")
+@CASES.case("FINITE", "LIFT_RED", "CARRY_RED", "SETTLED_RED", "INSIDE")
 def red_not_a_number_from_the_grasp(w: World) -> None:
     first = w.frames("close_red")[0]
     w.pose(RED)[first:] = math.nan
     w.velocity(RED)[first:] = math.nan
-
-
-@case("STEPS")
-def one_step_short(w: World) -> None:
-    w.step_count -= 1
-
-
-@case("STEPS")
-def one_step_long(w: World) -> None:
-    w.step_count += 1
-
-
-@case("OVERFLOW")
-def rows_lost(w: World) -> None:
-    w.overflow = 1
-
-
-@case()
-def iteration_limits_are_no_overflow(w: World) -> None:
-    w.overflow = (1 << 9) | (1 << 10)
 
 
 # Worlds that went back to their approach, as controller=scripted lets them: later than the others by three phases.
@@ -499,7 +458,7 @@ def _second_attempt(w: World, color: str, first: Callable[[World, np.ndarray], N
     first(w, again)
 
 
-@case()
+@CASES.case()
 def red_missed_and_grasped_at_the_second_attempt(w: World) -> None:
     def miss(w: World, frames: np.ndarray) -> None:
         w.jaw(RED, 0)[frames] = 0.0
@@ -508,12 +467,12 @@ def red_missed_and_grasped_at_the_second_attempt(w: World) -> None:
     _second_attempt(w, "red", miss)
 
 
-@case()
+@CASES.case()
 def blue_dropped_and_grasped_at_the_second_attempt(w: World) -> None:
     _second_attempt(w, "blue", lambda w, frames: w.jaw(BLUE, 0).__setitem__(frames[-5:], 0.0))
 
 
-@case("GRASP_BLUE")
+@CASES.case("GRASP_BLUE")
 def blue_grasped_at_the_first_attempt_only(w: World) -> None:
     def last_attempt(w: World, frames: np.ndarray) -> None:
         w.jaw(BLUE, 0)[frames + len(frames)] = 0.0
@@ -521,27 +480,20 @@ def blue_grasped_at_the_first_attempt_only(w: World) -> None:
     _second_attempt(w, "blue", last_attempt)
 
 
-@case("DROP_RED")
+@CASES.case("DROP_RED")
 def red_dropped_at_the_second_attempt(w: World) -> None:
     _second_attempt(w, "red", lambda w, frames: w.jaw(RED, 1).__setitem__(w.frames("carry_red")[3], 0.0))
 
 
 @pytest.fixture(scope="module")
-def altered() -> dict[str, tuple[Verdict, int, World]]:
-    """Every case as one world of one batch."""
-    rec, worlds = recorded("so101"), []
-    for alter, _ in CASES.values():
-        world = World.of(rec)
-        alter(world)
-        worlds.append(world)
-    verdict = feed(worlds)
-    return {name: (verdict, k, worlds[k]) for k, name in enumerate(CASES)}
+def altered() -> Altered:
+    return CASES.play(lambda: World.of(recorded("so101")), feed)
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_altered_recording(name: str, altered: dict[str, tuple[Verdict, int, World]]) -> None:
+@pytest.mark.parametrize("name", CASES.alter)
+def test_altered_recording(name: str, altered: Altered) -> None:
     verdict, k, world = altered[name]
-    assert names_of(int(verdict.failed[k])) == CASES[name][1]
+    assert CASES.broken(verdict, k) == CASES.breaks[name]
     assert_same(verdict, k, reference(world))
 
 
@@ -549,7 +501,7 @@ def test_episode_cut_short_fails_whatever_came_before() -> None:
     world = World.of(recorded("so101"))
     for name in ("phase", "qpos", "qvel", "sensordata"):
         setattr(world, name, getattr(world, name)[:-1])
-    assert {"STEPS", "INSIDE", "JAW_CLEAR"} <= names_of(int(feed([world]).failed[0]))
+    assert {"STEPS", "INSIDE", "JAW_CLEAR"} <= CASES.broken(feed([world]))
 
 
 def test_episode_that_goes_on_fails_for_its_length_alone() -> None:
@@ -558,15 +510,15 @@ def test_episode_that_goes_on_fails_for_its_length_alone() -> None:
         values = getattr(world, name)
         setattr(world, name, np.concatenate([values, values[:60]]))  # cubes back on the table
     verdict = feed([world])
-    assert names_of(int(verdict.failed[0])) == {"STEPS", "INSIDE", "JAW_CLEAR"}
+    assert CASES.broken(verdict) == {"STEPS", "INSIDE", "JAW_CLEAR"}
     assert float(verdict.values["slot_err_red_m"][0]) < 0.01
 
 
 def test_every_rule_has_words_and_a_case_of_its_own() -> None:
-    alone = {next(iter(rules)) for _, rules in CASES.values() if len(rules) == 1}
+    alone = {next(iter(rules)) for rules in CASES.breaks.values() if len(rules) == 1}
     # Where red never is released, it was not before blue was grasped either.
     assert {rule.name for rule in BoxRule} - alone == {"RELEASE_RED"}
-    assert {"RELEASE_RED", "ORDER"} in [rules for _, rules in CASES.values()]
+    assert {"RELEASE_RED", "ORDER"} in CASES.breaks.values()
     for rule in BoxRule:
         assert describe_rules(BoxRule, int(rule))
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from environments import brisk
 
 import mjstack
 from mjstack.config import load_config
@@ -258,7 +259,8 @@ def test_sizes_at_the_peak_are_enough_and_one_less_is_not(first_frames: Callable
 def too_small(new_context: NewContext) -> tuple[GateContext, GateResult, list[str]]:
     """The gate on Warp's CPU device with too few rows, and what it said."""
     said: list[str] = []
-    context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch.njmax=100", "gate.capacity.random_frames=40")
+    few = ("nworld=2", "gate.capacity.random_frames=20", *brisk())
+    context = new_context("sim=mjwarp", "sim.device=cpu", "batch.njmax=100", *few)
     context.say = said.append
     (result,) = run_capacity(context)
     return context, result, said
@@ -273,7 +275,7 @@ def test_too_small_is_found_and_the_printed_override_cures_it(
     task = next(line for line in said if line.startswith("scripted task: "))
     overrides = task.removeprefix("scripted task: ").split()
     assert f"batch.njmax={result.metrics['recommended.njmax']}" in overrides
-    cured = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch.njmax=100", *overrides)
+    cured = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch.njmax=100", *overrides, *brisk())
     run = play_task(cured, cured.cfg.reset, resolve_sizes(cured.cfg))
     assert not run.peaks.overflow.any()
     assert run.accepted == 2
@@ -325,7 +327,9 @@ def test_memory_is_that_of_the_arrays(
 
 
 def test_defaults_too_small_for_environments_fail(new_context: NewContext) -> None:
-    context = new_context("sim=native", "nworld=2", "gate.capacity.random_frames=40", "robot.layouts.stack.env_njmax=60")
+    context = new_context(
+        "sim=native", "nworld=2", "gate.capacity.random_frames=40", "robot.layouts.stack.env_njmax=60", *brisk()
+    )
     (result,) = run_capacity(context)
     assert result.status is Status.failed
     assert "environments: njmax overflow in 2 of 2 worlds" in result.reason
@@ -333,7 +337,7 @@ def test_defaults_too_small_for_environments_fail(new_context: NewContext) -> No
 
 def test_native_says_what_it_cannot_know(new_context: NewContext) -> None:
     said: list[str] = []
-    context = new_context("sim=native", "nworld=2", "gate.capacity.random_frames=5")
+    context = new_context("sim=native", "nworld=2", "gate.capacity.random_frames=5", *brisk())
     context.say = said.append
     (result,) = run_capacity(context)
     assert result.status is Status.passed
@@ -344,7 +348,7 @@ def test_native_says_what_it_cannot_know(new_context: NewContext) -> None:
 
 
 def test_a_layout_out_of_reach_leaves_the_other_workloads(new_context: NewContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    context = new_context("sim=native", "nworld=1", "gate.capacity.random_frames=5")
+    context = new_context("sim=native", "nworld=1", "gate.capacity.random_frames=5", *brisk())
     measure = capacity_module.measure_task
 
     def unreachable(context: GateContext, reset: dict) -> Workload:
@@ -533,7 +537,7 @@ def test_batch_uses_what_capacity_measured(new_context: NewContext) -> None:
 
 def test_batch_measures_where_capacity_does_not_run(new_context: NewContext) -> None:
     said: list[str] = []
-    context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=1", "batch=auto", "gates=[batch]")
+    context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=1", "batch=auto", "gates=[batch]", *brisk())
     context.say = said.append
     (result,) = run_batch(context)
     assert result.status is Status.passed, result.reason

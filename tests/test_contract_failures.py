@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from comparison import assert_same_run
+from environments import brisk
 
 from mjstack.gates import gate as gate_module
 from mjstack.gates.batch import run_batch
@@ -19,14 +20,13 @@ from mjstack.report.record import Status
 from mjstack.sim import Overflow, Simulation
 from mjstack.tasks.stack import StackEvidence, StackRule
 
-AFTER_RELEASE = 480
-
 
 def teleport(context: GateContext, world: int) -> Callable[[int, Simulation], None]:
     """Moves red beside the stack, once, when it has been released."""
+    released = context.phase_start("retreat")
 
     def hook(frame: int, sim: Simulation) -> None:
-        if frame == AFTER_RELEASE:
+        if frame == released:
             sim.qpos[world, context.index.cube_qpos[0]] += 0.08
 
     return hook
@@ -61,14 +61,14 @@ def test_native(robot: str, stage: Callable[[str], GateContext], make_sim: Calla
     assert found[5] == {"STEPS"}
 
 
-def test_mjwarp(stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]) -> None:
-    context = stage("so101")
+def test_mjwarp(stage: Callable[..., GateContext], make_sim: Callable[..., Simulation]) -> None:
+    context = stage("so101", *brisk())
     sim = make_sim("mjwarp", 3)
     push = teleport(context, 1)
 
     def hook(frame: int, sim: Simulation) -> None:
         push(frame, sim)
-        if frame == 300:
+        if frame == context.phase_start("above_blue"):
             sim.qvel[2, context.index.cube_qvel[1]] = math.nan
 
     episode = run_episode(sim, context.index, context.cfg, context.planner, context.cfg.reset, on_frame=hook)
@@ -130,8 +130,11 @@ def test_overflow_in_exactly_the_crowded_world(
     assert sim.overflow.tolist() == [0, 0, 0]
 
 
+FEW = ("sim=native", "nworld=2", "gate.capacity.random_frames=20", *brisk())
+
+
 def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., GateContext]) -> None:
-    context = new_context("sim=native", "nworld=2", "batch.njmax=100")
+    context = new_context(*FEW, "batch.njmax=100")
     (result,) = run_capacity(context)
     assert result.status is Status.failed
     assert "njmax overflow in 2 of 2 worlds (0, 1)" in result.reason
@@ -142,14 +145,14 @@ def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., GateC
 
 
 def test_capacity_gate_passes_with_what_it_recommends(new_context: Callable[..., GateContext]) -> None:
-    (result,) = run_capacity(new_context("sim=native", "nworld=2", "batch.njmax=184", "batch.nconmax=40"))
+    (result,) = run_capacity(new_context(*FEW, "batch.njmax=184", "batch.nconmax=40"))
     assert result.status is Status.passed, result.reason
     assert int(result.metrics["recommended.njmax"]) <= 184
     assert int(result.metrics["recommended.nconmax"]) <= 40
 
 
 def test_capacity_gate_sizes_the_contact_pool(new_context: Callable[..., GateContext]) -> None:
-    (result,) = run_capacity(new_context("sim=native", "nworld=2", "batch.nconmax=8"))
+    (result,) = run_capacity(new_context(*FEW, "batch.nconmax=8"))
     assert result.status is Status.failed
     assert "contact pool overflow in 2 of 2 worlds (0, 1)" in result.reason
     assert "batch.nconmax=" in result.reason
@@ -159,7 +162,12 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
     new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     context = new_context(
-        "sim=native", "nworld=4", "gate.throughput.frames=2", "gate.throughput.repetitions=1", "gates=[batch,throughput]"
+        "sim=native",
+        "nworld=4",
+        "gate.throughput.frames=2",
+        "gate.throughput.repetitions=1",
+        "gates=[batch,throughput]",
+        *brisk(),
     )
 
     def broken_episode(*args: object, **kwargs: object) -> object:

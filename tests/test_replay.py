@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from environments import brisk
 from omegaconf import OmegaConf
 
 from mjstack.cli import run
@@ -34,14 +35,32 @@ def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def replay_into(out: Path, folder: Path, *args: str) -> tuple[int, dict]:
+    status = run(["job=replay", f"run={folder}", f"hydra.run.dir={out}", *args])
+    return status, json.loads((out / "report.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def failing(earlier: Path) -> tuple[Path, int, dict]:
+    """The replay of a failing world: its folder, the exit status and the report."""
+    out = earlier.parent / "failing"
+    return out, *replay_into(out, earlier, f"world={FAILING}")
+
+
+@pytest.fixture(scope="module")
+def accepted(earlier: Path) -> tuple[Path, int, dict]:
+    """Likewise of an accepted one, of the other seed."""
+    out = earlier.parent / "accepted"
+    return out, *replay_into(out, earlier, f"world={ACCEPTED}")
+
+
 @pytest.fixture
 def replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, dict]]:
     """Replays with some arguments into ``out``; returns the exit status and the report."""
     monkeypatch.chdir(tmp_path)
 
     def do(folder: Path, *args: str) -> tuple[int, dict]:
-        status = run(["job=replay", f"run={folder}", "hydra.run.dir=out", *args])
-        return status, json.loads((tmp_path / "out" / "report.json").read_text())
+        return replay_into(Path("out"), folder, *args)
 
     return do
 
@@ -56,10 +75,10 @@ def copy_of(folder: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / "copy"))
 
 
-def test_failing_world_fails_again_bit_for_bit(earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
+def test_failing_world_fails_again_bit_for_bit(earlier: Path, failing: tuple[Path, int, dict]) -> None:
     record = record_of(earlier, 0)
     assert record.failed[4] == StackRule.STACKED
-    status, report = replay(earlier, f"world={FAILING}")
+    out, status, report = failing
     assert status == 1
     assert report["status"] == "fail"
     (gate,) = report["gates"]
@@ -72,10 +91,10 @@ def test_failing_world_fails_again_bit_for_bit(earlier: Path, replay: Callable[.
     assert broken[0].startswith(f"STACKED: BROKEN, not stacked: xy_err up to {1e3 * record.values['xy_err_m'][4]:.3g} mm")
     assert "at most 1.5 mm" in broken[0]
     assert len(gate["details"]) == len(StackRule)
-    with np.load(tmp_path / "out" / "trajectory.npz") as held:
+    with np.load(out / "trajectory.npz") as held:
         assert np.array_equal(held["qpos"][-1], record.qpos[4])
         assert (int(held["seed"]), int(held["world"]), int(held["failed"])) == (0, 4, int(StackRule.STACKED))
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+    assert sorted(path.name for path in (out).iterdir()) == [
         ".hydra",
         "replayed_config.yaml",
         "report.json",
@@ -87,31 +106,28 @@ def test_failing_world_fails_again_bit_for_bit(earlier: Path, replay: Callable[.
     ]
 
 
-def test_accepted_world_of_another_seed(earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
+def test_accepted_world_of_another_seed(earlier: Path, accepted: tuple[Path, int, dict]) -> None:
     record = record_of(earlier, 1)
     assert record.failed[3] == 0
-    status, report = replay(earlier, f"world={ACCEPTED}")
+    out, status, report = accepted
     assert status == 0
     (gate,) = report["gates"]
     assert gate["status"] == "pass"
     assert gate["reason"].endswith("; as recorded, and it ends bit for bit where it did")
     assert not [line for line in gate["details"] if "BROKEN" in line]
-    with np.load(tmp_path / "out" / "trajectory.npz") as held:
+    with np.load(out / "trajectory.npz") as held:
         assert np.array_equal(held["qpos"][-1], record.qpos[3])
 
 
-def test_trajectory_holds_the_episode(
-    earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path, new_context: Callable[..., GateContext]
-) -> None:
-    replay(earlier, "world=5")
+def test_trajectory_holds_the_episode(failing: tuple[Path, int, dict], new_context: Callable[..., GateContext]) -> None:
     context = new_context("sim=native", "gate.acceptance.xy_err=0.0015")
     sim = context.batch_simulation(7)
     _, controller = start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
-    with np.load(tmp_path / "out" / "trajectory.npz") as held:
-        assert np.array_equal(held["start_qpos"], snapshot(sim).qpos[5])
+    with np.load(failing[0] / "trajectory.npz") as held:
+        assert np.array_equal(held["start_qpos"], snapshot(sim).qpos[4])
         assert not np.array_equal(held["start_qpos"], snapshot(sim).qpos[0])
         assert (held["start_qvel"] == 0.0).all()
-        commands = np.stack([controller.command()[5].numpy() for _ in range(controller.frames)])
+        commands = np.stack([controller.command()[4].numpy() for _ in range(controller.frames)])
         assert np.allclose(held["ctrl"][:, context.index.ctrl], commands)
         assert held["time_s"][[0, -1]] == pytest.approx([0.02, 12.0])
         assert [str(held["phase"][i]) for i in (0, 59, 60, -1)] == ["above_red", "above_red", "descend_red", "done"]
@@ -128,15 +144,15 @@ def test_trajectory_holds_the_episode(
     sim.close()
 
 
-def test_saved_configuration_is_the_runs_own(earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
-    _, report = replay(earlier, "world=1:3")
+def test_saved_configuration_is_the_runs_own(earlier: Path, accepted: tuple[Path, int, dict]) -> None:
+    out, _, report = accepted
     then = json.loads((earlier / "report.json").read_text())["provenance"]
     assert report["provenance"]["model_sha256"] == then["model_sha256"]
     loaded = load_saved(earlier / ".hydra" / "config.yaml")
     assert loaded == load_config(
         ["gates=[batch]", "sim=native", "nworld=7", "gate.batch.seeds=2", "gate.acceptance.xy_err=0.0015"]
     )
-    played = OmegaConf.load(tmp_path / "out" / "replayed_config.yaml")
+    played = OmegaConf.load(out / "replayed_config.yaml")
     assert (played.seed, played.gate.acceptance.xy_err) == (1, 0.0015)
 
 
@@ -176,7 +192,8 @@ def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
     replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
     folder = tmp_path / "random"
-    run(["gates=[batch]", "sim=native", "nworld=3", "reset=randomized", "robot=rebot", f"hydra.run.dir={folder}"])
+    args = ["gates=[batch]", "sim=native", "nworld=3", "reset=randomized", "robot=rebot", *brisk("rebot")]
+    run([*args, f"hydra.run.dir={folder}"])
     _, report = replay(folder, "world=2", "sim=native")
     assert report["gates"][0]["reason"].endswith("as recorded, and it ends bit for bit where it did")
     with np.load(tmp_path / "out" / "trajectory.npz") as held:
@@ -186,7 +203,7 @@ def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
 
 def test_mjwarp_world_is_played_on_both_engines(replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
     folder = tmp_path / "warp"
-    args = ["gates=[batch]", "sim=mjwarp", "sim.device=cpu", "nworld=2", "gate.acceptance.xy_err=1e-6"]
+    args = ["gates=[batch]", "sim=mjwarp", "sim.device=cpu", "nworld=2", "gate.acceptance.xy_err=1e-6", *brisk()]
     assert run([*args, f"hydra.run.dir={folder}"]) == 1
     status, report = replay(folder, "world=1")
     assert status == 1

@@ -10,11 +10,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from evidence_cases import STOPPED_EARLY, Altered, Cases
 from stack_checker import BLUE, RED, Outcome, check_world
 
 from mjstack.tasks.evidence import Verdict, describe_rules
 from mjstack.tasks.stack import StackEvidence, StackRule
 
+CASES = Cases(StackRule)
 HAIR = 2e-6  # [m], [m/s], [rad]: a good deal more than float32 rounds at these sizes
 NUMBERS = {
     "xy_err": "xy_err_m",
@@ -68,10 +70,6 @@ def feed(worlds: list[World], rec: SimpleNamespace, dtype: torch.dtype = torch.f
     return evidence.verdict(sim)
 
 
-def names_of(bits: int) -> set[str]:
-    return {rule.name for rule in StackRule if bits & rule}
-
-
 def reference(w: World) -> Outcome:
     return check_world(
         w.pose,
@@ -79,13 +77,13 @@ def reference(w: World) -> Outcome:
         w.rec.cfg,
         w.rec.phases,
         step_count=w.step_count,
-        overflow=w.overflow != 0,
+        overflow=bool(w.overflow & ~STOPPED_EARLY),
         finite_elsewhere=math.isfinite(w.arm),
     )
 
 
 def assert_same(verdict: Verdict, k: int, expected: Outcome) -> None:
-    assert names_of(int(verdict.failed[k])) == expected.failed
+    assert CASES.broken(verdict, k) == expected.failed
     for name, value in NUMBERS.items():
         wanted = getattr(expected, name)
         wanted = math.degrees(wanted) if value.endswith("_deg") else wanted
@@ -105,125 +103,109 @@ def test_recorded_episodes(robot: str, recorded: Callable[[str], SimpleNamespace
         assert_same(rec.verdict, k, expected)
 
 
-# Alterations of an accepted recording whose last frames have been made ideal, each with the rules it has to break.
-
-Case = tuple[Callable[[World], None], set[str]]
-CASES: dict[str, Case] = {}
+# Alterations of a recording whose last frames have been made ideal.
 
 
-def case(*rules: str) -> Callable[[Callable[[World], None]], Callable[[World], None]]:
-    def register(alter: Callable[[World], None]) -> Callable[[World], None]:
-        CASES[alter.__name__] = (alter, set(rules))
-        return alter
-
-    return register
-
-
-@case()
-def untouched(w: World) -> None:
-    pass
-
-
-@case("STACKED")
+@CASES.case("STACKED")
 def red_teleported_after_release(w: World) -> None:
     w.pose[w.frames("retreat").start :, RED, 0] += 0.06
 
 
-@case("STACKED")
+@CASES.case("STACKED")
 def fallen_off_in_the_last_frame_only(w: World) -> None:
     w.pose[-1, RED, :2] = w.pose[-1, BLUE, :2] + [0.0153, 0.0]
     w.pose[-2, RED, :2] = w.pose[-2, BLUE, :2] + [0.0147, 0.0]
     w.pose[w.window, RED, 0] = np.where(np.arange(50) == 49, w.pose[-1, RED, 0], w.pose[-2, RED, 0])
 
 
-@case("STACKED")
+@CASES.case("STACKED")
 def stacked_late_by_one_frame(w: World) -> None:
     first = len(w.pose) - w.rec.cfg.gate.acceptance.window
     w.pose[w.window, RED, 0] += 0.0149
     w.pose[first, RED, 0] += 0.0002
 
 
-@case()
+@CASES.case()
 def not_stacked_just_before_the_window(w: World) -> None:
     w.pose[: len(w.pose) - 50][-1, RED, 0] += 0.05
 
 
-@case("SUPPORTED", "STACKED")
+@CASES.case("SUPPORTED", "STACKED")
 def blue_sunk_into_the_table(w: World) -> None:
     w.pose[w.window, BLUE, 2] -= 0.012
 
 
-@case("SUPPORTED")
+@CASES.case("SUPPORTED")
 def both_off_the_table_edge(w: World) -> None:
     reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.cube_half
     w.pose[w.window, :, 1] = w.rec.cfg.scene.table_center[1] + reach + HAIR
 
 
-@case()
+@CASES.case()
 def both_at_the_table_edge(w: World) -> None:
     reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.cube_half
     w.pose[w.window, :, 1] = w.rec.cfg.scene.table_center[1] + reach - HAIR
 
 
-@case("SUPPORTED")
+@CASES.case("SUPPORTED")
 def both_off_the_far_edge(w: World) -> None:
     reach = w.rec.cfg.scene.table_half[0] - w.rec.cfg.scene.cube_half
     w.pose[w.window, :, 0] = w.rec.cfg.scene.table_center[0] - reach - HAIR
 
 
-@case("SUPPORTED")
+@CASES.case("SUPPORTED")
 def blue_tilted_off_its_support(w: World) -> None:
     w.pose[w.window, BLUE, 3:] = [math.cos(0.2), math.sin(0.2), 0.0, 0.0]
 
 
-@case("REST_POSITION")
+@CASES.case("REST_POSITION")
 def slow_drift(w: World) -> None:
     w.pose[w.window, :, 1] += np.linspace(0.0, 0.0052, 50)[:, None]
 
 
-@case("REST_POSITION")
+@CASES.case("REST_POSITION")
 def drift_there_and_back(w: World) -> None:
     w.pose[w.window, :, 1] += (0.0026 * np.sin(np.linspace(0.0, 2.0 * np.pi, 50)))[:, None]
 
 
-@case("REST_ROTATION")
+@CASES.case("REST_ROTATION")
 def slow_turn_of_blue(w: World) -> None:
     half = 0.5 * np.radians(np.linspace(0.0, 3.1, 50))
     w.pose[w.window, BLUE, 3:] = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
 
 
-@case("REST_ROTATION")
+@CASES.case("REST_ROTATION")
 def turn_between_the_middle_and_the_ends(w: World) -> None:
     half = 0.5 * np.radians(1.6 * np.sin(np.linspace(0.0, 2.0 * np.pi, 50)))
     w.pose[w.window, RED, 3:] = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
 
 
-@case()
+@CASES.case()
 def quaternion_of_either_sign(w: World) -> None:
     w.pose[::2, :, 3:] *= -1.0
 
 
-@case("REST_SPEED")
+@CASES.case("REST_SPEED")
 def jitter_in_place(w: World) -> None:
     w.velocity[w.window, RED, 0] = 0.06 * (-1.0) ** np.arange(50)
 
 
-@case("REST_SPEED")
+@CASES.case("REST_SPEED")
 def spin_in_place(w: World) -> None:
     w.velocity[w.window, BLUE, 5] = 0.0502 / (math.sqrt(3.0) * 0.022)
 
 
-@case()
+@CASES.case()
 def one_fast_frame(w: World) -> None:
     w.velocity[-20, RED, 0] = 0.3
 
 
-@case("LIFT", "CARRY")
+@CASES.case("LIFT", "CARRY")
 def never_lifted(w: World) -> None:
     w.pose[w.frames("lift_red").start : w.frames("above_blue").stop, RED, 2] = w.pose[0, RED, 2]
 
 
-@case("LIFT", "CARRY")
+@CASES.case("LIFT", "CARRY")
 def airborne_runs_of_nine_frames(w: World) -> None:
     frames = range(w.frames("lift_red").start, w.frames("above_blue").stop)
     for k, frame in enumerate(frames):
@@ -231,19 +213,19 @@ def airborne_runs_of_nine_frames(w: World) -> None:
             w.pose[frame, RED, 2] = w.pose[0, RED, 2]
 
 
-@case("CARRY")
+@CASES.case("CARRY")
 def dragged_in_above_blue(w: World) -> None:
     w.pose[w.frames("above_blue"), RED, 2] = w.pose[0, RED, 2]
 
 
-@case("CARRY")
+@CASES.case("CARRY")
 def carried_in_hops_of_nine_frames(w: World) -> None:
     for k, frame in enumerate(range(w.frames("above_blue").start, w.frames("above_blue").stop)):
         if k % 10 == 0:
             w.pose[frame, RED, 2] = w.pose[0, RED, 2]
 
 
-@case("CARRY")
+@CASES.case("CARRY")
 def moved_between_two_flights_only(w: World) -> None:
     part = w.frames("above_blue")
     middle = (part.start + part.stop) // 2
@@ -252,46 +234,31 @@ def moved_between_two_flights_only(w: World) -> None:
     w.pose[middle : part.stop, RED, :2] = w.pose[-1, RED, :2]
 
 
-@case("FINITE")
+@CASES.case("FINITE")
 def not_a_number_in_one_frame(w: World) -> None:
     w.velocity[100, RED, 3] = math.nan
 
 
-@case("FINITE", "LIFT", "CARRY", "STACKED", "REST_SPEED", "REST_POSITION", "REST_ROTATION")
+@CASES.case("FINITE", "LIFT", "CARRY", "STACKED", "REST_SPEED", "REST_POSITION", "REST_ROTATION")
 def red_not_a_number_from_the_grasp(w: World) -> None:
     w.pose[w.frames("grasp_red").start :, RED] = math.nan
     w.velocity[w.frames("grasp_red").start :, RED] = math.nan
 
 
-@case("FINITE", "REST_SPEED")
+@CASES.case("FINITE", "REST_SPEED")
 def infinite_velocity_at_the_end(w: World) -> None:
     w.velocity[-1, BLUE, 0] = math.inf
 
 
-@case("FINITE")
+@CASES.case("FINITE")
 def arm_not_a_number(w: World) -> None:
     w.arm = math.nan
 
 
-@case("STEPS")
-def one_step_short(w: World) -> None:
-    w.step_count -= 1
-
-
-@case("STEPS")
-def one_step_long(w: World) -> None:
-    w.step_count += 1
-
-
-@case("OVERFLOW")
-def rows_lost(w: World) -> None:
-    w.overflow = 1
-
-
-def hair(name: str, broken: str, amount: Callable[[World, float], None]) -> None:
+def hair(name: str, amount: Callable[[World, float], None], *broken: str) -> None:
     """Registers both sides of a threshold."""
-    CASES[f"{name}_inside"] = (lambda w: amount(w, -HAIR), set())
-    CASES[f"{name}_outside"] = (lambda w: amount(w, HAIR), {broken})
+    CASES.add(f"{name}_inside", set(), lambda w: amount(w, -HAIR))
+    CASES.add(f"{name}_outside", {*broken}, lambda w: amount(w, HAIR))
 
 
 def _xy(w: World, by: float) -> None:
@@ -339,31 +306,28 @@ def _carry_distance(w: World, by: float) -> None:
     w.pose[w.frames("above_blue").stop - 1, RED, 0] += w.rec.cfg.gate.acceptance.carry_distance - by
 
 
-hair("xy_err", "STACKED", _xy)
-hair("dz_min", "STACKED", _dz_min)
-hair("dz_max", "STACKED", _dz_max)
-hair("gap_above", "SUPPORTED", _gap_above)
-hair("gap_below", "SUPPORTED", _gap_below)
-hair("rest_speed", "REST_SPEED", _speed)
-hair("rest_position", "REST_POSITION", _position)
-hair("rest_rotation", "REST_ROTATION", _rotation)
-hair("carry_distance", "CARRY", _carry_distance)
-CASES["airborne_height_inside"] = (lambda w: _height(w, -HAIR), set())
-CASES["airborne_height_outside"] = (lambda w: _height(w, HAIR), {"LIFT", "CARRY"})
+hair("xy_err", _xy, "STACKED")
+hair("dz_min", _dz_min, "STACKED")
+hair("dz_max", _dz_max, "STACKED")
+hair("gap_above", _gap_above, "SUPPORTED")
+hair("gap_below", _gap_below, "SUPPORTED")
+hair("rest_speed", _speed, "REST_SPEED")
+hair("rest_position", _position, "REST_POSITION")
+hair("rest_rotation", _rotation, "REST_ROTATION")
+hair("carry_distance", _carry_distance, "CARRY")
+hair("airborne_height", _height, "LIFT", "CARRY")
 
 
 @pytest.fixture(scope="module")
-def altered(recorded: Callable[[str], SimpleNamespace]) -> dict[str, tuple[Verdict, int, World]]:
-    """Every case as one world of one batch."""
+def altered(recorded: Callable[[str], SimpleNamespace]) -> Altered:
     rec = recorded("so101")
-    worlds = []
-    for alter, _ in CASES.values():
+
+    def fresh() -> World:
         world = World(rec.pose[0].copy(), rec.velocity[0].copy(), int(rec.step_count[0]), rec)
         _make_ideal(world)
-        alter(world)
-        worlds.append(world)
-    verdict = feed(worlds, rec)
-    return {name: (verdict, k, worlds[k]) for k, name in enumerate(CASES)}
+        return world
+
+    return CASES.play(fresh, lambda worlds: feed(worlds, rec))
 
 
 def _make_ideal(w: World) -> None:
@@ -375,29 +339,21 @@ def _make_ideal(w: World) -> None:
     w.velocity[w.window] = 0.0
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_altered_recording(name: str, altered: dict[str, tuple[Verdict, int, World]]) -> None:
+@pytest.mark.parametrize("name", CASES.alter)
+def test_altered_recording(name: str, altered: Altered) -> None:
     verdict, k, world = altered[name]
-    assert names_of(int(verdict.failed[k])) == CASES[name][1]
+    assert CASES.broken(verdict, k) == CASES.breaks[name]
     assert_same(verdict, k, reference(world))
 
 
 def test_episode_cut_short_fails_whatever_came_before(recorded: Callable[[str], SimpleNamespace]) -> None:
     rec = recorded("so101")
     world = World(rec.pose[0][:-1], rec.velocity[0][:-1], int(rec.step_count[0]), rec)
-    failed = names_of(int(feed([world], rec).failed[0]))
-    assert {"STEPS", "STACKED", "SUPPORTED"} <= failed
-
-
-def test_iteration_limits_are_no_overflow(recorded: Callable[[str], SimpleNamespace]) -> None:
-    """MJWarp's bits 9 and 10 say that the solver stopped early, not that physics was dropped."""
-    rec = recorded("so101")
-    world = World(rec.pose[0], rec.velocity[0], int(rec.step_count[0]), rec, overflow=(1 << 9) | (1 << 10))
-    assert int(feed([world], rec).failed[0]) == 0
+    assert {"STEPS", "STACKED", "SUPPORTED"} <= CASES.broken(feed([world], rec))
 
 
 def test_every_rule_has_words_and_a_case() -> None:
-    assert {rule.name for rule in StackRule} == set().union(*(rules for _, rules in CASES.values()))
+    assert {rule.name for rule in StackRule} == set().union(*CASES.breaks.values())
     for rule in StackRule:
         assert describe_rules(StackRule, int(rule))
     assert describe_rules(StackRule, int(StackRule.LIFT | StackRule.STACKED)).count(",") == 1

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from environments import brisk, configure, rushed
 
 from mjstack.cli import run
 from mjstack.config import load_config
@@ -30,7 +31,7 @@ from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation
 from mjstack.tasks.stack import StackRule
 
-PHASES = list(load_config().controller.phases)
+PHASES = list(configure().controller.phases)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,7 @@ def passed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a native run of six SO-101 worlds in a small region."""
     folder = tmp_path_factory.mktemp("success") / "run"
     args = ["gates=[success]", "sim=native", "nworld=6", "gate.success.region=[0.03,0.03]", "gate.success.cell_episodes=2"]
-    assert run([*args, f"hydra.run.dir={folder}"]) == 0
+    assert run([*args, *brisk(), f"hydra.run.dir={folder}"]) == 0
     return folder
 
 
@@ -47,7 +48,9 @@ def warp(passed: Path) -> Path:
     """The folder of a run on Warp's CPU device from the native run's layouts."""
     folder = passed.parent / "warp"
     start = ["reset=layout", f"layout={passed}/layouts_seed0.csv"]
-    assert run(["gates=[success]", "sim=mjwarp", "sim.device=cpu", "nworld=6", *start, f"hydra.run.dir={folder}"]) == 0
+    assert (
+        run(["gates=[success]", "sim=mjwarp", "sim.device=cpu", "nworld=6", *start, *brisk(), f"hydra.run.dir={folder}"]) == 0
+    )
     return folder
 
 
@@ -109,7 +112,7 @@ def test_rebot_passes(new_context: Callable[..., GateContext], tmp_path: Path) -
 def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
     """A gripper that never closes: the grasp is empty, is tried again, and is empty again."""
     folder = tmp_path / "broken"
-    args = ["gates=[success]", "sim=native", "nworld=2", "robot.gripper_closed=[0.7]", f"hydra.run.dir={folder}"]
+    args = ["gates=[success]", "sim=native", "nworld=2", "robot.gripper_closed=[0.7]", *brisk(), f"hydra.run.dir={folder}"]
     assert run(args) == 1
     gate = gate_of(folder)
     assert gate["status"] == "fail"
@@ -135,12 +138,9 @@ def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
 @pytest.fixture
 def hasty() -> Callable[..., GateContext]:
     """Contexts of episodes that are over, and have failed, after a second."""
-    phases = [f"controller.phases.{name}.seconds=0.1" for name in PHASES]
 
     def make(*overrides: str) -> GateContext:
-        windows = ["gate.acceptance.window=5", "gate.box.window=5"]
-        quick = ["gates=[success]", "sim=native", "nworld=2", *windows, *phases]
-        return GateContext(cfg=load_config([*quick, *overrides]))
+        return GateContext(cfg=load_config(["gates=[success]", "sim=native", "nworld=2", *rushed(), *overrides]))
 
     return make
 
