@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import os
-import pickle
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-import yaml
-from hydra import compose
-from omegaconf import DictConfig
 
-from mjstack.config import load_config, store
+from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.gates.episode import run_episode
 from mjstack.gates.gate import GateContext
@@ -42,26 +38,6 @@ def _outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     os.chdir(tmp_path_factory.mktemp("cwd"))
     yield
     os.chdir(before)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _composed_once() -> Iterator[None]:
-    """Hydra composes for half a second, and many tests want the same: they get copies of what the first one got.
-
-    OmegaConf's loader of YAML derives from `yaml.SafeLoader`; the one in C is the same and takes a tenth of the time.
-    """
-    made: dict[tuple[str, ...], bytes] = {}
-
-    def composed(name: str, overrides: Sequence[str] = ()) -> DictConfig:
-        key = (name, *overrides)
-        if key not in made:
-            made[key] = pickle.dumps(compose(name, overrides=list(overrides)))
-        return pickle.loads(made[key])
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store, "compose", composed)
-        patch.setattr(yaml, "SafeLoader", getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        yield
 
 
 @pytest.fixture(scope="session")
