@@ -73,9 +73,9 @@ def gate_episode(cfg: Config) -> Episode:
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
-    """Four real episodes. The stacks' offsets are 6.7, 0.2, 1.1 and 2.2 mm: by the threshold two of them fail, and are kept."""
+    """Four real episodes. The stacks' offsets are 0.2, 0.7, 1.2 and 1.3 mm: by the threshold two of them fail, and are kept."""
     folder = tmp_path_factory.mktemp("collect")
-    args = [*COMMAND, "nworld=4", "job.episodes=4", "job.keep_failures=true", "gate.acceptance.xy_err=0.0017"]
+    args = [*COMMAND, "nworld=4", "job.episodes=4", "job.keep_failures=true", "gate.acceptance.xy_err=0.001"]
     before = os.getcwd()
     os.chdir(folder)
     try:
