@@ -25,7 +25,7 @@ from rich.table import Table
 import mjstack
 from mjstack.config.help import help_text
 from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, own_hydra, to_config
-from mjstack.errors import MjstackError
+from mjstack.errors import MjstackError, UnknownName
 from mjstack.jobs import JobOutcome, check_job, job_folder, run_job
 from mjstack.report.markdown import escape_cell
 from mjstack.report.record import Status
@@ -33,6 +33,9 @@ from mjstack.report.record import Status
 INTERRUPTED = 130
 _OTHER_CONFIG = {"--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp"}
 _HELP = {"--help", "-h"}
+_SWEEP = {"-m", "--multirun"}
+_VALUED = {"--cfg", "-c", "--package", "-p"}
+_OTHER_FLAGS = {"--resolve", "--run", "-r"}
 _FLAGS_WITHOUT_RUN = {"--hydra-help", "--info", "-i", "--shell-completion", "-sc"}
 
 
@@ -52,7 +55,7 @@ def run(args: list[str]) -> int:
         return 0
     if _FLAGS_WITHOUT_RUN & set(args) or any(a.startswith(("--info", "--hydra-help")) for a in args):
         return _run_hydra(args, [])
-    sweep = bool({"-m", "--multirun"} & set(args))
+    sweep = bool(_SWEEP & set(args))
     dry = any(a in ("--cfg", "-c") or a.startswith("--cfg=") for a in args)
     try:
         overrides = _overrides(args)
@@ -112,17 +115,18 @@ def _run_hydra(args: list[str], outcomes: list[JobOutcome]) -> int:
 
 def _overrides(args: list[str]) -> list[str]:
     """The key=value arguments; Hydra's own flags and their values are left out."""
-    takes_value = {"--cfg", "-c", "--package", "-p"}
+    flags = {*_HELP, "--version", *_FLAGS_WITHOUT_RUN, *_SWEEP, *_VALUED, *_OTHER_FLAGS}
     out, skip = [], False
     for arg in args:
         if skip:
             skip = False
         elif arg.partition("=")[0] in _OTHER_CONFIG:
             raise CompositionError(f"argument '{arg}': mjstack runs its own configuration. Change it with key=value overrides.")
-        elif arg in takes_value:
+        elif arg in _VALUED:
             skip = True
         elif arg.startswith("-"):
-            continue
+            if arg.partition("=")[0] not in flags:
+                raise UnknownName("flag", arg, flags)
         elif "=" not in arg and not arg.startswith("~"):
             raise CompositionError(f"argument '{arg}' is not an override. Write key=value, such as nworld=64.")
         else:

@@ -134,6 +134,11 @@ def test_acceptance_figures(so101_cfg: Config) -> None:
 BAD = [
     (["job=collect", "job.episode=3"], "Did you mean 'job.episodes'?"),
     (["job=scaling", "job.retri=true"], "Did you mean 'job.retry'?"),
+    (["job.episodes=3"], "job.episodes is a key of job=collect, and this is job=gates. Set job=collect."),
+    (["job=study", "job.nworlds=[4]"], "job.nworlds is a key of job=scaling, and this is job=study. Set job=scaling."),
+    (["=3"], "override '=3' has no key"),
+    (["nworld"], "override 'nworld' has no value"),
+    (["~reward.grap"], "~reward.grap: there is none to leave out. Did you mean 'reward.grasp'?"),
     (["robot=so100"], "Did you mean 'so101'?"),
     (["robots=so101"], "Did you mean 'robot'?"),
     (["phase=stack"], "Did you mean 'phases'?"),

@@ -6,6 +6,7 @@ import difflib
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import cast
 
@@ -29,10 +30,9 @@ _TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 _KINDS = {"Integer": "an integer", "Float": "a number", "Boolean": "true or false"}
 
 ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
-ConfigStore.instance().store(name="study_schema", node=StudyJobCfg, provider="mjstack")
-ConfigStore.instance().store(name="scaling_schema", node=ScalingJobCfg, provider="mjstack")
-ConfigStore.instance().store(name="reachability_schema", node=ReachabilityJobCfg, provider="mjstack")
-ConfigStore.instance().store(name="collect_schema", node=CollectJobCfg, provider="mjstack")
+_JOBS = {"study": StudyJobCfg, "scaling": ScalingJobCfg, "reachability": ReachabilityJobCfg, "collect": CollectJobCfg}
+for _name, _node in _JOBS.items():
+    ConfigStore.instance().store(name=f"{_name}_schema", node=_node, provider="mjstack")
 
 
 class CompositionError(MjstackError):
@@ -58,6 +58,12 @@ def load_config(overrides: Sequence[str] = ()) -> Config:
 
 def compose_overrides(overrides: Sequence[str]) -> DictConfig:
     """Composes without validating values; errors are one line each."""
+    for override in overrides:
+        key, equals, _ = override.partition("=")
+        if not key.strip("+~ "):
+            raise CompositionError(f"override '{override}' has no key. Write key=value without spaces, such as nworld=64.")
+        if not equals and not override.startswith("~"):
+            raise CompositionError(f"override '{override}' has no value. Write key=value, such as nworld=64.")
     with own_hydra():
         return _compose(overrides)
 
@@ -120,7 +126,7 @@ def _translate(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     text = str(cause).splitlines()[0] if str(cause) else type(cause).__name__
     deleted = re.match(r"Could not delete from config\. '([^']+)' does not exist", text)
     if deleted:
-        return _unknown_key(error, deleted.group(1), overrides)
+        return _unknown_deletion(deleted.group(1), overrides)
     if isinstance(cause, ConfigKeyError | AttributeError) or "not in struct" in text or "not in 'Config'" in text:
         return _unknown_key(error, str(key or getattr(cause, "key", "") or ""), overrides)
     converted = re.search(r"Value '(.*)' of type '\w+' could not be converted to (\w+)", text)
@@ -132,7 +138,7 @@ def _translate(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
             "gate.batch.seeds=10 sets a value."
         )
     if key and "not a ListConfig" in text:
-        return CompositionError(f"{key}: expected a list, such as {key}=[...].")
+        return CompositionError(f"{key}: expected a list, such as '{key}=[...]'.")
     if "Ambiguous value for argument" in text:
         return CompositionError(f"{text.rstrip('.')}: several values are a sweep. Add -m, or give one value.")
     match = re.search(r"Could not override '([^']+)'\. No match in the defaults list", str(error))
@@ -155,6 +161,13 @@ def _unknown_key(error: Exception, key: str, overrides: Sequence[str]) -> Mjstac
             base = OmegaConf.to_container(compose(CONFIG_NAME), resolve=False)
     keys = _flat_keys(base)
     leaf = key.rpartition(".")[2]
+    if key.startswith("job."):
+        owners = [name for name in _JOBS if leaf in {f.name for f in fields(_JOBS[name])} and f"job={name}" not in jobs]
+        if owners:
+            now = jobs[-1] if jobs else "job=gates"
+            return CompositionError(
+                f"{key} is a key of job={' and job='.join(owners)}, and this is {now}. Set job={owners[0]}."
+            )
     if key.partition(".")[0] in _TERM_GROUPS:
         return _unknown_term_key(key, keys)
     same_leaf = [k for k in keys if k.rpartition(".")[2] == leaf and k != key]
@@ -170,6 +183,18 @@ def _unknown_key(error: Exception, key: str, overrides: Sequence[str]) -> Mjstac
         return CompositionError(f"configuration key '{key}' does not exist. Did you mean '{nearest}'?")
     pool = sorted({*siblings, *(k for k in keys if "." not in k)})
     return CompositionError(f"configuration key '{key}' does not exist. {suggest(key, _nearest_first(leaf, pool))}")
+
+
+def _unknown_deletion(key: str, overrides: Sequence[str]) -> MjstackError:
+    """``~key`` of what is not there: what is there, beside it."""
+    with own_hydra():
+        try:
+            base = compose(CONFIG_NAME, overrides=[o for o in overrides if not o.startswith("~")])
+        except (HydraException, OmegaConfBaseException) as error:
+            return _translate(error)
+    parent = key.rpartition(".")[0]
+    keys = [k for k in _flat_keys(OmegaConf.to_container(base, resolve=False)) if k.rpartition(".")[0] == parent]
+    return CompositionError(f"~{key}: there is none to leave out. {suggest(key, keys)}")
 
 
 def _unknown_term_key(key: str, keys: Sequence[str]) -> MjstackError:

@@ -58,9 +58,8 @@ class ScriptedController:
         """
         cfg, device, n = env.cfg, env.device, env.nworld
         if list(cfg.action.values()) != list(cfg.controller.action.values()):
-            raise ArgumentError(
-                "env", f"actions {', '.join(cfg.action)}", "those of controller.action", "Set action=joint_absolute"
-            )
+            expected = "absolute joint commands, which the expert gives"
+            raise ArgumentError("env", "other actions", expected, "Build it with action=joint_absolute")
         if bool((env.frame != 0).any()):  # it begins where the environment's episodes do
             raise ArgumentError("env", "worlds that have moved on", "worlds at their start", "Call env.reset() before")
         self._env, self._cfg = env, cfg

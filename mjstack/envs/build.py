@@ -26,7 +26,7 @@ def make_env(
 
     Args:
         overrides: Such as ``["task=reach", "robot=rebot", "action=ee_delta"]``.
-        nworld: Number of worlds.
+        nworld: Number of worlds. What is given here and below wins over an override of the same key.
         seed: Seed of every random number.
         device: ``auto``, ``cpu`` or ``cuda:N``.
 

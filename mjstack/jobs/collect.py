@@ -71,7 +71,7 @@ def run_collect_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutco
         def conclude(status: Status, problem: str = "") -> None:
             result = collection.result(status, problem, time.perf_counter() - began)
             if collection.write_table(folder, result):
-                context.say(f"dataset: {collection.path}, described in {folder}/dataset.md")
+                context.say(f"dataset: {collection.path}, described in {collection.home / 'dataset.md'}")
             record(result)
 
         try:

@@ -41,7 +41,7 @@ def validate(cfg: Config) -> None:
     if cfg.layout is not None and not reads_layout(cfg.reset):
         raise ConfigError("layout", cfg.layout, "null, because no reset term reads it", "Add reset=layout")
     if not _DEVICE.fullmatch(cfg.sim.device):
-        raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N")
+        raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N, such as cuda:0")
     check_timing(cfg)
     check_solver_and_batch(cfg)
     check_robot(cfg)
