@@ -186,7 +186,7 @@ BAD = [
     (["solver.cone=round"], "elliptic, pyramidal"),
     (["solver.gripper_condim=2"], "1, 3, 4, 6"),
     (["job=studies"], "Did you mean 'study'?"),
-    (["job=stud_schema"], "Did you mean 'study'"),
+    (["job=stud_schema"], "Did you mean 'study'? Available: collect, gates,"),
     (["job.repetitions=3"], "job.repetitions"),
     (["job=study", "job.repetitions=0"], "job.repetitions=0"),
     (["job=study", "job.max_seconds=0"], "job.max_seconds"),
