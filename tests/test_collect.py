@@ -22,6 +22,7 @@ from environments import brisk
 
 from mjstack.cli import run
 from mjstack.config import load_config
+from mjstack.config.content import config_hash
 from mjstack.config.schema import Backend, Config
 from mjstack.datasets import DatasetWriter, Feature, read_dataset
 from mjstack.datasets.shard import Shard
@@ -33,7 +34,7 @@ from mjstack.jobs import collection
 from mjstack.jobs.collect import collect_folder, run_collect_job
 from mjstack.jobs.collect_record import FILE
 from mjstack.jobs.demonstration import FrameRecorder, Played
-from mjstack.jobs.demonstration_spec import config_hash, episode_config, first_difference, make_spec
+from mjstack.jobs.demonstration_spec import episode_config, first_difference, make_spec
 from mjstack.managers.reset import required_fields
 from mjstack.report.collect import LOADING
 from mjstack.sim import make_simulation
@@ -227,7 +228,9 @@ def test_the_same_command_again_does_nothing(demos: SimpleNamespace, monkeypatch
     before = contents(demos.dataset / "data")
     assert run(demos.args) == 0
     assert contents(demos.dataset / "data") == before
-    assert "4 episodes, 4 asked for" in report_of(demos.home)["gates"][0]["reason"]
+    reason = report_of(demos.home)["gates"][0]["reason"]
+    assert "4 episodes, 4 asked for" in reason
+    assert reason.endswith("; they were there already")
 
 
 def test_another_configuration_is_refused(

@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 
 from mjstack.cli import run
 from mjstack.config import load_config
+from mjstack.errors import ConfigError
 from mjstack.jobs import scaling
 from mjstack.jobs.case import OutOfTime, _row, read_case
 from mjstack.jobs.scaling import case_overrides, scaling_folder
@@ -285,6 +286,20 @@ def test_folder_depends_on_what_a_case_depends_on() -> None:
     assert name("sim=native") == same
     for override in ("robot=rebot", "job.repetitions=2", "batch.njmax=99", "seed=1", "sim.device=cpu", "~reward.grasp"):
         assert name(override) != same, override
+
+
+def test_folder_depends_on_a_layouts_content(tmp_path: Path) -> None:
+    def name(path: Path) -> str:
+        return str(scaling_folder(load_config(["job=scaling", "reset=layout", f"layout={path}"])))
+
+    first, second = tmp_path / "first.csv", tmp_path / "second.csv"
+    first.write_text("world,red_x_m\n0,0.33\n")
+    second.write_bytes(first.read_bytes())
+    assert name(first) == name(second)
+    second.write_text("world,red_x_m\n0,0.34\n")
+    assert name(first) != name(second)
+    with pytest.raises(ConfigError, match=r"layout=.*no\.csv.*a file that can be read"):
+        name(tmp_path / "no.csv")
 
 
 def test_cases_get_the_command_line() -> None:

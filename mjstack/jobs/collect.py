@@ -12,6 +12,7 @@ from typing import Any, cast
 import torch
 from omegaconf import OmegaConf
 
+from mjstack.config.content import CONTENT, config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
 from mjstack.datasets import DatasetSpec, require_pyarrow
 from mjstack.datasets.opening import check_same, lock_folder, read_info
@@ -20,7 +21,7 @@ from mjstack.errors import ConfigError, DatasetError, UnwrittenError
 from mjstack.gates.gate import GateContext
 from mjstack.jobs.collect_record import read_batches
 from mjstack.jobs.collection import DATASET, Collection, most_worlds
-from mjstack.jobs.demonstration_spec import CONTENT, config_hash, episode_config, first_difference, make_spec
+from mjstack.jobs.demonstration_spec import episode_config, first_difference, make_spec
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar

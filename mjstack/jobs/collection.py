@@ -12,6 +12,7 @@ from typing import cast
 import numpy as np
 import torch
 
+from mjstack.config.content import config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
 from mjstack.datasets import DatasetWriter, EpisodeData, layout
 from mjstack.envs import Env, build_env, demonstration_config
@@ -20,7 +21,7 @@ from mjstack.gates.episode import NOMINAL
 from mjstack.gates.gate import GateContext, failing_rules
 from mjstack.jobs.collect_record import CollectedBatch, read_batches, write_batches
 from mjstack.jobs.demonstration import ACTION, STATE, Played, frame_layout, frames_block, play_demonstrations
-from mjstack.jobs.demonstration_spec import config_hash, episode_config, make_spec
+from mjstack.jobs.demonstration_spec import episode_config, make_spec
 from mjstack.jobs.reported import run_provenance
 from mjstack.math import wilson_interval
 from mjstack.report.collect import ColumnRange, to_markdown
@@ -235,6 +236,8 @@ class Collection:
             metrics |= {f"{name}_s": value for name, value in self._seconds.items()} | {"episodes_per_s": new / seconds}
             times = ", ".join(f"{name} {value:.1f} s" for name, value in self._seconds.items())
             reason += f"; {times}, {new / seconds:.3g} episodes/s in all"
+        elif self.committed >= asked:
+            reason += "; they were there already"
         return GateResult(
             name="collect",
             status=status,

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, cast
 
 import mujoco
-from omegaconf import OmegaConf
 
+from mjstack.config.content import config_content, config_hash
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
-from mjstack.config.validate import reads_layout
 from mjstack.datasets import DatasetSpec, Feature
 from mjstack.envs import Env
 from mjstack.errors import ConfigError
@@ -22,7 +18,6 @@ from mjstack.sim import resolve_backend
 # Changing one of these changes no episode. The action terms are the controller's, and nothing ends an episode early.
 _NO_MATTER = ("action", "termination", "batch", "sim", "job", "nworld", "gates", "graph", "view", "video", "run", "world")
 _OTHER_GATES = ("parity", "capacity", "batch", "throughput", "success")
-CONTENT = "sha256:"  # in front of what stands for a file
 _JOINTS, _JOINT_SPEEDS = "of the joints", "of the joints, per second"
 # Of the observation terms; one that is not here, such as a user's own, has the unit "unknown".
 _UNITS: dict[str, str | tuple[str, ...]] = {
@@ -46,34 +41,15 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     Raises:
         ConfigError: The layout file cannot be read.
     """
-    config = cast(dict[str, Any], OmegaConf.to_container(OmegaConf.structured(cfg), enum_to_str=True))
+    config = config_content(cfg)
     for key in _NO_MATTER:
         del config[key]
     for key in _OTHER_GATES:
         del config["gate"][key]
-    for name, term in cfg.reset.items():
-        path, params = term.params.get("path"), config["reset"][name]["params"]
-        if reads_layout({name: term}) and path is not None:
-            if path == cfg.layout:
-                params["path"], config["layout"] = "${layout}", _content("layout", path)
-            else:
-                params["path"] = _content(f"reset.{name}.params.path", path)
     backend, _ = resolve_backend(cfg)
     config["sim"] = {"backend": backend.value}
     config["job"] = {"keep_failures": cast(CollectJobCfg, cfg.job).keep_failures}
-    return cast(dict[str, Any], json.loads(json.dumps(config)))
-
-
-def _content(key: str, path: str) -> str:
-    try:
-        return CONTENT + hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    except OSError as error:
-        raise ConfigError(key, path, f"a file that can be read ({error.strerror})") from error
-
-
-def config_hash(config: Mapping[str, Any]) -> str:
-    """SHA-256 of a configuration."""
-    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
+    return config
 
 
 def first_difference(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> tuple[str, Any, Any] | None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 import math
 import time
@@ -16,6 +14,7 @@ from omegaconf import OmegaConf
 from rich.console import Console
 from rich.markup import escape
 
+from mjstack.config.content import config_content, config_hash
 from mjstack.config.schema import Backend, Config, ScalingJobCfg
 from mjstack.errors import ConfigError
 from mjstack.jobs.case import OutOfTime, is_done, read_case, run_case
@@ -54,13 +53,11 @@ def scaling_folder(cfg: Config) -> Path:
     job = asdict(_job(cfg))
     for key in ("nworlds", "backends", "case_minutes", "max_minutes", "retry"):  # they change no case
         del job[key]
-    config = OmegaConf.to_container(OmegaConf.structured(replace(cfg, job=_job(cfg))), enum_to_str=True)
-    assert isinstance(config, dict)
+    config = config_content(cfg)
     for key in ("nworld", "gates", "view", "video"):
         del config[key]
     config["sim"].pop("backend")
-    text = json.dumps(config | {"job": job}, sort_keys=True)
-    return Path("outputs") / "scaling" / hashlib.sha256(text.encode()).hexdigest()[:12]
+    return Path("outputs") / "scaling" / config_hash(config | {"job": job})[:12]
 
 
 def run_scaling_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
