@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mujoco
@@ -114,7 +114,7 @@ def test_joints_stay_within_both_ranges(stage: Stage, robot: str) -> None:
 
 
 REGIONS = [
-    ("so101", "[0.12,0.05]", "red_cube at (0.450, -0.180) m the point at the cube is"),
+    ("so101", "[0.12,0.05]", "red_cube at (0.450, -0.180) m the point"),
     ("so101", "[0.05,0.3]", "red_cube at"),
     ("rebot", "[0.3,0.0]", None),  # the whole depth of its table is within reach
     ("so101", "[0.03,0.03]", None),
@@ -224,6 +224,63 @@ def test_nothing_starts_in_a_wall(robot: str, euler: float) -> None:
     assert nearest >= 0.01 - 1e-6
     without = Placement(cfg, build_model(cfg), index, region=(0.05, 0.05), gap=0.01, pose=cfg.robot.start)
     assert float(without._choose(draws)[0][:, 0, 1].max()) > float(offsets[:, 0, 1].max()) + 0.01
+
+
+def touches_arm(model: mujoco.MjModel, index: SceneIndex, command: np.ndarray, xy: Sequence[float], yaw: float) -> bool:
+    """Whether red, at a place, touches the arm."""
+    data = mujoco.MjData(model)
+    data.qpos[index.robot_qpos] = command
+    red, blue = index.cube_qpos
+    data.qpos[blue : blue + 3] = 5.0, 5.0, 5.0
+    data.qpos[red : red + 2] = xy
+    data.qpos[red + 3 : red + 7] = math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_collision(model, data)
+    cube = index.geoms["red_cube"][0]
+    pairs = [set(pair) for pair in data.contact.geom[: data.ncon].tolist()]
+    return any(cube in pair and model.geom("table").id not in pair for pair in pairs)
+
+
+def test_nothing_starts_at_the_arm_wherever_noise_puts_it() -> None:
+    """Around the jaws of a SO-101 that has come down to the table."""
+    cfg = configure("reset=randomized", "scene.red_xy=[0.26,-0.03]", "scene.blue_xy=[0.42,0.05]")
+    model, noise = build_model(cfg), 0.02
+    index = SceneIndex(model, cfg.robot)
+    pose = np.array(cfg.robot.start)
+    pose[1] += 0.15  # the shoulder, so that the jaws are among the cubes
+    placement = Placement(cfg, model, index, region=(0.07, 0.07), gap=0.01, pose=pose.tolist(), noise=noise)
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-1.0, 1.0, (600, 2))
+    draws = torch.zeros(600, 2, 1, 2, dtype=torch.float64)
+    draws[:, 0, 0] = torch.from_numpy(places)
+    free = placement._choose(draws)[1].numpy()
+    assert 0.1 < free.mean() < 0.9
+    hit = np.zeros(600, dtype=bool)
+    for k, place in enumerate(places * 0.07 + cfg.scene.red_xy):
+        for _ in range(8):
+            command = pose.copy()
+            command[: index.n_arm] += noise * rng.choice([-1.0, 1.0], index.n_arm)
+            hit[k] |= touches_arm(model, index, command, place, rng.uniform(0.0, math.pi))
+    assert not (hit & free).any()
+    assert hit.sum() > 30
+
+
+def test_all_of_the_region_is_drawn_from(robot: str, stage: Stage) -> None:
+    """Nothing but the other cube keeps one from any place of it."""
+    for task in ("stack", "box"):
+        cfg = configure("reset=randomized", f"task={task}", robot=robot)
+        model, gap = build_model(cfg), cfg.robot.finger_room
+        region = (cfg.scene.random_xy[0], cfg.scene.random_xy[1])
+        placement = Placement(
+            cfg, model, SceneIndex(model, cfg.robot), region=region, gap=gap, pose=cfg.robot.start, noise=0.02
+        )
+        placement._apart = 0.0  # the other cube aside
+        grid = torch.linspace(-1.0, 1.0, 41, dtype=torch.float64)
+        places = torch.cartesian_prod(grid, grid)
+        for cube in (0, 1):
+            draws = torch.zeros(len(places), 2, 1, 2, dtype=torch.float64)
+            draws[:, cube, 0] = places
+            assert bool(placement._choose(draws)[1].all()), (task, cube)
 
 
 def test_a_wall_that_leaves_no_room_is_said() -> None:

@@ -21,9 +21,7 @@ from mjstack.kinematics.reach import PointReach
 from mjstack.report.reachability import CubeRegion, ReachLevel, ReachMap, save_map, to_csv, to_markdown, to_npz
 from mjstack.report.record import GateResult, Status, write_atomic
 from mjstack.scene import BLUE, RED, table_top
-from mjstack.scene.phases import BLUE as AT_BLUE
-from mjstack.scene.phases import RED as AT_RED
-from mjstack.scene.phases import anchor_of
+from mjstack.scene.phases import cube_targets
 from mjstack.sim import resolve_backend
 
 log = logging.getLogger(__name__)
@@ -82,16 +80,13 @@ def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
 
     ``approach`` is the controller's first target, ``grasp`` its lowest where a cube stands, and ``carry`` its highest there.
     """
-    center, targets = table_top(cfg.scene) + cfg.scene.cube_half, []
-    for name, phase in cfg.controller.phases.items():
-        anchor = anchor_of(cfg, name)
-        if anchor is not None and anchor.source in (AT_RED, AT_BLUE):
-            targets.append((anchor.z - center, phase.gripper))
-    if not targets:
+    red, blue = cube_targets(cfg)
+    if not red + blue:
         raise ConfigError("controller.phases", list(cfg.controller.phases), "a phase with a cube as its anchor")
-    low, high = min(height for height, _ in targets), max(height for height, _ in targets)
+    low, high = (end(red + blue, key=lambda target: target.height) for end in (min, max))
+    first = (red + blue)[0]
     # The jaws close where they grasp, but come there open, which reaches less far where one jaw stays.
-    return {"grasp": (low, "open"), "approach": targets[0], "carry": next(t for t in targets if t[0] == high)}
+    return {"grasp": (low.height, "open"), "approach": (first.height, first.gripper), "carry": (high.height, high.gripper)}
 
 
 def axes(cfg: Config) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from mjstack.errors import ArgumentError, ConfigError, ParameterError
 from mjstack.managers.base import EnvView, uses_fields
 from mjstack.mdp.geometry import joint_positions, named_pose, pose_w, robot
 from mjstack.mdp.layout_file import LayoutTable, column_names, read_layout_file, short
-from mjstack.mdp.placement import reach_distances
+from mjstack.mdp.reachable import out_of_reach
 from mjstack.mdp.variation import FRICTION_FIELDS, GAIN_FIELDS, MASS_FIELDS, CubeMasses, ServoGains, SlidingFriction, bounds
 from mjstack.report.record import write_atomic
 
@@ -271,22 +271,12 @@ def _check_touching(env: EnvView, file: LayoutTable, places: np.ndarray, command
 
 
 def _check_reach(env: EnvView, file: LayoutTable, places: np.ndarray) -> None:
-    """The arm gets to every cube, and above it."""
-    flat = places[..., :2].reshape(-1, 2)
-    distances = reach_distances(env, flat)
-    bad = np.argwhere(~(distances <= env.cfg.controller.ik_tolerance))
-    if bad.size:
-        row, level = bad[0]
-        world, cube = divmod(int(row), places.shape[1])
-        name = list(env.index.objects)[cube]
-        point = ("at it", "above it")[level]
-        raise file.misfit(
-            world,
-            _place(name),
-            f"a place that the arm reaches; with {name} at ({flat[row, 0]:.3f}, {flat[row, 1]:.3f}) m the point {point} is "
-            f"{1e3 * distances[row, level]:.1f} mm out of reach",
-            "Move it closer; job=reachability draws a map",
-        )
+    """The arm gets to every cube, above it, and wherever the phases go there."""
+    for cube, name in enumerate(env.index.objects):
+        if found := out_of_reach(env, cube, places[:, cube, :2]):
+            world, what = found
+            fix = "Move it closer; job=reachability draws a map"
+            raise file.misfit(world, _place(name), f"a place that the arm reaches; {what}", fix)
 
 
 def _place(name: str) -> list[str]:

@@ -11,7 +11,8 @@ from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import named_pose, pose_w, robot
-from mjstack.mdp.placement import Placement, require_reach
+from mjstack.mdp.placement import Placement
+from mjstack.mdp.reachable import require_reach
 from mjstack.mdp.variation import FRICTION_FIELDS, GAIN_FIELDS, MASS_FIELDS, CubeMasses, ServoGains, SlidingFriction, bounds
 
 

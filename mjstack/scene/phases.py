@@ -36,6 +36,21 @@ class Anchor:
     z: float
 
 
+@dataclass(frozen=True, slots=True)
+class CubeTarget:
+    """Where a phase brings the aperture centre above a cube that stands on the table.
+
+    Attributes:
+        phase: The first phase that does.
+        height: Above the cube's centre [m].
+        gripper: ``open`` or ``closed``.
+    """
+
+    phase: str
+    height: float
+    gripper: str
+
+
 def build_phases(cfg: Config) -> list[Phase]:
     """The controller's phases laid out over the episode's frames."""
     phases, start = [], 0
@@ -81,6 +96,22 @@ def anchor_of(cfg: Config, phase: str) -> Anchor | None:
     found = anchors[spec.anchor]
     above = spec.h_scale * cfg.robot.approach_height + spec.offset + (cfg.scene.grasp_offset if spec.in_hand else 0.0)
     return Anchor(found.source, found.xy, found.z + above)
+
+
+def cube_targets(cfg: Config) -> tuple[list[CubeTarget], list[CubeTarget]]:
+    """What the phases ask of the place of red, and of blue, in their order; each height and opening once.
+
+    Raises:
+        ConfigError: The scene lacks the anchor of a phase.
+    """
+    center = build_anchors(cfg.scene)["red"].z
+    found: tuple[dict[tuple[float, str], CubeTarget], ...] = ({}, {})
+    for name, spec in cfg.controller.phases.items():
+        anchor = anchor_of(cfg, name)
+        if anchor is not None and anchor.source in (RED, BLUE):
+            target = CubeTarget(name, anchor.z - center, spec.gripper)
+            found[anchor.source].setdefault((round(target.height, 6), spec.gripper), target)
+    return list(found[RED].values()), list(found[BLUE].values())
 
 
 def grasped_cubes(specs: Sequence[PhaseCfg]) -> list[int]:
