@@ -1,8 +1,15 @@
 """mjstack: a robot-arm task from one native MuJoCo world to thousands of MuJoCo Warp worlds, verified in gates."""
 
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from mjstack.errors import MjstackError
 from mjstack.report.gl import choose_gl
+
+if TYPE_CHECKING:
+    from mjstack.config import Config, load_config
+    from mjstack.envs import Env, make_env
 
 # The configuration lies at the top of a checkout and inside an installed package. This makes `mjstack.conf` mean the
 # first one in a checkout that is on the path without being installed.
@@ -12,9 +19,18 @@ if (_CHECKOUT / "conf" / "config.yaml").is_file():
 
 choose_gl()
 
-from mjstack.config import Config, load_config  # noqa: E402
-from mjstack.envs import Env, make_env  # noqa: E402
-from mjstack.errors import MjstackError  # noqa: E402
-
 __all__ = ["Config", "Env", "MjstackError", "load_config", "make_env"]
 __version__ = "0.1.0"
+
+_HOMES = {"Config": "mjstack.config", "load_config": "mjstack.config", "Env": "mjstack.envs", "make_env": "mjstack.envs"}
+
+
+def __getattr__(name: str) -> Any:
+    """Loads what takes seconds, torch and Warp, when it is asked for: the command line has things to do before."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'mjstack' has no attribute '{name}'")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

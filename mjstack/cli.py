@@ -11,7 +11,9 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -23,19 +25,23 @@ from rich.markup import escape
 from rich.table import Table
 
 import mjstack
+from mjstack.config import Config
 from mjstack.config.help import help_text
 from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, own_hydra, to_config
 from mjstack.errors import MjstackError, UnknownName
-from mjstack.jobs import JobOutcome, check_job, job_folder, run_job
 from mjstack.report.markdown import escape_cell
 from mjstack.report.record import Status
+from mjstack.startup import INTERRUPTED, started
 
-INTERRUPTED = 130
+if TYPE_CHECKING:
+    from mjstack.jobs import JobOutcome
+
 _OTHER_CONFIG = {"--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp"}
 _HELP = {"--help", "-h"}
 _SWEEP = {"-m", "--multirun"}
 _VALUED = {"--cfg", "-c", "--package", "-p"}
 _OTHER_FLAGS = {"--resolve", "--run", "-r"}
+_WIDE = 3  # gates; with more of them a sweep's table has only their status
 _FLAGS_WITHOUT_RUN = {"--hydra-help", "--info", "-i", "--shell-completion", "-sc"}
 
 
@@ -59,12 +65,14 @@ def run(args: list[str]) -> int:
     dry = any(a in ("--cfg", "-c") or a.startswith("--cfg=") for a in args)
     try:
         overrides = _overrides(args)
-        for job in _expand(overrides) if sweep else [overrides]:
-            own = [o for o in job if not _is_hydra(o)]
-            config = to_config(compose_overrides(own))
-            if not dry:
+        jobs = [[o for o in job if not _is_hydra(o)] for job in (_expand(overrides) if sweep else [overrides])]
+        configs = [to_config(compose_overrides(own)) for own in jobs]
+        from mjstack.jobs import check_job, job_folder  # loads torch and Warp, which what is misspelt need not wait for
+
+        if not dry:
+            for config, own in zip(configs, jobs, strict=True):
                 check_job(config, own)
-        folder = None if sweep or dry else job_folder(config)
+        folder = None if sweep or dry else job_folder(configs[0])
         if folder is not None and not any(o.startswith("hydra.run.dir=") for o in overrides):
             args, overrides = [*args, f"hydra.run.dir={folder}"], [*overrides, f"hydra.run.dir={folder}"]
         if not dry:
@@ -94,8 +102,10 @@ def _print_help() -> None:
 
 def _run_hydra(args: list[str], outcomes: list[JobOutcome]) -> int:
     """Hands the command line to Hydra; each job adds its outcome."""
+    from mjstack.jobs import run_job
 
     def job(cfg: DictConfig) -> None:
+        started()
         folder = Path(HydraConfig.get().runtime.output_dir)
         outcome = run_job(to_config(cfg), folder, overrides=list(HydraConfig.get().overrides.task))
         outcomes.append(outcome)
@@ -126,6 +136,9 @@ def _overrides(args: list[str]) -> list[str]:
             skip = True
         elif arg.startswith("-"):
             if arg.partition("=")[0] not in flags:
+                override = arg.lstrip("-")
+                if override.partition("=")[0].partition(".")[0] in {field.name for field in fields(Config)}:
+                    raise CompositionError(f"flag '{arg}' does not exist. Write {override}, an override without dashes.")
                 raise UnknownName("flag", arg, flags)
         elif "=" not in arg and not arg.startswith("~"):
             raise CompositionError(f"argument '{arg}' is not an override. Write key=value, such as nworld=64.")
@@ -195,7 +208,9 @@ def _print_sweep(outcomes: list[JobOutcome]) -> None:
         by_name = {gate.name: gate for gate in outcome.gates}
         cells = [f"{by_name[name].status.value}: {by_name[name].reason}" if name in by_name else "not run" for name in names]
         row = [str(number), " ".join(outcome.overrides), *cells, outcome.status.value]
-        table.add_row(*(escape(cell) for cell in row))
+        if len(names) > _WIDE:
+            cells = [cell.partition(":")[0] for cell in cells]
+        table.add_row(*(escape(cell) for cell in (row[0], row[1], *cells, row[-1])))
         lines.append(f"| {' | '.join(escape_cell(cell) for cell in row)} |")
     Console().print(table)
     sweep_folder = os.path.commonpath([str(outcome.folder) for outcome in outcomes])

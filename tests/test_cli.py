@@ -114,6 +114,54 @@ def test_bad_input_in_a_process_of_its_own(args: list[str], folder: Path) -> Non
     assert everything(folder) == []
 
 
+STARTING = """
+import importlib.abc, os, signal, sys
+
+class Impatient(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+
+signal.signal(signal.SIGINT, signal.{before})
+sys.meta_path.insert(0, Impatient())
+from mjstack.__main__ import main
+main()
+"""
+
+
+def starting(folder: Path, module: str, before: str, *args: str) -> subprocess.CompletedProcess:
+    """A command line on which somebody presses Ctrl-C as a module is loaded."""
+    program = STARTING.format(module=module, before=before)
+    return subprocess.run([sys.executable, "-c", program, *args], cwd=folder, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize("module", ["hydra", "torch"])
+def test_ctrl_c_while_modules_load_is_a_line(module: str, folder: Path) -> None:
+    done = starting(folder, module, "default_int_handler", "gates=[baseline]")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "mjstack: interrupted before anything ran\n")
+    assert everything(folder) == []
+
+
+def test_ctrl_c_stays_ignored_where_it_was(folder: Path) -> None:
+    done = starting(folder, "torch", "SIG_IGN", "nworld=0")
+    assert done.returncode == 2, done.stderr
+
+
+def test_what_is_misspelt_does_not_wait_for_torch(folder: Path) -> None:
+    for args in (["robo=so101"], ["nworld=many"], ["--nworld=3"], ["--version"], ["--help"]):
+        program = "import sys; from mjstack.__main__ import main; import atexit; "
+        program += "atexit.register(lambda: print('torch' in sys.modules, 'warp' in sys.modules, file=sys.stderr)); main()"
+        done = subprocess.run([sys.executable, "-c", program, *args], cwd=folder, capture_output=True, text=True, timeout=60)
+        assert done.stderr.splitlines()[-1] == "False False", args
+
+
+def test_an_override_with_dashes_is_told_without(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--gate.batch.seeds=[1]"]) == 2
+    assert capsys.readouterr().err.strip() == (
+        "mjstack: flag '--gate.batch.seeds=[1]' does not exist. Write gate.batch.seeds=[1], an override without dashes."
+    )
+
+
 def test_help_says_what_there_is_to_choose(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,7 +10,7 @@ import mjstack
 ROOT = Path(mjstack.__file__).parent
 # A module may import from its own layer and from earlier ones.
 LAYERS = [
-    {"errors", "math", "rng"},
+    {"errors", "math", "rng", "startup"},
     {"config"},
     {"robots"},
     {"scene"},
@@ -25,6 +25,7 @@ LAYERS = [
     {"benchmark", "benchmark_physics", "benchmark_ik"},
     {"jobs"},
     {"cli"},
+    {"__main__"},
 ]
 LEAVES = {"report": {"errors", "report"}}  # anything may import it, and it imports only these
 HOMES = {

@@ -17,7 +17,7 @@ from mjstack.report.record import Value, write_atomic
 from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow
 
 RESULT = "case.json"
-_START = "from mjstack.cli import main; main()"
+_START = "from mjstack.__main__ import main; main()"
 _OUT_OF_MEMORY = re.compile(
     r"out of memory|OutOfMemory|MemoryError|bad_alloc|Failed to allocate|Unable to allocate", re.IGNORECASE
 )

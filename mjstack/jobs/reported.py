@@ -83,7 +83,8 @@ def run_reported(cfg: Config, folder: Path, overrides: list[str], title: str, wo
         if report is not None:
             report.status = Status.interrupted
             report.write(folder)
-        console.print("interrupted; the finished gates are in the report")
+        kept = "the finished gates are in the report" if report is not None else "nothing had been finished"
+        console.print(f"interrupted; {kept}")
     except OSError as error:
         outcome.status = _mark_failed(report)
         Console(stderr=True).print(f"mjstack: {folder} cannot be written: {error.strerror}. Free space, or set hydra.run.dir.")

@@ -49,7 +49,8 @@ def save_places(
         bad = failed[:, number]
         axes.scatter(bad[:, 1], bad[:, 0], s=45.0, marker="x", color="k", lw=2.6)
         axes.scatter(bad[:, 1], bad[:, 0], s=40.0, marker="x", color=color, lw=1.2, label=f"{name}, failed: {len(bad)}")
-    axes.set(xlabel="y [m]", ylabel="x [m]", aspect="equal", title=title)
+    axes.set(xlabel="y [m]", ylabel="x [m]", aspect="equal")
+    axes.set_title(title, wrap=True)
     axes.invert_xaxis()
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5)

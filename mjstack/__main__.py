@@ -1,0 +1,15 @@
+"""The command: ``mjstack``, ``python -m mjstack`` and ``python scripts/run.py``."""
+
+from mjstack.startup import guard
+
+
+def main() -> None:
+    """Entry point of the console script; leaves with the exit status of the run."""
+    guard()
+    from mjstack.cli import main as run  # takes seconds
+
+    run()
+
+
+if __name__ == "__main__":
+    main()
