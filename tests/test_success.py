@@ -6,6 +6,7 @@ import csv
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +23,7 @@ from mjstack.gates.batch_record import FAILING, BatchRecord
 from mjstack.gates.episode import Episode, run_episode
 from mjstack.gates.gate import GateContext
 from mjstack.gates.regions import Region, find_regions, radial_yaw_deg
-from mjstack.gates.success import run_success, success_config
+from mjstack.gates.success import _tables, _Tally, run_success, success_config
 from mjstack.gates.success_record import PICTURE, REGIONS, STEM, clear_success
 from mjstack.gates.watch import FailureWatch, Sign
 from mjstack.jobs.gates import check_machine
@@ -485,6 +486,10 @@ def test_worst_regions_of_made_up_episodes() -> None:
     assert (whole.rate_low95, whole.rate_high95) == wilson_interval(whole.accepted, whole.episodes)
     assert len(set(found)) == len(found)
     assert isinstance(found[0], Region)
+    well = replace(found[0], cube="blue", accepted=found[0].episodes)  # has no place among the worst
+    (table,) = _tables(load_config(["gate.success.worst_regions=2"]), _Tally(False, StackRule, PHASES), [], [*found[:1], well])
+    assert table.title == "Worst regions of at least 20 episodes (1 of 1 with a failure)"
+    assert [row[0] for row in table.rows] == [found[0].where]
 
 
 @pytest.mark.gpu
