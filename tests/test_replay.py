@@ -5,21 +5,26 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from environments import brisk
+from environments import brisk, rushed
 from omegaconf import OmegaConf
 
 from mjstack.cli import run
 from mjstack.config import load_config
+from mjstack.config.schema import Backend, TermCfg
 from mjstack.config.store import load_saved
 from mjstack.gates.batch_record import BatchRecord
 from mjstack.gates.episode import snapshot, start_worlds
 from mjstack.gates.gate import GateContext
 from mjstack.gates.replay import _sizes_alone
+from mjstack.jobs.kept_layout import STEM, copy_names, keep_layouts
+from mjstack.jobs.replay import _compare
 from mjstack.sim import BatchSizes
 from mjstack.tasks.stack import StackRule
 
@@ -163,10 +168,175 @@ def test_another_verdict_is_said(earlier: Path, replay: Callable[..., tuple[int,
     record.qpos[3, 14] += 0.002  # somewhere in blue's position
     record.write(folder)
     status, report = replay(folder, "world=3")
-    assert status == 0
     (gate,) = report["gates"]
-    assert "NOT as recorded (red not carried): its cubes end 2 mm from where they did" in gate["reason"]
+    differs = "NOT as recorded (red not carried): its cubes end 2 mm from where they did, "
+    assert gate["reason"].startswith("accepted, ")
+    assert gate["reason"].endswith(f"{differs}expected bit for bit there")
     assert gate["metrics"]["recorded"] == "red not carried"
+    assert (status, report["status"], gate["status"]) == (1, "fail", "fail")
+
+    told = json.loads((folder / "report.json").read_text())
+    told["provenance"]["versions"]["mujoco"] = "3.9.9"  # which promises nothing
+    (folder / "report.json").write_text(json.dumps(told))
+    status, report = replay_into(tmp_path / "other", folder, "world=3")
+    (gate,) = report["gates"]
+    assert gate["reason"].endswith(f"{differs}and not all is as it was in that run")
+    assert any("mujoco was 3.9.9 in that run" in line for line in gate["details"])
+    assert (status, gate["status"]) == (0, "pass")
+
+
+@pytest.mark.parametrize(
+    ("bits", "moved", "device", "changes", "kept", "says"),
+    [
+        (0, 0.0, "cpu", [], True, "as recorded, and it ends bit for bit where it did"),
+        (0, 0.0, "cpu", ["mujoco"], True, "as recorded, and it ends bit for bit where it did"),
+        (0, 1e-9, "cpu", [], False, "NOT as recorded (the same verdict): its cubes end 1e-06 mm from where they did, expected"),
+        (0, 1e-9, "cpu", ["mujoco"], True, "as recorded, but its cubes end 1e-06 mm from where they did, and not all is as"),
+        (0, 1e-9, "cuda:0", [], True, "as recorded, but its cubes end 1e-06 mm from where they did, and runs on CUDA agree"),
+        (StackRule.CARRY, 0.0, "cpu", [], False, "NOT as recorded (red not carried): it ends bit for bit where it did"),
+        (StackRule.CARRY, 0.002, "cpu", [], False, "NOT as recorded (red not carried): its cubes end 2 mm from where they did"),
+        (StackRule.CARRY, 0.002, "cuda:0", [], True, "NOT as recorded (red not carried): its cubes end 2 mm"),
+        (StackRule.OVERFLOW, 0.002, "cpu", [], True, "mm from where they did, and a world alone shares no contact pool"),
+    ],
+)
+def test_what_is_promised_of_another_end(
+    bits: int, moved: float, device: str, changes: list[str], kept: bool, says: str, new_context: Callable[..., GateContext]
+) -> None:
+    """Bit for bit, but on CUDA, with other versions, and where the contact pool was too small."""
+    context = new_context("sim=native")
+    ours = np.zeros(context.model.nq)
+    theirs = ours.copy()
+    theirs[context.index.cube_qpos[1]] = moved
+    failed = np.array([0, int(bits)], np.int32)
+    record = BatchRecord(seed=0, backend="mjwarp", device=device, failed=failed, values={}, qpos=np.stack((ours, theirs)))
+    plan = SimpleNamespace(record=record, world=1, gate="batch")
+    done = SimpleNamespace(failed=0, qpos_end=ours)
+    found = _compare(plan, done, Backend.mjwarp, device, changes, context)
+    assert found[0] is kept
+    assert says in found[1]
+
+
+def test_a_start_that_is_not_the_recorded_one_is_refused(
+    earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Such as after random numbers have changed."""
+    folder = copy_of(earlier, tmp_path)
+    record = record_of(folder, 1)
+    assert record.start is not None
+    record.start[3, 14] += 0.002
+    record.write(folder)
+    monkeypatch.chdir(tmp_path)
+    assert run(["job=replay", f"run={folder}", f"world={ACCEPTED}"]) == 2
+    _refused(capsys, "world 3 of seed 1 would start up to 0.002 (m, rad) from where it did, expected its own start. Use the mj")
+    assert [path.name for path in tmp_path.iterdir()] == ["copy"]
+
+
+CARRY = """world,red_x_m,red_y_m,red_yaw_rad,blue_x_m,blue_y_m,blue_yaw_rad,red_mass_kg
+0,0.33,-0.13,0,0.33,0.06,0,0.08
+1,0.31,-0.1,0.3,0.34,0.08,-0.5,0.09
+"""
+
+
+@pytest.fixture(scope="module")
+def from_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of both gates from a file and, beside it, random joints. The file is gone."""
+    home = tmp_path_factory.mktemp("from_file")
+    noise = ["+reset.noise.func=mjstack.mdp.reset.JointNoise", "+reset.noise.params.arm=0.01"]
+    start = ["reset=layout", "layout=carry.csv", *noise, "nworld=2", "sim=native", "hydra.run.dir=run"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(home)
+        Path("carry.csv").write_text(CARRY)
+        assert run(["gates=[batch,success]", *start, *rushed()]) == 1
+        Path("carry.csv").unlink()
+    return home / "run"
+
+
+@pytest.mark.parametrize("gate", ["batch", "success"])
+def test_a_run_from_a_file_replays_from_its_own_copy(
+    gate: str, from_file: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path
+) -> None:
+    assert (from_file / "layout_played.csv").read_text() == CARRY
+    (tmp_path / "carry.csv").write_text(CARRY.replace("0.31", "0.32"))  # a file of that name where the replay is called
+    _, report = replay(from_file, f"world={gate}:1")
+    (found,) = report["gates"]
+    assert found["reason"].endswith("as recorded, and it ends bit for bit where it did")
+    with np.load(tmp_path / "out" / "trajectory.npz") as held:
+        assert 0.31 in held["start_qpos"]
+        assert held["field.body_mass"][-2:].tolist() == [0.09, 0.08]
+
+
+@pytest.mark.parametrize(
+    ("edit", "says"),
+    [
+        (
+            lambda copy: copy.unlink(),
+            "has no layout_played.csv, expected a copy of the layout file that it started from, carry",
+        ),
+        (lambda copy: _replace(copy, "0.31", "0.315"), "would start up to 0.005 (m, rad) from where it did"),
+        (lambda copy: _replace(copy, "0.31", "left"), "layout_played.csv, line 3, column red_x_m: expected a finite number"),
+    ],
+    ids=["lost", "edited", "damaged"],
+)
+@pytest.mark.parametrize("gate", ["batch", "success"])
+def test_another_layout_is_refused(
+    gate: str,
+    edit: Callable[[Path], None],
+    says: str,
+    from_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = copy_of(from_file, tmp_path)
+    edit(folder / "layout_played.csv")
+    monkeypatch.chdir(tmp_path)
+    assert run(["job=replay", f"run={folder}", f"world={gate}:1"]) == 2
+    _refused(capsys, says)
+    assert [path.name for path in tmp_path.iterdir()] == ["copy"]
+
+
+def test_what_the_start_does_not_show_is_found_at_the_end(
+    from_file: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path
+) -> None:
+    """Another mass; and a record from before starts were kept."""
+    folder = copy_of(from_file, tmp_path)
+    replace(record_of(folder, 0), start=None).write(folder)
+    assert record_of(folder, 0).start is None
+    _replace(folder / "layout_played.csv", "0.09", "0.1")
+    status, report = replay(folder, "world=batch:1")
+    assert "; NOT as recorded (the same verdict): its cubes end " in report["gates"][0]["reason"]
+    assert status == 1
+
+
+def test_copies_of_layouts(tmp_path: Path) -> None:
+    """Each file once, byte for byte, and those of an earlier run in the folder go unless they are read."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    own = folder / f"{STEM}_3.csv"
+    for path in (folder / f"{STEM}.csv", folder / f"{STEM}_2.csv", own):
+        path.write_bytes(path.name.encode())
+    (tmp_path / "a.csv").write_bytes(b"\xef\xbb\xbfworld\r\n")
+    cfg = load_config(["reset=layout", f"layout={tmp_path}/a.csv"])
+    cfg.reset["own"] = TermCfg(func="mjstack.mdp.layout.FromLayout", params={"path": str(own)})
+    cfg.reset["again"] = TermCfg(func="mjstack.mdp.layout.FromLayout", params={"path": str(own), "pose": "home"})
+    found = keep_layouts(cfg, folder)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
+        f"{STEM}.csv": b"\xef\xbb\xbfworld\r\n",
+        f"{STEM}_2.csv": own.name.encode(),
+        f"{STEM}_3.csv": own.name.encode(),
+    }
+    read = [term.params["path"] for term in found.reset.values()]
+    assert read == [str(folder / f"{STEM}{number}.csv") for number in ("", "_2", "_2")]
+    assert found.reset["again"].params["pose"] == "home"
+    assert cfg.reset["layout"].params["path"] == f"{tmp_path}/a.csv"  # what is saved and shown stays
+
+    plain = load_config(["gates=[batch]"])
+    assert keep_layouts(plain, folder) == plain
+    assert not list(folder.iterdir())
+    plain.gate.success.reset = dict(cfg.reset)
+    assert not copy_names(plain)  # of a gate that does not run
+    plain.gates = ["success"]
+    assert list(copy_names(plain)) == [f"{tmp_path}/a.csv", str(own)]
 
 
 def test_run_that_did_not_get_to_the_world(

@@ -6,6 +6,7 @@ import csv
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +23,7 @@ from mjstack.gates.batch_record import FAILING, BatchRecord
 from mjstack.gates.episode import Episode, run_episode
 from mjstack.gates.gate import GateContext
 from mjstack.gates.regions import Region, find_regions, radial_yaw_deg
-from mjstack.gates.success import run_success, success_config
+from mjstack.gates.success import _tables, _Tally, run_success, success_config
 from mjstack.gates.success_record import PICTURE, REGIONS, STEM, clear_success
 from mjstack.gates.watch import FailureWatch, Sign
 from mjstack.jobs.gates import check_machine
@@ -89,6 +90,8 @@ def test_small_region_passes(passed: Path) -> None:
         "success_regions.csv",
         "success_seed0.npz",
     ]
+    assert "no region of at least 2 episodes had a failure" in gate["details"]
+    assert not [table for table in gate["tables"] if "region" in table["title"]]
     assert "![success.png](success.png)" in (passed / "report.md").read_text()
     scene = load_config().scene
     with np.load(passed / "success_seed0.npz") as held:
@@ -147,7 +150,7 @@ def hasty() -> Callable[..., GateContext]:
 
 def test_seeds_add_up_and_the_rate_decides(hasty: Callable[..., GateContext], tmp_path: Path) -> None:
     """The threshold is on the rate itself; what fails is named all the same."""
-    context = hasty("gates=[batch,success]", "gate.success.seeds=2")
+    context = hasty("gates=[batch,success]", "gate.success.seeds=2", "gate.success.cell_episodes=2")
     lines: list[str] = []
     context.say = lines.append
     result = play(context, tmp_path)
@@ -160,6 +163,9 @@ def test_seeds_add_up_and_the_rate_decides(hasty: Callable[..., GateContext], tm
     assert [line.split(":")[0] for line in lines] == ["success, seed 0", "success, seed 1"]
     seeds = next(table for table in result.tables if table.title == "Seeds")
     assert [row[:3] for row in seeds.rows] == [["0", "2", "0"], ["1", "2", "0"]]
+    (worst,) = [table for table in result.tables if table.title.startswith("Worst regions of at least 2 episodes")]
+    assert worst.title.endswith(f"({len(worst.rows)} of {len(worst.rows)} with a failure)")
+    assert not any("had a failure" in line for line in result.details)
     (signs,) = [table for table in result.tables if "first sign" in table.header[0]]
     assert sum(int(row[1]) for row in signs.rows) == 4  # every failed episode is in one line, with a sign or without
     rows = list(csv.DictReader((tmp_path / "success_failing_worlds.csv").read_text().splitlines()))
@@ -480,6 +486,10 @@ def test_worst_regions_of_made_up_episodes() -> None:
     assert (whole.rate_low95, whole.rate_high95) == wilson_interval(whole.accepted, whole.episodes)
     assert len(set(found)) == len(found)
     assert isinstance(found[0], Region)
+    well = replace(found[0], cube="blue", accepted=found[0].episodes)  # has no place among the worst
+    (table,) = _tables(load_config(["gate.success.worst_regions=2"]), _Tally(False, StackRule, PHASES), [], [*found[:1], well])
+    assert table.title == "Worst regions of at least 20 episodes (1 of 1 with a failure)"
+    assert [row[0] for row in table.rows] == [found[0].where]
 
 
 @pytest.mark.gpu

@@ -111,7 +111,7 @@ def _play(context: GateContext, sim: Simulation, seed: int, tally: _Tally) -> Ba
     context.carry_start = episode.states.get(last, context.carry_start)
     if seed == cfg.seed:
         context.timed_episode = TimedEpisode.of(episode, sim)
-    record = BatchRecord.take(seed, sim, episode.verdict)
+    record = BatchRecord.take(seed, sim, episode)
     tally.add(record, episode, sim)
     return record
 

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from mjstack.errors import RunError
+from mjstack.gates.episode import Episode
 from mjstack.gates.gate import measured_values
 from mjstack.report.record import write_atomic
 from mjstack.sim import Simulation
-from mjstack.tasks.evidence import Rule, Verdict
+from mjstack.tasks.evidence import Rule
 
 FAILING = "failing_worlds.csv"
 WORLDS = "worlds"  # the batch gate's files begin with this
@@ -22,7 +23,7 @@ WORLDS = "worlds"  # the batch gate's files begin with this
 
 @dataclass(eq=False, kw_only=True, slots=True)
 class BatchRecord:
-    """All worlds of one seed after their episode. Some 300 bytes a world, whatever the episode's length.
+    """All worlds of one seed after their episode. Some 500 bytes a world, whatever the episode's length.
 
     Attributes:
         seed: The seed.
@@ -31,6 +32,7 @@ class BatchRecord:
         failed: Bits of the task's rules, shape ``(nworld,)``, int32.
         values: What the acceptance measured, by name with unit, each ``(nworld,)``.
         qpos: Final positions, shape ``(nworld, nq)``, in the backend's precision.
+        start: Positions at the start likewise; None in records of runs that did not keep them.
     """
 
     seed: int
@@ -39,17 +41,19 @@ class BatchRecord:
     failed: np.ndarray
     values: dict[str, np.ndarray]
     qpos: np.ndarray
+    start: np.ndarray | None = None
 
     @classmethod
-    def take(cls, seed: int, sim: Simulation, verdict: Verdict) -> BatchRecord:
+    def take(cls, seed: int, sim: Simulation, episode: Episode) -> BatchRecord:
         """Copies what there is to keep to the host."""
         return cls(
             seed=seed,
             backend=sim.backend,
             device=str(sim.device),
-            failed=verdict.failed.cpu().numpy(),
-            values=measured_values(verdict),
+            failed=episode.verdict.failed.cpu().numpy(),
+            values=measured_values(episode.verdict),
             qpos=sim.qpos.cpu().numpy().copy(),
+            start=episode.start,
         )
 
     @classmethod
@@ -76,6 +80,7 @@ class BatchRecord:
                     failed=held["failed"],
                     values={name[len("value.") :]: held[name] for name in held.files if name.startswith("value.")},
                     qpos=held["qpos"],
+                    start=held["start_qpos"] if "start_qpos" in held.files else None,
                 )
         except Exception as error:  # numpy and zipfile fail in their own ways
             raise RunError(
@@ -90,6 +95,7 @@ class BatchRecord:
             "device": self.device,
             "failed": self.failed,
             "qpos": self.qpos,
+            **({} if self.start is None else {"start_qpos": self.start}),
             **{f"value.{name}": values for name, values in self.values.items()},
             **more,
         }

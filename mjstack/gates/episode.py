@@ -58,6 +58,7 @@ class Episode:
     Attributes:
         verdict: The acceptance of every world.
         frames: How many.
+        start: Positions of every world before the first one, shape ``(nworld, nq)``, in the backend's precision.
         waypoint_error: Largest distance from a target that inverse kinematics left [m], shape ``(nworld,)``.
         retries: Grasps that were tried again, shape ``(nworld,)``.
         seconds: Wall time of the frames alone [s]; where they are captured, of as many replayed ones.
@@ -72,6 +73,7 @@ class Episode:
 
     verdict: Verdict
     frames: int
+    start: np.ndarray
     waypoint_error: np.ndarray
     retries: np.ndarray
     seconds: float
@@ -107,12 +109,18 @@ def start_worlds(
     Returns:
         The environment that the commands go through, and what gives the commands, which are its actions.
     """
+    env = place_worlds(sim, index, cfg, reset, worlds)
+    return env, make_controller(env, planner, advance)
+
+
+def place_worlds(sim: Simulation, index: SceneIndex, cfg: Config, reset: Reset, worlds: Sequence[int] | None = None) -> Env:
+    """Resets every world, and no more; see `start_worlds`."""
     env = Env(sim, index, scripted_config(cfg, reset=reset), check_faults=False)  # the acceptance names lost worlds
     if worlds is not None:
         env.world.copy_(torch.tensor(worlds))
     env.reset(seed=cfg.seed)
     sim.forward()
-    return env, make_controller(env, planner, advance)
+    return env
 
 
 def make_controller(env: Env, planner: ScriptedPlanner, advance: Advance | None = None) -> Controller:
@@ -170,7 +178,7 @@ def run_episode(
         repeat: Give these commands instead of the controller's.
     """
     env, controller = start_worlds(sim, index, cfg, reset, planner, advance, worlds)
-    frames = controller.frames
+    frames, start = controller.frames, sim.qpos.cpu().numpy().copy()
     recorded = Recorded(controller, env.action_manager.action_dim) if keep_commands else None
     if repeat is not None:
         repeat.rewind()
@@ -232,6 +240,7 @@ def run_episode(
     return Episode(
         evidence.verdict(sim),
         frames,
+        start,
         controller.error.double().cpu().numpy(),
         controller.retries.cpu().numpy(),
         seconds,

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Backend, Config
-from mjstack.gates.episode import Episode, FrameHook, State, Watch, snapshot, start_worlds
+from mjstack.gates.episode import Episode, FrameHook, State, Watch, place_worlds, snapshot, start_worlds
 from mjstack.gates.gate import GateContext, measured_values
 from mjstack.managers.reset import required_fields
 from mjstack.math import lowest_corner
@@ -107,15 +107,7 @@ def replay_world(
         watch: Looks on.
     """
     cfg = replace(context.cfg, seed=seed)
-    sim = make_simulation(
-        context.model,
-        cfg,
-        1,
-        backend=backend,
-        device=device,
-        fields=required_fields(cfg.reset),
-        sizes=_sizes_alone(resolve_sizes(cfg), cfg.nworld),
-    )
+    sim = _alone(context, backend, device)
     try:
         start_worlds(sim, context.index, cfg, cfg.reset, context.planner, worlds=[world])
         start = snapshot(sim)
@@ -140,6 +132,31 @@ def replay_world(
         )
     finally:
         sim.close()
+
+
+def start_of_world(context: GateContext, *, seed: int, world: int, backend: Backend, device: str) -> np.ndarray:
+    """Positions at which a world starts, shape ``(nq,)``; arguments as of `replay_world`."""
+    cfg = replace(context.cfg, seed=seed)
+    sim = _alone(context, backend, device)
+    try:
+        place_worlds(sim, context.index, cfg, cfg.reset, worlds=[world])
+        return sim.qpos[0].cpu().numpy().copy()
+    finally:
+        sim.close()
+
+
+def _alone(context: GateContext, backend: Backend, device: str) -> Simulation:
+    """A simulation for one world of the batch."""
+    cfg = context.cfg
+    return make_simulation(
+        context.model,
+        cfg,
+        1,
+        backend=backend,
+        device=device,
+        fields=required_fields(cfg.reset),
+        sizes=_sizes_alone(resolve_sizes(cfg), cfg.nworld),
+    )
 
 
 def _sizes_alone(sizes: BatchSizes, nworld: int) -> BatchSizes:

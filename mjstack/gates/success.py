@@ -17,7 +17,7 @@ from mjstack.gates.batch_record import FAILING, write_failing
 from mjstack.gates.episode import SCRIPTED
 from mjstack.gates.gate import GateContext, failing_rules, play_seeds
 from mjstack.gates.regions import Region, find_regions
-from mjstack.gates.success_record import BOTH, PICTURE, REGIONS, Start, SuccessRecord, layout_name
+from mjstack.gates.success_record import BOTH, PICTURE, REGIONS, SuccessRecord, layout_name, start_places
 from mjstack.gates.watch import FailureWatch, describe_sign
 from mjstack.math import wilson_interval
 from mjstack.mdp.layout import write_layout
@@ -57,7 +57,7 @@ class _Watch(FailureWatch):
     def start(self, env: Env) -> None:
         """See `Watch`."""
         super().start(env)
-        self.started = Start.of(env)
+        self.places = start_places(env)
         if self._path is not None:
             try:
                 write_layout(env, self._path)
@@ -111,7 +111,7 @@ class _Tally:
         self.seeds.append(seed)
         self.accepted.append(record.accepted)
         self.retries.append(record.retries)
-        self.places.append(record.start.places)
+        self.places.append(record.places)
         self.waypoint_error = float(np.maximum(self.waypoint_error, waypoint_error))  # NaN is handed on
         self.seconds += seconds
         self.failed += names(np.flatnonzero(failed).tolist())
@@ -163,7 +163,7 @@ def _play(context: GateContext, sim: Simulation, seed: int, tally: _Tally, detai
     episode = context.run(sim, cfg.reset, seed=seed, watch=watch)
     if watch.problem:
         details.append(f"seed {seed}: {watch.problem}")
-    record = SuccessRecord.take(seed, sim, cfg, episode, watch.started, watch)
+    record = SuccessRecord.take(seed, sim, cfg, episode, watch.places, watch)
     tally.add(record, episode.seconds, float(episode.waypoint_error.max()))
     return record
 
@@ -236,6 +236,8 @@ def _judge(
         problems.append("rate")
     if not regions:
         details.append(f"no region has {t.cell_episodes} episodes (gate.success.cell_episodes): more seeds have more")
+    elif all(region.accepted == region.episodes for region in regions):
+        details.append(f"no region of at least {t.cell_episodes} episodes had a failure")
     if tally.unreachable:
         details.append(f"target out of reach: {name_worlds(tally.unreachable, n, _NAMED, 'episodes')}")
     details += [f"{rule.text}: {name_worlds(worlds, n, _NAMED, 'episodes')}" for rule, worlds in tally.broken.items()]
@@ -303,12 +305,14 @@ def _tables(cfg: Config, tally: _Tally, per_seed: list[int], regions: list[Regio
         ]
         header = ["first sign of failure", "failed episodes", "which"]
         tables.append(Table(title="Where it went wrong", header=header, rows=rows))
-    if not regions:
+    failing = [r for r in regions if r.accepted < r.episodes]
+    if not failing:
         return tables
-    worst = [[r.where, str(r.episodes), str(r.accepted), *_rate_cells(r.accepted, r.episodes)] for r in regions]
+    worst = [[r.where, str(r.episodes), str(r.accepted), *_rate_cells(r.accepted, r.episodes)] for r in failing]
+    shown = f"{min(len(worst), t.worst_regions)} of {len(worst)} with a failure"
     tables.append(
         Table(
-            title=f"Worst regions of at least {t.cell_episodes} episodes ({min(len(worst), t.worst_regions)} of {len(worst)})",
+            title=f"Worst regions of at least {t.cell_episodes} episodes ({shown})",
             header=["where the cube started", "episodes", "accepted", "rate", "95 % interval"],
             rows=worst[: t.worst_regions],
         )

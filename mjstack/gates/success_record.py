@@ -24,25 +24,11 @@ REGIONS, PICTURE = "success_regions.csv", "success.png"
 BOTH = "success_failing_worlds.csv"  # the failing episodes, where the batch gate has a table of its own
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Start:
-    """How worlds started.
-
-    Attributes:
-        qpos: Positions, shape ``(nworld, nq)``, in the backend's precision.
-        places: x and y [m] and rotation about z [rad] of each cube, red first, shape ``(nworld, 2, 3)``.
-    """
-
-    qpos: np.ndarray
-    places: np.ndarray
-
-    @classmethod
-    def of(cls, env: Env) -> Start:
-        """Copies it to the host."""
-        poses = [pose_w(env, name).double().cpu().numpy() for name in env.index.objects]
-        # Cubes stand flat at a start, so that all of a rotation is about z.
-        places = [np.column_stack((p[:, :2], 2.0 * np.arctan2(p[:, 6], p[:, 3]))) for p in poses]
-        return cls(qpos=env.sim.qpos.cpu().numpy().copy(), places=np.stack(places, axis=1))
+def start_places(env: Env) -> np.ndarray:
+    """Where cubes stand, red first: x and y [m] and rotation about z [rad], on the host, shape ``(nworld, 2, 3)``."""
+    poses = [pose_w(env, name).double().cpu().numpy() for name in env.index.objects]
+    # Cubes stand flat at a start, so that all of a rotation is about z.
+    return np.stack([np.column_stack((p[:, :2], 2.0 * np.arctan2(p[:, 6], p[:, 3]))) for p in poses], axis=1)
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -50,8 +36,8 @@ class SuccessRecord:
     """All episodes of one seed.
 
     Attributes:
-        batch: Verdicts, what was measured, and final positions.
-        start: How the worlds started.
+        batch: Verdicts, what was measured, and positions at the start and at the end.
+        places: Of the cubes at the start; see `start_places`.
         retries: Grasps that were tried again, shape ``(nworld,)``.
         unreachable: Whether a target was out of reach, shape ``(nworld,)``, bool.
         sign: Number of the first `Sign` of failure, shape ``(nworld,)``.
@@ -60,7 +46,7 @@ class SuccessRecord:
     """
 
     batch: BatchRecord
-    start: Start
+    places: np.ndarray
     retries: np.ndarray
     unreachable: np.ndarray
     sign: np.ndarray
@@ -69,13 +55,13 @@ class SuccessRecord:
 
     @classmethod
     def take(
-        cls, seed: int, sim: Simulation, cfg: Config, episode: Episode, start: Start, watch: FailureWatch
+        cls, seed: int, sim: Simulation, cfg: Config, episode: Episode, places: np.ndarray, watch: FailureWatch
     ) -> SuccessRecord:
         """Copies what there is to keep to the host."""
         sign, phase, frame = torch.stack((watch.sign, watch.phase, watch.frame)).cpu().numpy()
         return cls(
-            batch=BatchRecord.take(seed, sim, episode.verdict),
-            start=start,
+            batch=BatchRecord.take(seed, sim, episode),
+            places=places,
             retries=episode.retries,
             unreachable=~(episode.waypoint_error <= cfg.controller.ik_tolerance),  # NaN is not reached
             sign=sign,
@@ -93,8 +79,7 @@ class SuccessRecord:
         self.batch.write(
             folder,
             STEM,
-            start_qpos=self.start.qpos,
-            start_places=self.start.places,
+            start_places=self.places,
             retries=self.retries,
             unreachable=self.unreachable,
             sign=self.sign,
@@ -114,7 +99,7 @@ class SuccessRecord:
             frame = self.frame[world] if self.frame[world] >= 0 else ""
             cells = [self.batch.seed, world, broken, Sign(self.sign[world]).name, phase, frame]
             cells += [self.retries[world], int(self.unreachable[world])]
-            cells += [f"{number:.6g}" for number in self.start.places[world].ravel()]
+            cells += [f"{number:.6g}" for number in self.places[world].ravel()]
             writer.writerow([*cells, *(f"{values[world]:.6g}" for values in self.batch.values.values())])
         return out.getvalue().splitlines()
 

@@ -15,6 +15,7 @@ from mjstack.gates.gate import GateContext
 from mjstack.gates.runner import run_gates
 from mjstack.gates.success import success_config
 from mjstack.gates.success_record import clear_success
+from mjstack.jobs.kept_layout import keep_layouts
 from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.reported import Record, check_showing, run_reported
@@ -66,6 +67,7 @@ def run_gates_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome
 
 def _run(context: GateContext, bar: ProgressBar, record: Record) -> None:
     if context.folder is not None:
+        context.cfg = keep_layouts(context.cfg, context.folder)
         clear_records(context.folder)
         clear_success(context.folder, keep=None if context.cfg.layout is None else Path(context.cfg.layout))
     run_gates(context, bar.start, record)

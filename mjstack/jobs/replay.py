@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,16 +12,17 @@ from omegaconf import OmegaConf
 from rich.markup import escape
 
 from mjstack.config.schema import Backend, Config, SimCfg
-from mjstack.errors import ConfigError, DeviceError
+from mjstack.errors import ConfigError, DeviceError, RunError
 from mjstack.gates.batch_record import BatchRecord
 from mjstack.gates.gate import GateContext, judge_one
-from mjstack.gates.replay import ReplayedWorld, replay_world
+from mjstack.gates.replay import ReplayedWorld, replay_world, start_of_world
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
 from mjstack.gates.success_record import STEM
 from mjstack.gates.watch import FailureWatch, describe_sign
 from mjstack.jobs.earlier_run import EarlierRun
 from mjstack.jobs.gates import check_task
+from mjstack.jobs.kept_layout import copy_names, kept_layouts
 from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.reported import Record, check_showing, run_provenance, run_reported
@@ -30,6 +32,9 @@ from mjstack.tasks.evidence import describe_rules
 
 KEYS = ("job", "run", "world", "sim", "view", "video")
 """What its command line may set. All else is the earlier run's."""
+
+_PLACES = {"git_commit": "mjstack's commit", "cpu": "the processor"}  # besides versions, what arithmetic depends on
+_SAME_START = 1e-6  # [m, rad], and of quaternions: backends differ by rounding, another start by more
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -44,7 +49,7 @@ class ReplayPlan:
         world: The world's number.
         where: Backend and device, each played once; the first is the earlier run's unless ``sim`` says otherwise.
         record: What the gate found there, or None.
-        note: What could not be as it was.
+        notes: What could not be as it was.
     """
 
     run: EarlierRun
@@ -54,7 +59,7 @@ class ReplayPlan:
     world: int
     where: list[tuple[Backend, str]]
     record: BatchRecord | None
-    note: str
+    notes: list[str]
 
 
 def check_replay(cfg: Config) -> None:
@@ -62,6 +67,7 @@ def check_replay(cfg: Config) -> None:
     plan = _plan(cfg)
     check_task(plan.cfg)
     check_showing(plan.cfg)
+    _check_start(plan)
 
 
 def run_replay_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
@@ -88,8 +94,9 @@ def _plan(cfg: Config) -> ReplayPlan:
     if not world < run.cfg.nworld:
         raise ConfigError("world", cfg.world, f"a world from 0 to {run.cfg.nworld - 1}, as that run has")
     record = run.batch_record(seed, *([STEM] if gate == "success" else []))
-    played = success_config(run.cfg) if gate == "success" else run.cfg
-    where, note = _choose(cfg.sim, run, record)
+    kept = kept_layouts(run.cfg, run.folder)
+    played = success_config(kept) if gate == "success" else kept
+    where, notes = _choose(cfg.sim, run, record)
     backend, device = where[0]
     return ReplayPlan(
         run=run,
@@ -99,7 +106,7 @@ def _plan(cfg: Config) -> ReplayPlan:
         world=world,
         where=where,
         record=record,
-        note=note,
+        notes=notes,
     )
 
 
@@ -111,20 +118,41 @@ def _whose(cfg: Config, named: str | None, world: str) -> str:
     return named or (had[0] if had else "batch")
 
 
-def _choose(asked: SimCfg, run: EarlierRun, record: BatchRecord | None) -> tuple[list[tuple[Backend, str]], str]:
+def _choose(asked: SimCfg, run: EarlierRun, record: BatchRecord | None) -> tuple[list[tuple[Backend, str]], list[str]]:
     """Backends and devices to play on, and what could not be as it was."""
     ran = _ran_on(run, record)
     backend = ran[0] if asked.backend is Backend.auto else asked.backend
     if backend is Backend.native:
-        return [(Backend.native, "cpu")], ""
-    device, note = resolve_device(asked.device), ""
+        return [(Backend.native, "cpu")], []
+    device, notes = resolve_device(asked.device), []
     if asked.device == "auto" and ran[0] is Backend.mjwarp:
         try:
             device = resolve_device(ran[1])
         except DeviceError:
-            note = f"that run was on {ran[1]}, which is not here: replayed on {device}"
+            notes = [f"that run was on {ran[1]}, which is not here: replayed on {device}"]
     where = [(Backend.mjwarp, device)]
-    return where + [(Backend.native, "cpu")] * (asked.backend is Backend.auto), note
+    return where + [(Backend.native, "cpu")] * (asked.backend is Backend.auto), notes
+
+
+def _check_start(plan: ReplayPlan) -> None:
+    """Raises if the world would start elsewhere than it did in that run."""
+    if plan.record is None or plan.record.start is None:
+        return
+    context, then = GateContext(cfg=plan.cfg), plan.record.start[plan.world]
+    # MJWarp takes longer to load than the native start does to compute, and rounding may have it draw otherwise.
+    for backend, device in dict.fromkeys([(Backend.native, "cpu"), plan.where[0]]):
+        now = start_of_world(context, seed=plan.seed, world=plan.world, backend=backend, device=device)
+        off = float(np.abs(now - then).max()) if now.shape == then.shape else math.inf
+        if off <= _SAME_START:
+            return
+    fix = f"Use the mjstack that ran it ({plan.run.provenance.get('git_commit')})"
+    copies = ", ".join(copy_names(plan.run.cfg).values())
+    if copies:
+        fix = f"Put back what it started from, as {copies}"
+    raise RunError(
+        f"run={plan.run.folder}: world {plan.world} of seed {plan.seed} would start up to {off:.3g} (m, rad) from where it "
+        f"did, expected its own start. {fix}."
+    )
 
 
 def _ran_on(run: EarlierRun, record: BatchRecord | None) -> tuple[Backend, str]:
@@ -142,31 +170,28 @@ def _run(plan: ReplayPlan, context: GateContext, bar: ProgressBar, record: Recor
     assert context.folder is not None
     played = replace(plan.cfg, seed=plan.seed)
     write_atomic(context.folder / "replayed_config.yaml", OmegaConf.to_yaml(OmegaConf.structured(played)))
-    notes = [plan.note] if plan.note else []
-    notes += _changes(plan.run.provenance, run_provenance(plan.cfg, context))
-    for line in notes:
+    changes = _changes(plan.run.provenance, run_provenance(plan.cfg, context))
+    for line in plan.notes + changes:
         bar.say(escape(line))
     for number, (backend, device) in enumerate(plan.where):
         name = f"replay_{backend.value}"
         bar.start(name)
-        run_guarded(context, name, partial(_replay, plan, number, backend, device, notes), record)
+        run_guarded(context, name, partial(_replay, plan, number, backend, device, changes), record)
 
 
 def _changes(then: dict, now: dict) -> list[str]:
-    """What is not as it was in the earlier run and could change the physics."""
-    was, versions = then.get("versions"), now["versions"]
-    lines = [
-        f"{name} was {was[name]} in that run and is {version} now"
-        for name, version in versions.items()
-        if isinstance(was, dict) and name in was and was[name] != version
-    ]
+    """What is not as it was in the earlier run and could change a result, or its last bits."""
+    was = then.get("versions")
+    pairs = [(name, was[name], version) for name, version in now["versions"].items() if isinstance(was, dict) and name in was]
+    pairs += [(what, then[key], now[key]) for key, what in _PLACES.items() if key in then]
+    lines = [f"{what} was {before} in that run and is {here} now" for what, before, here in pairs if before != here]
     if then.get("model_sha256") != now["model_sha256"]:
         lines.append("the compiled model is not the same as in that run: this is another physics")
     return lines
 
 
 def _replay(
-    plan: ReplayPlan, number: int, backend: Backend, device: str, notes: list[str], context: GateContext
+    plan: ReplayPlan, number: int, backend: Backend, device: str, changes: list[str], context: GateContext
 ) -> list[GateResult]:
     """Plays the world on one backend and says how it went, and whether that is what was recorded."""
     first = number == 0
@@ -182,7 +207,10 @@ def _replay(
     )
     status, reason, metrics = judge_one(context.evidence.rules, done.episode.verdict)
     reason = reason or f"accepted, {context.evidence.headline(metrics)}"
-    reason += f"; {_compare(plan, done, backend, device, context)}"
+    kept, compared = _compare(plan, done, backend, device, changes, context)
+    reason += f"; {compared}"
+    if not kept:
+        status = Status.failed
     if first:
         context.shown, context.shown_by = done.episode, f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
     told = [str(finding) for finding in done.findings] + ([] if watch is None else [_first_sign(watch, done, context)])
@@ -205,7 +233,7 @@ def _replay(
             reason=reason,
             thresholds=context.evidence.thresholds(plan.cfg),
             metrics=values,
-            details=[*told, *notes],
+            details=told + plan.notes + changes,
         )
     ]
 
@@ -218,25 +246,34 @@ def _first_sign(watch: FailureWatch, done: ReplayedWorld, context: GateContext) 
     return f"first sign of failure: {describe_sign(sign, name) if sign else 'none'}{when}; grasps tried again: {retries}"
 
 
-def _compare(plan: ReplayPlan, done: ReplayedWorld, backend: Backend, device: str, context: GateContext) -> str:
-    """What the gate recorded of this world, against what happened now."""
+def _compare(
+    plan: ReplayPlan, done: ReplayedWorld, backend: Backend, device: str, changes: list[str], context: GateContext
+) -> tuple[bool, str]:
+    """What the gate recorded of this world against what happened now, and whether that keeps what is promised."""
     record = plan.record
     if record is None:
-        return f"that run recorded no verdict, because its {plan.gate} gate did not get there"
+        return True, f"that run recorded no verdict, because its {plan.gate} gate did not get there"
     bits = int(record.failed[plan.world])
     rules = context.evidence.rules
     told = describe_rules(rules, bits) or "accepted"
     same = bits == done.failed
     if record.backend != backend.value:
-        return f"that run's {record.backend} world had {'the same verdict' if same else f'another verdict: {told}'}"
+        return True, f"that run's {record.backend} world had {'the same verdict' if same else f'another verdict: {told}'}"
     ours, theirs = done.qpos_end, record.qpos[plan.world]
-    if np.array_equal(ours, theirs, equal_nan=True):
-        return "as recorded, and it ends bit for bit where it did"
+    exact = np.array_equal(ours, theirs, equal_nan=True)
+    if same and exact:
+        return True, "as recorded, and it ends bit for bit where it did"
     apart = max(float(np.linalg.norm(ours[a : a + 3] - theirs[a : a + 3])) for a in context.index.cube_qpos)
-    ends = f"its cubes end {1e3 * apart:.3g} mm from where they did"
-    cuda = device.startswith("cuda") or record.device.startswith("cuda")
-    why = ", and runs on CUDA agree to rounding only" if cuda else ""
-    if same:
-        return f"as recorded, but {ends}{why}"
-    pool = ", and a world alone shares no contact pool" if bits & rules["OVERFLOW"] else ""
-    return f"NOT as recorded ({told}): {ends}{why}{pool}"
+    ends = "it ends bit for bit where it did" if exact else f"its cubes end {1e3 * apart:.3g} mm from where they did"
+    reasons = []  # why it need not end bit for bit where it did
+    if device.startswith("cuda") or record.device.startswith("cuda"):
+        reasons.append("runs on CUDA agree to rounding only")
+    if (bits | done.failed) & rules["OVERFLOW"]:
+        reasons.append("a world alone shares no contact pool")
+    if changes:
+        reasons.append("not all is as it was in that run")
+    if not reasons:
+        wanted = "" if exact else ", expected bit for bit there"
+        return False, f"NOT as recorded ({'the same verdict' if same else told}): {ends}{wanted}"
+    why = ", and ".join(["", *reasons])
+    return True, f"as recorded, but {ends}{why}" if same else f"NOT as recorded ({told}): {ends}{why}"
