@@ -1,6 +1,4 @@
-"""Whole episodes of the box task, by both controllers and on both backends; its evidence on the device against the plain
-checker, world by world, on what was recorded of them and on alterations of it.
-"""
+"""Episodes of the box task, as recorded and altered: the evidence on the device against the plain checker, world by world."""
 
 from __future__ import annotations
 
