@@ -20,8 +20,8 @@ ROBOTS = ("so101", "rebot")
 # Files of 40 s and more start first, the longest at the front, so that both processes end together. The second process
 # begins with files that need few of MJWarp's kernels: with a cold cache both would compile the same ones.
 LONGEST = (
-    *("graph", "readme", "scaling", "collect", "capacity", "replay", "success", "cli"),
-    *("env_contract", "terms", "docs", "config", "study", "box", "reachability", "layout"),
+    *("graph", "readme", "scaling", "collect", "capacity", "replay", "success", "box_evidence", "cli"),
+    *("env_contract", "terms", "docs", "config", "study", "batched_ik", "reachability", "layout"),
 )
 
 

@@ -1,4 +1,4 @@
-"""The box scene and what a policy needs of the task: geometry, starts, success, rewards; and whole episodes on MJWarp."""
+"""The box scene and what a policy needs of the task: geometry, starts, success, rewards."""
 
 from __future__ import annotations
 
@@ -11,23 +11,18 @@ import numpy as np
 import pytest
 import torch
 from box_checker import BoxRecording, lowest_geometry
-from environments import brisk
 
 from mjstack import make_env
 from mjstack.config import load_config
-from mjstack.config.schema import Backend, Config
+from mjstack.config.schema import Config
 from mjstack.control.planner import ScriptedPlanner
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
-from mjstack.gates.episode import NOMINAL, run_episode
-from mjstack.gates.gate import GateContext
 from mjstack.math import quat_to_matrix
 from mjstack.scene import BLUE, RED, LowestPoint, SceneIndex, build_model
 from mjstack.scene.phases import build_phases
-from mjstack.sim import Simulation, make_simulation
-from mjstack.tasks.box import BoxEvidence, BoxRule, BoxSuccess
+from mjstack.tasks.box import BoxEvidence, BoxSuccess
 from mjstack.tasks.box_terms import GraspNext, InBox, Place, ReachNext, ToSlot
-from mjstack.tasks.evidence import describe_rules
 
 X0 = {"so101": 0.305, "rebot": 0.47}
 TOP = {"so101": 0.024, "rebot": 0.212}
@@ -388,35 +383,3 @@ def test_bad_terms_are_named(override: str, parts: list[str]) -> None:
 def test_terms_of_the_box_need_a_box() -> None:
     with pytest.raises(MjstackError, match="box"):
         make_env(["task=stack", "sim=native", "reward=box"], nworld=1)
-
-
-# Whole episodes
-
-
-@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
-def test_mjwarp_fills_the_box(robot: str, device: str) -> None:
-    """One world on Warp's CPU device; on CUDA, where a frame is a graph with the evidence in it, jittered ones."""
-    if device != "cpu" and not torch.cuda.is_available():
-        pytest.skip("no CUDA device here")
-    faster = brisk(robot, "box") if device == "cpu" else ()
-    context = GateContext(cfg=load_config(["task=box", f"robot={robot}", *faster]))
-    nworld, reset = (1, NOMINAL) if device == "cpu" else (64, context.cfg.reset)
-    sim = make_simulation(context.model, context.cfg, nworld, backend=Backend.mjwarp, device=device)
-    carry = (context.phase_start("carry_red") + context.phase_start("hold_red")) // 2
-    last = context.planner.phases[-1].stop - 1
-    supports: dict[int, list[bool]] = {}
-
-    def feel(frame: int, sim: Simulation) -> None:
-        if frame in (20, carry, last):  # on the table, red in the air, in the box
-            felt = [sim.sensordata[:, context.index.support_force[name][0] :][:, :3].norm(dim=1) > 1e-5 for name in (RED, BLUE)]
-            supports[frame] = [bool(pressed.all()) for pressed in felt]
-
-    episode = run_episode(sim, context.index, context.cfg, context.planner, reset, on_frame=feel)
-    assert supports == {20: [True, True], carry: [False, True], last: [True, True]}
-    for failed in episode.verdict.failed.tolist():
-        assert failed == 0, describe_rules(BoxRule, failed)
-    assert episode.captured == (device != "cpu")
-    sizes = context.cfg.robot.layouts["box"]
-    assert int(sim.peak_contacts.max()) <= sizes.nconmax
-    assert int(sim.peak_constraints.max()) <= sizes.njmax
-    sim.close()

@@ -1,155 +1,73 @@
-"""The box task's evidence on the device against the plain checker, world by world."""
+"""Episodes of the box task, as recorded and altered: the evidence on the device against the plain checker, world by world."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from box_checker import BLUE, RED, BoxOutcome, BoxRecording, check_box_world
-from evidence_cases import STOPPED_EARLY, Altered, Cases
+from box_checker import BLUE, RED, BoxOutcome
+from box_recordings import RecordingContext, World, feed, put_cube, recording_context
+from environments import brisk
+from evidence_cases import Altered, Cases
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend
-from mjstack.gates.episode import run_episode
-from mjstack.gates.gate import GateContext
-from mjstack.scene import BLUE as BLUE_NAME
-from mjstack.scene import RED as RED_NAME
-from mjstack.sim import Simulation, make_simulation
+from mjstack.envs import Env
+from mjstack.gates.episode import NOMINAL
+from mjstack.gates.success import run_success
+from mjstack.gates.watch import Sign
+from mjstack.report.record import Status
+from mjstack.sim import make_simulation
 from mjstack.tasks.box import BoxEvidence, BoxRule
 from mjstack.tasks.evidence import Verdict, describe_rules
 
 CASES = Cases(BoxRule)
 HAIR = 2e-6  # [m], [m/s]: a good deal more than float32 rounds at these sizes
-NAMES = (RED_NAME, BLUE_NAME)
 
 
 @cache
-def context_of(robot: str) -> GateContext:
-    return GateContext(cfg=load_config(["task=box", f"robot={robot}", "nworld=2"]))
+def planned(robot: str) -> SimpleNamespace:
+    """Two jittered native worlds; in the second one red drops out of the hand halfway to the box, onto the table beside it."""
 
+    def drop(env: Env, _: str) -> None:
+        if int(env.frame[-1]) == (context.phase_start("carry_red") + context.phase_start("hold_red")) // 2:
+            scene = context.cfg.scene
+            x, y = scene.red_xy
+            top = scene.table_center[2] + scene.table_half[2]
+            put_cube(env, RED, [x - 0.08, y, top + scene.cube_half, 1.0, 0.0, 0.0, 0.0])
 
-@cache
-def recorded(robot: str) -> SimpleNamespace:
-    """A native episode of two jittered worlds: everything at every frame end, worlds first, and the verdict."""
-    context = context_of(robot)
+    context = recording_context(robot, "nworld=2", disturb=drop)
     sim = make_simulation(context.model, context.cfg, 2, backend=Backend.native)
-    kept: dict[str, list[np.ndarray]] = {"qpos": [], "qvel": [], "sensordata": []}
-
-    def keep(_: int, sim: Simulation) -> None:
-        for name, rows in kept.items():
-            rows.append(getattr(sim, name).numpy().copy())
-
-    episode = run_episode(sim, context.index, context.cfg, context.planner, context.cfg.reset, on_frame=keep)
-    sim.kinematics()
-    ends = {name: getattr(sim, name).numpy().copy() for name in ("xpos", "xquat", "step_count")}
+    context.run(sim, context.cfg.reset)
     sim.close()
-    phases = np.array([i for i, p in enumerate(context.planner.phases) for _ in range(p.start, p.stop)])
-    return SimpleNamespace(
-        context=context, verdict=episode.verdict, phase=phases, **{k: np.stack(v, 1) for k, v in kept.items()}, **ends
-    )
+    (rec,) = context.recordings
+    return rec
 
 
-@dataclass
-class World:
-    """A recording to be altered."""
+@cache
+def scripted(robot: str) -> SimpleNamespace:
+    """What the success gate plays natively from two random starts; in the second one each cube is taken from between the jaws
+    as they close for the first time, and put down beside them."""
+    taken: list[str] = []
 
-    context: GateContext
-    phase: np.ndarray
-    qpos: np.ndarray
-    qvel: np.ndarray
-    sensordata: np.ndarray
-    xpos: np.ndarray
-    xquat: np.ndarray
-    step_count: int
-    overflow: int = 0
+    def take_away(env: Env, phase: str) -> None:
+        if phase.startswith("close_") and phase not in taken:
+            taken.append(phase)
+            cube = RED if phase == "close_red" else BLUE
+            at = env.index.cube_qpos[cube]
+            put_cube(env, cube, np.add(env.sim.qpos[-1, at : at + 3].numpy(), [0.0, 0.07, 0.0]))
 
-    @classmethod
-    def of(cls, rec: SimpleNamespace, k: int = 0) -> World:
-        arrays = {n: getattr(rec, n)[k].copy() for n in ("qpos", "qvel", "sensordata", "xpos", "xquat")}
-        return cls(context=rec.context, phase=rec.phase.copy(), step_count=int(rec.step_count[k]), **arrays)
-
-    def frames(self, *names: str) -> np.ndarray:
-        """Numbers of the frames of some phases."""
-        numbers = [i for i, p in enumerate(self.context.planner.phases) if p.name in names]
-        return np.flatnonzero(np.isin(self.phase, numbers))
-
-    def pose(self, cube: int) -> np.ndarray:
-        """A view of a cube's pose, shape ``(frames, 7)``."""
-        at = self.context.index.cube_qpos[cube]
-        return self.qpos[:, at : at + 7]
-
-    def velocity(self, cube: int) -> np.ndarray:
-        """A view of its velocity, shape ``(frames, 6)``."""
-        at = self.context.index.cube_qvel[cube]
-        return self.qvel[:, at : at + 6]
-
-    def jaw(self, cube: int, jaw: int) -> np.ndarray:
-        """A view of a jaw's force on it, shape ``(frames, 3)``."""
-        at = self.context.index.jaw_force[NAMES[cube]][jaw]
-        return self.sensordata[:, at : at + 3]
-
-    def support(self, cube: int, number: int = 0) -> np.ndarray:
-        """A view of the world's force on it, or of the other cube's, shape ``(frames, 3)``."""
-        at = self.context.index.support_force[NAMES[cube]][number]
-        return self.sensordata[:, at : at + 3]
-
-    @property
-    def gripper(self) -> np.ndarray:
-        """A view of the gripper's first joint, shape ``(frames,)``."""
-        index = self.context.index
-        return self.qpos[:, index.robot_qpos[index.n_arm]]
-
-    @property
-    def recording(self) -> BoxRecording:
-        index, cubes = self.context.index, (RED, BLUE)
-        names = np.array([p.name for p in self.context.planner.phases])
-        ours = [c for a in index.cube_qpos for c in range(a, a + 7)]
-        return BoxRecording(
-            phase=names[self.phase],
-            pose=np.stack([self.pose(c) for c in cubes], 1),
-            velocity=np.stack([self.velocity(c) for c in cubes], 1),
-            jaw_force=np.stack([np.stack([self.jaw(c, j) for j in (0, 1)], 1) for c in cubes], 1),
-            support_force=np.stack([np.stack([self.support(c, j) for j in (0, 1)], 1) for c in cubes], 1),
-            gripper=self.qpos[:, index.robot_qpos[index.n_arm :]],
-            xpos=self.xpos,
-            xquat=self.xquat,
-            step_count=self.step_count,
-            overflow=bool(self.overflow & ~STOPPED_EARLY),
-            finite_elsewhere=bool(np.isfinite(np.delete(self.qpos, ours, axis=1)).all()),
-        )
-
-
-def feed(worlds: list[World], dtype: torch.dtype = torch.float64) -> Verdict:
-    """Plays recordings through the evidence."""
-    context, n = worlds[0].context, len(worlds)
-    evidence = BoxEvidence(context.cfg, context.index, context.planner.phases, n, torch.device("cpu"))
-    stacked = {name: np.stack([getattr(w, name) for w in worlds]) for name in ("qpos", "qvel", "sensordata", "phase")}
-    ends = {name: torch.tensor(np.stack([getattr(w, name) for w in worlds]), dtype=dtype) for name in ("xpos", "xquat")}
-    sim = SimpleNamespace(
-        model=context.model,
-        nworld=n,
-        device=torch.device("cpu"),
-        step_count=torch.tensor([w.step_count for w in worlds]),
-        overflow=torch.tensor([w.overflow for w in worlds], dtype=torch.int32),
-        kinematics=lambda: None,
-        **ends,
-    )
-    for frame in range(stacked["phase"].shape[1]):
-        for name in ("qpos", "qvel", "sensordata"):
-            setattr(sim, name, torch.tensor(stacked[name][:, frame], dtype=dtype))
-        evidence.update(sim, torch.tensor(stacked["phase"][:, frame]))
-    return evidence.verdict(sim)
-
-
-def reference(w: World) -> BoxOutcome:
-    return check_box_world(w.recording, w.context.cfg, w.context.model)
+    context = recording_context(robot, "sim=native", "nworld=2", "gates=[success]", disturb=take_away)
+    (result,) = run_success(context)
+    (rec,) = context.recordings
+    rec.result = result
+    return rec
 
 
 def assert_same(verdict: Verdict, k: int, expected: BoxOutcome) -> None:
@@ -158,16 +76,89 @@ def assert_same(verdict: Verdict, k: int, expected: BoxOutcome) -> None:
         assert float(verdict.values[name][k]) == pytest.approx(value, abs=1e-6, rel=1e-5, nan_ok=True), name
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_recorded_episodes(robot: str, dtype: torch.dtype) -> None:
-    rec = recorded(robot)
-    worlds = [World.of(rec, k) for k in range(2)]
-    verdict = feed(worlds, dtype)
+def test_recorded_episodes(robot: str) -> None:
+    """As they were judged while they were played, and fed to the evidence once more, in float32 and as one batch."""
+    recs = [planned(robot), scripted(robot)]
+    worlds = [World.of(rec, k) for rec in recs for k in range(2)]
+    verdict = feed(worlds, torch.float32)
+    broken = []
     for k, world in enumerate(worlds):
-        expected = reference(world)
+        expected = world.outcome
+        broken.append(expected.failed)
+        assert_same(verdict, k, expected)
+        assert_same(recs[k // 2].verdict, k % 2, expected)
+    assert broken == [set(), {"DROP_RED", "CARRY_RED", "SETTLED_RED", "INSIDE"}, set(), set()]
+
+
+def test_scripted_controller_passes_the_success_gate(robot: str) -> None:
+    """An undisturbed world, and one in which both first grasps are empty: each is tried again, and both cubes get there."""
+    rec = scripted(robot)
+    result, metrics = rec.result, rec.result.metrics
+    assert result.status is Status.passed, result.reason
+    assert result.thresholds["success_rate_min"] == 0.97
+    assert (metrics["accepted"], metrics["episodes"], metrics["distinct_starts"], metrics["unreachable"]) == (2, 2, 2, 0)
+    assert (metrics["retried"], metrics["retries"], metrics["retried_accepted"]) == (1, 2, 1)
+    assert rec.episode.retries.tolist() == [0, 2]
+    assert rec.watch.sign.tolist() == [Sign.NONE] * 2
+    names = [phase.name for phase in rec.context.planner.phases]
+    worlds = [World.of(rec, k) for k in range(2)]
+    assert worlds[0].order == names
+    again = []
+    for name in names:
+        role, _, color = name.partition("_")
+        again += [f"approach_{color}", f"descend_{color}", f"close_{color}"] if role == "lift" else []
+        again.append(name)
+    assert worlds[1].order == again
+    assert (worlds[0].phase != worlds[1].phase).mean() > 0.5
+    for world, attempts in zip(worlds, (1, 2), strict=True):
+        for cube, color in ((RED, "red"), (BLUE, "blue")):
+            closing = world.frames(f"close_{color}")
+            ends = closing[np.flatnonzero(np.diff(closing, append=-1) != 1)]
+            loaded = [all(np.linalg.norm(world.jaw(cube, jaw)[end]) > 0.0 for jaw in (0, 1)) for end in ends]
+            assert loaded == [False] * (attempts - 1) + [True]
+        window = world.context.cfg.gate.box.window
+        assert (world.phase[-window:] == len(names) - 1).all()  # no hurry at the end
+
+
+ON_CUDA = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")]
+PLAYED = [
+    ("so101", "scripted", "cpu"),
+    ("rebot", "planned", "cpu"),
+    *(pytest.param(r, c, "cuda:0", marks=ON_CUDA) for r in ("so101", "rebot") for c in ("scripted", "planned")),
+]
+
+
+@pytest.mark.parametrize(("robot", "controller", "device"), PLAYED)
+def test_mjwarp_fills_the_box(robot: str, controller: str, device: str) -> None:
+    """One world on Warp's CPU device; on CUDA, where a frame is a graph with the evidence in it, jittered ones."""
+    cpu = device == "cpu"
+    faster = brisk(robot, "box") if cpu else ()
+    cfg = load_config(["task=box", f"robot={robot}", f"controller={controller}", *faster])
+    context = RecordingContext(cfg=cfg)
+    nworld, reset = (1, NOMINAL) if cpu else (64, cfg.reset)
+    sim = make_simulation(context.model, cfg, nworld, backend=Backend.mjwarp, device=device)
+    episode = context.run(sim, reset)
+    for failed in episode.verdict.failed.tolist():
+        assert failed == 0, describe_rules(BoxRule, failed)
+    assert episode.captured == (not cpu)
+    sizes = cfg.robot.layouts["box"]
+    assert int(sim.peak_contacts.max()) <= sizes.nconmax
+    assert int(sim.peak_constraints.max()) <= sizes.njmax
+    sim.close()
+
+    worlds = [World.of(context.recordings[0], k) for k in range(nworld)]
+    for world in worlds:
+        carry = world.frames("carry_red")
+        frames = [20, carry[len(carry) // 2], -1]  # on the table, red in the air, in the box
+        felt = [[np.linalg.norm(world.support(cube)[frame]) > 1e-5 for cube in (RED, BLUE)] for frame in frames]
+        assert felt == [[True, True], [False, True], [True, True]]
+    few = worlds[:4]
+    verdict = feed(few, torch.float32)
+    for k, world in enumerate(few):
+        expected = world.outcome
         assert expected.failed == set()
         assert_same(verdict, k, expected)
-        assert_same(rec.verdict, k, expected)
+        assert_same(episode.verdict, k, expected)
 
 
 def both(name: str, rules: set[str], alter: Callable[[World, int, str], None]) -> None:
@@ -407,7 +398,7 @@ def blue_touched_by_one_jaw_before_red_is_released(w: World) -> None:
 
 def _jaws_at(by: float) -> Callable[[World], None]:
     def alter(w: World) -> None:
-        clearance = reference(w).values["jaw_clearance_m"]
+        clearance = w.outcome.values["jaw_clearance_m"]
         w.xpos[:, 2] += w.context.cfg.gate.box.jaw_clearance - clearance + by
 
     return alter
@@ -487,25 +478,25 @@ def red_dropped_at_the_second_attempt(w: World) -> None:
 
 @pytest.fixture(scope="module")
 def altered() -> Altered:
-    return CASES.play(lambda: World.of(recorded("so101")), feed)
+    return CASES.play(lambda: World.of(planned("so101")), feed)
 
 
 @pytest.mark.parametrize("name", CASES.alter)
 def test_altered_recording(name: str, altered: Altered) -> None:
     verdict, k, world = altered[name]
     assert CASES.broken(verdict, k) == CASES.breaks[name]
-    assert_same(verdict, k, reference(world))
+    assert_same(verdict, k, world.outcome)
 
 
 def test_episode_cut_short_fails_whatever_came_before() -> None:
-    world = World.of(recorded("so101"))
+    world = World.of(planned("so101"))
     for name in ("phase", "qpos", "qvel", "sensordata"):
         setattr(world, name, getattr(world, name)[:-1])
     assert {"STEPS", "INSIDE", "JAW_CLEAR"} <= CASES.broken(feed([world]))
 
 
 def test_episode_that_goes_on_fails_for_its_length_alone() -> None:
-    world = World.of(recorded("so101"))
+    world = World.of(planned("so101"))
     for name in ("phase", "qpos", "qvel", "sensordata"):
         values = getattr(world, name)
         setattr(world, name, np.concatenate([values, values[:60]]))  # cubes back on the table
@@ -524,7 +515,7 @@ def test_every_rule_has_words_and_a_case_of_its_own() -> None:
 
 
 def test_explained_rules_are_the_rules(robot: str) -> None:
-    rec = recorded(robot)
+    rec = planned(robot)
     values = {name: float(v[0]) for name, v in rec.verdict.values.items()}
     told = BoxEvidence.explain(rec.context.cfg, {}, values)
     assert set(told) | {"FINITE", "STEPS", "OVERFLOW"} == {rule.name for rule in BoxRule}

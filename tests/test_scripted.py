@@ -123,28 +123,6 @@ def test_an_empty_grasp_is_tried_once_more_in_time(robot: str, stage: Stage) -> 
     env.close()
 
 
-def test_each_cube_may_be_tried_again() -> None:
-    """In the box task both grasps fail once: each goes back to its own approach, and the window of rest stays free."""
-    faster = ["timing.physics_dt=0.002", "timing.substeps=10"]
-    context = GateContext(cfg=load_config(["task=box", "robot=rebot", "sim=native", *faster]))
-    env, controller = driven(context, "task=box", *faster, nworld=1)
-    names = [phase.name for phase in controller.phases]
-    seen: list[str] = []
-    for _ in range(controller.frames):
-        # The jaws' sensors tell of no force in the last frame of each first closing.
-        env.step(controller.command())
-        name = names[int(controller.phase[0])]
-        seen.append(name)
-        if name.startswith("close_") and seen.count(name) < 130:
-            env.sim.sensordata.zero_()
-    assert controller.retries.tolist() == [2]
-    order = [name for name, before in zip(seen, ["", *seen], strict=False) if name != before]
-    assert order.count("approach_red") == order.count("approach_blue") == 2
-    assert order.count("lift_red") == order.count("lift_blue") == 1
-    assert seen[-env.cfg.gate.box.window :] == ["done"] * env.cfg.gate.box.window
-    env.close()
-
-
 def test_a_cube_arrives_as_it_stood() -> None:
     """From near the base, where the gripper could point down, to far from it, where it must lean; and the other way round."""
     env = make_env(["task=stack", "action=joint_absolute", "sim=native"], nworld=2)
