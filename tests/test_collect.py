@@ -320,15 +320,16 @@ from mjstack.jobs.demonstration import Played
 
 
 def pretended(fails, after=None):
-    def play(context, sim, seed, values):
+    def play(context, sim, seed, values, worlds):
         layout = {"observation.state": 6, "observation.policy": 24, "observation.privileged": 46, "action": 6, "next.reward": 1}
-        for world in range(sim.nworld):
-            values[:, world] = 1e-3 * seed + 1e-6 * world
-        failed = np.array([8 if fails(seed, world) else 0 for world in range(sim.nworld)], dtype=np.int32)
+        for place, world in enumerate(worlds):
+            values[:, place] = 1e-3 * seed + 1e-6 * world
+        failed = np.array([8 if fails(seed, world) else 0 for world in worlds], dtype=np.int32)
         if after is not None:
             after(seed, values)
         frames = SimpleNamespace(values=values, layout=layout)
-        return Played(seed=seed, frames=frames, failed=failed, retries=np.zeros(sim.nworld, dtype=np.int32), seconds=0.5)
+        none = np.zeros(len(worlds), dtype=np.int32)
+        return Played(seed=seed, worlds=worlds, frames=frames, failed=failed, retries=none, seconds=0.5)
 
     return play
 """
@@ -562,7 +563,7 @@ def test_frames_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> N
     values = torch.randn(5, 7, 4)
     frames = cast(FrameRecorder, SimpleNamespace(values=values, layout={"a": 3, "b": 1}))
     none = np.zeros(7, dtype=np.int32)
-    played = Played(seed=0, frames=frames, failed=none, retries=none, seconds=0.0)
+    played = Played(seed=0, worlds=range(7), frames=frames, failed=none, retries=none, seconds=0.0)
     for size in (1, 2 * 5 * 4 * 4, 10**6):  # one world, two and all at once
         monkeypatch.setattr("mjstack.jobs.demonstration._CHUNK_BYTES", size)
         found = dict(played.episodes([6, 0, 3]))
