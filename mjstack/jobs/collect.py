@@ -121,7 +121,7 @@ def _check_folder(home: Path, spec: DatasetSpec) -> None:
         if folder.exists() and not folder.is_dir():
             raise DatasetError(f"{folder} is a file, expected a folder. Set job.folder to another")
     saved = home / ".hydra" / "config.yaml"
-    if saved.exists():
+    if saved.exists() and saved.stat().st_size:  # empty: a call that was killed as it wrote the file
         name = OmegaConf.select(OmegaConf.load(saved), "job.name")
         if name != "collect":
             raise DatasetError(
@@ -151,6 +151,6 @@ def _way_back(home: Path, difference: Difference) -> str:
         value = as_override(difference.found)
         return f", or {difference.key} to {'a file with that content' if value.startswith(CONTENT) else value}"
     saved = home / ".hydra" / "overrides.yaml"
-    if not saved.exists():  # it was made by other means than the command line
+    if not (saved.exists() and saved.stat().st_size):  # it was made by other means than the command line
         return ""
     return f", or give what it was made with: {shlex.join(map(str, OmegaConf.load(saved)))}"
