@@ -6,10 +6,10 @@ import hashlib
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from environments import brisk
+from pretended import episodes_of, pairs, pretended
 
 from mjstack.cli import run
 from mjstack.config import load_config
@@ -42,11 +43,6 @@ from mjstack.sim import make_simulation
 README = Path(__file__).resolve().parents[1] / "README.md"
 COMMAND = ["job=collect", "sim=native", "job.folder=outputs/demos"]
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
-
-
-def episodes_of(dataset: Path) -> list[dict]:
-    table = pq.read_table(dataset / "meta/episodes")
-    return table.drop_columns([name for name in table.column_names if name.startswith("stats/")]).to_pylist()
 
 
 def frames_of(dataset: Path, number: int) -> dict[str, np.ndarray]:
@@ -306,35 +302,38 @@ def test_what_the_hash_is_of() -> None:
     assert on_cpu != base  # the backend changes episodes in their last digits, the device does not count
 
 
-def test_first_difference() -> None:
-    assert first_difference({"a": {"b": 1, "c": [1]}}, {"a": {"b": 1, "c": [1]}}) is None
-    assert first_difference({"a": {"b": 1, "c": [1]}}, {"a": {"b": 1, "c": [2]}}) == ("a.c", [1], [2])
-    assert first_difference({"a": 1, "d": {"e": 2}}, {"a": 1}) == ("d.e", 2, "nothing")
+@pytest.mark.parametrize(
+    ("theirs", "ours", "text", "alone"),
+    [
+        ({"a": {"b": 1, "c": [1]}}, {"a": {"b": 1, "c": [2]}}, "a.c=[1], expected [2]", True),
+        ({"a": {"b": True, "c": 2}}, {"a": {"b": None, "c": 3}}, "a.b=true, expected null", False),
+        ({"a": {"b": {"c": {}}, "d": 1}}, {"a": {"b": {"c": {"e": 1}}, "d": 1}}, "a.b.c has nothing, expected e", False),
+        ({"a": {"b": {"c": {"e": 1}}}}, {"a": {"b": {"c": {}}}}, "a.b.c has e, expected nothing", False),
+        ({"a": {"b": 1, "c": 2}}, {"a": {"b": 3}}, "a has b, c, expected b", False),
+        ({"a": {"b": None}}, {"a": {"b": {"c": 1}}}, 'a.b=null, expected {"c": 1}', True),
+    ],
+)
+def test_first_difference(theirs: dict, ours: dict, text: str, alone: bool) -> None:
+    assert first_difference(ours, ours) is None
+    found = first_difference(theirs, ours)
+    assert found is not None
+    assert (str(found), found.alone) == (text, alone)
 
 
-PRETEND = """
-import numpy as np
-from types import SimpleNamespace
-from mjstack.jobs import collection
-from mjstack.jobs.demonstration import Played
-
-
-def pretended(fails, after=None):
-    def play(context, sim, seed, values):
-        layout = {"observation.state": 6, "observation.policy": 24, "observation.privileged": 46, "action": 6, "next.reward": 1}
-        for world in range(sim.nworld):
-            values[:, world] = 1e-3 * seed + 1e-6 * world
-        failed = np.array([8 if fails(seed, world) else 0 for world in range(sim.nworld)], dtype=np.int32)
-        if after is not None:
-            after(seed, values)
-        frames = SimpleNamespace(values=values, layout=layout)
-        return Played(seed=seed, frames=frames, failed=failed, retries=np.zeros(sim.nworld, dtype=np.int32), seconds=0.5)
-
-    return play
-"""
-namespace: dict = {}
-exec(PRETEND, namespace)  # the same lines run in a process that is killed
-pretended: Callable[..., Callable[..., Played]] = namespace["pretended"]
+def test_another_group_is_refused_by_its_names(
+    demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The way back that it names is one that can be typed."""
+    monkeypatch.chdir(demos.cwd)
+    assert run([*demos.args, "reset=jitter"]) == 2
+    err = capsys.readouterr().err.strip()
+    assert err.startswith(
+        "mjstack: outputs/demos/dataset has episodes of another configuration: reset has home, joints, cubes, mass, friction, "
+        "gains, expected home, cubes. Set job.folder to another folder, or give what it was made with: job=collect "
+    )
+    back = shlex.split(err.partition("made with: ")[2].removesuffix("."))
+    monkeypatch.setattr(collection, "play_demonstrations", None)
+    assert run(back) == 0
 
 
 def collect(*overrides: str) -> int:
@@ -343,10 +342,6 @@ def collect(*overrides: str) -> int:
     home = collect_folder(cfg)
     home.mkdir(parents=True, exist_ok=True)
     return run_collect_job(cfg, home, []).exit_code
-
-
-def pairs(dataset: Path) -> list[tuple[int, int]]:
-    return [(row["seed"], row["world"]) for row in episodes_of(dataset)]
 
 
 def test_seeds_go_on_until_the_episodes_are_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -500,14 +495,18 @@ def test_a_full_disk_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch, 
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
 
 
-def test_a_kill_loses_no_finished_batch(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed while the second batch is written, when one of its episodes is on the disk already."""
+def test_a_kill_in_the_middle_of_a_batch(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed when the batch's first data file is committed and an episode of the second one is on the disk."""
     kill = """
 import os, signal
+from functools import partial
 from mjstack.cli import run
 from mjstack.datasets.shard import Shard
+from mjstack.jobs import collection
+from pretended import pretended
 
-collection.play_demonstrations = pretended(lambda seed, world: False)
+collection.play_demonstrations = pretended(lambda seed, world: world == 1, noise=True)
+collection.DatasetWriter = partial(collection.DatasetWriter, file_mb=1)
 add = Shard.add
 
 def killed(self, *args):
@@ -518,20 +517,28 @@ def killed(self, *args):
 Shard.add = killed
 run(ARGS)
 """
-    args = ["nworld=2", "job.episodes=5"]
-    program = f"{PRETEND}\nARGS = {[*COMMAND, *args]!r}\n{kill}"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
-    assert done.returncode == -signal.SIGKILL
+    args = ["nworld=7", "job.episodes=8"]
+    program = f"ARGS = {[*COMMAND, *args]!r}\n{kill}"
+    found = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, env=found)
+    assert done.returncode == -signal.SIGKILL, done.stderr
     left = contents(folder / "dataset" / "data")
     before = {name: data for name, data in left.items() if "/." not in name}
     assert len(before) == 1 < len(left)
-    assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
+    whole = [(0, 0), *((0, world) for world in range(2, 7)), (1, 0), (1, 2)]
+    kept = len(pairs(folder / "dataset"))
+    assert 2 <= kept < 6
+    assert pairs(folder / "dataset") == whole[:kept]
     assert report_of(folder)["status"] == "interrupted"
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    (folder / ".hydra" / "config.yaml").write_text("")  # and so would be left by a kill a little later, in a second call
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: world == 1, noise=True))
     assert run([*COMMAND, *args]) == 0
-    assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
+    assert pairs(folder / "dataset") == whole
     assert before.items() <= contents(folder / "dataset" / "data").items()
     read_dataset(folder / "dataset")
+    batches = json.loads((folder / FILE).read_text())
+    assert [(batch["worlds"], batch["accepted"], batch["kept"]) for batch in batches] == [(7, 6, 6), (3, 2, 2)]
+    assert report_of(folder)["gates"][0]["metrics"]["accepted"] == 8
 
 
 def test_damaged_notes_are_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -562,7 +569,7 @@ def test_frames_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> N
     values = torch.randn(5, 7, 4)
     frames = cast(FrameRecorder, SimpleNamespace(values=values, layout={"a": 3, "b": 1}))
     none = np.zeros(7, dtype=np.int32)
-    played = Played(seed=0, frames=frames, failed=none, retries=none, seconds=0.0)
+    played = Played(seed=0, worlds=range(7), frames=frames, failed=none, retries=none, seconds=0.0)
     for size in (1, 2 * 5 * 4 * 4, 10**6):  # one world, two and all at once
         monkeypatch.setattr("mjstack.jobs.demonstration._CHUNK_BYTES", size)
         found = dict(played.episodes([6, 0, 3]))

@@ -107,6 +107,21 @@ def read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
         return require_pyarrow()[1].read_table(path).slice(0, info["total_tasks"])["task"].to_pylist()
 
 
+def read_committed(folder: Path, info: dict[str, Any]) -> list[tuple[int, int]]:
+    """Seed and world of every episode that counts, in order.
+
+    Raises:
+        DatasetError: A file is missing or damaged.
+    """
+    pairs: list[tuple[int, int]] = []
+    for number in range(info["mjstack"]["shards"]):
+        path = layout.episodes_path(folder, number)
+        with readable(path):
+            table = require_pyarrow()[1].ParquetFile(path).read(columns=["seed", "world"])
+            pairs += zip(table["seed"].to_pylist(), table["world"].to_pylist(), strict=True)
+    return pairs
+
+
 @dataclass(eq=False, kw_only=True, slots=True)
 class StoredShard:
     """A shard that counts.

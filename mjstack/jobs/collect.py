@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -15,13 +16,13 @@ from omegaconf import OmegaConf
 from mjstack.config.content import CONTENT, config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
 from mjstack.datasets import DatasetSpec, require_pyarrow
-from mjstack.datasets.opening import check_same, lock_folder, read_info
+from mjstack.datasets.opening import check_same, lock_folder, read_committed, read_info
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.errors import ConfigError, DatasetError, UnwrittenError
 from mjstack.gates.gate import GateContext
 from mjstack.jobs.collect_record import read_batches
 from mjstack.jobs.collection import DATASET, Collection, most_worlds
-from mjstack.jobs.demonstration_spec import episode_config, first_difference, make_spec
+from mjstack.jobs.demonstration_spec import Difference, as_override, episode_config, first_difference, make_spec
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
@@ -120,7 +121,7 @@ def _check_folder(home: Path, spec: DatasetSpec) -> None:
         if folder.exists() and not folder.is_dir():
             raise DatasetError(f"{folder} is a file, expected a folder. Set job.folder to another")
     saved = home / ".hydra" / "config.yaml"
-    if saved.exists():
+    if saved.exists() and saved.stat().st_size:  # empty: a call that was killed as it wrote the file
         name = OmegaConf.select(OmegaConf.load(saved), "job.name")
         if name != "collect":
             raise DatasetError(
@@ -136,13 +137,20 @@ def _check_folder(home: Path, spec: DatasetSpec) -> None:
     theirs: Mapping[str, Any] = history[-1].get("config", {}) if history else {}
     difference = first_difference(theirs, spec.provenance["config"]) if theirs else None
     if difference is not None and info["mjstack"]["config_sha256"] != spec.config_sha256:
-        key, found, expected = difference
-        remedy = f"{key} to {found}"
-        if str(found).startswith(CONTENT):
-            remedy = f"{key} to a file with that content"
         raise DatasetError(
-            f"{home / DATASET} has episodes of another configuration: {key}={found}, expected {expected}. Set job.folder to "
-            f"another folder, or {remedy}"
+            f"{home / DATASET} has episodes of another configuration: {difference}. Set job.folder to another folder"
+            f"{_way_back(home, difference)}"
         )
     check_same(home / DATASET, info, spec)
-    read_batches(home)
+    read_batches(home, read_committed(home / DATASET, info))
+
+
+def _way_back(home: Path, difference: Difference) -> str:
+    """How to go on with a dataset of another configuration: the value to set, or the overrides that it was made with."""
+    if difference.alone:
+        value = as_override(difference.found)
+        return f", or {difference.key} to {'a file with that content' if value.startswith(CONTENT) else value}"
+    saved = home / ".hydra" / "overrides.yaml"
+    if not (saved.exists() and saved.stat().st_size):  # it was made by other means than the command line
+        return ""
+    return f", or give what it was made with: {shlex.join(map(str, OmegaConf.load(saved)))}"

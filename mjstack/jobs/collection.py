@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -16,10 +17,10 @@ from mjstack.config.content import config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
 from mjstack.datasets import DatasetWriter, EpisodeData, layout
 from mjstack.envs import Env, build_env, demonstration_config
-from mjstack.errors import ConfigError
+from mjstack.errors import ConfigError, UnwrittenError
 from mjstack.gates.episode import NOMINAL
 from mjstack.gates.gate import GateContext, failing_rules
-from mjstack.jobs.collect_record import CollectedBatch, read_batches, write_batches
+from mjstack.jobs.collect_record import FILE, CollectedBatch, read_batches, write_batches
 from mjstack.jobs.demonstration import ACTION, STATE, Played, frame_layout, frames_block, play_demonstrations
 from mjstack.jobs.demonstration_spec import episode_config, make_spec
 from mjstack.jobs.reported import run_provenance
@@ -40,19 +41,24 @@ class Collection:
     """A dataset, and what it takes to add to it.
 
     A batch is one seed in as many worlds as are needed and fit; the next batch has the next seed, in later calls too. So a pair
-    of seed and world is one episode, whatever nworld was. A batch is committed as a whole, and noted beside the dataset.
+    of seed and world is one episode, whatever nworld was.
+
+    A batch's verdicts and what is to be kept of it are noted beside the dataset before the first episode is added. So whatever
+    stops it in between, the next call finds what is missing and begins with it: those worlds of that seed are played again, as
+    many at a time as nworld then allows, and added in order. What was committed stays as it is. On CUDA two plays of a world
+    agree only nearly: an episode that is judged otherwise than noted is left out, and the first verdict counts.
 
     Attributes:
         home: The job's folder.
         path: The dataset.
         spec: What it holds.
-        batches: All that were finished, earlier calls' too.
+        batches: All that were played, in earlier calls too; read by `play`.
         committed: Episodes of the dataset.
         frames: Likewise.
     """
 
     def __init__(self, context: GateContext, home: Path) -> None:
-        """Finds out what a frame holds, and what an earlier call has left."""
+        """Finds out what a frame holds."""
         cfg = context.cfg
         self._context, self._cfg, self._job = context, cfg, cast(CollectJobCfg, cfg.job)
         shown = replace(demonstration_config(cfg), reset=NOMINAL)  # what a frame holds, no start changes
@@ -63,7 +69,7 @@ class Collection:
         self.spec = make_spec(env, cfg, provenance)
         env.close()
         self.home, self.path = home, home / DATASET
-        self.batches = read_batches(home) if (self.path / layout.INFO).exists() else []
+        self.batches: list[CollectedBatch] = []
         self.committed = self.frames = self._before = 0
         self._seconds = {"simulation": 0.0, "copy": 0.0, "writing": 0.0}  # of this call
         self._sim: Simulation | None = None
@@ -79,41 +85,56 @@ class Collection:
             DatasetError: The folder is somebody else's.
             UnwrittenError: The dataset cannot be written any further; what was committed is kept.
         """
+        if not (self.path / layout.INFO).exists():
+            (self.home / FILE).unlink(missing_ok=True)  # of a dataset that was removed
         writer = DatasetWriter(self.path, self.spec)
         self._count(writer)
         self._before = self.committed
         try:
             with writer:
+                self.batches = read_batches(self.home, writer.committed)
                 return self._play(writer)
         finally:
             self._count(writer)
+            if self.batches:
+                with suppress(UnwrittenError):  # the next call counts again
+                    self._note(writer)
             self._close_worlds()
 
     def _play(self, writer: DatasetWriter) -> str:
-        seed = max([self._cfg.seed - 1, *(seed for seed, _ in writer.committed), *(b.seed for b in self.batches)]) + 1
         empty = 0
-        while (missing := self._job.episodes - len(writer.committed)) > 0:
+        while (wanted := self._job.episodes - len(writer.committed)) > 0:
+            batch = next((batch for batch in self.batches if batch.missing), None)
+            if batch is not None:
+                seed, worlds = batch.seed, list(batch.missing)[: min(self._most, wanted)]
+                # In fewer of MJWarp's worlds a world could find less room in their common buffers than it had.
+                room = min(batch.worlds, self._most) if self._context.backend[0] is Backend.mjwarp else len(worlds)
+            else:
+                seed = max([self._cfg.seed - 1, *(seed for seed, _ in writer.committed), *(b.seed for b in self.batches)]) + 1
+                room = min(self._most, wanted if self._job.keep_failures else math.ceil(_SPARE * wanted))
+                worlds = list(range(room))
             if seed >= _SEEDS:
                 return (
                     f"the next seed would be {seed}, expected at most {_SEEDS - 1}: begin another dataset with a smaller seed"
                 )
-            sim, block = self._worlds(missing if self._job.keep_failures else math.ceil(_SPARE * missing))
-            played = play_demonstrations(self._context, sim, seed, block)
+            sim, block = self._worlds(room)
+            played = play_demonstrations(self._context, sim, seed, block, worlds)
             if not self._unchanged():
                 return f"the file of reset=layout changed while seed {seed} was played: restore it, or begin another dataset"
-            batch = self._add_batch(writer, played, missing)
-            self.batches.append(batch)
-            write_batches(self.home, self.batches)
+            done = f"{len(worlds)} worlds played again"
+            if batch is None:
+                batch = self._judge(played, wanted)
+                self.batches.append(batch)
+                done = f"{batch.accepted} of {batch.worlds} worlds accepted"
+            self._spend(batch, "simulation", played.seconds)
+            self._note(writer)
+            self._add(writer, batch, played)
             self._count(writer)
-            self._context.say(
-                f"collect, seed {seed}: {batch.accepted} of {batch.worlds} worlds accepted, "
-                f"{self.committed} of {self._job.episodes} episodes there"
-            )
+            self._context.say(f"collect, seed {seed}: {done}, {self.committed} of {self._job.episodes} episodes there")
             empty = 0 if batch.kept else empty + 1
             if empty == _GIVE_UP:
                 why = "; ".join(f"{text} in {count} of {batch.worlds} worlds" for text, count in batch.broken.items())
                 return f"{_GIVE_UP} seeds in a row brought no episode, the last because of: {why}"
-            seed += 1
         return ""
 
     def _unchanged(self) -> bool:
@@ -123,60 +144,81 @@ class Collection:
         except ConfigError:  # it cannot be read any more
             return False
 
-    def _add_batch(self, writer: DatasetWriter, played: Played, missing: int) -> CollectedBatch:
-        """Commits the episodes of a seed that are to be kept, as far as they are missing."""
-        keep_all = self._job.keep_failures
-        failing = failing_rules(self._context.evidence.rules, played.failed)
-        batch = CollectedBatch(
+    def _judge(self, played: Played, wanted: int) -> CollectedBatch:
+        """What is to be noted of a seed that was played for the first time, with the episodes that are to be kept of it."""
+        rules, keep_all = self._context.evidence.rules, self._job.keep_failures
+        failed = np.flatnonzero(played.failed).tolist()
+        lost = [place for place in failed if not played.finite(place)] if keep_all else failed
+        keep = [place for place in range(len(played.worlds)) if place not in lost]
+        return CollectedBatch(
             seed=played.seed,
-            worlds=len(played.failed),
+            worlds=len(played.worlds),
             accepted=int((played.failed == 0).sum()),
+            missing={played.worlds[place]: describe_rules(rules, int(played.failed[place])) for place in keep[:wanted]},
+            not_finite=len(lost) if keep_all else 0,
             retries=int(played.retries.sum()),
-            broken={rule.text: len(worlds) for rule, worlds in failing.items()},
-            simulation_s=played.seconds,
+            broken={rule.text: len(places) for rule, places in failing_rules(rules, played.failed).items()},
         )
-        worlds = np.flatnonzero(keep_all | (played.failed == 0)).tolist()
-        began = time.perf_counter()
-        for world, arrays in played.episodes(worlds if keep_all else worlds[:missing]):
-            copied = time.perf_counter()
-            batch.copy_s += copied - began
-            if played.failed[world] and not all(np.isfinite(array).all() for array in arrays.values()):
-                batch.not_finite += 1
-            elif batch.kept < missing:
-                writer.add([self._episode(played, world, arrays)])
-                batch.kept += 1
-                self._context.tell(f"episodes of seed {played.seed}", batch.kept, min(len(worlds), missing))
-            began = time.perf_counter()
-            batch.writing_s += began - copied
-        writer.flush()
-        batch.writing_s += time.perf_counter() - began
-        for name in self._seconds:
-            self._seconds[name] += getattr(batch, f"{name}_s")
-        return batch
 
-    def _episode(self, played: Played, world: int, arrays: dict[str, np.ndarray]) -> EpisodeData:
+    def _add(self, writer: DatasetWriter, batch: CollectedBatch, played: Played) -> None:
+        """Commits the episodes of a batch that are missing, as far as they were played, and notes it."""
+        places = [place for place, world in enumerate(played.worlds) if world in batch.missing]
+        changed: list[int] = []
+        began = time.perf_counter()
+        for count, (place, arrays) in enumerate(played.episodes(places), 1):
+            copied = time.perf_counter()
+            self._spend(batch, "copy", copied - began)
+            broken = describe_rules(self._context.evidence.rules, int(played.failed[place]))
+            if broken != batch.missing[played.worlds[place]] or (broken and not played.finite(place)):
+                changed.append(played.worlds[place])
+            else:
+                writer.add([self._episode(played, place, arrays, broken)])
+            self._context.tell(f"episodes of seed {played.seed}", count, len(places))
+            began = time.perf_counter()
+            self._spend(batch, "writing", began - copied)
+        writer.flush()
+        self._spend(batch, "writing", time.perf_counter() - began)
+        for world in changed:
+            del batch.missing[world]
+        batch.changed += len(changed)
+        self._note(writer)
+
+    def _spend(self, batch: CollectedBatch, name: str, seconds: float) -> None:
+        """Counts time to a batch and to this call."""
+        self._seconds[name] += seconds
+        setattr(batch, f"{name}_s", getattr(batch, f"{name}_s") + seconds)
+
+    def _note(self, writer: DatasetWriter) -> None:
+        """Writes down what was played, and what of it is in the dataset."""
+        for batch in self.batches:
+            if batch.missing:
+                batch.take_in(writer.committed)
+        try:
+            write_batches(self.home, self.batches)
+        except OSError as error:
+            raise UnwrittenError(str(self.home / FILE), error, len(writer.committed)) from error
+
+    def _episode(self, played: Played, place: int, arrays: dict[str, np.ndarray], broken: str) -> EpisodeData:
         """A world's frames and what is known of it. `next.success` is true in the last frame of an accepted episode alone."""
-        bits = int(played.failed[world])
         last = np.arange(len(arrays[STATE])) == len(arrays[STATE]) - 1
         return EpisodeData(
-            arrays={**arrays, "next.done": last, "next.success": last & (bits == 0)},
+            arrays={**arrays, "next.done": last, "next.success": last & (not broken)},
             task=self._cfg.task.instruction or self._cfg.task.name,
-            success=bits == 0,
+            success=not broken,
             seed=played.seed,
-            world=world,
+            world=played.worlds[place],
             values={
-                "retries": int(played.retries[world]),
-                "failed_rules": describe_rules(self._context.evidence.rules, bits),
+                "retries": int(played.retries[place]),
+                "failed_rules": broken,
                 "config_sha256": self.spec.config_sha256,
             },
         )
 
-    def _worlds(self, wanted: int) -> tuple[Simulation, torch.Tensor]:
-        """As many worlds as are wanted and allowed, with room for their frames.
+    def _worlds(self, n: int) -> tuple[Simulation, torch.Tensor]:
+        """As many worlds as are asked for, with room for their frames.
 
         MJWarp's are kept where there are more than that: fewer are hardly faster, and new ones have to be set up.
         """
-        n = min(wanted, self._most)
         sim, block = self._sim, self._block
         if sim is None or block is None or not (sim.nworld == n or (sim.backend == "mjwarp" and sim.nworld > n)):
             self._close_worlds()
@@ -232,6 +274,16 @@ class Collection:
             details += [f"{text}: {count} of {worlds} worlds" for text, count in broken.items()]
             if lost := sum(batch.not_finite for batch in self.batches):
                 details.append(f"{lost} failed episodes with a number that is not finite are not in the dataset")
+            if changed := sum(batch.changed for batch in self.batches):
+                details.append(f"{changed} episodes judged otherwise when they were played again are not in the dataset")
+            details += [
+                f"seed {batch.seed} is unfinished: {len(batch.missing)} of its episodes are still to come"
+                for batch in self.batches
+                if batch.missing
+            ]
+        if unknown := self.committed - sum(batch.kept for batch in self.batches):
+            metrics["episodes_without_note"] = unknown
+            reason += f"; {unknown:,} episodes are of seeds that {FILE} does not have, and in no success rate"
         if new:
             metrics |= {f"{name}_s": value for name, value in self._seconds.items()} | {"episodes_per_s": new / seconds}
             times = ", ".join(f"{name} {value:.1f} s" for name, value in self._seconds.items())

@@ -65,32 +65,42 @@ class Played:
 
     Attributes:
         seed: What it was played with.
-        frames: All frames, on the device.
-        failed: Bits of the task's rules, shape ``(nworld,)``, int32.
-        retries: Grasps that were tried again, shape ``(nworld,)``.
+        worlds: Numbers of its worlds.
+        frames: All frames, on the device; the first of them, along the worlds, are of these worlds.
+        failed: Bits of the task's rules, shape ``(len(worlds),)``, int32.
+        retries: Grasps that were tried again, shape ``(len(worlds),)``.
         seconds: Wall time, from the reset to the verdict [s].
     """
 
     seed: int
+    worlds: Sequence[int]
     frames: FrameRecorder
     failed: np.ndarray
     retries: np.ndarray
     seconds: float
 
-    def episodes(self, worlds: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    def finite(self, place: int) -> bool:
+        """Whether every number of a world's frames is finite.
+
+        Args:
+            place: Which world, by its place in the batch.
+        """
+        return bool(self.frames.values[:, place].isfinite().all())
+
+    def episodes(self, places: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
         """Some worlds' frames on the host, by kind, each ``(frames, dim)``; copied in chunks.
 
         Args:
-            worlds: Which, by their place in the batch.
+            places: Which, by their place in the batch.
         """
         values = self.frames.values
         size = max(1, _CHUNK_BYTES // (values[:, 0].numel() * values.element_size()))
         ends = np.cumsum(list(self.frames.layout.values()))[:-1]
-        for first in range(0, len(worlds), size):
-            chunk = torch.tensor(worlds[first : first + size], device=values.device)
+        for first in range(0, len(places), size):
+            chunk = torch.tensor(places[first : first + size], device=values.device)
             rows = values.index_select(1, chunk).transpose(0, 1).contiguous().cpu().numpy()
-            for world, row in zip(worlds[first:], rows, strict=False):
-                yield world, dict(zip(self.frames.layout, np.split(row, ends, axis=1), strict=True))
+            for place, row in zip(places[first:], rows, strict=False):
+                yield place, dict(zip(self.frames.layout, np.split(row, ends, axis=1), strict=True))
 
 
 def frames_block(sim: Simulation, frames: int, dim: int) -> torch.Tensor:
@@ -98,20 +108,24 @@ def frames_block(sim: Simulation, frames: int, dim: int) -> torch.Tensor:
     return torch.zeros((frames, sim.nworld, dim), dtype=torch.float32, device=sim.device)
 
 
-def play_demonstrations(context: GateContext, sim: Simulation, seed: int, values: torch.Tensor) -> Played:
-    """Plays the configured controller once in every world, and judges it by the task's acceptance.
+def play_demonstrations(
+    context: GateContext, sim: Simulation, seed: int, values: torch.Tensor, worlds: Sequence[int]
+) -> Played:
+    """Plays the configured controller once in some worlds of a seed, and judges it by the task's acceptance.
 
     Nothing ends an episode: worlds go on to its end, so all have as many frames. On CUDA a frame is one graph.
 
     Args:
         context: Configuration, scene and planner.
-        sim: The worlds.
+        sim: Room for the worlds; what it has more of them is played as well and not looked at.
         seed: What they start by.
         values: Room for the frames, shape ``(frames, nworld, dim)``; see `frames_block`.
+        worlds: Their numbers, which random numbers depend on.
     """
     began = time.perf_counter()
     cfg = replace(context.cfg, seed=seed)
     env = Env(sim, context.index, demonstration_config(cfg), check_faults=False)  # the acceptance names lost worlds
+    env.world[: len(worlds)].copy_(torch.tensor(worlds))
     env.reset(seed=seed)
     sim.forward()
     controller = make_controller(env, context.planner, context.advance)
@@ -136,8 +150,9 @@ def play_demonstrations(context: GateContext, sim: Simulation, seed: int, values
     play.drop()
     return Played(
         seed=seed,
+        worlds=worlds,
         frames=recorder,
-        failed=evidence.verdict(sim).failed.cpu().numpy(),
-        retries=controller.retries.cpu().numpy(),
+        failed=evidence.verdict(sim).failed.cpu().numpy()[: len(worlds)],
+        retries=controller.retries.cpu().numpy()[: len(worlds)],
         seconds=time.perf_counter() - began,
     )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import mujoco
@@ -52,14 +54,54 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     return config
 
 
-def first_difference(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
-    """The first key in which two configurations differ, with both values; None if they are the same."""
-    found, expected = dict(_flat(theirs)), dict(_flat(ours))
-    for key in [*expected, *found]:
-        pair = found.get(key, "nothing"), expected.get(key, "nothing")
-        if pair[0] != pair[1]:
-            return key, *pair
-    return None
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Difference:
+    """Where two configurations differ first. Its text is ``key=found, expected value``, or the names that a group has.
+
+    Attributes:
+        key: What differs.
+        found: What the one has: a value, or a group with other names in it.
+        expected: What the other has.
+        alone: Whether it is one value, and nothing else differs.
+    """
+
+    key: str
+    found: Any
+    expected: Any
+    alone: bool
+
+    def __str__(self) -> str:
+        if isinstance(self.found, Mapping) and isinstance(self.expected, Mapping):
+            found, expected = (", ".join(map(str, group)) or "nothing" for group in (self.found, self.expected))
+            return f"{self.key or 'the configuration'} has {found}, expected {expected}"
+        return f"{self.key}={as_override(self.found)}, expected {as_override(self.expected)}"
+
+
+def first_difference(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> Difference | None:
+    """Where two configurations differ first; None if they are the same."""
+    all_of_them = list(_differences(theirs, ours))
+    if not all_of_them:
+        return None
+    key, found, expected = all_of_them[0]
+    alone = len(all_of_them) == 1 and not isinstance(found, Mapping)
+    return Difference(key=key, found=found, expected=expected, alone=alone)
+
+
+def as_override(value: Any) -> str:
+    """A value of a configuration as one types it."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _differences(theirs: Any, ours: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """The keys whose values differ, and the groups that have other names in them, with what each side has."""
+    if not (isinstance(theirs, Mapping) and isinstance(ours, Mapping)):
+        if theirs != ours:
+            yield key, theirs, ours
+    elif theirs.keys() != ours.keys():
+        yield key, theirs, ours
+    else:
+        for name in ours:
+            yield from _differences(theirs[name], ours[name], f"{key}.{name}" if key else name)
 
 
 def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSpec:
@@ -137,11 +179,3 @@ def _scaled(units: Sequence[str], scale: float) -> list[str]:
     if scale == 0.0:
         return ["unknown"] * len(units)
     return [unit if unit == "unknown" else f"{1.0 / scale:g} {unit}".removesuffix(" 1") for unit in units]
-
-
-def _flat(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(node, Mapping) and node:
-        for name, value in node.items():
-            yield from _flat(value, f"{prefix}.{name}" if prefix else str(name))
-    else:
-        yield prefix, node
