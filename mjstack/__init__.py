@@ -23,14 +23,17 @@ __all__ = ["Config", "Env", "MjstackError", "load_config", "make_env"]
 __version__ = "0.1.0"
 
 _HOMES = {"Config": "mjstack.config", "load_config": "mjstack.config", "Env": "mjstack.envs", "make_env": "mjstack.envs"}
+_PACKAGES = {"config", "control", "envs", "kinematics", "managers", "math", "mdp", "rng", "robots", "scene", "sim", "tasks"}
 
+if not TYPE_CHECKING:  # a type checker would take any name for one of these
 
-def __getattr__(name: str) -> Any:
-    """Loads what takes seconds, torch and Warp, when it is asked for: the command line has things to do before."""
-    if name not in _HOMES:
+    def __getattr__(name: str) -> Any:
+        """Loads what takes seconds, torch and Warp, when it is asked for: the command line has things to do before."""
+        if name in _HOMES:
+            return getattr(import_module(_HOMES[name]), name)
+        if name in _PACKAGES:
+            return import_module(f"mjstack.{name}")
         raise AttributeError(f"module 'mjstack' has no attribute '{name}'")
-    return getattr(import_module(_HOMES[name]), name)
 
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__, *_PACKAGES})

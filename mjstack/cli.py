@@ -127,7 +127,7 @@ def _overrides(args: list[str]) -> list[str]:
     """The key=value arguments; Hydra's own flags and their values are left out."""
     flags = {*_HELP, "--version", *_FLAGS_WITHOUT_RUN, *_SWEEP, *_VALUED, *_OTHER_FLAGS}
     out, skip = [], False
-    for arg in args:
+    for number, arg in enumerate(args):
         if skip:
             skip = False
         elif arg.partition("=")[0] in _OTHER_CONFIG:
@@ -137,8 +137,12 @@ def _overrides(args: list[str]) -> list[str]:
         elif arg.startswith("-"):
             if arg.partition("=")[0] not in flags:
                 override = arg.lstrip("-")
-                if override.partition("=")[0].partition(".")[0] in {field.name for field in fields(Config)}:
-                    raise CompositionError(f"flag '{arg}' does not exist. Write {override}, an override without dashes.")
+                key, given, _ = override.partition("=")
+                if key.partition(".")[0] in {field.name for field in fields(Config)}:
+                    follows = args[number + 1 : number + 2]
+                    value = follows[0] if follows and not follows[0].startswith("-") and "=" not in follows[0] else "VALUE"
+                    meant = override if given else f"{key}={value}"
+                    raise CompositionError(f"flag '{arg}' does not exist. Write {meant}, an override without dashes.")
                 raise UnknownName("flag", arg, flags)
         elif "=" not in arg and not arg.startswith("~"):
             raise CompositionError(f"argument '{arg}' is not an override. Write key=value, such as nworld=64.")

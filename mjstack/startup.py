@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from types import FrameType
 
 INTERRUPTED = 130
 
 
 def guard() -> None:
-    """From here to `started` Ctrl-C ends the process at once. Where it is ignored, as in a shell's background, it stays so."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    """From here to `started` Ctrl-C ends the process at once. Handlers of somebody else's and other threads are left alone."""
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _stop)
 
 

@@ -155,11 +155,53 @@ def test_what_is_misspelt_does_not_wait_for_torch(folder: Path) -> None:
         assert done.stderr.splitlines()[-1] == "False False", args
 
 
-def test_an_override_with_dashes_is_told_without(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["--gate.batch.seeds=[1]"]) == 2
+@pytest.mark.parametrize(
+    ("args", "wrong", "meant"),
+    [
+        (["--gate.batch.seeds=[1]"], "--gate.batch.seeds=[1]", "gate.batch.seeds=[1]"),
+        (["--nworld", "64"], "--nworld", "nworld=64"),
+        (["--seed", "nworld=2"], "--seed", "seed=VALUE"),
+    ],
+)
+def test_an_override_with_dashes_is_told_without(
+    args: list[str], wrong: str, meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(args) == 2
     assert capsys.readouterr().err.strip() == (
-        "mjstack: flag '--gate.batch.seeds=[1]' does not exist. Write gate.batch.seeds=[1], an override without dashes."
+        f"mjstack: flag '{wrong}' does not exist. Write {meant}, an override without dashes."
     )
+
+
+def test_the_command_in_another_program_leaves_its_ctrl_c_alone(folder: Path) -> None:
+    program = """
+import os, signal, sys, threading
+from mjstack.__main__ import main
+sys.argv = ["mjstack", "nworld=0"]
+
+def call():
+    try:
+        main()
+    except SystemExit as stop:
+        print(stop.code)
+
+thread = threading.Thread(target=call)
+thread.start()
+thread.join()
+call()
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+except KeyboardInterrupt:
+    print("mine")
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == ["2", "2", "mine"], done.stderr
+
+
+def test_packages_are_there_after_a_plain_import(folder: Path) -> None:
+    program = "import mjstack; print(mjstack.scene.build_model.__name__, mjstack.errors.MjstackError.__name__); mjstack.no_such"
+    done = subprocess.run([sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == ["build_model", "MjstackError"]
+    assert done.stderr.strip().endswith("AttributeError: module 'mjstack' has no attribute 'no_such'")
 
 
 def test_help_says_what_there_is_to_choose(

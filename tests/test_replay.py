@@ -319,8 +319,10 @@ def test_copies_of_layouts(tmp_path: Path) -> None:
     cfg = load_config(["reset=layout", f"layout={tmp_path}/a.csv"])
     cfg.reset["own"] = TermCfg(func="mjstack.mdp.layout.FromLayout", params={"path": str(own)})
     cfg.reset["again"] = TermCfg(func="mjstack.mdp.layout.FromLayout", params={"path": str(own), "pose": "home"})
+    (folder / f"{STEM}_backup.csv").write_bytes(b"the user's")
     found = keep_layouts(cfg, folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
+        f"{STEM}_backup.csv": b"the user's",
         f"{STEM}.csv": b"\xef\xbb\xbfworld\r\n",
         f"{STEM}_2.csv": own.name.encode(),
         f"{STEM}_3.csv": own.name.encode(),

@@ -27,7 +27,7 @@ class CollectedBatch:
         kept: Episodes of it that are in the dataset.
         missing: Worlds whose episodes are still to come, in order, with the rules that each broke; empty once it is finished.
         changed: Episodes left out because their worlds, played again, were judged otherwise.
-        not_finite: Failed episodes that were not kept because a number in them is not finite.
+        not_finite: Episodes that were not kept only because a number in them is not finite.
         retries: Grasps that were tried again, in all worlds.
         broken: How many worlds broke each rule, by its words.
         simulation_s: Wall time of playing [s].

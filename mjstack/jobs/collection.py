@@ -147,15 +147,14 @@ class Collection:
     def _judge(self, played: Played, wanted: int) -> CollectedBatch:
         """What is to be noted of a seed that was played for the first time, with the episodes that are to be kept of it."""
         rules, keep_all = self._context.evidence.rules, self._job.keep_failures
-        failed = np.flatnonzero(played.failed).tolist()
-        lost = [place for place in failed if not played.finite(place)] if keep_all else failed
-        keep = [place for place in range(len(played.worlds)) if place not in lost]
+        good = range(len(played.worlds)) if keep_all else np.flatnonzero(played.failed == 0).tolist()
+        keep = [place for place in good if played.finite(place)]
         return CollectedBatch(
             seed=played.seed,
             worlds=len(played.worlds),
             accepted=int((played.failed == 0).sum()),
             missing={played.worlds[place]: describe_rules(rules, int(played.failed[place])) for place in keep[:wanted]},
-            not_finite=len(lost) if keep_all else 0,
+            not_finite=len(good) - len(keep),
             retries=int(played.retries.sum()),
             broken={rule.text: len(places) for rule, places in failing_rules(rules, played.failed).items()},
         )
@@ -169,7 +168,7 @@ class Collection:
             copied = time.perf_counter()
             self._spend(batch, "copy", copied - began)
             broken = describe_rules(self._context.evidence.rules, int(played.failed[place]))
-            if broken != batch.missing[played.worlds[place]] or (broken and not played.finite(place)):
+            if broken != batch.missing[played.worlds[place]] or not played.finite(place):
                 changed.append(played.worlds[place])
             else:
                 writer.add([self._episode(played, place, arrays, broken)])
@@ -273,7 +272,7 @@ class Collection:
                     broken[text] = broken.get(text, 0) + count
             details += [f"{text}: {count} of {worlds} worlds" for text, count in broken.items()]
             if lost := sum(batch.not_finite for batch in self.batches):
-                details.append(f"{lost} failed episodes with a number that is not finite are not in the dataset")
+                details.append(f"{lost} episodes with a number that is not finite are not in the dataset")
             if changed := sum(batch.changed for batch in self.batches):
                 details.append(f"{changed} episodes judged otherwise when they were played again are not in the dataset")
             details += [

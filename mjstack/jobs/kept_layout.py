@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from mjstack.errors import ConfigError, RunError
 from mjstack.report.record import write_atomic
 
 STEM = "layout_played"
+_COPY = re.compile(rf"{STEM}(_[0-9]+)?\.csv")  # not a file of the user's, such as layout_played_backup.csv
 
 
 def keep_layouts(cfg: Config, folder: Path) -> Config:
@@ -32,7 +34,7 @@ def keep_layouts(cfg: Config, folder: Path) -> Config:
     contents = {name: _read(cfg, path) for path, name in names.items()}  # first, because a file may be an earlier copy
     sources = {Path(path).resolve() for path in names}
     for path in folder.glob(f"{STEM}*.csv"):
-        if path.resolve() not in sources:
+        if _COPY.fullmatch(path.name) and path.resolve() not in sources:
             path.unlink()
     for name, content in contents.items():
         write_atomic(folder / name, content)

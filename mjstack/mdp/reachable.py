@@ -29,8 +29,9 @@ def reach_distances(env: EnvView, cube: int, xy: np.ndarray) -> tuple[np.ndarray
     """
     robot, scene = env.cfg.robot, env.cfg.scene
     # Whatever the phases do: other tasks and controllers take either cube.
-    targets = [CubeTarget("", scene.grasp_offset, "open"), CubeTarget("", robot.approach_height, "open")]
-    targets += cube_targets(env.cfg)[cube]
+    own = [CubeTarget("", scene.grasp_offset, "open"), CubeTarget("", robot.approach_height, "open")]
+    asked = {(round(target.height, 6), target.gripper): target for target in [*own, *cube_targets(env.cfg)[cube]]}
+    targets = list(asked.values())
     center = table_top(scene) + scene.cube_half
     distances = np.zeros((len(xy), len(targets)))
     for gripper, command in (("open", robot.gripper_open), ("closed", robot.gripper_closed)):

@@ -54,11 +54,16 @@ def _cpu_name() -> str:
 
 
 def _git_commit() -> str:
-    """The checkout's commit, marked where files differ from it; an installed wheel has none."""
-    git = ["git", "-C", str(Path(__file__).resolve().parents[2])]
+    """The checkout's commit, marked where files differ from it; an installed wheel has none, whatever repository it lies in."""
+    root = Path(__file__).resolve().parents[2]
+    git = ["git", "-C", str(root)]
     try:
-        commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True)
-        dirty = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, timeout=10, check=True)
+        top, commit, dirty = (
+            subprocess.run([*git, *args], capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+            for args in (("rev-parse", "--show-toplevel"), ("rev-parse", "HEAD"), ("status", "--porcelain"))
+        )
     except (OSError, subprocess.SubprocessError):
         return "no checkout"
-    return commit.stdout.strip() + (" with changes" if dirty.stdout.strip() else "")
+    if Path(top).resolve() != root:
+        return "no checkout"
+    return commit + (" with changes" if dirty else "")
