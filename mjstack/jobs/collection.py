@@ -133,7 +133,8 @@ class Collection:
             self._context.say(f"collect, seed {seed}: {done}, {self.committed} of {self._job.episodes} episodes there")
             empty = 0 if batch.kept else empty + 1
             if empty == _GIVE_UP:
-                why = "; ".join(f"{text} in {count} of {batch.worlds} worlds" for text, count in batch.broken.items())
+                counts = batch.broken | ({"a number that is not finite": batch.not_finite} if batch.not_finite else {})
+                why = "; ".join(f"{text} in {count} of {batch.worlds} worlds" for text, count in counts.items())
                 return f"{_GIVE_UP} seeds in a row brought no episode, the last because of: {why}"
         return ""
 
