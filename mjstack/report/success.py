@@ -10,6 +10,7 @@ import numpy as np
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.collections import PathCollection
 from matplotlib.patches import Rectangle
 
 _COLORS = ("#cc2a24", "#2457c7")
@@ -42,17 +43,21 @@ def save_places(
     failed = places[~accepted]
     for number, (name, color) in enumerate(zip(names, _COLORS, strict=True)):
         good = places[accepted, number]
-        axes.scatter(good[:, 1], good[:, 0], s=size, color=color, alpha=alpha, lw=0, label=f"{name}, accepted: {len(good)}")
+        axes.scatter(good[:, 1], good[:, 0], s=size, color=color, alpha=alpha, lw=0, label=f"{name}, accepted: {len(good):,}")
     for pair in failed:
         axes.plot(pair[:, 1], pair[:, 0], color="0.3", lw=0.5, alpha=0.6)
     for number, (name, color) in enumerate(zip(names, _COLORS, strict=True)):
         bad = failed[:, number]
         axes.scatter(bad[:, 1], bad[:, 0], s=45.0, marker="x", color="k", lw=2.6)
-        axes.scatter(bad[:, 1], bad[:, 0], s=40.0, marker="x", color=color, lw=1.2, label=f"{name}, failed: {len(bad)}")
+        axes.scatter(bad[:, 1], bad[:, 0], s=40.0, marker="x", color=color, lw=1.2, label=f"{name}, failed: {len(bad):,}")
     axes.set(xlabel="y [m]", ylabel="x [m]", aspect="equal")
     axes.set_title(title, wrap=True)
     axes.invert_xaxis()
     axes.grid(alpha=0.3)
-    axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5)
+    legend = axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5)
+    for handle in legend.legend_handles:
+        if isinstance(handle, PathCollection):  # the dots of ten thousand worlds are too small and faint to tell apart here
+            handle.set_sizes([40.0])
+            handle.set_alpha(1.0)
     figure.savefig(path, dpi=110)
     plt.close(figure)
