@@ -26,8 +26,10 @@ from rich.table import Table
 
 import mjstack
 from mjstack.config import Config
+from mjstack.config.explain import CompositionError
 from mjstack.config.help import help_text
-from mjstack.config.store import CONFIG_MODULE, CONFIG_NAME, CompositionError, compose_overrides, own_hydra, to_config
+from mjstack.config.session import CONFIG_MODULE, CONFIG_NAME, own_hydra
+from mjstack.config.store import compose_overrides, to_config
 from mjstack.errors import MjstackError, UnknownName
 from mjstack.report.markdown import escape_cell
 from mjstack.report.record import Status

@@ -124,6 +124,7 @@ ON_CUDA = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), re
 PLAYED = [
     ("so101", "scripted", "cpu"),
     ("rebot", "planned", "cpu"),
+    ("rebot", "scripted", "cpu"),
     *(pytest.param(r, c, "cuda:0", marks=ON_CUDA) for r in ("so101", "rebot") for c in ("scripted", "planned")),
 ]
 

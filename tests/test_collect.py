@@ -455,6 +455,22 @@ def test_an_expert_that_never_succeeds_is_given_up(folder: Path, monkeypatch: py
     assert report_of(folder)["gates"][0]["metrics"]["success_rate"] == pytest.approx(4 / 10)
 
 
+@pytest.mark.parametrize("keep_failures", [False, True])
+def test_worlds_of_which_none_is_finite_are_given_up(
+    folder: Path, keep_failures: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diverge(seed: int, values: torch.Tensor) -> None:
+        values[3] = torch.nan
+
+    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False, diverge))
+    assert collect("nworld=2", "job.episodes=3", f"job.keep_failures={keep_failures}") == 1
+    (gate,) = report_of(folder)["gates"]
+    assert gate["reason"].startswith(
+        "3 seeds in a row brought no episode, the last because of: a number that is not finite in 2 of 2 worlds"
+    )
+    assert gate["metrics"]["episodes"] == 0
+
+
 def test_ctrl_c_keeps_finished_batches(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(seed: int, values: torch.Tensor) -> None:
         if seed == 1:

@@ -7,6 +7,8 @@ import time
 import traceback
 from collections.abc import Callable
 
+import torch
+
 from mjstack.errors import MjstackError
 from mjstack.gates.baseline import run_baseline
 from mjstack.gates.batch import run_batch
@@ -63,6 +65,12 @@ def run_guarded(
         results = run(context)
     except MjstackError as error:
         results = [GateResult(name=name, status=Status.failed, reason=str(error))]
+    except (MemoryError, torch.OutOfMemoryError) as error:
+        log.error("gate %s ran out of memory:\n%s", name, traceback.format_exc())
+        reason = (
+            f"out of memory: {(str(error).splitlines() or ['no more is known'])[0].rstrip('.')}. Use fewer worlds (nworld=...)"
+        )
+        results = [GateResult(name=name, status=Status.failed, reason=reason)]
     except Exception as error:
         log.error("gate %s broke:\n%s", name, traceback.format_exc())
         reason = f"internal error, {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"

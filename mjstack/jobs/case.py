@@ -19,7 +19,8 @@ from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow
 RESULT = "case.json"
 _START = "from mjstack.__main__ import main; main()"
 _OUT_OF_MEMORY = re.compile(
-    r"out of memory|OutOfMemory|MemoryError|bad_alloc|Failed to allocate|Unable to allocate", re.IGNORECASE
+    r"out of memory|OutOfMemory|MemoryError|bad_alloc|Failed to allocate|Unable to allocate|that fit into the \d+ GiB",
+    re.IGNORECASE,
 )
 _GRACE = 20.0  # s, for a process that was asked to stop
 

@@ -19,6 +19,7 @@ from mjstack.jobs.kept_layout import keep_layouts
 from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.reported import Record, check_showing, run_reported
+from mjstack.jobs.room import check_room
 from mjstack.sim import resolve_backend
 
 _SCRIPTED = ("stack", "box")  # tasks
@@ -54,6 +55,8 @@ def check_task(cfg: Config) -> None:
         raise ConfigError("task", cfg.task.name, expected, "Train it: mjstack.make_env")
     ScriptedPlanner(cfg)  # reads the robot, and reaches every nominal target
     env = build_env(cfg, nworld=1, backend=Backend.native, device="cpu")  # builds and checks every term
+    if cfg.job.name == "gates":
+        check_room(cfg, env.sim.model)
     if cfg.controller.approach_gain > 0.0:
         turn_sign(env.sim.model, cfg)
     env.close()

@@ -78,7 +78,7 @@ def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> Job
 def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
     """Heights above a cube's centre [m] at which the task needs the aperture centre, and the gripper's command there.
 
-    ``approach`` is the first target above red, ``grasp`` its lowest where a cube stands, and ``carry`` its highest there.
+    ``approach`` is the controller's first target over a cube, ``grasp`` its lowest, and ``carry`` its highest.
     """
     red, blue = cube_targets(cfg)
     if not red + blue:

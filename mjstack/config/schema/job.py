@@ -75,3 +75,7 @@ class CollectJobCfg(JobCfg):
     keep_failures: bool = MISSING
     folder: str | None = None
     buffer_gib: float = MISSING
+
+
+# Jobs with keys of their own; the others have `JobCfg`.
+JOBS = {"study": StudyJobCfg, "scaling": ScalingJobCfg, "reachability": ReachabilityJobCfg, "collect": CollectJobCfg}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mjstack.config.schema import CollectJobCfg, JobCfg, ReachabilityJobCfg, ScalingJobCfg, StudyJobCfg
 from mjstack.config.validate.physics import check_solver
-from mjstack.config.validate.values import not_negative, positive, positive_int
+from mjstack.config.validate.values import not_negative, positive, positive_int, world_count
 from mjstack.errors import ConfigError, UnknownName
 
 SCALING_BACKENDS = ("mjwarp", "native")
@@ -26,7 +26,7 @@ def _scaling(job: ScalingJobCfg) -> None:
     if not job.nworlds or len(set(job.nworlds)) < len(job.nworlds):
         raise ConfigError("job.nworlds", job.nworlds, "at least one number of worlds, each once")
     for nworld in job.nworlds:
-        positive_int("job.nworlds", nworld)
+        world_count("job.nworlds", nworld)
     for name in job.backends or ():
         if name not in SCALING_BACKENDS:
             raise UnknownName("job.backends: backend", name, SCALING_BACKENDS)

@@ -12,7 +12,7 @@ from mjstack.config.validate.robot import check_robot
 from mjstack.config.validate.scene import check_scene
 from mjstack.config.validate.task import check_controller
 from mjstack.config.validate.term import reads_layout
-from mjstack.config.validate.values import positive_int
+from mjstack.config.validate.values import world_count
 from mjstack.errors import ConfigError, UnknownName
 
 GATES = ("baseline", "parity", "capacity", "batch", "throughput", "success")
@@ -23,7 +23,7 @@ _WORLD = re.compile(r"((batch|success):)?(\d+:)?\d+")
 
 def validate(cfg: Config) -> None:
     """Raises a `ConfigError` or `UnknownName` for the first value that cannot be used."""
-    positive_int("nworld", cfg.nworld)
+    world_count("nworld", cfg.nworld)
     if not 0 <= cfg.seed < 1 << 32:
         raise ConfigError("seed", cfg.seed, "an integer from 0 to 4294967295")
     if not cfg.gates:

@@ -1,0 +1,59 @@
+"""Checks of overrides before Hydra sees them: what it would answer with a traceback, or with words about its own parser."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, QuotedString
+from hydra.errors import HydraException
+
+from mjstack.config.explain import TERM_GROUPS, CompositionError
+from mjstack.config.help import list_groups
+
+
+def check_overrides(overrides: Sequence[str]) -> None:
+    """Raises a `CompositionError` for the first override that is none, or asks a group for something else than a choice."""
+    for override in overrides:
+        key, equals, _ = override.partition("=")
+        if not key.strip("+~ "):
+            raise CompositionError(f"override '{override}' has no key. Write key=value without spaces, such as nworld=64.")
+        if not equals and not override.startswith("~"):
+            raise CompositionError(f"override '{override}' has no value. Write key=value, such as nworld=64.")
+    groups = {group.name: group.choices for group in list_groups()}
+    for override in overrides:
+        parsed = _parse(override)
+        if parsed.is_sweep_override():
+            raise CompositionError(f"'{override}': several values are a sweep. Add -m, or give one value.")
+        if parsed.is_delete():
+            _check_deletion(parsed)
+        elif parsed.key_or_group in groups and parsed.package is None:
+            _check_choice(parsed, override, groups[parsed.key_or_group])
+
+
+def _parse(override: str) -> Override:
+    try:
+        return OverridesParser.create().parse_override(override)
+    except HydraException as error:
+        raise CompositionError(
+            f"override {override!r} cannot be read: expected key=value without spaces around the sign, and quotes around a "
+            "value with spaces, brackets or commas in it, such as 'layout=\"my worlds.csv\"'."
+        ) from error
+
+
+def _check_deletion(parsed: Override) -> None:
+    """Terms can be left out; all other keys and groups need a value."""
+    if parsed.key_or_group.partition(".")[0] not in TERM_GROUPS:
+        raise CompositionError(
+            f"~{parsed.key_or_group}: expected a term of {', '.join(TERM_GROUPS)}, such as ~reward.lift, because everything "
+            f"else needs a value. Write {parsed.key_or_group}=VALUE."
+        )
+
+
+def _check_choice(parsed: Override, override: str, choices: Sequence[str]) -> None:
+    """A group takes the name of a choice, or a list of names. A mapping sets keys below it, which the schema checks."""
+    value = parsed.value()
+    names = value if isinstance(value, list) else [value]
+    if isinstance(value, dict) or all(isinstance(name, str | QuotedString) for name in names):
+        return
+    raise CompositionError(f"{override}: expected the name of a choice: {', '.join(choices)}.")
