@@ -210,6 +210,8 @@ BAD = [
     (["+nworld=4"], "+nworld: there is one already. Write nworld=VALUE"),
     (["~nworld"], "~nworld: expected a term of"),
     (["~robot"], "~robot: expected a term of"),
+    (["~gate.batch.seeds"], "~gate.batch.seeds: it needs a value and cannot be left out. Write gate.batch.seeds=VALUE."),
+    (["~batch.njmax"], "~batch.njmax: it is null, so there is nothing to leave out."),
 ]
 
 

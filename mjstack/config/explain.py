@@ -79,6 +79,8 @@ def _wrong_value(key: str, text: str) -> CompositionError | None:
         return CompositionError(f"{key}={found.group(1)}: expected text.")
     if re.search(r"is not Optional|NoneType is not a subclass", text):
         return CompositionError(f"{key}=null: expected a value.")
+    if "does not support deletion" in text:
+        return CompositionError(f"~{key}: it needs a value and cannot be left out. Write {key}=VALUE.")
     if "not a ListConfig" in text or "Cannot merge DictConfig with ListConfig" in text:
         return CompositionError(f"{key}: expected a list, such as '{key}=[...]'.")
     return None
@@ -154,6 +156,8 @@ def _unknown_deletion(key: str, overrides: Sequence[str]) -> MjstackError:
             return explain(error)
     parent = key.rpartition(".")[0]
     keys = [k for k in _flat_keys(OmegaConf.to_container(base, resolve=False)) if k.rpartition(".")[0] == parent]
+    if key in keys:  # Hydra takes a null for nothing
+        return CompositionError(f"~{key}: it is null, so there is nothing to leave out. Write {key}=VALUE, or nothing.")
     return CompositionError(f"~{key}: there is none to leave out. {suggest(key, keys)}")
 
 

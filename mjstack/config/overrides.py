@@ -42,8 +42,8 @@ def _parse(override: str) -> Override:
 
 
 def _check_deletion(parsed: Override) -> None:
-    """Terms can be left out; all other keys and groups need a value."""
-    if parsed.key_or_group.partition(".")[0] not in TERM_GROUPS:
+    """Of the top level only terms can be left out; all other keys and groups there need a value."""
+    if "." not in parsed.key_or_group and parsed.key_or_group not in TERM_GROUPS:
         raise CompositionError(
             f"~{parsed.key_or_group}: expected a term of {', '.join(TERM_GROUPS)}, such as ~reward.lift, because everything "
             f"else needs a value. Write {parsed.key_or_group}=VALUE."
