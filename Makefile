@@ -12,12 +12,13 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-com
 run: $(READY)
 	$(BIN)/python scripts/run.py robot=so101 nworld=32 $(ARGS)
 
+# Two processes on two cores: with threads of their own as well they would wait for each other.
 # pip left no bytecode: without this, where the shell forbids writing it, each process that a test starts compiles torch's.
 test: $(READY_DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 setup: $(READY_DEV)
 

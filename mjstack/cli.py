@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.markup import escape
@@ -28,6 +27,7 @@ import mjstack
 from mjstack.config import Config
 from mjstack.config.explain import CompositionError
 from mjstack.config.help import help_text
+from mjstack.config.overrides import parse
 from mjstack.config.session import CONFIG_MODULE, CONFIG_NAME, own_hydra
 from mjstack.config.store import compose_overrides, to_config
 from mjstack.errors import MjstackError, UnknownName
@@ -157,10 +157,7 @@ def _expand(overrides: list[str]) -> list[list[str]]:
     """The jobs of a sweep, as Hydra's basic sweeper makes them."""
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 
-    try:
-        parsed = OverridesParser.create().parse_overrides(overrides)
-    except OverrideParseException as error:
-        raise CompositionError(f"override cannot be read: {str(error).splitlines()[0]}.") from error
+    parsed = [parse(override) for override in overrides]
     try:
         return [list(job) for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
     except HydraException as error:

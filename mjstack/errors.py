@@ -6,7 +6,20 @@ Every error that a user can cause derives from `MjstackError` and carries the ex
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Sequence
+
+# As Python, C++, NumPy, torch, Warp and CUDA put it, each with an exception of its own.
+_OUT_OF_MEMORY = re.compile(
+    r"out of memory|OutOfMemory|MemoryError|bad_alloc|failed to allocate|unable to allocate"
+    r"|can't allocate memory|not enough memory",
+    re.IGNORECASE,
+)
+
+
+def is_out_of_memory(text: str) -> bool:
+    """Whether an exception's type and text, or a process's output, say that memory ran out."""
+    return _OUT_OF_MEMORY.search(text) is not None
 
 
 class MjstackError(Exception):

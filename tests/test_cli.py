@@ -53,6 +53,8 @@ BAD = [
     ["gate.throughput.from_phase=lift"],
     ["nworld"],
     ["=3"],
+    ["-m", "nworld =3"],
+    ["-m", "nworld=[1,"],
     ["--helpp"],
     ["-x", "nworld=3"],
     ["~reward.nope"],

@@ -29,12 +29,17 @@ def test_native_bytes_are_some_of_those_that_are_held(so101_cfg: Config) -> None
     assert native_bytes(model, 5) == sum(array.nbytes for array in arrays)
 
 
-@pytest.mark.parametrize("backend", ["native", "mjwarp"])
-def test_more_than_memory_holds_is_refused(backend: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "args", [["sim=native"], ["sim=mjwarp"], ["sim=native", "job=study"], ["sim=native", "gates=[success]"]], ids=" ".join
+)
+def test_more_than_memory_holds_is_refused(
+    args: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gib = 64
+    monkeypatch.setattr(room, "total_memory", lambda device: gib << 30)
     folder = tmp_path / "run"
-    assert run([f"nworld={MANY}", f"sim={backend}", "sim.device=cpu", f"hydra.run.dir={folder}"]) == 2
+    assert run([f"nworld={MANY}", *args, "sim.device=cpu", f"hydra.run.dir={folder}"]) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mjstack: ")]
-    gib = round(total_memory("cpu") / 2**30)
     found = re.fullmatch(
         rf"mjstack: nworld={MANY}: expected worlds that fit into the {gib} GiB of this machine, "
         r"and these need (\d+) GiB or more\. Use fewer\.",
@@ -55,9 +60,13 @@ def test_what_could_fit_is_not_refused(sizes: str, so101_cfg: Config, monkeypatc
         check_room(cfg, model)
     found = re.search(r"need (\d+) GiB", str(caught.value))
     assert found is not None
-    monkeypatch.setattr(room, "total_memory", lambda device: (int(found[1]) + 1) << 30)
+    needed = int(found[1])
+    monkeypatch.setattr(room, "total_memory", lambda device: (needed - 1) << 30)
+    with pytest.raises(ConfigError):
+        check_room(cfg, model)
+    monkeypatch.setattr(room, "total_memory", lambda device: (needed + 1) << 30)
     check_room(cfg, model)
-    assert (int(found[1]) >= 10) == (sizes == "batch=default")
+    assert (needed >= 10) == (sizes == "batch=default")
 
 
 def test_gates_of_one_world_are_not_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,11 +75,25 @@ def test_gates_of_one_world_are_not_refused(monkeypatch: pytest.MonkeyPatch) -> 
     check_room(cfg, build_model(cfg))
 
 
-@pytest.mark.parametrize("error", [MemoryError("Unable to allocate 9 GiB"), torch.OutOfMemoryError("Unable to allocate 9 GiB")])
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("Unable to allocate 9 GiB"),
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9 GiB"),
+        RuntimeError("Failed to allocate 99 bytes on device 'cuda:0'"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:118] DefaultCPUAllocator: can't allocate memory: you tried to"),
+    ],
+)
 def test_memory_that_runs_out_later(error: Exception, so101_cfg: Config) -> None:
     def gate(context: GateContext) -> list[GateResult]:
         raise error
 
     (result,) = run_guarded(GateContext(cfg=so101_cfg), "batch", gate)
     assert result.status is Status.failed
-    assert result.reason == "out of memory: Unable to allocate 9 GiB. Use fewer worlds (nworld=...)"
+    assert result.reason.startswith(f"out of memory ({error}). Run fewer worlds")
+
+
+def test_memory_of_this_machine() -> None:
+    there = total_memory("cpu")
+    assert there is not None
+    assert 1 << 28 < there < 1 << 50

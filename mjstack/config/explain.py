@@ -13,12 +13,12 @@ from omegaconf import OmegaConf
 from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
 from mjstack.config.help import list_groups
-from mjstack.config.schema import JOBS
+from mjstack.config.schema import JOB_SCHEMAS
 from mjstack.config.session import CONFIG_NAME, own_hydra
 from mjstack.errors import MjstackError, UnknownName, suggest
 
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
-_KINDS = {"Integer": "an integer", "Float": "a number", "Boolean": "true or false", "int": "an integer", "float": "a number"}
+_KINDS = {"Integer": "an integer", "Float": "a number", "Boolean": "true or false"}
 
 
 class CompositionError(MjstackError):
@@ -46,7 +46,7 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
             "gate: expected no choice, because the thresholds of all gates are in use. gates=[...] chooses what runs, "
             "gate.batch.seeds=10 sets a value."
         )
-    wrong = _wrong_value(str(key), text) if key else None
+    wrong = _wrong_value(str(key), text, overrides) if key else None
     if wrong is not None:
         return wrong
     there = re.match(r"Could not append to config\. An item is already at '([^']+)'", text)
@@ -56,14 +56,14 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     if match:
         return UnknownName("configuration group", match.group(1), [group.name for group in list_groups()])
     if isinstance(cause, AssertionError | TypeError | ValueError) and not isinstance(cause, OmegaConfBaseException):
-        reason = f"{type(cause).__name__}: {text.rstrip('.')}"
+        where = f"{' '.join(overrides)}: this does" if overrides else "the values do"
         return _below_null(overrides) or CompositionError(
-            f"{' '.join(overrides)}: these overrides do not fit the configuration files ({reason})."
+            f"{where} not fit the configuration files ({type(cause).__name__}: {text.rstrip('.')})."
         )
     return CompositionError(f"{key}: {text}." if key else f"{text.rstrip('.')}.")
 
 
-def _wrong_value(key: str, text: str) -> CompositionError | None:
+def _wrong_value(key: str, text: str, overrides: Sequence[str]) -> CompositionError | None:
     """What OmegaConf says of a value that has not its key's type, if this is one of those messages."""
     found = re.search(r"Value '(.*)' of type '\w+' could not be converted to (\w+)", text)
     if found:
@@ -81,6 +81,8 @@ def _wrong_value(key: str, text: str) -> CompositionError | None:
         return CompositionError(f"{key}=null: expected a value.")
     if "does not support deletion" in text:
         return CompositionError(f"~{key}: it needs a value and cannot be left out. Write {key}=VALUE.")
+    if "Cannot merge DictConfig with ListConfig" in text and any(o.lstrip("+").startswith(f"{key}=[") for o in overrides):
+        return CompositionError(f"{key}: expected keys and values, not a list. Set a key below it, such as {key}.KEY=VALUE.")
     if "not a ListConfig" in text or "Cannot merge DictConfig with ListConfig" in text:
         return CompositionError(f"{key}: expected a list, such as '{key}=[...]'.")
     return None
@@ -124,7 +126,9 @@ def _unknown_key(error: Exception, key: str, overrides: Sequence[str]) -> Mjstac
     keys = _flat_keys(base)
     leaf = key.rpartition(".")[2]
     if key.startswith("job."):
-        owners = [name for name in JOBS if leaf in {f.name for f in fields(JOBS[name])} and f"job={name}" not in jobs]
+        owners = [
+            name for name in JOB_SCHEMAS if leaf in {f.name for f in fields(JOB_SCHEMAS[name])} and f"job={name}" not in jobs
+        ]
         if owners:
             now = jobs[-1] if jobs else "job=gates"
             return CompositionError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, QuotedString
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from mjstack.config.explain import TERM_GROUPS, CompositionError
@@ -22,31 +22,38 @@ def check_overrides(overrides: Sequence[str]) -> None:
             raise CompositionError(f"override '{override}' has no value. Write key=value, such as nworld=64.")
     groups = {group.name: group.choices for group in list_groups()}
     for override in overrides:
-        parsed = _parse(override)
+        parsed = parse(override)
         if parsed.is_sweep_override():
-            raise CompositionError(f"'{override}': several values are a sweep. Add -m, or give one value.")
+            raise CompositionError(
+                f"'{override}': several values are a sweep. Add -m, or give one value; a list has brackets: "
+                f"'{parsed.key_or_group}=[a,b]'."
+            )
         if parsed.is_delete():
             _check_deletion(parsed)
-        elif parsed.key_or_group in groups and parsed.package is None:
+        elif parsed.key_or_group in groups:
             _check_choice(parsed, override, groups[parsed.key_or_group])
 
 
-def _parse(override: str) -> Override:
+def parse(override: str) -> Override:
+    """Hydra's reading of an override, or a `CompositionError`."""
     try:
         return OverridesParser.create().parse_override(override)
     except HydraException as error:
+        why = str(error).splitlines()[0].rstrip(".")
+        hint = f" ({why})" if " while evaluating " in why else ""  # the rest is the parser's own language
         raise CompositionError(
-            f"override {override!r} cannot be read: expected key=value without spaces around the sign, and quotes around a "
-            "value with spaces, brackets or commas in it, such as 'layout=\"my worlds.csv\"'."
+            f"override {override!r} cannot be read{hint}: expected key=value without spaces around the sign. "
+            "A value with brackets, signs or letters beyond ASCII wants quotes of its own: 'layout=\"run(1).csv\"'."
         ) from error
 
 
 def _check_deletion(parsed: Override) -> None:
-    """Of the top level only terms can be left out; all other keys and groups there need a value."""
-    if "." not in parsed.key_or_group and parsed.key_or_group not in TERM_GROUPS:
+    """At the top only terms, and an experiment, can be left out."""
+    key = parsed.key_or_group
+    if "." not in key and key not in (*TERM_GROUPS, "experiment"):
         raise CompositionError(
-            f"~{parsed.key_or_group}: expected a term of {', '.join(TERM_GROUPS)}, such as ~reward.lift, because everything "
-            f"else needs a value. Write {parsed.key_or_group}=VALUE."
+            f"~{key}: expected a term of {', '.join(TERM_GROUPS)}, such as ~reward.lift. Keys and groups at the top are always "
+            f"there: set {key}=VALUE, or leave it as it is."
         )
 
 
@@ -54,6 +61,6 @@ def _check_choice(parsed: Override, override: str, choices: Sequence[str]) -> No
     """A group takes the name of a choice, or a list of names. A mapping sets keys below it, which the schema checks."""
     value = parsed.value()
     names = value if isinstance(value, list) else [value]
-    if isinstance(value, dict) or all(isinstance(name, str | QuotedString) for name in names):
+    if isinstance(value, dict) or all(isinstance(name, str) for name in names):
         return
     raise CompositionError(f"{override}: expected the name of a choice: {', '.join(choices)}.")

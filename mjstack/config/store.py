@@ -14,13 +14,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mjstack.config.explain import CompositionError, explain
 from mjstack.config.overrides import check_overrides
-from mjstack.config.schema import JOBS, Config
+from mjstack.config.schema import JOB_SCHEMAS, Config
 from mjstack.config.session import CONFIG_NAME, own_hydra
 from mjstack.config.terms import type_terms
 from mjstack.config.validate import validate
 
 ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
-for _name, _node in JOBS.items():
+for _name, _node in JOB_SCHEMAS.items():
     ConfigStore.instance().store(name=f"{_name}_schema", node=_node, provider="mjstack")
 
 

@@ -7,9 +7,7 @@ import time
 import traceback
 from collections.abc import Callable
 
-import torch
-
-from mjstack.errors import MjstackError
+from mjstack.errors import MjstackError, is_out_of_memory
 from mjstack.gates.baseline import run_baseline
 from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import run_capacity
@@ -65,16 +63,14 @@ def run_guarded(
         results = run(context)
     except MjstackError as error:
         results = [GateResult(name=name, status=Status.failed, reason=str(error))]
-    except (MemoryError, torch.OutOfMemoryError) as error:
-        log.error("gate %s ran out of memory:\n%s", name, traceback.format_exc())
-        reason = (
-            f"out of memory: {(str(error).splitlines() or ['no more is known'])[0].rstrip('.')}. Use fewer worlds (nworld=...)"
-        )
-        results = [GateResult(name=name, status=Status.failed, reason=reason)]
     except Exception as error:
         log.error("gate %s broke:\n%s", name, traceback.format_exc())
-        reason = f"internal error, {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-        results = [GateResult(name=name, status=Status.failed, reason=f"{reason} (run.log has the traceback)")]
+        first = (str(error).splitlines() or [""])[0].rstrip(".")
+        reason = f"internal error, {type(error).__name__}: {first} (run.log has the traceback)"
+        if is_out_of_memory(f"{type(error).__name__}: {error}"):
+            smaller = "Run fewer worlds, or with smaller buffers (batch.nconmax, batch.njmax)"
+            reason = f"out of memory ({first or type(error).__name__}). {smaller}"
+        results = [GateResult(name=name, status=Status.failed, reason=reason)]
     seconds = time.perf_counter() - began
     for result in results:
         if result.status is not Status.skipped and not result.seconds:

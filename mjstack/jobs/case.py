@@ -12,16 +12,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mjstack.errors import MjstackError
+from mjstack.errors import MjstackError, is_out_of_memory
 from mjstack.report.record import Value, write_atomic
 from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow
 
 RESULT = "case.json"
 _START = "from mjstack.__main__ import main; main()"
-_OUT_OF_MEMORY = re.compile(
-    r"out of memory|OutOfMemory|MemoryError|bad_alloc|Failed to allocate|Unable to allocate|that fit into the \d+ GiB",
-    re.IGNORECASE,
-)
+_NO_ROOM = re.compile(r"that fit into the \d+ GiB")  # refused before it started
 _GRACE = 20.0  # s, for a process that was asked to stop
 
 
@@ -123,7 +120,7 @@ def _row(folder: Path, nworld: int, backend: str, code: int | None) -> ScalingRo
         return row
     row.status = "fail"
     row.reason = "; ".join(failed) or last
-    if _OUT_OF_MEMORY.search(row.reason) or (code != 2 and _OUT_OF_MEMORY.search(output)):
+    if is_out_of_memory(row.reason) or _NO_ROOM.search(row.reason) or (code != 2 and is_out_of_memory(output)):
         row.status = "out of memory"
     elif code is not None and code < 0:
         row.status = "out of memory" if code == -9 else "crashed"

@@ -55,7 +55,7 @@ def check_task(cfg: Config) -> None:
         raise ConfigError("task", cfg.task.name, expected, "Train it: mjstack.make_env")
     ScriptedPlanner(cfg)  # reads the robot, and reaches every nominal target
     env = build_env(cfg, nworld=1, backend=Backend.native, device="cpu")  # builds and checks every term
-    if cfg.job.name == "gates":
+    if cfg.job.name in ("gates", "study"):
         check_room(cfg, env.sim.model)
     if cfg.controller.approach_gain > 0.0:
         turn_sign(env.sim.model, cfg)

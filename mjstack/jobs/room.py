@@ -13,8 +13,8 @@ from mjstack.sim import BatchSizes, resolve_backend, resolve_sizes
 from mjstack.sim.native import native_bytes
 
 _GIB = 1 << 30
-_ALWAYS_FIT = 100_000  # worlds; some 10 GB of MJWarp's buffers at most, and not worth loading Warp for
-_OF_THE_BATCH = {"batch", "throughput", "success"}
+_UNCHECKED = 100_000  # worlds; fewer are not worth loading Warp for
+_OF_THE_BATCH = {"batch", "throughput", "success"}  # gates; capacity measures that many on CUDA alone
 
 
 def check_room(cfg: Config, model: mujoco.MjModel) -> None:
@@ -26,9 +26,10 @@ def check_room(cfg: Config, model: mujoco.MjModel) -> None:
         cfg: The configuration.
         model: The compiled model.
     """
-    if cfg.nworld <= _ALWAYS_FIT or not _OF_THE_BATCH & set(cfg.gates):
-        return
     backend, device = resolve_backend(cfg)
+    gates = _OF_THE_BATCH | ({"capacity"} if device.startswith("cuda") else set())
+    if cfg.nworld <= _UNCHECKED or not (cfg.job.name == "study" or gates & set(cfg.gates)):
+        return
     if backend is Backend.native:
         least = native_bytes(model, cfg.nworld)
     else:
@@ -37,7 +38,7 @@ def check_room(cfg: Config, model: mujoco.MjModel) -> None:
         sizes = BatchSizes(nconmax=1, njmax=1) if cfg.batch.auto else resolve_sizes(cfg)  # auto: not measured yet
         least = data_bytes(model, cfg.nworld, sizes)
     there = total_memory(device)
-    if least > there:
+    if there is not None and least > there:
         where = "this machine" if device == "cpu" else device
         raise ConfigError(
             "nworld",
@@ -47,8 +48,10 @@ def check_room(cfg: Config, model: mujoco.MjModel) -> None:
         )
 
 
-def total_memory(device: str) -> int:
-    """Bytes of memory of a device, free or taken: ``cpu``, or a CUDA device such as ``cuda:0``."""
+def total_memory(device: str) -> int | None:
+    """Bytes of memory of a device, free or taken: ``cpu``, or a CUDA device such as ``cuda:0``. None if it is not known."""
     if device.startswith("cuda"):
         return int(torch.cuda.get_device_properties(device).total_memory)
+    if not hasattr(os, "sysconf"):  # Windows
+        return None
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

@@ -14,7 +14,7 @@ from mjstack.config.schema.gate import (
     SuccessGateCfg,
     ThroughputCfg,
 )
-from mjstack.config.schema.job import JOBS, CollectJobCfg, JobCfg, ReachabilityJobCfg, ScalingJobCfg, StudyJobCfg
+from mjstack.config.schema.job import JOB_SCHEMAS, CollectJobCfg, JobCfg, ReachabilityJobCfg, ScalingJobCfg, StudyJobCfg
 from mjstack.config.schema.physics import Backend, BatchCfg, Cone, GraphMode, SimCfg, SolverCfg, TimingCfg
 from mjstack.config.schema.robot import LayoutCfg, ModelCfg, ModelSource, RobotCfg
 from mjstack.config.schema.root import Config
@@ -30,7 +30,7 @@ from mjstack.config.schema.term import (
 )
 
 __all__ = [
-    "JOBS",
+    "JOB_SCHEMAS",
     "AcceptanceCfg",
     "ActionTermCfg",
     "Backend",

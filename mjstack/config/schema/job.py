@@ -78,4 +78,4 @@ class CollectJobCfg(JobCfg):
 
 
 # Jobs with keys of their own; the others have `JobCfg`.
-JOBS = {"study": StudyJobCfg, "scaling": ScalingJobCfg, "reachability": ReachabilityJobCfg, "collect": CollectJobCfg}
+JOB_SCHEMAS = {"study": StudyJobCfg, "scaling": ScalingJobCfg, "reachability": ReachabilityJobCfg, "collect": CollectJobCfg}
