@@ -46,11 +46,14 @@ def train(block: str, folder: Path) -> list[float]:
 
 
 def test_training_block_learns(tmp_path: Path) -> None:
-    """Without learning (a learning rate of 0) the return stays at 0.4 and varies by 0.1; with it, it passes 1.5."""
+    """Without learning (a learning rate of 0) the return stays at 0.4 and varies by 0.1; with it, it passes 1.5.
+
+    Held against that and not against the first iterations, in which some runs, from other weights, have learnt already.
+    """
     (block,) = python_blocks(training=True)
     assert len(block.splitlines()) <= 30
     block, replaced = re.subn(r"(?m)^iterations = \d+$", f"iterations = {ITERATIONS}", block)
     assert replaced == 1
     returns = train(block, tmp_path)[STARTED:]
-    assert mean(returns[-5:]) > 2.0 * mean(returns[:5]), [round(value, 2) for value in returns]
+    assert mean(returns[-5:]) > 1.0, [round(value, 2) for value in returns]
     assert (tmp_path / "outputs" / "reach" / f"model_{ITERATIONS - 1}.pt").is_file()
