@@ -18,7 +18,14 @@ from mjstack.config.session import CONFIG_NAME, own_hydra
 from mjstack.errors import MjstackError, UnknownName, suggest
 
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
-_KINDS = {"Integer": "an integer", "Float": "a number", "Boolean": "true or false"}
+_KINDS = {"Integer": "an integer", "Float": "a number", "Boolean": "true or false", "bool": "true or false", "string": "text"}
+# What OmegaConf says of a value that has not its key's type, and what was expected.
+_MISFITS = (
+    (r"Value '(?P<value>.*)' of type '\w+' could not be converted to (?P<kind>\w+)", "{}"),
+    (r"Value '(?P<value>.*)' is not a valid (?P<kind>bool)", "{}"),
+    (r"Invalid value '(?P<value>.*)', expected one of \[(?P<kind>.*)\]", "one of {}"),
+    (r"Cannot convert '\w+' to (?P<kind>string): '(?P<value>.*)'", "{}"),
+)
 
 
 class CompositionError(MjstackError):
@@ -65,18 +72,11 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
 
 def _wrong_value(key: str, text: str, overrides: Sequence[str]) -> CompositionError | None:
     """What OmegaConf says of a value that has not its key's type, if this is one of those messages."""
-    found = re.search(r"Value '(.*)' of type '\w+' could not be converted to (\w+)", text)
-    if found:
-        return CompositionError(f"{key}={found.group(1)}: expected {_KINDS.get(found.group(2), found.group(2))}.")
-    found = re.search(r"Value '(.*)' is not a valid bool", text)
-    if found:
-        return CompositionError(f"{key}={found.group(1)}: expected true or false.")
-    found = re.search(r"Invalid value '(.*)', expected one of \[(.*)\]", text)
-    if found:
-        return CompositionError(f"{key}={found.group(1)}: expected one of {found.group(2)}.")
-    found = re.search(r"Cannot convert '\w+' to string: '(.*)'", text)
-    if found:
-        return CompositionError(f"{key}={found.group(1)}: expected text.")
+    for pattern, expected in _MISFITS:
+        found = re.search(pattern, text)
+        if found:
+            kind = found["kind"]
+            return CompositionError(f"{key}={found['value']}: expected {expected.format(_KINDS.get(kind, kind))}.")
     if re.search(r"is not Optional|NoneType is not a subclass", text):
         return CompositionError(f"{key}=null: expected a value.")
     if "does not support deletion" in text:
