@@ -1,4 +1,6 @@
-"""mjstack: a robot-arm task from one native MuJoCo world to thousands of MuJoCo Warp worlds, verified in gates."""
+"""mjstack: a robot-arm task from one native MuJoCo world to thousands of MuJoCo Warp worlds,
+verified in gates.
+"""
 
 from importlib import import_module
 from pathlib import Path
@@ -11,8 +13,8 @@ if TYPE_CHECKING:
     from mjstack.config import Config, load_config
     from mjstack.envs import Env, make_env
 
-# The configuration lies at the top of a checkout and inside an installed package. This makes `mjstack.conf` mean the
-# first one in a checkout that is on the path without being installed.
+# The configuration lies at the top of a checkout and inside an installed package. This makes
+# `mjstack.conf` mean the first one in a checkout that is on the path without being installed.
 _CHECKOUT = Path(__file__).resolve().parent.parent
 if (_CHECKOUT / "conf" / "config.yaml").is_file():
     __path__.append(str(_CHECKOUT))
@@ -22,13 +24,33 @@ choose_gl()
 __all__ = ["Config", "Env", "MjstackError", "load_config", "make_env"]
 __version__ = "0.1.0"
 
-_HOMES = {"Config": "mjstack.config", "load_config": "mjstack.config", "Env": "mjstack.envs", "make_env": "mjstack.envs"}
-_PACKAGES = {"config", "control", "envs", "kinematics", "managers", "math", "mdp", "rng", "robots", "scene", "sim", "tasks"}
+_HOMES = {
+    "Config": "mjstack.config",
+    "load_config": "mjstack.config",
+    "Env": "mjstack.envs",
+    "make_env": "mjstack.envs",
+}
+_PACKAGES = {
+    "config",
+    "drivers",
+    "envs",
+    "kinematics",
+    "managers",
+    "math",
+    "mdp",
+    "rng",
+    "robots",
+    "scene",
+    "sim",
+    "tasks",
+}
 
 if not TYPE_CHECKING:  # a type checker would take any name for one of these
 
     def __getattr__(name: str) -> Any:
-        """Loads what takes seconds, torch and Warp, when it is asked for: the command line has things to do before."""
+        """Loads what takes seconds, torch and Warp, when it is asked for: the command line has
+        things to do before.
+        """
         if name in _HOMES:
             return getattr(import_module(_HOMES[name]), name)
         if name in _PACKAGES:

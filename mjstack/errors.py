@@ -1,6 +1,7 @@
 """Errors built from facts: what is wrong with its value, what was expected, what to do.
 
-Every error that a user can cause derives from `MjstackError` and carries the exit status that the command line returns for it.
+Every error that a user can cause derives from `MjstackError` and carries the exit status that the
+command line returns for it.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class ConfigError(MjstackError):
         """Builds the message.
 
         Args:
-            key: Dotted configuration key, such as ``timing.substeps``.
+            key: Dotted configuration key, such as ``timing.decimation``.
             value: The offending value.
             expected: What would have been accepted.
             fix: What to do about it, a sentence without its full stop.
@@ -84,7 +85,8 @@ class UnsupportedModel(MjstackError):
 
     def __init__(self, feature: str) -> None:
         super().__init__(
-            f"MJWarp does not support this model: {feature}. Remove the feature from the model, or run sim=native."
+            f"MJWarp does not support this model: {feature}. Remove the feature from the model, or"
+            " run sim=native."
         )
 
 
@@ -100,12 +102,16 @@ class TermError(MjstackError):
 
 
 class ParameterError(MjstackError):
-    """A value that a term cannot use. The manager turns it into a `ConfigError` that has the term's key."""
+    """A value that a term cannot use. The manager turns it into a `ConfigError` that has the term's
+    key.
+    """
 
     exit_code = 2
 
     def __init__(self, name: str, value: object, expected: str, fix: str = "") -> None:
-        """Keeps the parameter's name, its value, what would have been accepted, and what to do about it."""
+        """Keeps the parameter's name, its value, what would have been accepted, and what to do
+        about it.
+        """
         super().__init__(f"{name}={value}: expected {expected}." + (f" {fix}." if fix else ""))
         self.facts = (name, value, expected, fix)
 
@@ -114,27 +120,36 @@ class FaultError(MjstackError):
     """Something went wrong while worlds were stepped."""
 
     def __init__(self, what: str, fix: str) -> None:
-        """Builds the message from what went wrong and what to do, each a sentence without its full stop."""
+        """Builds the message from what went wrong and what to do, each a sentence without its full
+        stop.
+        """
         super().__init__(f"{what}. {fix}.")
 
 
 class Unreachable(MjstackError):
-    """The arm cannot bring its aperture centre to a target."""
+    """The arm cannot bring its grasp point to a target."""
 
     exit_code = 2
 
-    def __init__(self, world: int, phase: str, target: Sequence[float], distance: float, tolerance: float) -> None:
+    def __init__(
+        self, world: int, phase: str, target: Sequence[float], distance: float, tolerance: float
+    ) -> None:
         where = ", ".join(f"{x:.3f}" for x in target)
         super().__init__(
-            f"world {world}, phase {phase}: target ({where}) m is {1e3 * distance:.1f} mm out of reach of the aperture "
-            f"centre, expected at most {1e3 * tolerance:.1f} mm. Move the cube closer, or change controller.phases.{phase}."
+            f"world {world}, phase {phase}: target ({where}) m is {1e3 * distance:.1f} mm out of"
+            f" reach of the grasp_point centre, expected at most {1e3 * tolerance:.1f} mm. Move the"
+            f" cube closer, or change controller.phases.{phase}."
         )
         self.world = world
         self.phase = phase
         self.distance = distance
         self._facts = (world, phase, target, distance, tolerance)
 
-    def __reduce__(self) -> tuple[type[Unreachable], tuple]:  # by default an exception is made again from its message alone
+    def __reduce__(
+        self,
+    ) -> tuple[
+        type[Unreachable], tuple
+    ]:  # by default an exception is made again from its message alone
         return type(self), self._facts
 
 
@@ -148,20 +163,24 @@ class WorkerLost(MjstackError):
             label: Which worker, such as ``2 of 15``.
             status: Its exit status; negative for the signal that killed it.
         """
-        ended = f"was killed by signal {-status}" if status < 0 else f"ended with exit status {status}"
+        ended = (
+            f"was killed by signal {-status}" if status < 0 else f"ended with exit status {status}"
+        )
         super().__init__(
-            f"planning worker {label} {ended}: expected it to run until every world is planned. Run again with more free "
-            "memory, or on one core (taskset -c 0), which starts no workers."
+            f"planning worker {label} {ended}: expected it to run until every world is planned. Run"
+            " again with more free memory, or on one core (taskset -c 0), which starts no workers."
         )
 
 
 class MissingField(MjstackError, KeyError):
-    """A per-world model field that the simulation was made without. It is a KeyError too, as of any mapping."""
+    """A per-world model field that the simulation was made without. It is a KeyError too, as of any
+    mapping.
+    """
 
     def __init__(self, name: str) -> None:
         super().__init__(
-            f"sim.fields['{name}'] is not a per-world field of this simulation: make it with fields=['{name}'], or mark the "
-            f"reset term with uses_fields('{name}')."
+            f"sim.fields['{name}'] is not a per-world field of this simulation: make it with"
+            f" fields=['{name}'], or mark the reset term with uses_fields('{name}')."
         )
 
     def __str__(self) -> str:  # KeyError's own would quote the message
@@ -177,7 +196,10 @@ class RebindError(MjstackError):
         Args:
             view: The view as the user writes it, such as ``sim.qpos``.
         """
-        super().__init__(f"{view} is a view of the simulation's memory and cannot be rebound: write {view}[:] = ... instead.")
+        super().__init__(
+            f"{view} is a view of the simulation's memory and cannot be rebound: write {view}[:] ="
+            " ... instead."
+        )
         self.view = view
 
 
@@ -189,14 +211,14 @@ class CaptureError(MjstackError):
 
         Args:
             name: What was to be captured.
-            culprit: What was running, if that is known.
+            culprit: What was current_term, if that is known.
             error: What the capture says.
         """
         reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
         where = f" because of {culprit}" if culprit else ""
         super().__init__(
-            f"{name} cannot be captured{where} ({reason}): expected fixed shapes and no host read (.item(), .cpu(), nonzero, "
-            "if tensor). Correct it, or set graph=off."
+            f"{name} cannot be captured{where} ({reason}): expected fixed shapes and no host read"
+            " (.item(), .cpu(), nonzero, if tensor). Correct it, or set graph=off."
         )
         self.culprit = culprit
 
@@ -215,17 +237,23 @@ class ArgumentError(MjstackError):
             expected: What would have been accepted.
             fix: What to do about it, a sentence without its full stop.
         """
-        super().__init__(f"{name}: found {found}, expected {expected}." + (f" {fix}." if fix else ""))
+        super().__init__(
+            f"{name}: found {found}, expected {expected}." + (f" {fix}." if fix else "")
+        )
         self.name = name
 
 
 class DatasetError(MjstackError):
-    """A dataset of demonstrations that cannot be opened or read, or an episode that does not fit into it."""
+    """A dataset of demonstrations that cannot be opened or read, or an episode that does not fit
+    into it.
+    """
 
     exit_code = 2
 
     def __init__(self, message: str) -> None:
-        """Takes the message without its full stop: what is wrong with its value, what was expected, and what to do."""
+        """Takes the message without its full stop: what is wrong with its value, what was expected,
+        and what to do.
+        """
         super().__init__(f"{message}.")
 
 
@@ -241,8 +269,9 @@ class UnwrittenError(MjstackError):
             kept: Episodes that were committed before.
         """
         super().__init__(
-            f"{folder}: cannot be written ({error.strerror or error}): {kept} committed episodes are kept, those added since "
-            "are not. Make room or correct it, and do the same again: it goes on after the last one kept."
+            f"{folder}: cannot be written ({error.strerror or error}): {kept} committed episodes"
+            " are kept, those added since are not. Make room or correct it, and do the same again:"
+            " it goes on after the last one kept."
         )
 
 
@@ -252,7 +281,9 @@ class MissingExtra(MjstackError):
     exit_code = 2
 
     def __init__(self, what: str, package: str, extra: str) -> None:
-        super().__init__(f"{what} needs {package}, which is not installed: run pip install 'mjstack[{extra}]'.")
+        super().__init__(
+            f"{what} needs {package}, which is not installed: run pip install 'mjstack[{extra}]'."
+        )
 
 
 def suggest(name: str, available: Iterable[str]) -> str:
@@ -263,7 +294,9 @@ def suggest(name: str, available: Iterable[str]) -> str:
     return f"{hint}Available: {', '.join(names) or 'none'}."
 
 
-def name_worlds(worlds: Sequence[int | str], nworld: int, limit: int = 8, what: str = "worlds") -> str:
+def name_worlds(
+    worlds: Sequence[int | str], nworld: int, limit: int = 8, what: str = "worlds"
+) -> str:
     """Says how many worlds and names the first ones: ``17 of 4096 worlds (first: 3, 41, 96)``."""
     shown = ", ".join(str(w) for w in worlds[:limit])
     label = "first: " if len(worlds) > limit else ""

@@ -34,14 +34,16 @@ def quat_from_yaw(yaw: torch.Tensor) -> torch.Tensor:
     Returns:
         Unit quaternion, shape ``(..., 4)``.
     """
-    half, zero = 0.5 * yaw, torch.zeros_like(yaw)
+    half = 0.5 * yaw
+    zero = torch.zeros_like(yaw)
     return torch.stack((torch.cos(half), zero, zero, torch.sin(half)), dim=-1)
 
 
 def quat_angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Angle [rad] of the rotation between two unit quaternions, in [0, pi], shape ``(...)``.
 
-    The sine comes from the vector part of ``conj(a) b``, so that small angles keep their precision in float32.
+    The sine comes from the vector part of ``conj(a) b``, so that small angles keep their precision
+    in float32.
     """
     conj = torch.cat((a[..., :1], -a[..., 1:]), dim=-1)
     rel = quat_mul(conj, b)
@@ -49,16 +51,27 @@ def quat_angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def quat_z_row(quat: torch.Tensor) -> torch.Tensor:
-    """Third row of the rotation matrix: the world-z components of the body's axes, shape ``(..., 3)``."""
-    w, xy, z = quat[..., :1], quat[..., 1:3], quat[..., 3:]
-    x, y = quat[..., 1:2], quat[..., 2:3]
+    """Third row of the rotation matrix: the world-z components of the body's axes, shape ``(...,
+    3)``.
+    """
+    w = quat[..., :1]
+    xy = quat[..., 1:3]
+    z = quat[..., 3:]
+    x = quat[..., 1:2]
+    y = quat[..., 2:3]
     turned = torch.cat((-y, x), dim=-1)
-    return torch.cat((2.0 * torch.addcmul(xy * z, turned, w), 1.0 - 2.0 * xy.square().sum(-1, keepdim=True)), dim=-1)
+    return torch.cat(
+        (2.0 * torch.addcmul(xy * z, turned, w), 1.0 - 2.0 * xy.square().sum(-1, keepdim=True)),
+        dim=-1,
+    )
 
 
 def quat_to_matrix(quat: torch.Tensor) -> torch.Tensor:
-    """Rotation matrix of a unit quaternion: its columns are the body's axes in the world, shape ``(..., 3, 3)``."""
-    w, v = quat[..., :1], quat[..., 1:]
+    """Rotation matrix of a unit quaternion: its columns are the body's axes in the world, shape
+    ``(..., 3, 3)``.
+    """
+    w = quat[..., :1]
+    v = quat[..., 1:]
     outer = 2.0 * v[..., :, None] * v[..., None, :]
     x, y, z = (2.0 * w * v).unbind(-1)
     zero = torch.zeros_like(x)
@@ -90,13 +103,17 @@ def not_finite(*parts: torch.Tensor) -> torch.Tensor:
     Returns:
         Shape ``(n,)``, bool.
     """
-    # 0 times a number that is not finite is NaN, which a sum keeps. It takes fewer kernels than to ask each number.
+    # 0 times a number that is not finite is NaN, which a sum keeps. It takes fewer kernels than to
+    # ask each number.
     first, *others = ((part * 0.0).sum(1) for part in parts)
     return sum(others, first) != 0.0
 
 
-def wilson_interval(successes: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
-    """Confidence interval of a success rate (Wilson, "Probable inference", JASA 1927), sound at 0 and at all successes too.
+def wilson_interval(
+    successes: int, trials: int, z: float = 1.959963984540054
+) -> tuple[float, float]:
+    """Confidence interval of a success rate (Wilson, "Probable inference", JASA 1927), sound at 0
+    and at all successes too.
 
     Args:
         successes: How many succeeded.
@@ -106,7 +123,8 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959963984540054) -
     Returns:
         Lower and upper end, from 0 to 1.
     """
-    rate, share = successes / trials, z * z / trials
+    rate = successes / trials
+    share = z * z / trials
     centre = (rate + 0.5 * share) / (1.0 + share)
     half = z * math.sqrt(rate * (1.0 - rate) / trials + 0.25 * share / trials) / (1.0 + share)
     # At the ends the exact bounds are 0 and 1; rounding must not miss them.

@@ -1,7 +1,8 @@
 """Random numbers keyed by (seed, world, episode, step, stream), on any device, without state.
 
-Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) written with int64 tensors. World 5
-of 16 draws what world 5 of 2048 draws, and no draw depends on which other worlds reset.
+Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) written with
+int64 tensors. World 5 of 16 draws what world 5 of 2048 draws, and no draw depends on which other
+worlds reset.
 """
 
 from __future__ import annotations
@@ -11,8 +12,10 @@ from functools import lru_cache
 import torch
 
 _MASK = 0xFFFFFFFF
-_M0, _M1 = 0xD2511F53, 0xCD9E8D57
-_W0, _W1 = 0x9E3779B9, 0xBB67AE85
+_M0 = 0xD2511F53
+_M1 = 0xCD9E8D57
+_W0 = 0x9E3779B9
+_W1 = 0xBB67AE85
 
 
 def philox(counter: torch.Tensor, key: tuple[int, int]) -> torch.Tensor:
@@ -26,10 +29,14 @@ def philox(counter: torch.Tensor, key: tuple[int, int]) -> torch.Tensor:
         Four random 32-bit words held in int64, shape ``(..., 4)``.
     """
     multipliers, keys = _constants(key, counter.device)
-    # Words 0 and 2 are multiplied, words 1 and 3 are mixed in: both pairs go through each round together.
-    multiplied, mixed = counter[..., ::2], counter[..., 1::2]
+    # Words 0 and 2 are multiplied, words 1 and 3 are mixed in: both pairs go through each round
+    # together.
+    multiplied = counter[..., ::2]
+    mixed = counter[..., 1::2]
     for round_ in range(10):
-        product = multiplied * multipliers  # int64 wraps, and the mask after the shift drops the sign
+        product = (
+            multiplied * multipliers
+        )  # int64 wraps, and the mask after the shift drops the sign
         high = (product >> 32).bitwise_and_(_MASK)
         multiplied = high.flip(-1).bitwise_xor_(mixed).bitwise_xor_(keys[round_])
         mixed = product.bitwise_and_(_MASK).flip(-1)
@@ -38,13 +45,21 @@ def philox(counter: torch.Tensor, key: tuple[int, int]) -> torch.Tensor:
 
 @lru_cache(maxsize=1024)
 def _constants(key: tuple[int, int], device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-    """Multipliers ``(2,)`` and the key of each round ``(10, 2)``; made once, because a captured step cannot copy them."""
+    """Multipliers ``(2,)`` and the key of each round ``(10, 2)``; made once, because a captured
+    step cannot copy them.
+    """
     rounds = [[(key[0] + i * _W0) & _MASK, (key[1] + i * _W1) & _MASK] for i in range(10)]
     return torch.tensor([_M0, _M1], device=device), torch.tensor(rounds, device=device)
 
 
 def uniform(
-    *, seed: int, world: torch.Tensor, episode: torch.Tensor, step: torch.Tensor, stream: int, size: int
+    *,
+    seed: int,
+    world: torch.Tensor,
+    episode: torch.Tensor,
+    step: torch.Tensor,
+    stream: int,
+    size: int,
 ) -> torch.Tensor:
     """Uniform numbers in [-1, 1).
 

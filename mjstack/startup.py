@@ -1,6 +1,8 @@
-"""Ctrl-C while the command loads its modules and composes its configuration: one line, and nothing has happened yet.
+"""Ctrl-C while the command loads its modules and composes its configuration: one line, and nothing
+has happened yet.
 
-Where torch, Warp or omegaconf meet a `KeyboardInterrupt`, what comes out is their traceback, or another error of theirs.
+Where torch, Warp or omegaconf meet a `KeyboardInterrupt`, what comes out is their traceback, or
+another error of theirs.
 """
 
 from __future__ import annotations
@@ -14,8 +16,13 @@ INTERRUPTED = 130
 
 
 def guard() -> None:
-    """From here to `started` Ctrl-C ends the process at once. Handlers of somebody else's and other threads are left alone."""
-    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    """From here to `started` Ctrl-C ends the process at once. Handlers of somebody else's and other
+    threads are left alone.
+    """
+    if (
+        threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    ):
         signal.signal(signal.SIGINT, _stop)
 
 

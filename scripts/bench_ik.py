@@ -1,6 +1,8 @@
-"""Measures batched inverse kinematics: ``python scripts/bench_ik.py robot=so101 --nworld 2048 --iterations 4 8``."""
+"""Measures batched inverse kinematics: ``python scripts/bench_ik.py robot=so101 --nworld 2048
+--iterations 4 8``.
+"""
 
-from mjstack.benchmark_ik import main
+from mjstack.bench.ik_cli import main
 
 if __name__ == "__main__":
     main()

@@ -1,6 +1,8 @@
-"""Measures what each change to the physics step is worth: ``python scripts/bench_physics.py robot=so101 nworld=2048``."""
+"""Measures what each change to the physics step is worth: ``python scripts/bench_physics.py
+robot=so101 nworld=2048``.
+"""
 
-from mjstack.benchmark_physics import main
+from mjstack.bench.physics_cli import main
 
 if __name__ == "__main__":
     main()

@@ -1,7 +1,7 @@
-"""The acceptance rules of the box task for one recorded world, in plain NumPy.
+"""The rules of the check of the box task for one recorded world, in plain NumPy.
 
-Written from the rules' text, not from `mjstack.tasks.box`: the two have to agree because both are right.
-"""
+Written from the rules' text, not from `mjstack.tasks.box`: the two have to agree because both are
+right."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ import numpy as np
 
 from mjstack.config.schema import Config
 
-RED, BLUE = 0, 1
+RED = 0
+BLUE = 1
 COLORS = ("red", "blue")
 SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 @dataclass
 class BoxRecording:
-    """One world at every frame end.
+    """One world at every step end.
 
     Attributes:
-        phase: Name of its phase, shape ``(frames,)``.
-        pose: Red's and blue's, shape ``(frames, 2, 7)``.
-        velocity: Likewise, as MuJoCo has it, shape ``(frames, 2, 6)``.
-        jaw_force: Of each jaw on each cube [N], shape ``(frames, 2, jaws, 3)``.
-        support_force: Of whatever else touches each cube [N], shape ``(frames, 2, n, 3)``.
-        gripper: Joint positions, shape ``(frames, n_gripper)``.
+        phase: Name of its phase, shape ``(steps,)``.
+        pose: Red's and blue's, shape ``(steps, 2, 7)``.
+        velocity: Likewise, as MuJoCo has it, shape ``(steps, 2, 6)``.
+        jaw_force: Of each jaw on each cube [N], shape ``(steps, 2, jaws, 3)``.
+        support_force: Of whatever else touches each cube [N], shape ``(steps, 2, n, 3)``.
+        gripper: Joint positions, shape ``(steps, n_gripper)``.
         xpos: All bodies at the end, shape ``(nbody, 3)``.
         xquat: Likewise, shape ``(nbody, 4)``.
         step_count: Physics steps the world has made.
@@ -51,7 +52,7 @@ class BoxRecording:
 
 @dataclass
 class BoxOutcome:
-    """Names of the broken rules, and the numbers behind them, named as the acceptance names them."""
+    """Names of the broken rules, and the numbers behind them, named as the check names them."""
 
     failed: set[str] = field(default_factory=set)
     values: dict[str, float] = field(default_factory=dict)
@@ -59,69 +60,91 @@ class BoxOutcome:
 
 def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> BoxOutcome:
     """Judges one world."""
-    rules, box, out = cfg.gate.box, cfg.scene.box, BoxOutcome()
+    rules = cfg.gate.box
+    box = cfg.scene.box
+    out = BoxOutcome()
     assert box is not None
-    frames, top = len(rec.phase), cfg.scene.table_center[2] + cfg.scene.table_half[2]
-    wanted = sum(round(p.seconds / cfg.timing.frame_dt) for p in cfg.controller.phases.values())
+    steps = len(rec.phase)
+    top = cfg.scene.table_center[2] + cfg.scene.table_half[2]
+    wanted = sum(round(p.seconds / cfg.timing.step_dt) for p in cfg.controller.phases.values())
 
-    if not (np.isfinite(rec.pose).all() and np.isfinite(rec.velocity).all() and rec.finite_elsewhere):
+    if not (
+        np.isfinite(rec.pose).all() and np.isfinite(rec.velocity).all() and rec.finite_elsewhere
+    ):
         out.failed.add("FINITE")
-    if rec.step_count != wanted * cfg.timing.substeps or frames != wanted:
+    if rec.step_count != wanted * cfg.timing.decimation or steps != wanted:
         out.failed.add("STEPS")
     if rec.overflow:
         out.failed.add("OVERFLOW")
 
     touching = np.linalg.norm(rec.jaw_force, axis=-1) > rules.force
     supported = (np.linalg.norm(rec.support_force, axis=-1) > rules.force).any(-1)
-    closed, opened = np.array(cfg.robot.gripper_closed), np.array(cfg.robot.gripper_open)
+    closed = np.array(cfg.robot.gripper_closed)
+    opened = np.array(cfg.robot.gripper_open)
     opening = ((rec.gripper - closed) / (opened - closed)).min(1)
-    x_low, x_high = box.center[0] - box.half[0], box.center[0] + box.half[0]
-    y_low, y_high = box.center[1] - box.half[1], box.center[1] + box.half[1]
+    x_low = box.center[0] - box.half[0]
+    x_high = box.center[0] + box.half[0]
+    y_low = box.center[1] - box.half[1]
+    y_high = box.center[1] + box.half[1]
 
     released_at = {}
     for cube, color in enumerate(COLORS):
         corners, speed = corners_of(rec.pose[:, cube], rec.velocity[:, cube], cfg.scene.cube_half)
-        x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
-        outside = np.stack([x_low - x, x - x_high, y_low - y, y - y_high, top + box.floor - z, z - top - box.height]).max(
-            axis=(0, 2)
-        )
+        x = corners[..., 0]
+        y = corners[..., 1]
+        z = corners[..., 2]
+        outside = np.stack(
+            [
+                x_low - x,
+                x - x_high,
+                y_low - y,
+                y - y_high,
+                top + box.floor - z,
+                z - top - box.height,
+            ]
+        ).max(axis=(0, 2))
         over = ((x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high)).all(1)
-        loaded, detached = touching[:, cube].all(1), ~touching[:, cube].any(1)
+        loaded = touching[:, cube].all(1)
+        detached = ~touching[:, cube].any(1)
         airborne = loaded & (z.min(1) - top >= rules.lift_height) & ~supported[:, cube]
 
         # A world that goes back to its approach is judged from there.
         approaches = np.flatnonzero(rec.phase == f"approach_{color}")
         first = approaches[-1] + 1 if len(approaches) else 0
 
-        def frames_in(*roles: str, color: str = color, first: int = first) -> list[int]:
+        def steps_in(*roles: str, color: str = color, first: int = first) -> list[int]:
             names = {f"{role}_{color}" for role in roles}
-            return [f for f in range(first, frames) if rec.phase[f] in names]
+            return [f for f in range(first, steps) if rec.phase[f] in names]
 
-        grasp = longest(loaded, frames_in("close"))
-        if grasp < rules.grasp_frames:
+        grasp = longest(loaded, steps_in("close"))
+        if grasp < rules.grasp_steps:
             out.failed.add(f"GRASP_{color.upper()}")
-        lift = longest(airborne, frames_in("lift", "carry"))
-        if lift < rules.lift_frames:
+        lift = longest(airborne, steps_in("lift", "carry"))
+        if lift < rules.lift_steps:
             out.failed.add(f"LIFT_{color.upper()}")
         distance = 0.0
-        for run in runs(airborne, frames_in("carry")):
-            if len(run) >= rules.carry_frames:
+        for run in runs(airborne, steps_in("carry")):
+            if len(run) >= rules.carry_steps:
                 xy = rec.pose[run, cube, :2]
                 distance = max(distance, float(np.linalg.norm(xy - xy[0], axis=1).max()))
-        holds = frames_in("hold")
+        holds = steps_in("hold")
         if not (distance >= rules.carry_distance and len(holds) and over[holds[-1]]):
             out.failed.add(f"CARRY_{color.upper()}")
 
-        grasps = [run for run in runs(loaded, frames_in("close")) if len(run) >= rules.grasp_frames]
-        grasped_at = grasps[-1][rules.grasp_frames - 1] if grasps else None  # the last one made while closing
+        grasps = [run for run in runs(loaded, steps_in("close")) if len(run) >= rules.grasp_steps]
+        grasped_at = (
+            grasps[-1][rules.grasp_steps - 1] if grasps else None
+        )  # the last one made while closing
         unloaded = 0
         if grasped_at is not None:
-            unloaded = sum(not loaded[f] for f in frames_in("close", "lift", "carry", "hold") if f >= grasped_at)
+            unloaded = sum(
+                not loaded[f] for f in steps_in("close", "lift", "carry", "hold") if f >= grasped_at
+            )
         if unloaded:
             out.failed.add(f"DROP_{color.upper()}")
 
         widest = 0.0
-        for f in frames_in("open", "retreat", "settle"):
+        for f in steps_in("open", "retreat", "settle"):
             if detached[f]:
                 widest = max(widest, float(opening[f]))
                 if opening[f] >= rules.open_fraction:
@@ -130,26 +153,26 @@ def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> Bo
             out.failed.add(f"RELEASE_{color.upper()}")
 
         still = detached & (outside <= rules.inside) & (speed < rules.rest_speed)
-        settles = frames_in("settle")
+        settles = steps_in("settle")
         settled = rest_until(still, settles[-1]) if settles else 0
         if settled < rules.window:
             out.failed.add(f"SETTLED_{color.upper()}")
-        if rest_until(still, frames - 1) < rules.window:
+        if rest_until(still, steps - 1) < rules.window:
             out.failed.add("INSIDE")
 
         slot = np.array(getattr(cfg.scene, f"{color}_slot"))
         out.values |= {
             f"slot_err_{color}_m": float(np.linalg.norm(rec.pose[-1, cube, :2] - slot)),
-            f"grasp_frames_{color}": grasp,
-            f"lift_frames_{color}": lift,
+            f"grasp_steps_{color}": grasp,
+            f"lift_steps_{color}": lift,
             f"carry_{color}_m": distance,
-            f"unloaded_frames_{color}": unloaded,
+            f"unloaded_steps_{color}": unloaded,
             f"opening_{color}": widest,
-            f"settled_frames_{color}": settled,
+            f"settled_steps_{color}": settled,
         }
 
     blue_loaded = np.flatnonzero(touching[:, BLUE].all(1))
-    if len(blue_loaded) and blue_loaded[0] < released_at.get("red", frames):
+    if len(blue_loaded) and blue_loaded[0] < released_at.get("red", steps):
         out.failed.add("ORDER")
 
     clearance = lowest_geometry(rec, cfg.robot.jaw_bodies, model) - max(top, top + box.height)
@@ -159,18 +182,25 @@ def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> Bo
     return out
 
 
-def corners_of(pose: np.ndarray, velocity: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:
-    """World places of the eight corners, ``(frames, 8, 3)``, and the speed of the fastest, ``(frames,)``."""
+def corners_of(
+    pose: np.ndarray, velocity: np.ndarray, half: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """World places of the eight corners, ``(steps, 8, 3)``, and the speed of the fastest,
+    ``(steps,)``.
+    """
     turn = rotations(pose[:, 3:])
     arms = np.einsum("fij,kj->fki", turn, half * SIGNS)
-    spin = np.einsum("fij,fj->fi", turn, velocity[:, 3:])  # a free joint's angular velocity is in the body's frame
+    spin = np.einsum(
+        "fij,fj->fi", turn, velocity[:, 3:]
+    )  # a free joint's angular velocity is in the body's frame
     moving = velocity[:, None, :3] + np.cross(spin[:, None], arms)
     return pose[:, None, :3] + arms, np.linalg.norm(moving, axis=2).max(1)
 
 
 def rotations(quat: np.ndarray) -> np.ndarray:
     """Matrices, by rotating the unit vectors: v + 2 w (u x v) + 2 u x (u x v)."""
-    w, u = quat[:, :1], quat[:, 1:]
+    w = quat[:, :1]
+    u = quat[:, 1:]
     columns = []
     for axis in np.eye(3):
         first = np.cross(u, axis)
@@ -179,7 +209,7 @@ def rotations(quat: np.ndarray) -> np.ndarray:
 
 
 def runs(holds: np.ndarray, judged: list[int]) -> list[list[int]]:
-    """Uninterrupted runs in which something holds, among the judged frames."""
+    """Uninterrupted runs in which something holds, among the judged steps."""
     out: list[list[int]] = []
     going = False
     for f in judged:
@@ -197,7 +227,7 @@ def longest(holds: np.ndarray, judged: list[int]) -> int:
 
 
 def rest_until(still: np.ndarray, last: int) -> int:
-    """Frames in a row up to the last one."""
+    """Steps in a row up to the last one."""
     moving = np.flatnonzero(~still[: last + 1])
     return last - (moving[-1] if len(moving) else -1)
 
@@ -208,12 +238,15 @@ def lowest_geometry(rec: BoxRecording, bodies: list[str], model: mujoco.MjModel)
     down = np.array([0.0, 0.0, -1.0])
     for geom in range(model.ngeom):
         body = model.geom_bodyid[geom]
-        if model.body(body).name not in bodies or not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+        if model.body(body).name not in bodies or not (
+            model.geom_contype[geom] or model.geom_conaffinity[geom]
+        ):
             continue
-        frame = rotations(rec.xquat[None, body])[0]
-        turn = frame @ rotations(model.geom_quat[None, geom])[0]
-        center = rec.xpos[body] + frame @ model.geom_pos[geom]
-        size, kind = model.geom_size[geom], mujoco.mjtGeom(model.geom_type[geom])
+        step = rotations(rec.xquat[None, body])[0]
+        turn = step @ rotations(model.geom_quat[None, geom])[0]
+        center = rec.xpos[body] + step @ model.geom_pos[geom]
+        size = model.geom_size[geom]
+        kind = mujoco.mjtGeom(model.geom_type[geom])
         if kind == mujoco.mjtGeom.mjGEOM_BOX:
             points = [turn @ (size * s) for s in SIGNS]
         elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:

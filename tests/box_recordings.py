@@ -1,4 +1,6 @@
-"""Recorded episodes of the box task: whole batches at every frame end, and single worlds for the checker or for alterations."""
+"""Recorded episodes of the box task: whole batches at every step end, and single worlds for the
+checker or for alterations.
+"""
 
 from __future__ import annotations
 
@@ -11,30 +13,34 @@ from typing import Any
 import numpy as np
 import torch
 from box_checker import BLUE, RED, BoxOutcome, BoxRecording, check_box_world
-from evidence_cases import STOPPED_EARLY
+from check_cases import STOPPED_EARLY
 
 from mjstack.config import load_config
-from mjstack.control.controller import Controller
+from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
-from mjstack.gates.episode import Episode, Reset, Watch
-from mjstack.gates.gate import GateContext
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.rollout import Episode, Reset, Watch
 from mjstack.scene import BLUE as BLUE_NAME
 from mjstack.scene import RED as RED_NAME
 from mjstack.sim import Simulation
-from mjstack.tasks.box import BoxEvidence
-from mjstack.tasks.evidence import Evidence, Verdict
+from mjstack.tasks.box import BoxCheck
+from mjstack.tasks.check import CheckResult, EpisodeCheck
 
 NAMES = (RED_NAME, BLUE_NAME)
 STATE = ("qpos", "qvel", "sensordata")
 Disturb = Callable[[Env, str], None]
-"""Interferes at a frame's end, after it was judged and kept; told the phase of the last world."""
+"""Interferes at a step's end, after it was judged and kept; told the phase of the last world."""
 
 
 class Recorder:
-    """Keeps every world's state and phase at every frame end; looks on, and hands on to what else looks on."""
+    """Keeps every world's state and phase at every step end; looks on, and hands on to what else
+    looks on.
+    """
 
     def __init__(self, context: GateContext, watch: Watch | None, disturb: Disturb | None) -> None:
-        self.context, self.watch, self._disturb = context, watch, disturb
+        self.context = context
+        self.watch = watch
+        self._disturb = disturb
         self._names = [phase.name for phase in context.planner.phases]
         self._rows: dict[str, list[np.ndarray]] = {name: [] for name in (*STATE, "phase")}
 
@@ -43,10 +49,12 @@ class Recorder:
         if self.watch is not None:
             self.watch.start(env)
 
-    def update(self, env: Env, controller: Controller, evidence: Evidence) -> None:
-        self._controller = controller  # a graph may hold this call: what is kept is copied in `keep`
+    def update(self, env: Env, controller: Controller, check: EpisodeCheck) -> None:
+        self._controller = (
+            controller  # a graph may hold this call: what is kept is copied in `keep`
+        )
         if self.watch is not None:
-            self.watch.update(env, controller, evidence)
+            self.watch.update(env, controller, check)
 
     def keep(self, _: int, sim: Simulation) -> None:
         for name in STATE:
@@ -58,23 +66,43 @@ class Recorder:
 
     def recording(self, sim: Simulation, episode: Episode) -> SimpleNamespace:
         sim.kinematics()
-        ends = {name: getattr(sim, name).cpu().numpy().copy() for name in ("xpos", "xquat", "step_count", "overflow")}
+        ends = {
+            name: getattr(sim, name).cpu().numpy().copy()
+            for name in ("xpos", "xquat", "step_count", "overflow")
+        }
         rows = {name: np.stack(kept, 1) for name, kept in self._rows.items()}
-        return SimpleNamespace(context=self.context, episode=episode, verdict=episode.verdict, watch=self.watch, **rows, **ends)
+        return SimpleNamespace(
+            context=self.context,
+            episode=episode,
+            result=episode.result,
+            watch=self.watch,
+            **rows,
+            **ends,
+        )
 
 
 @dataclass(eq=False)
 class RecordingContext(GateContext):
-    """A gate context that records the episodes that it plays; so does one that a gate derives from it."""
+    """A gate context that records the episodes that it plays; so does one that a gate derives from
+    it.
+    """
 
     disturb: Disturb | None = None
     recordings: list[SimpleNamespace] = field(default_factory=list)
 
     def run(
-        self, sim: Simulation, reset: Reset, *, seed: int | None = None, watch: Watch | None = None, **kwargs: Any
+        self,
+        sim: Simulation,
+        reset: Reset,
+        *,
+        seed: int | None = None,
+        watch: Watch | None = None,
+        **kwargs: Any,
     ) -> Episode:
         recorder = Recorder(self, watch, self.disturb)
-        episode = super().run(sim, reset, seed=seed, watch=recorder, on_frame=recorder.keep, **kwargs)
+        episode = super().run(
+            sim, reset, seed=seed, watch=recorder, on_step=recorder.keep, **kwargs
+        )
         self.recordings.append(recorder.recording(sim, episode))
         return episode
 
@@ -84,17 +112,24 @@ def base_context(robot: str) -> GateContext:
     return GateContext(cfg=load_config(["task=box", f"robot={robot}"]))
 
 
-def recording_context(robot: str, *overrides: str, disturb: Disturb | None = None) -> RecordingContext:
+def recording_context(
+    robot: str, *overrides: str, disturb: Disturb | None = None
+) -> RecordingContext:
     """For overrides that change neither scene nor plan: both are shared by the robot's contexts."""
     base = base_context(robot)
-    context = RecordingContext(cfg=load_config(["task=box", f"robot={robot}", *overrides]), disturb=disturb)
+    context = RecordingContext(
+        cfg=load_config(["task=box", f"robot={robot}", *overrides]), disturb=disturb
+    )
     context.__dict__.update(model=base.model, planner=base.planner)
     return context
 
 
 def put_cube(env: Env, cube: int, place: list[float] | np.ndarray) -> None:
-    """Puts a cube of the last world somewhere, at rest; the place has its x, y, z [m] and, if it is longer, its quaternion."""
-    at, velocity = env.index.cube_qpos[cube], env.index.cube_qvel[cube]
+    """Puts a cube of the last world somewhere, at rest; the place has its x, y, z [m] and, if it is
+    longer, its quaternion.
+    """
+    at = env.index.cube_qpos[cube]
+    velocity = env.index.cube_qvel[cube]
     env.sim.qpos[-1, at : at + len(place)] = torch.as_tensor(place).to(env.sim.qpos)
     env.sim.qvel[-1, velocity : velocity + 6] = 0.0
 
@@ -116,10 +151,15 @@ class World:
     @classmethod
     def of(cls, rec: SimpleNamespace, k: int = 0) -> World:
         arrays = {n: getattr(rec, n)[k].copy() for n in (*STATE, "phase", "xpos", "xquat")}
-        return cls(context=rec.context, step_count=int(rec.step_count[k]), overflow=int(rec.overflow[k]), **arrays)
+        return cls(
+            context=rec.context,
+            step_count=int(rec.step_count[k]),
+            overflow=int(rec.overflow[k]),
+            **arrays,
+        )
 
-    def frames(self, *names: str) -> np.ndarray:
-        """Numbers of the frames of some phases."""
+    def steps(self, *names: str) -> np.ndarray:
+        """Numbers of the steps of some phases."""
         numbers = [i for i, p in enumerate(self.context.planner.phases) if p.name in names]
         return np.flatnonzero(np.isin(self.phase, numbers))
 
@@ -130,34 +170,35 @@ class World:
         return [self.context.planner.phases[number].name for number in self.phase[first]]
 
     def pose(self, cube: int) -> np.ndarray:
-        """A view of a cube's pose, shape ``(frames, 7)``."""
+        """A view of a cube's pose, shape ``(steps, 7)``."""
         at = self.context.index.cube_qpos[cube]
         return self.qpos[:, at : at + 7]
 
     def velocity(self, cube: int) -> np.ndarray:
-        """A view of its velocity, shape ``(frames, 6)``."""
+        """A view of its velocity, shape ``(steps, 6)``."""
         at = self.context.index.cube_qvel[cube]
         return self.qvel[:, at : at + 6]
 
     def jaw(self, cube: int, jaw: int) -> np.ndarray:
-        """A view of a jaw's force on it, shape ``(frames, 3)``."""
+        """A view of a jaw's force on it, shape ``(steps, 3)``."""
         at = self.context.index.jaw_force[NAMES[cube]][jaw]
         return self.sensordata[:, at : at + 3]
 
     def support(self, cube: int, number: int = 0) -> np.ndarray:
-        """A view of the world's force on it, or of the other cube's, shape ``(frames, 3)``."""
+        """A view of the world's force on it, or of the other cube's, shape ``(steps, 3)``."""
         at = self.context.index.support_force[NAMES[cube]][number]
         return self.sensordata[:, at : at + 3]
 
     @property
     def gripper(self) -> np.ndarray:
-        """A view of the gripper's first joint, shape ``(frames,)``."""
+        """A view of the gripper's first joint, shape ``(steps,)``."""
         index = self.context.index
         return self.qpos[:, index.robot_qpos[index.n_arm]]
 
     @property
     def recording(self) -> BoxRecording:
-        index, cubes = self.context.index, (RED, BLUE)
+        index = self.context.index
+        cubes = (RED, BLUE)
         names = np.array([p.name for p in self.context.planner.phases])
         ours = [c for a in index.cube_qpos for c in range(a, a + 7)]
         return BoxRecording(
@@ -165,7 +206,9 @@ class World:
             pose=np.stack([self.pose(c) for c in cubes], 1),
             velocity=np.stack([self.velocity(c) for c in cubes], 1),
             jaw_force=np.stack([np.stack([self.jaw(c, j) for j in (0, 1)], 1) for c in cubes], 1),
-            support_force=np.stack([np.stack([self.support(c, j) for j in (0, 1)], 1) for c in cubes], 1),
+            support_force=np.stack(
+                [np.stack([self.support(c, j) for j in (0, 1)], 1) for c in cubes], 1
+            ),
             gripper=self.qpos[:, index.robot_qpos[index.n_arm :]],
             xpos=self.xpos,
             xquat=self.xquat,
@@ -180,12 +223,16 @@ class World:
         return check_box_world(self.recording, self.context.cfg, self.context.model)
 
 
-def feed(worlds: list[World], dtype: torch.dtype = torch.float64) -> Verdict:
-    """Plays recordings of one robot, equally long and with the same phases, through the evidence."""
-    context, n = worlds[0].context, len(worlds)
-    evidence = BoxEvidence(context.cfg, context.index, context.planner.phases, n, torch.device("cpu"))
+def feed(worlds: list[World], dtype: torch.dtype = torch.float64) -> CheckResult:
+    """Plays recordings of one robot, equally long and with the same phases, through the check."""
+    context = worlds[0].context
+    n = len(worlds)
+    check = BoxCheck(context.cfg, context.index, context.planner.phases, n, torch.device("cpu"))
     stacked = {name: np.stack([getattr(w, name) for w in worlds]) for name in (*STATE, "phase")}
-    ends = {name: torch.tensor(np.stack([getattr(w, name) for w in worlds]), dtype=dtype) for name in ("xpos", "xquat")}
+    ends = {
+        name: torch.tensor(np.stack([getattr(w, name) for w in worlds]), dtype=dtype)
+        for name in ("xpos", "xquat")
+    }
     sim = SimpleNamespace(
         model=context.model,
         nworld=n,
@@ -195,8 +242,8 @@ def feed(worlds: list[World], dtype: torch.dtype = torch.float64) -> Verdict:
         kinematics=lambda: None,
         **ends,
     )
-    for frame in range(stacked["phase"].shape[1]):
+    for step in range(stacked["phase"].shape[1]):
         for name in STATE:
-            setattr(sim, name, torch.tensor(stacked[name][:, frame], dtype=dtype))
-        evidence.update(sim, torch.tensor(stacked["phase"][:, frame]))
-    return evidence.verdict(sim)
+            setattr(sim, name, torch.tensor(stacked[name][:, step], dtype=dtype))
+        check.update(sim, torch.tensor(stacked["phase"][:, step]))
+    return check.result(sim)

@@ -8,7 +8,9 @@ from mjstack.sim import Simulation
 
 
 def assert_same_run(a: torch.Tensor, b: torch.Tensor, backend: str) -> None:
-    """Bit for bit on the CPU backends. CUDA sums in no fixed order: there two runs agree to rounding (docs/design.md)."""
+    """Bit for bit on the CPU backends. CUDA sums in no fixed order: there two runs agree to
+    rounding (docs/design.md).
+    """
     if backend.endswith("cuda"):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
     else:
@@ -16,7 +18,9 @@ def assert_same_run(a: torch.Tensor, b: torch.Tensor, backend: str) -> None:
 
 
 def assert_worlds_step_alone(many: Simulation, one: Simulation, backend: str) -> None:
-    """World k of many ends as the only world of a simulation does that starts in its state, with its model fields."""
+    """World k of many ends as the only world of a simulation does that starts in its state, with
+    its model fields.
+    """
     views = ("qpos", "qvel", "ctrl")
     initial = {name: getattr(many, name).clone() for name in views}
     for _ in range(3):

@@ -1,4 +1,6 @@
-"""Shared scenes, planners and simulations. Everything here works offline and writes only below pytest's temporary folder."""
+"""Shared scenes, planners and simulations. Everything here works offline and writes only below
+pytest's temporary folder.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +15,26 @@ import torch
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
-from mjstack.gates.episode import run_episode
-from mjstack.gates.gate import GateContext
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.rollout import run_episode
 from mjstack.sim import Simulation, make_simulation
 
 ROBOTS = ("so101", "rebot")
-# Files of 40 s and more start first, the longest at the front, so that both processes end together. The second process
-# begins with files that need few of MJWarp's kernels: with a cold cache both would compile the same ones.
+# Files of 40 s and more start first, the longest at the front, so that both processes end together.
+# The second process begins with files that need few of MJWarp's kernels: with a cold cache both
+# would compile the same ones.
 LONGEST = (
-    *("graph", "readme", "scaling", "collect", "capacity", "replay", "success", "box_evidence", "cli"),
-    *("env_contract", "terms", "docs", "config", "study", "batched_ik", "reachability", "layout"),
+    *("graph", "readme", "scaling", "collect", "capacity", "replay", "success", "box_check", "cli"),
+    *(
+        "env_contract",
+        "terms",
+        "docs",
+        "config",
+        "study",
+        "batched_ik",
+        "reachability",
+        "starts_file",
+    ),
 )
 
 
@@ -33,7 +45,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Spares the garbage collector the modules and the tests, which stay to the end: a sixth of the time went into them."""
+    """Spares the garbage collector the modules and the tests, which stay to the end: a sixth of the
+    time went into them.
+    """
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
@@ -50,7 +64,9 @@ def _outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture(scope="session")
 def stage() -> Callable[..., GateContext]:
-    """Configuration, model, index and planner of a robot under some overrides, each made once in the session."""
+    """Configuration, model, index and planner of a robot under some overrides, each made once in
+    the session.
+    """
     made: dict[tuple[str, ...], GateContext] = {}
 
     def get(robot: str, *overrides: str) -> GateContext:
@@ -64,12 +80,18 @@ def stage() -> Callable[..., GateContext]:
 
 @pytest.fixture(scope="session")
 def new_context(stage: Callable[..., GateContext]) -> Callable[..., GateContext]:
-    """A gate context of its own for some overrides that change neither scene nor, but for its phases, plan: both are shared."""
+    """A gate context of its own for some overrides that change neither scene nor, but for its
+    phases, plan: both are shared.
+    """
 
     def make(*overrides: str, robot: str = "so101") -> GateContext:
-        shared = stage(robot, *(override for override in overrides if override.startswith("controller.phases.")))
+        shared = stage(
+            robot,
+            *(override for override in overrides if override.startswith("controller.phases.")),
+        )
         context = GateContext(cfg=load_config([f"robot={robot}", *overrides]))
-        context.__dict__["model"], context.__dict__["planner"] = shared.model, shared.planner
+        context.__dict__["model"] = shared.model
+        context.__dict__["planner"] = shared.planner
         return context
 
     return make
@@ -77,7 +99,9 @@ def new_context(stage: Callable[..., GateContext]) -> Callable[..., GateContext]
 
 @pytest.fixture(scope="session")
 def make_sim(stage: Callable[[str], GateContext]) -> Callable[..., Simulation]:
-    """Simulations by (backend, nworld, overrides), reset and shared by all tests: MJWarp's are slow to build."""
+    """Simulations by (backend, nworld, overrides), reset and shared by all tests: MJWarp's are slow
+    to build.
+    """
     made: dict[tuple, Simulation] = {}
 
     def make(backend: str, nworld: int, *overrides: str, robot: str = "so101") -> Simulation:
@@ -86,7 +110,9 @@ def make_sim(stage: Callable[[str], GateContext]) -> Callable[..., Simulation]:
             cfg = load_config([f"robot={robot}", *overrides])
             kind = Backend.native if backend == "native" else Backend.mjwarp
             device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
-            made[key] = make_simulation(stage(robot).model, cfg, nworld, backend=kind, device=device)
+            made[key] = make_simulation(
+                stage(robot).model, cfg, nworld, backend=kind, device=device
+            )
         made[key].reset()
         return made[key]
 
@@ -94,25 +120,40 @@ def make_sim(stage: Callable[[str], GateContext]) -> Callable[..., Simulation]:
 
 
 @pytest.fixture(scope="session")
-def recorded(stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]) -> Callable[[str], SimpleNamespace]:
-    """A native episode of four jittered worlds per robot: cube poses and velocities at every frame end, and the verdict."""
+def recorded(
+    stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]
+) -> Callable[[str], SimpleNamespace]:
+    """A native episode of four jittered worlds per robot: cube poses and velocities at every step
+    end, and the result.
+    """
     made: dict[str, SimpleNamespace] = {}
 
     def get(robot: str) -> SimpleNamespace:
         if robot not in made:
             context = stage(robot)
             sim = make_sim("native", 4, robot=robot)
-            pose, velocity = [], []
+            pose = []
+            velocity = []
 
             def keep(_: int, sim: Simulation) -> None:
-                pose.append(np.stack([sim.qpos[:, a : a + 7].numpy().copy() for a in context.index.cube_qpos], 1))
-                velocity.append(np.stack([sim.qvel[:, a : a + 6].numpy().copy() for a in context.index.cube_qvel], 1))
+                pose.append(
+                    np.stack(
+                        [sim.qpos[:, a : a + 7].numpy().copy() for a in context.index.cube_qpos], 1
+                    )
+                )
+                velocity.append(
+                    np.stack(
+                        [sim.qvel[:, a : a + 6].numpy().copy() for a in context.index.cube_qvel], 1
+                    )
+                )
 
-            episode = run_episode(sim, context.index, context.cfg, context.planner, context.cfg.reset, on_frame=keep)
+            episode = run_episode(
+                sim, context.index, context.cfg, context.planner, context.cfg.reset, on_step=keep
+            )
             made[robot] = SimpleNamespace(
                 pose=np.stack(pose, 1),
                 velocity=np.stack(velocity, 1),
-                verdict=episode.verdict,
+                result=episode.result,
                 step_count=sim.step_count.numpy().copy(),
                 cfg=context.cfg,
                 phases=context.planner.phases,
@@ -133,14 +174,19 @@ BACKENDS = [
     "mjwarp",
     pytest.param(
         "mjwarp-cuda",
-        marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")],
+        marks=[
+            pytest.mark.gpu,
+            pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here"),
+        ],
     ),
 ]
 
 
 @pytest.fixture(params=BACKENDS)
 def backend(request: pytest.FixtureRequest) -> str:
-    """Every backend this machine has; MJWarp on Warp's CPU device, and on CUDA where there is one."""
+    """Every backend this machine has; MJWarp on Warp's CPU device, and on CUDA where
+    there is one.
+    """
     return request.param
 
 

@@ -23,21 +23,30 @@ def resident_mb() -> float:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
 
 
-def soak(backend: str, nworld: int, steps: int, *, episode_frames: int = 150, robot: str = "so101") -> dict[str, object]:
+def soak(
+    backend: str, nworld: int, steps: int, *, episode_steps: int = 150, robot: str = "so101"
+) -> dict[str, object]:
     """Steps one environment with random actions; episodes end by the clock and by what happens.
 
     Args:
         backend: ``native`` or ``mjwarp`` (on the CPU), or ``mjwarp-cuda``.
         nworld: Number of worlds.
         steps: Calls of step.
-        episode_frames: After which the time-out ends an episode.
+        episode_steps: After which the time-out ends an episode.
         robot: Name of its configuration.
     """
     kind, _, device = backend.partition("-")
-    overrides = ["task=stack", f"sim={kind}", f"robot={robot}", "reset=randomized", f"task.episode_frames={episode_frames}"]
+    overrides = [
+        "task=stack",
+        f"sim={kind}",
+        f"robot={robot}",
+        "reset=randomized",
+        f"task.episode_steps={episode_steps}",
+    ]
     env = make_env(overrides, nworld=nworld, seed=0, device="cuda:0" if device else "cpu")
     generator = torch.Generator(device=env.device).manual_seed(0)
-    low, span = env.action_manager.low, env.action_manager.high - env.action_manager.low
+    low = env.action_manager.low
+    span = env.action_manager.high - env.action_manager.low
     shape = (nworld, env.action_manager.action_dim)
     finite = torch.ones((), dtype=torch.bool, device=env.device)
     episodes = torch.zeros((), dtype=torch.int64, device=env.device)
@@ -75,10 +84,19 @@ def soak(backend: str, nworld: int, steps: int, *, episode_frames: int = 150, ro
         "rss_growth_percent": round(100.0 * (rss[steps] / rss[steps // 5] - 1.0), 3),
         "finite": bool(finite),
         "seconds": round(seconds, 1),
-        "ended_by": {name.partition("/")[2]: round(v, 4) for name, v in statistics.items() if name.startswith("termination/")},
+        "ended_by": {
+            name.partition("/")[2]: round(v, 4)
+            for name, v in statistics.items()
+            if name.startswith("termination/")
+        },
     }
 
 
 if __name__ == "__main__":
-    name, worlds, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-    print(json.dumps(soak(name, worlds, number, robot=sys.argv[4] if len(sys.argv) > 4 else "so101")), flush=True)
+    name = sys.argv[1]
+    worlds = int(sys.argv[2])
+    number = int(sys.argv[3])
+    print(
+        json.dumps(soak(name, worlds, number, robot=sys.argv[4] if len(sys.argv) > 4 else "so101")),
+        flush=True,
+    )

@@ -1,4 +1,6 @@
-"""Environments for tests. Configurations and simulations are slow to make, so tests share them, one environment at a time."""
+"""Environments for tests. Configurations and simulations are slow to make, so tests share them, one
+environment at a time.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,14 @@ from mjstack.sim.sizes import resolve_env_sizes
 TASKS = ("stack", "reach")
 STATE = ("qpos", "qvel", "act", "ctrl")
 POSES = ("xpos", "xquat", "site_xpos", "geom_xpos")
-COUNTS = ("contact_count", "constraint_count", "step_count", "overflow", "peak_contacts", "peak_constraints")
+COUNTS = (
+    "contact_count",
+    "constraint_count",
+    "step_count",
+    "overflow",
+    "peak_contacts",
+    "peak_constraints",
+)
 VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata", *COUNTS)
 Trace = list[dict[str, torch.Tensor]]
 
@@ -36,20 +45,30 @@ def configure(*overrides: str, robot: str = "so101") -> Config:
 
 @cache
 def brisk(robot: str = "so101", task: str = "stack") -> tuple[str, ...]:
-    """Overrides that halve the phases' times: both arms still do both tasks, and stacking has the same peaks."""
+    """Overrides that halve the phases' times: both arms still do both tasks, and stacking has the
+    same peaks.
+    """
     phases = _composed((f"robot={robot}", f"task={task}")).controller.phases
-    return tuple(f"controller.phases.{name}.seconds={phase.seconds / 2}" for name, phase in phases.items())
+    return tuple(
+        f"controller.phases.{name}.seconds={phase.seconds / 2}" for name, phase in phases.items()
+    )
 
 
 @cache
 def rushed() -> tuple[str, ...]:
     """Overrides of an episode that is over, and has failed, after a second."""
     phases = _composed(("robot=so101", "task=stack")).controller.phases
-    return ("gate.acceptance.window=5", "gate.box.window=5", *(f"controller.phases.{name}.seconds=0.1" for name in phases))
+    return (
+        "gate.acceptance.window=5",
+        "gate.box.window=5",
+        *(f"controller.phases.{name}.seconds=0.1" for name in phases),
+    )
 
 
 def new_sim(backend: str, nworld: int, robot: str = "so101") -> Simulation:
-    """A simulation with every field that a reset term of mjstack writes, and room for random actions."""
+    """A simulation with every field that a reset term of mjstack writes, and room for random
+    actions.
+    """
     cfg = _composed((f"robot={robot}", "reset=randomized"))
     return make_simulation(
         _model(robot),
@@ -66,7 +85,9 @@ _shared = cache(new_sim)
 
 
 def on_shared_sim(backend: str, nworld: int, cfg: Config) -> Env:
-    """An environment on the simulation that tests share: it is the tests' only one until the next is built."""
+    """An environment on the simulation that tests share: it is the tests' only one until the next
+    is built.
+    """
     sim = _shared(backend, nworld, cfg.robot.name)
     for name, field in sim.fields.items():
         field[:] = torch.from_numpy(getattr(sim.model, name)).to(field)
@@ -80,13 +101,18 @@ def on_new_sim(backend: str, nworld: int, cfg: Config) -> Env:
     return Env(sim, SceneIndex(sim.model, cfg.robot), cfg)
 
 
-def actions(env: Env, frames: int, seed: int = 0) -> list[torch.Tensor]:
-    """Random actions between the bounds; world k's are the same in any environment that starts with world 0."""
-    low, high = env.action_manager.low.cpu(), env.action_manager.high.cpu()
+def actions(env: Env, steps: int, seed: int = 0) -> list[torch.Tensor]:
+    """Random actions between the bounds; world k's are the same in any environment that starts with
+    world 0.
+    """
+    low = env.action_manager.low.cpu()
+    high = env.action_manager.high.cpu()
     rows = []
     for world in env.world.tolist():
         generator = torch.Generator().manual_seed(1000 * seed + world)
-        rows.append(torch.rand((frames, env.action_manager.action_dim), generator=generator, dtype=low.dtype))
+        rows.append(
+            torch.rand((steps, env.action_manager.action_dim), generator=generator, dtype=low.dtype)
+        )
     draw = low + (high - low) * torch.stack(rows, dim=1)
     return list(draw.to(env.device))
 
@@ -100,11 +126,14 @@ def mask_of(env: Env, *worlds: int) -> torch.Tensor:
 
 def returned(step: tuple[Any, ...]) -> dict[str, torch.Tensor]:
     """What `step` or `reset` returned, flat; the tensors themselves."""
-    obs, extras = step[0], step[-1]
+    obs = step[0]
+    extras = step[-1]
     out = {f"obs.{name}": value for name, value in obs.items()}
     if len(step) == 5:
         out |= dict(zip(("reward", "terminated", "truncated"), step[1:4], strict=True))
-        out |= {f"final.{name}": value for name, value in extras["final_obs"].items()} | {"success": extras["success"]}
+        out |= {f"final.{name}": value for name, value in extras["final_obs"].items()} | {
+            "success": extras["success"]
+        }
     return out
 
 
@@ -112,24 +141,33 @@ def held(env: Env, views: tuple[str, ...] = VIEWS) -> dict[str, torch.Tensor]:
     """Copies of everything that an environment and its simulation keep for each world."""
     out = {name: getattr(env.sim, name).clone() for name in views}
     out |= {f"fields.{name}": field.clone() for name, field in env.sim.fields.items()}
-    out |= {name: getattr(env, name).clone() for name in ("episode", "frame", "success", "action", "previous_action")}
+    out |= {
+        name: getattr(env, name).clone()
+        for name in ("episode", "step", "success", "action", "previous_action")
+    }
     out["episode_sums"] = env.reward_manager.episode_sums.clone()
     return out
 
 
 def play(env: Env, moves: list[torch.Tensor], before: Callable[[int], None] | None = None) -> Trace:
-    """Steps through the moves; per frame what was returned, and the state, episode and frame after it."""
+    """Steps through the moves; per step what was returned, and the state, episode and step after
+    it.
+    """
     trace = []
     for t, move in enumerate(moves):
         if before is not None:
             before(t)
         row = returned(env.step(move))
-        row |= {name: getattr(env.sim, name).clone() for name in (*STATE, "site_xpos", "sensordata")}
-        trace.append(row | {"episode": env.episode.clone(), "frame": env.frame.clone()})
+        row |= {
+            name: getattr(env.sim, name).clone() for name in (*STATE, "site_xpos", "sensordata")
+        }
+        trace.append(row | {"episode": env.episode.clone(), "step": env.episode_step.clone()})
     return trace
 
 
-def pairs(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
+def pairs(
+    a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]
+) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
     """Values of the same name; both have the same names."""
     assert a.keys() == b.keys()
     for name in a:
@@ -137,7 +175,12 @@ def pairs(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> Iterator[tu
 
 
 def assert_rows(
-    a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], rows: Any, other: Any, backend: str, where: str = ""
+    a: dict[str, torch.Tensor],
+    b: dict[str, torch.Tensor],
+    rows: Any,
+    other: Any,
+    backend: str,
+    where: str = "",
 ) -> None:
     """Rows of one are the other rows of the other."""
     for name, x, y in pairs(a, b):
@@ -148,7 +191,7 @@ def assert_rows(
 
 
 def assert_traces(a: Trace, b: Trace, rows: Any, other: Any, backend: str) -> None:
-    """Likewise frame by frame."""
+    """Likewise step by step."""
     assert len(a) == len(b) > 0
     for t, (x, y) in enumerate(zip(a, b, strict=True)):
-        assert_rows(x, y, rows, other, backend, f"frame {t}:")
+        assert_rows(x, y, rows, other, backend, f"step {t}:")

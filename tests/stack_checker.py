@@ -1,7 +1,7 @@
-"""The acceptance rules of the stack task for one recorded world, in plain NumPy and simple loops.
+"""The rules of the check of the stack task for one recorded world, in plain NumPy and simple loops.
 
-Written from the rules' text, not from `mjstack.tasks.stack`: the two have to agree because both are right.
-"""
+Written from the rules' text, not from `mjstack.tasks.stack`: the two have to agree because both are
+right."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import numpy as np
 
 from mjstack.config.schema import Config
 
-RED, BLUE = 0, 1
+RED = 0
+BLUE = 1
 
 
 @dataclass
@@ -31,7 +32,8 @@ class Outcome:
 
 def rotation_matrix(quat: np.ndarray) -> np.ndarray:
     """Rotates the unit vectors one by one: v + 2 w (u x v) + 2 u x (u x v)."""
-    w, u = quat[0], quat[1:]
+    w = quat[0]
+    u = quat[1:]
     columns = [v + 2.0 * w * np.cross(u, v) + 2.0 * np.cross(u, np.cross(u, v)) for v in np.eye(3)]
     return np.array(columns).T
 
@@ -39,12 +41,19 @@ def rotation_matrix(quat: np.ndarray) -> np.ndarray:
 def lowest_corner(pose: np.ndarray, half: float) -> float:
     """Smallest world z of the eight corners."""
     turn = rotation_matrix(pose[3:])
-    return min(float((pose[:3] + turn @ (half * np.array(s)))[2]) for s in itertools.product((-1.0, 1.0), repeat=3))
+    return min(
+        float((pose[:3] + turn @ (half * np.array(s)))[2])
+        for s in itertools.product((-1.0, 1.0), repeat=3)
+    )
 
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle between two orientations: the chord between quaternions, the nearer of the two signs."""
-    chord = min(np.linalg.norm(a - b), np.linalg.norm(a + b)) if np.isfinite(a + b).all() else math.nan
+    """Angle between two orientations: the chord between quaternions, the nearer of the
+    two signs.
+    """
+    chord = (
+        min(np.linalg.norm(a - b), np.linalg.norm(a + b)) if np.isfinite(a + b).all() else math.nan
+    )
     return 4.0 * math.asin(min(1.0, 0.5 * chord)) if math.isfinite(chord) else math.nan
 
 
@@ -61,23 +70,25 @@ def check_world(
     """Judges one world.
 
     Args:
-        pose: Red's and blue's pose at every frame end, shape ``(frames, 2, 7)``.
-        velocity: Their velocity, shape ``(frames, 2, 6)``.
+        pose: Red's and blue's pose at every step end, shape ``(steps, 2, 7)``.
+        velocity: Their velocity, shape ``(steps, 2, 6)``.
         cfg: Thresholds, table and cubes.
-        phases: Names with first and last (exclusive) frame.
+        phases: Names with first and last (exclusive) step.
         step_count: Physics steps the world has made.
         overflow: Whether it lost contacts or constraint rows.
         finite_elsewhere: Whether the rest of its state stayed finite.
     """
-    rules, scene = cfg.gate.acceptance, cfg.scene
-    half, top = scene.cube_half, scene.table_center[2] + scene.table_half[2]
-    frames = len(pose)
+    rules = cfg.gate.acceptance
+    scene = cfg.scene
+    half = scene.cube_half
+    top = scene.table_center[2] + scene.table_half[2]
+    steps = len(pose)
     span = {p.name: (p.start, p.stop) for p in phases}
     failed: set[str] = set()
 
     if not (np.isfinite(pose).all() and np.isfinite(velocity).all() and finite_elsewhere):
         failed.add("FINITE")
-    if step_count != frames * cfg.timing.substeps or frames != phases[-1].stop:
+    if step_count != steps * cfg.timing.decimation or steps != phases[-1].stop:
         failed.add("STEPS")
     if overflow:
         failed.add("OVERFLOW")
@@ -85,47 +96,59 @@ def check_world(
     airborne = [lowest_corner(p[RED], half) - top > rules.airborne_height for p in pose]
 
     run = longest = 0
-    for frame in range(frames):
-        if any(span[name][0] <= frame < span[name][1] for name in rules.lift_phases):
-            run = run + 1 if airborne[frame] else 0
+    for step in range(steps):
+        if any(span[name][0] <= step < span[name][1] for name in rules.lift_phases):
+            run = run + 1 if airborne[step] else 0
             longest = max(longest, run)
-    if longest < rules.lift_frames:
+    if longest < rules.lift_steps:
         failed.add("LIFT")
 
     carried = False
-    run_frames: list[int] = []
-    for frame in range(*span[rules.carry_phase]):
-        run_frames = [*run_frames, frame] if airborne[frame] else []
-        if run_frames:
-            start = pose[run_frames[0], RED, :2]
-            far = max(float(np.linalg.norm(pose[f, RED, :2] - start)) for f in run_frames)
-            carried = carried or (len(run_frames) >= rules.carry_frames and far >= rules.carry_distance)
+    run_steps: list[int] = []
+    for step in range(*span[rules.carry_phase]):
+        run_steps = [*run_steps, step] if airborne[step] else []
+        if run_steps:
+            start = pose[run_steps[0], RED, :2]
+            far = max(float(np.linalg.norm(pose[f, RED, :2] - start)) for f in run_steps)
+            carried = carried or (
+                len(run_steps) >= rules.carry_steps and far >= rules.carry_distance
+            )
     if not carried:
         failed.add("CARRY")
 
-    window = range(frames - rules.window, frames)
-    for frame in window:
-        red, blue = pose[frame, RED], pose[frame, BLUE]
-        xy, dz = float(np.linalg.norm(red[:2] - blue[:2])), float(red[2] - blue[2])
+    window = range(steps - rules.window, steps)
+    for step in window:
+        red = pose[step, RED]
+        blue = pose[step, BLUE]
+        xy = float(np.linalg.norm(red[:2] - blue[:2]))
+        dz = float(red[2] - blue[2])
         if not (xy <= rules.xy_err and rules.dz_min <= dz <= rules.dz_max):
             failed.add("STACKED")
         gap = abs(lowest_corner(blue, half) - top)
-        inside = all(abs(blue[i] - scene.table_center[i]) <= scene.table_half[i] - half for i in (0, 1))
+        inside = all(
+            abs(blue[i] - scene.table_center[i]) <= scene.table_half[i] - half for i in (0, 1)
+        )
         if not (gap <= rules.support_gap and inside):
             failed.add("SUPPORTED")
 
-    rms, peaks, distances, angles = [], [], [], []
+    rms = []
+    peaks = []
+    distances = []
+    angles = []
     for cube in (RED, BLUE):
         speeds = []
-        for frame in window:
-            v, w = velocity[frame, cube, :3], velocity[frame, cube, 3:]
+        for step in window:
+            v = velocity[step, cube, :3]
+            w = velocity[step, cube, 3:]
             speeds.append(float(np.linalg.norm(v) + math.sqrt(3.0) * half * np.linalg.norm(w)))
         rms.append(math.sqrt(sum(s * s for s in speeds) / len(speeds)))
         peaks.append(np.max(speeds))
         for a, b in itertools.combinations(window, 2):
             distances.append(float(np.linalg.norm(pose[a, cube, :3] - pose[b, cube, :3])))
             angles.append(rotation_between(pose[a, cube, 3:], pose[b, cube, 3:]))
-    rest_speed, rest_position, rest_rotation = float(np.max(rms)), float(np.max(distances)), float(np.max(angles))
+    rest_speed = float(np.max(rms))
+    rest_position = float(np.max(distances))
+    rest_rotation = float(np.max(angles))
     if not rest_speed <= rules.rest_speed:
         failed.add("REST_SPEED")
     if not rest_position <= rules.rest_position:

@@ -30,7 +30,7 @@ def make() -> Iterator[Make]:
     made: list[mjstack.Env] = []
 
     def build(*overrides: str, nworld: int = 3, seed: int = 0) -> mjstack.Env:
-        base = ["task=reach", "sim=native", f"task.episode_frames={FRAMES}"]
+        base = ["task=reach", "sim=native", f"task.episode_steps={FRAMES}"]
         made.append(mjstack.make_env([*base, *overrides], nworld=nworld, seed=seed))
         return made[-1]
 
@@ -49,10 +49,13 @@ def zeros(env: Any) -> np.ndarray:
 def test_vector_spaces(make: Make) -> None:
     inner = make()
     env = GymnasiumVectorEnv(inner)
-    policy, actions = inner.observation_manager.group_dims["policy"], inner.action_manager.action_dim
+    policy = inner.observation_manager.group_dims["policy"]
+    actions = inner.action_manager.action_dim
     assert env.num_envs == 3
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    assert env.single_observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (policy,), np.float32)
+    assert env.single_observation_space == gymnasium.spaces.Box(
+        -np.inf, np.inf, (policy,), np.float32
+    )
     assert env.single_action_space == gymnasium.spaces.Box(-1.0, 1.0, (actions,), np.float32)
     assert env.observation_space.shape == (3, policy)
     obs, infos = env.reset(seed=1)
@@ -84,7 +87,9 @@ def test_vector_groups(make: Make) -> None:
     assert obs in env.observation_space
     privileged, _ = GymnasiumVectorEnv(inner, group="privileged").reset(seed=0)
     np.testing.assert_array_equal(privileged, obs["privileged"])
-    with pytest.raises(UnknownName, match=r"observation group 'polcy' does not exist\. Did you mean 'policy'"):
+    with pytest.raises(
+        UnknownName, match=r"observation group 'polcy' does not exist\. Did you mean 'policy'"
+    ):
         GymnasiumVectorEnv(inner, group="polcy")
 
 
@@ -96,7 +101,8 @@ def test_vector_seeding(make: Make) -> None:
     def rollout(seed: int) -> np.ndarray:
         return np.stack([env.reset(seed=seed)[0], *(env.step(action)[0] for action in actions)])
 
-    first, other = rollout(7), rollout(8)
+    first = rollout(7)
+    other = rollout(8)
     assert np.array_equal(first, rollout(7))
     assert not np.isclose(first[0], other[0]).all(1).any()
     assert env.np_random_seed == 7
@@ -104,14 +110,15 @@ def test_vector_seeding(make: Make) -> None:
 
 def test_vector_autoreset_in_the_same_step(make: Make) -> None:
     """Against an identical environment without the adapter, over two episodes with unequal ends."""
-    inner, env = make(), GymnasiumVectorEnv(make())
+    inner = make()
+    env = GymnasiumVectorEnv(make())
     raw, _ = inner.reset(seed=3)
     obs, _ = env.reset(seed=3)
     np.testing.assert_array_equal(obs, raw["policy"].numpy())
     rng = np.random.default_rng(0)
     for step in range(1, 2 * FRAMES + 1):
         action = rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
-        if step == 2:  # world 1 starts over, and from here on ends two frames after the others
+        if step == 2:  # world 1 starts over, and from here on ends two steps after the others
             mask = np.array([False, True, False])
             raw, _ = inner.reset(mask=torch.from_numpy(mask))
             before, (obs, _) = obs, env.reset(options={"reset_mask": mask})
@@ -124,7 +131,9 @@ def test_vector_autoreset_in_the_same_step(make: Make) -> None:
         np.testing.assert_array_equal(reward, raw_reward.numpy())
         np.testing.assert_array_equal(truncated, raw_truncated.numpy())
         late = (step - 1) % FRAMES == 0
-        np.testing.assert_array_equal(truncated, [step % FRAMES == 0, late and step > 1, step % FRAMES == 0])
+        np.testing.assert_array_equal(
+            truncated, [step % FRAMES == 0, late and step > 1, step % FRAMES == 0]
+        )
         assert not terminated.any()
         assert ("final_obs" in infos) == truncated.any()
         if not truncated.any():
@@ -132,7 +141,9 @@ def test_vector_autoreset_in_the_same_step(make: Make) -> None:
         assert list(infos["_final_obs"]) == list(infos["_final_info"]) == list(truncated)
         for world in range(3):
             if truncated[world]:
-                np.testing.assert_array_equal(infos["final_obs"][world], extras["final_obs"]["policy"][world].numpy())
+                np.testing.assert_array_equal(
+                    infos["final_obs"][world], extras["final_obs"]["policy"][world].numpy()
+                )
                 assert not np.isclose(infos["final_obs"][world], obs[world]).all()
             else:
                 assert infos["final_obs"][world] is None
@@ -140,7 +151,7 @@ def test_vector_autoreset_in_the_same_step(make: Make) -> None:
 
 
 def test_vector_final_obs_of_all_groups(make: Make) -> None:
-    env = GymnasiumVectorEnv(make("task.episode_frames=1"), group=None)
+    env = GymnasiumVectorEnv(make("task.episode_steps=1"), group=None)
     env.reset(seed=0)
     *_, infos = env.step(zeros(env))
     assert infos["final_obs"].shape == (3,)
@@ -148,7 +159,9 @@ def test_vector_final_obs_of_all_groups(make: Make) -> None:
 
 
 def test_vector_success_ends_an_episode(make: Make) -> None:
-    env = GymnasiumVectorEnv(make("task.success.params.distance=10.0", "task.success.params.frames=2"))
+    env = GymnasiumVectorEnv(
+        make("task.success.params.distance=10.0", "task.success.params.steps=2")
+    )
     env.reset(seed=0)
     assert not env.step(zeros(env))[2].any()
     _, _, terminated, truncated, infos = env.step(zeros(env))
@@ -172,7 +185,10 @@ def test_vector_wrappers_of_gymnasium_work(make: Make) -> None:
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (np.zeros((3, 2)), r"action: found shape \(3, 2\), expected a float32 array of shape \(3, 6\)"),
+        (
+            np.zeros((3, 2)),
+            r"action: found shape \(3, 2\), expected a float32 array of shape \(3, 6\)",
+        ),
         (np.zeros(6), r"action: found shape \(6,\), expected"),
         ("up", r"action: found str, expected"),
         (np.full((3, 6), np.nan), r"action: found \[nan.* in world 0, expected finite numbers"),
@@ -192,7 +208,10 @@ def test_vector_wrong_actions(make: Make, action: Any, message: str) -> None:
         ({"seed": [1, 2, 3]}, "seed: found"),
         ({"options": {"mask": None}}, "reset option 'mask' does not exist"),
         ({"options": {"reset_mask": [True, False, True]}}, "found list, expected a bool array"),
-        ({"options": {"reset_mask": np.ones(4, dtype=bool)}}, r"found bool of shape \(4,\), expected a bool array of shape"),
+        (
+            {"options": {"reset_mask": np.ones(4, dtype=bool)}},
+            r"found bool of shape \(4,\), expected a bool array of shape",
+        ),
         ({"options": {"reset_mask": np.ones(3)}}, r"found float64 of shape"),
         ({"options": {"reset_mask": np.ones(3, dtype=bool)}, "seed": 1}, "no mask beside it"),
     ],
@@ -224,7 +243,9 @@ def test_single_env_passes_gymnasiums_checker(group: str | None) -> None:
         env = gymnasium.make("mjstack-test/Reach-v0").unwrapped
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            warnings.filterwarnings("ignore", message=r".*space (minimum|maximum) value is -?infinity")  # as it should be
+            warnings.filterwarnings(
+                "ignore", message=r".*space (minimum|maximum) value is -?infinity"
+            )  # as it should be
             check_env(env)
         env.close()
     finally:
@@ -232,8 +253,11 @@ def test_single_env_passes_gymnasiums_checker(group: str | None) -> None:
 
 
 def test_single_env_is_the_one_world(make: Make) -> None:
-    """The done step returns the final observation, and ``reset`` the start of the episode that follows."""
-    inner, env = make(nworld=1), GymnasiumEnv(make(nworld=1))
+    """The done step returns the final observation, and ``reset`` the start of the episode that
+    follows.
+    """
+    inner = make(nworld=1)
+    env = GymnasiumEnv(make(nworld=1))
     raw, _ = inner.reset(seed=5)
     obs, _ = env.reset(seed=5)
     assert obs in env.observation_space
@@ -255,7 +279,7 @@ def test_single_env_is_the_one_world(make: Make) -> None:
 
 
 def test_single_env_seed_after_the_end_of_an_episode(make: Make) -> None:
-    env = GymnasiumEnv(make("task.episode_frames=1", nworld=1))
+    env = GymnasiumEnv(make("task.episode_steps=1", nworld=1))
     first, _ = env.reset(seed=2)
     env.step(zeros(env))
     again, _ = env.reset(seed=2)
@@ -263,13 +287,18 @@ def test_single_env_seed_after_the_end_of_an_episode(make: Make) -> None:
 
 
 def test_single_env_wrong_use(make: Make) -> None:
-    with pytest.raises(ArgumentError, match=r"env: found 3 worlds, expected one\. Build it with nworld=1"):
+    with pytest.raises(
+        ArgumentError, match=r"env: found 3 worlds, expected one\. Build it with nworld=1"
+    ):
         GymnasiumEnv(make())
     env = GymnasiumEnv(make(nworld=1))
     with pytest.raises(UnknownName, match="reset option 'reset_mask' does not exist"):
         env.reset(options={"reset_mask": np.ones(1, dtype=bool)})
     env.reset()
-    with pytest.raises(ArgumentError, match=r"action: found shape \(1, 6\), expected a float32 array of shape \(6,\)"):
+    with pytest.raises(
+        ArgumentError,
+        match=r"action: found shape \(1, 6\), expected a float32 array of shape \(6,\)",
+    ):
         env.step(np.zeros((1, 6)))
 
 
@@ -284,7 +313,9 @@ def test_rsl_rl_shapes(make: Make) -> None:
     assert env.cfg is inner.cfg
     obs = env.get_observations()
     assert obs.batch_size == torch.Size([3])
-    assert {name: tuple(value.shape) for name, value in obs.items()} == {name: (3, dim) for name, dim in dims.items()}
+    assert {name: tuple(value.shape) for name, value in obs.items()} == {
+        name: (3, dim) for name, dim in dims.items()
+    }
     stepped, rewards, dones, extras = env.step(torch.zeros(3, 6))
     assert {value.dtype for value in stepped.values()} == {torch.float32}
     assert (rewards.shape, rewards.dtype) == ((3,), torch.float32)
@@ -297,22 +328,28 @@ def test_rsl_rl_shapes(make: Make) -> None:
 
 
 def test_rsl_rl_tells_time_outs_from_other_ends(make: Make) -> None:
-    env = RslRlVecEnv(make("task.success.params.distance=10.0", "task.success.params.frames=3"))
+    env = RslRlVecEnv(make("task.success.params.distance=10.0", "task.success.params.steps=3"))
     env.episode_length_buf = torch.tensor([0, FRAMES - 2, FRAMES - 3])
     ends = [env.step(torch.zeros(3, 6))[2:] for _ in range(3)]
     assert [dones.tolist() for dones, _ in ends] == [[0, 0, 0], [0, 1, 0], [1, 0, 1]]
-    # In the third frame world 2 is at its time limit too, but it is the success that ended it.
-    assert [extras["time_outs"].tolist() for _, extras in ends] == [[False] * 3, [False, True, False], [False] * 3]
+    # In the third step world 2 is at its time limit too, but it is the success that ended it.
+    assert [extras["time_outs"].tolist() for _, extras in ends] == [
+        [False] * 3,
+        [False, True, False],
+        [False] * 3,
+    ]
 
 
 def test_rsl_rl_episode_length_is_the_environments_own(make: Make) -> None:
     inner = make()
     env = RslRlVecEnv(inner)
-    frame = inner.frame
-    env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
+    step = inner.episode_step
+    env.episode_length_buf = torch.randint_like(
+        env.episode_length_buf, high=int(env.max_episode_length)
+    )
     env.episode_length_buf = torch.tensor([0, 2, FRAMES - 1])
-    assert inner.frame is frame
-    assert inner.frame.tolist() == [0, 2, FRAMES - 1]
+    assert inner.episode_step is step
+    assert inner.episode_step.tolist() == [0, 2, FRAMES - 1]
     _, _, dones, _ = env.step(torch.zeros(3, 6))
     assert dones.tolist() == [0, 0, 1]
     assert env.episode_length_buf.tolist() == [1, 3, 0]
@@ -327,7 +364,11 @@ def test_rsl_rl_log(make: Make) -> None:
     assert [i for i, log in enumerate(logs) if log is not None] == [FRAMES, 2 * FRAMES + 1]
     log = logs[FRAMES]
     assert log is not None
-    assert (log["episode/episodes"], log["episode/frames"], log["episode/success"]) == (3.0, FRAMES, 0.0)
+    assert (log["episode/episodes"], log["episode/steps"], log["episode/success"]) == (
+        3.0,
+        FRAMES,
+        0.0,
+    )
     terms = sum(value for name, value in log.items() if name.startswith("episode/reward/"))
     assert log["episode/return"] == pytest.approx(terms, rel=1e-5)
     with pytest.raises(ArgumentError, match="log_interval"):
@@ -361,10 +402,18 @@ def test_rsl_rl_steps_in_inference_mode_and_out_of_it(make: Make) -> None:
 
 def test_import_of_mjstack_loads_no_adapter() -> None:
     code = "import sys, mjstack; print(*({'gymnasium', 'rsl_rl', 'tensordict'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == ""
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        == ""
+    )
 
 
-@pytest.mark.parametrize(("adapter", "library"), [("gymnasium", "gymnasium"), ("rsl_rl", "rsl_rl"), ("rsl_rl", "tensordict")])
+@pytest.mark.parametrize(
+    ("adapter", "library"),
+    [("gymnasium", "gymnasium"), ("rsl_rl", "rsl_rl"), ("rsl_rl", "tensordict")],
+)
 def test_missing_extra_is_one_line(adapter: str, library: str) -> None:
     code = (
         f"import sys; sys.modules['{library}'] = None\n"
@@ -372,7 +421,9 @@ def test_missing_extra_is_one_line(adapter: str, library: str) -> None:
         f"try: import mjstack.adapters.{adapter}\n"
         "except MjstackError as error: print(error)"
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
     assert len(out.splitlines()) == 1
     assert library in out
     assert "pip install 'mjstack[train]'" in out

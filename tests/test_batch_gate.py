@@ -1,4 +1,6 @@
-"""The batch gate: totals over seeds, the interval of its rate, what it keeps of every world, and what a failure leaves."""
+"""The batch gate: totals over seeds, the interval of its rate, what it keeps of every world, and
+what a failure leaves.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,13 @@ import pytest
 import torch
 from environments import brisk
 
-from mjstack.control.planner import CommandTape
+from mjstack.drivers.open_loop import JointTrajectory
+from mjstack.episodes import context as gate_module
+from mjstack.episodes.batch_record import FAILING, BatchRecord, clear_records, write_failing
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.rollout import Episode, run_episode
 from mjstack.errors import RunError
-from mjstack.gates import gate as gate_module
 from mjstack.gates.batch import run_batch
-from mjstack.gates.batch_record import FAILING, BatchRecord, clear_records, write_failing
-from mjstack.gates.episode import Episode, run_episode
-from mjstack.gates.gate import GateContext
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
 from mjstack.tasks.stack import StackRule
@@ -43,7 +45,9 @@ def test_wilson_interval(successes: int, trials: int, low: float, high: float) -
     found = wilson_interval(successes, trials)
     assert found == pytest.approx((low, high), abs=1e-5)
     for p in found:
-        assert (successes / trials - p) ** 2 == pytest.approx(1.959964**2 * p * (1.0 - p) / trials, rel=1e-4, abs=1e-12)
+        assert (successes / trials - p) ** 2 == pytest.approx(
+            1.959964**2 * p * (1.0 - p) / trials, rel=1e-4, abs=1e-12
+        )
     assert 0.0 <= found[0] <= successes / trials <= found[1] <= 1.0
 
 
@@ -57,7 +61,9 @@ def play(context: GateContext, folder: Path | None) -> GateResult:
 def two_seeds(
     new_context: Callable[..., GateContext], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, GateResult, list[str]]:
-    """A native batch of seven worlds under seeds 0 and 1, some of which fail, its folder, and what it said."""
+    """A native batch of seven worlds under seeds 0 and 1, some of which fail, its folder, and what
+    it said.
+    """
     folder = tmp_path_factory.mktemp("batch")
     context = new_context("sim=native", "nworld=7", "gate.batch.seeds=2", TIGHT)
     lines: list[str] = []
@@ -68,20 +74,31 @@ def two_seeds(
 def test_seeds_add_up(two_seeds: tuple[Path, GateResult, list[str]]) -> None:
     folder, result, lines = two_seeds
     records = [BatchRecord.read(folder, seed) for seed in (0, 1)]
-    failing = [f"{seed}:{w}" for seed, r in enumerate(records) if r is not None for w in np.flatnonzero(r.failed)]
+    failing = [
+        f"{seed}:{w}"
+        for seed, r in enumerate(records)
+        if r is not None
+        for w in np.flatnonzero(r.failed)
+    ]
     assert 0 < len(failing) < 14
-    assert {name[0] for name in failing} == {"0", "1"}  # the test would show less if one seed had none
-    accepted = 14 - len(failing)
-    low, high = wilson_interval(accepted, 14)
+    assert {name[0] for name in failing} == {
+        "0",
+        "1",
+    }  # the test would show less if one seed had none
+    succeeded = 14 - len(failing)
+    low, high = wilson_interval(succeeded, 14)
     metrics = result.metrics
     assert result.status is Status.failed
-    assert (metrics["world_episodes"], metrics["accepted"], metrics["seeds"]) == (14, accepted, 2)
-    assert metrics["seed0.accepted"] + metrics["seed1.accepted"] == accepted
+    assert (metrics["world_episodes"], metrics["succeeded"], metrics["seeds"]) == (14, succeeded, 2)
+    assert metrics["seed0.succeeded"] + metrics["seed1.succeeded"] == succeeded
     assert metrics["failed.STACKED"] == len(failing)
     assert metrics["distinct_final_states"] == 14
     assert (metrics["success_rate_low95"], metrics["success_rate_high95"]) == (low, high)
-    assert f"{len(failing)} of 14 world-episodes ({', '.join(failing)}) failed: not stacked in {len(failing)}" in result.reason
-    assert f"{accepted} of 14 world-episodes accepted (" in result.reason
+    assert (
+        f"{len(failing)} of 14 world-episodes ({', '.join(failing)}) failed: not stacked in"
+        f" {len(failing)}" in result.reason
+    )
+    assert f"{succeeded} of 14 world-episodes succeeded (" in result.reason
     assert "95 % interval" in result.reason
     assert f"job=replay run={folder} world={failing[0]}" in result.reason
     assert not {"episode_s", "world_steps_per_s"} & set(metrics)  # void where worlds failed
@@ -103,11 +120,16 @@ def test_failing_worlds_are_a_table(two_seeds: tuple[Path, GateResult, list[str]
 
 
 def test_second_seed_is_what_it_is_alone(
-    two_seeds: tuple[Path, GateResult, list[str]], new_context: Callable[..., GateContext], tmp_path: Path
+    two_seeds: tuple[Path, GateResult, list[str]],
+    new_context: Callable[..., GateContext],
+    tmp_path: Path,
 ) -> None:
-    """Worlds are started anew: nothing of seed 0 is left in them. Fewer of them, too, because nworld does not matter."""
+    """Worlds are started anew: nothing of seed 0 is left in them. Fewer of them, too, because
+    nworld does not matter.
+    """
     result = play(new_context("sim=native", "nworld=3", "seed=1", TIGHT), tmp_path)
-    alone, after = BatchRecord.read(tmp_path, 1), BatchRecord.read(two_seeds[0], 1)
+    alone = BatchRecord.read(tmp_path, 1)
+    after = BatchRecord.read(two_seeds[0], 1)
     assert alone is not None
     assert after is not None
     assert np.array_equal(alone.qpos, after.qpos[:3])
@@ -116,7 +138,9 @@ def test_second_seed_is_what_it_is_alone(
     assert first is not None
     assert not np.array_equal(first.qpos, after.qpos)
     bad = np.flatnonzero(alone.failed).tolist()
-    assert f"({', '.join(map(str, bad))}) failed" in result.reason  # one seed: worlds have no seed in their names
+    assert (
+        f"({', '.join(map(str, bad))}) failed" in result.reason
+    )  # one seed: worlds have no seed in their names
     assert result.metrics["worlds"] == 3
 
 
@@ -125,13 +149,17 @@ def test_second_seed_is_what_it_is_alone(
 def test_commands_do_not_depend_on_nworld(nu: int, dtype: torch.dtype) -> None:
     """Not even in their last bits, or a world would not do alone what it did among many."""
     rng = np.random.default_rng(0)
-    knots, weights = rng.normal(size=(200, 12, nu)), rng.normal(size=(5, 6))
-    segments, error = np.array([0, 0, 6, 6, 6]), np.zeros(200)
-    many = CommandTape(knots, weights, segments, error).to(torch.device("cpu"), dtype)
+    knots = rng.normal(size=(200, 12, nu))
+    weights = rng.normal(size=(5, 6))
+    segments = np.array([0, 0, 6, 6, 6])
+    error = np.zeros(200)
+    many = JointTrajectory(knots, weights, segments, error).to(torch.device("cpu"), dtype)
     for world in range(0, 200, 7):
-        alone = CommandTape(knots[world : world + 1], weights, segments, error[:1]).to(torch.device("cpu"), dtype)
-        for frame in range(5):
-            assert torch.equal(alone.command(frame)[0], many.command(frame)[world])
+        alone = JointTrajectory(knots[world : world + 1], weights, segments, error[:1]).to(
+            torch.device("cpu"), dtype
+        )
+        for step in range(5):
+            assert torch.equal(alone.command(step)[0], many.command(step)[world])
 
 
 class Stop(Exception):
@@ -140,7 +168,10 @@ class Stop(Exception):
 
 @pytest.mark.parametrize("error", [Stop("the second seed"), KeyboardInterrupt()])
 def test_what_stops_the_second_seed_keeps_the_first(
-    error: BaseException, new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    error: BaseException,
+    new_context: Callable[..., GateContext],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     def stops(*args: object, **kwargs: object) -> Episode:
         if (tmp_path / "worlds_seed0.npz").exists():
@@ -148,7 +179,9 @@ def test_what_stops_the_second_seed_keeps_the_first(
         return run_episode(*args, **kwargs)
 
     monkeypatch.setattr(gate_module, "run_episode", stops)
-    context = new_context("sim=native", "nworld=2", "gate.batch.seeds=3", "gate.acceptance.xy_err=1e-6")
+    context = new_context(
+        "sim=native", "nworld=2", "gate.batch.seeds=3", "gate.acceptance.xy_err=1e-6"
+    )
     if isinstance(error, KeyboardInterrupt):
         with pytest.raises(KeyboardInterrupt):
             play(context, tmp_path)
@@ -173,8 +206,12 @@ def test_full_disk_takes_no_verdict_back(
     monkeypatch.setattr(os, "replace", full)
     result = play(new_context("sim=native", "nworld=2"), tmp_path)
     assert result.status is Status.passed
-    assert "2 of 2 worlds accepted (100 %, 95 % interval 34.24 to 100 %), 2 distinct" in result.reason
-    assert result.metrics["world_steps_per_s"] == pytest.approx(2 * 6000 / result.metrics["episode_s"])
+    assert (
+        "2 of 2 worlds succeeded (100 %, 95 % interval 34.24 to 100 %), 2 distinct" in result.reason
+    )
+    assert result.metrics["world_steps_per_s"] == pytest.approx(
+        2 * 6000 / result.metrics["episode_s"]
+    )
     assert any("No space left on device" in line for line in result.details)
     assert list(tmp_path.iterdir()) == []
 
@@ -211,9 +248,11 @@ def test_a_few_failures_may_be_allowed(new_context: Callable[..., GateContext]) 
     """nworld=5 of seed 0 has world 4 off; allowed, it is still named."""
     result = play(new_context("sim=native", "nworld=5", "gate.batch.failed_worlds=1", TIGHT), None)
     assert result.status is Status.passed
-    assert "4 of 5 worlds accepted (80 %," in result.reason
+    assert "4 of 5 worlds succeeded (80 %," in result.reason
     assert "1 of 5 worlds (4) failed: not stacked in 1" in result.reason
-    assert not {"episode_s", "world_steps_per_s"} & set(result.metrics)  # allowed, and void nonetheless
+    assert not {"episode_s", "world_steps_per_s"} & set(
+        result.metrics
+    )  # allowed, and void nonetheless
 
 
 def test_no_trajectory_is_kept(new_context: Callable[..., GateContext], tmp_path: Path) -> None:

@@ -19,16 +19,19 @@ from test_robot_models import REPO, upstream
 from mjstack import benchmark_ik
 from mjstack.config import load_config
 from mjstack.config.schema import RobotCfg
+from mjstack.episodes.context import GateContext
 from mjstack.errors import ArgumentError, ConfigError, MjstackError, UnknownName
-from mjstack.gates.gate import GateContext
 from mjstack.kinematics.batched_ik import BatchedIk
-from mjstack.kinematics.mink_ik import ApertureIk
+from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.robots import robot_spec
 from mjstack.sim.streams import torch_stream_scope
 
 Stage = Callable[[str], GateContext]
 
-CUDA = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")]
+CUDA = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here"),
+]
 DEVICES = ["cpu", pytest.param("cuda:0", marks=CUDA)]
 TOLERANCE = 0.0005  # m, as the scripted controller's
 
@@ -42,7 +45,8 @@ class Arm:
     """A robot in a model, with kinematics of its own by native MuJoCo."""
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
-        self.model, self.robot = model, robot
+        self.model = model
+        self.robot = robot
         self.names = [*robot.arm_joints, *robot.gripper_joints]
         self.low, self.high = np.array([model.joint(name).range for name in self.names]).T
         self.moved = [self.names.index(name) for name in robot.ik_joints]
@@ -51,43 +55,55 @@ class Arm:
             self.home[self.names.index(name)] = value
         self.home[len(robot.arm_joints) :] = robot.gripper_open
 
-    def aperture(self, commands: np.ndarray) -> np.ndarray:
-        data, out = mujoco.MjData(self.model), []
+    def grasp_point(self, commands: np.ndarray) -> np.ndarray:
+        data = mujoco.MjData(self.model)
+        out = []
         for command in np.asarray(commands, dtype=float):
             for name, value in zip(self.names, command, strict=True):
                 data.joint(name).qpos[0] = value
             mujoco.mj_kinematics(self.model, data)
-            out.append(np.mean([data.site(name).xpos for name in self.robot.aperture_sites], axis=0))
+            out.append(np.mean([data.site(name).xpos for name in self.robot.grasp_sites], axis=0))
         return np.array(out)
 
     def directions(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Closing and approach axis."""
-        data, closing, approach = mujoco.MjData(self.model), [], []
+        data = mujoco.MjData(self.model)
+        closing = []
+        approach = []
         for command in np.asarray(commands, dtype=float):
             for name, value in zip(self.names, command, strict=True):
                 data.joint(name).qpos[0] = value
             mujoco.mj_kinematics(self.model, data)
-            first, second = (data.site(name).xpos for name in self.robot.aperture_sites)
+            first, second = (data.site(name).xpos for name in self.robot.grasp_sites)
             closing.append((second - first) / np.linalg.norm(second - first))
-            approach.append(data.body(self.robot.approach_body).xmat.reshape(3, 3) @ self.robot.approach_axis)
+            approach.append(
+                data.body(self.robot.approach_body).xmat.reshape(3, 3) @ self.robot.approach_axis
+            )
         return np.array(closing), np.array(approach)
 
     def jacobian(self, command: np.ndarray) -> np.ndarray:
-        """Of the aperture centre for the joints that inverse kinematics moves, by differences, shape ``(3, n_moved)``."""
+        """Of the grasp point for the joints that inverse kinematics moves, by differences, shape
+        ``(3, n_moved)``.
+        """
         steps = np.zeros((2 * len(self.moved), len(command)))
         for k, j in enumerate(self.moved):
-            steps[2 * k, j], steps[2 * k + 1, j] = 1e-5, -1e-5
-        at = self.aperture(command + steps)
+            steps[2 * k, j] = 1e-5
+            steps[2 * k + 1, j] = -1e-5
+        at = self.grasp_point(command + steps)
         return ((at[::2] - at[1::2]) / 2e-5).T
 
     def spare(self, command: np.ndarray) -> np.ndarray:
-        """Projects onto what those joints can do without moving the centre, shape ``(n_moved, n_moved)``."""
+        """Projects onto what those joints can do without moving the centre, shape ``(n_moved,
+        n_moved)``.
+        """
         jacobian = self.jacobian(command)
         return np.eye(len(self.moved)) - np.linalg.pinv(jacobian) @ jacobian
 
     def free(self, commands: np.ndarray, margin: float = 0.01) -> np.ndarray:
         """Worlds in which no moved joint is near a limit."""
-        q, low, high = commands[:, self.moved], self.low[self.moved], self.high[self.moved]
+        q = commands[:, self.moved]
+        low = self.low[self.moved]
+        high = self.high[self.moved]
         return ((q > low + margin) & (q < high - margin)).all(1)
 
     def solver(self, nworld: int, device: str = "cpu", **settings: float) -> BatchedIk:
@@ -98,29 +114,40 @@ class Arm:
 
     def at_limits(self, nworld: int, seed: int) -> np.ndarray:
         """As `anywhere`, with about half of those joints at a limit, 1e-5 rad inside."""
-        commands, rng = self.anywhere(nworld, seed), np.random.default_rng(seed + 1000)
-        low, high = self.low + 1e-5, self.high - 1e-5
+        commands = self.anywhere(nworld, seed)
+        rng = np.random.default_rng(seed + 1000)
+        low = self.low + 1e-5
+        high = self.high - 1e-5
         ends = np.where(rng.random(commands.shape) < 0.5, low, high)
         chosen = rng.random(commands.shape) < 0.5
-        commands[:, self.moved] = np.where(chosen, ends, np.clip(commands, low, high))[:, self.moved]
+        commands[:, self.moved] = np.where(chosen, ends, np.clip(commands, low, high))[
+            :, self.moved
+        ]
         return commands
 
     def anywhere(self, nworld: int, seed: int) -> np.ndarray:
-        """Random positions of the joints that inverse kinematics moves; the others at home, gripper open."""
+        """Random positions of the joints that inverse kinematics moves; the others at home, gripper
+        open.
+        """
         commands = self.at_home(nworld)
         moved = self.moved
-        commands[:, moved] = np.random.default_rng(seed).uniform(self.low[moved], self.high[moved], (nworld, len(moved)))
+        commands[:, moved] = np.random.default_rng(seed).uniform(
+            self.low[moved], self.high[moved], (nworld, len(moved))
+        )
         return commands
 
 
-def above_table(context: GateContext, arm: Arm, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Random commands, and where they bring the aperture centre: up to 25 cm above the table."""
-    center, half = np.array(context.cfg.scene.table_center), np.array(context.cfg.scene.table_half)
+def above_table(
+    context: GateContext, arm: Arm, n: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Random commands, and where they bring the grasp point: up to 25 cm above the table."""
+    center = np.array(context.cfg.scene.table_center)
+    half = np.array(context.cfg.scene.table_half)
     commands: list[np.ndarray] = []
     points: list[np.ndarray] = []
     while sum(map(len, points)) < n:
         tried = arm.anywhere(4000, seed)
-        at = arm.aperture(tried)
+        at = arm.grasp_point(tried)
         height = at[:, 2] - center[2] - half[2]
         inside = (np.abs(at - center)[:, :2] <= half[:2]).all(1) & (height > 0.0) & (height < 0.25)
         commands.append(tried[inside])
@@ -133,7 +160,9 @@ def tensors(device: str, *arrays: np.ndarray) -> list[torch.Tensor]:
     return [torch.as_tensor(array, device=device) for array in arrays]
 
 
-def results(ik: BatchedIk, command: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def results(
+    ik: BatchedIk, command: np.ndarray, target: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """A solve, copied to the host as float64."""
     new, distance = ik.solve(*tensors(str(ik.device), command, target))
     return new.cpu().numpy().astype(float), distance.cpu().numpy().astype(float)
@@ -150,7 +179,9 @@ def arm(robot: str, get_arm: Callable[[str], Arm]) -> Arm:
 
 
 @pytest.fixture(scope="module")
-def workspace(stage: Stage, get_arm: Callable[[str], Arm]) -> Callable[[str], tuple[np.ndarray, np.ndarray]]:
+def workspace(
+    stage: Stage, get_arm: Callable[[str], Arm]
+) -> Callable[[str], tuple[np.ndarray, np.ndarray]]:
     made: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def get(robot: str) -> tuple[np.ndarray, np.ndarray]:
@@ -162,25 +193,34 @@ def workspace(stage: Stage, get_arm: Callable[[str], Arm]) -> Callable[[str], tu
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_aperture_is_native_mujocos(arm: Arm, device: str, dtype: torch.dtype) -> None:
+def test_grasp_point_is_native_mujocos(arm: Arm, device: str, dtype: torch.dtype) -> None:
     commands = np.random.default_rng(1).uniform(arm.low, arm.high, (200, len(arm.names)))
-    centre = arm.solver(200, device).aperture(torch.as_tensor(commands, dtype=dtype, device=device))
+    centre = arm.solver(200, device).grasp_point(
+        torch.as_tensor(commands, dtype=dtype, device=device)
+    )
     assert centre.shape == (200, 3)
     assert centre.dtype == torch.float32
-    assert np.abs(centre.cpu().numpy() - arm.aperture(commands)).max() <= 1e-6
+    assert np.abs(centre.cpu().numpy() - arm.grasp_point(commands)).max() <= 1e-6
 
 
-def test_targets_in_the_workspace_are_reached(robot: str, arm: Arm, device: str, workspace: Callable) -> None:
+def test_targets_in_the_workspace_are_reached(
+    robot: str, arm: Arm, device: str, workspace: Callable
+) -> None:
     _, targets = workspace(robot)
     start = arm.at_home(len(targets))
     command, distance = results(arm.solver(len(targets), device, iterations=40), start, targets)
-    miss = np.linalg.norm(arm.aperture(command) - targets, axis=1)
-    print(f"{robot}: {(miss <= TOLERANCE).mean():.2%} within 0.5 mm, largest {1e6 * miss.max():.2f} um")
+    miss = np.linalg.norm(arm.grasp_point(command) - targets, axis=1)
+    print(
+        f"{robot}: {(miss <= TOLERANCE).mean():.2%} within 0.5 mm, largest"
+        f" {1e6 * miss.max():.2f} um"
+    )
     assert (miss <= 0.00001).all()
     np.testing.assert_allclose(distance, miss, atol=1e-6)
 
 
-def test_eight_iterations_reach_almost_every_target_from_home(robot: str, arm: Arm, workspace: Callable) -> None:
+def test_eight_iterations_reach_almost_every_target_from_home(
+    robot: str, arm: Arm, workspace: Callable
+) -> None:
     _, targets = workspace(robot)
     _, distance = results(arm.solver(len(targets)), arm.at_home(len(targets)), targets)
     assert (distance <= TOLERANCE).mean() >= 0.99
@@ -191,7 +231,7 @@ class Compared:
     """What mink makes of 1,000 targets, from home and drawn there.
 
     Attributes:
-        targets: Where the aperture centre goes [m], shape ``(1000, 3)``.
+        targets: Where the grasp point goes [m], shape ``(1000, 3)``.
         commands: Where mink ended, gripper open, shape ``(1000, nu)``.
         reached: Whether within the tolerance.
     """
@@ -207,30 +247,43 @@ class Compared:
 
 
 @pytest.fixture(scope="module")
-def by_mink(stage: Stage, get_arm: Callable[[str], Arm], workspace: Callable) -> Callable[[str], dict[str, Compared]]:
-    """On and above the table, and wherever the arm reaches above the table's height; each target is solved once."""
+def by_mink(
+    stage: Stage, get_arm: Callable[[str], Arm], workspace: Callable
+) -> Callable[[str], dict[str, Compared]]:
+    """On and above the table, and wherever the arm reaches above the table's height; each target is
+    solved once.
+    """
     made: dict[str, dict[str, Compared]] = {}
 
     def get(robot: str) -> dict[str, Compared]:
         if robot not in made:
-            context, arm = stage(robot), get_arm(robot)
+            context = stage(robot)
+            arm = get_arm(robot)
             top = context.cfg.scene.table_center[2] + context.cfg.scene.table_half[2]
-            anywhere = arm.aperture(arm.anywhere(3000, 25))
+            anywhere = arm.grasp_point(arm.anywhere(3000, 25))
             anywhere = anywhere[anywhere[:, 2] > top][:1000]
             assert len(anywhere) == 1000
-            mink = ApertureIk(arm.robot, context.cfg.model, tolerance=TOLERANCE, iterations=60)
+            mink = GraspIk(arm.robot, context.cfg.model, tolerance=TOLERANCE, iterations=60)
             made[robot] = {}
-            for where, targets in (("on and above the table", workspace(robot)[1]), ("wherever it reaches", anywhere)):
-                pairs = [mink.solve(target, np.array(arm.robot.gripper_open), arm.home) for target in targets]
+            for where, targets in (
+                ("on and above the table", workspace(robot)[1]),
+                ("wherever it reaches", anywhere),
+            ):
+                pairs = [
+                    mink.solve(target, np.array(arm.robot.gripper_open), arm.home)
+                    for target in targets
+                ]
                 distance = np.array([left for _, left in pairs])
-                made[robot][where] = Compared(targets, np.array([command for command, _ in pairs]), distance <= TOLERANCE)
+                made[robot][where] = Compared(
+                    targets, np.array([command for command, _ in pairs]), distance <= TOLERANCE
+                )
         return made[robot]
 
     return get
 
 
 def shipped(context: GateContext) -> dict[str, float]:
-    """The gains with which ``controller=scripted`` runs."""
+    """The gains with which ``controller=closed_loop`` runs."""
     c = context.cfg.controller
     return {"posture_gain": c.posture_gain, "approach_gain": c.approach_gain}
 
@@ -239,21 +292,28 @@ def shipped(context: GateContext) -> dict[str, float]:
 def test_reaches_what_mink_reaches(
     robot: str, gains: str, stage: Stage, arm: Arm, by_mink: Callable, capsys: pytest.CaptureFixture
 ) -> None:
-    """From home, in 40 iterations: with the gains that the robot is shipped with, and drawn home as mink is.
+    """From home, in 40 iterations: with the gains that the robot is shipped with, and drawn home as
+    mink is.
 
-    In front of the base nothing that mink reaches is missed. Behind it, where the way from home ends at the joints' limits,
-    either one ends short at times where the other arrives; with the base turned as mink turned it, nothing is missed at all.
-    """
-    ik = arm.solver(1000, iterations=40, **(shipped(stage(robot)) if gains == "shipped" else {"posture_gain": 0.3}))
+    In front of the base nothing that mink reaches is missed. Behind it, where the way from home
+    ends at the joints' limits, either one ends short at times where the other arrives; with the
+    base turned as mink turned it, nothing is missed at all."""
+    ik = arm.solver(
+        1000,
+        iterations=40,
+        **(shipped(stage(robot)) if gains == "shipped" else {"posture_gain": 0.3}),
+    )
     for where, mink in by_mink(robot).items():
-        theirs, front = mink.reached, mink.front
+        theirs = mink.reached
+        front = mink.front
         command, distance = results(ik, arm.at_home(1000), mink.targets)
         ours = distance <= TOLERANCE
         missed = theirs & ~ours
         with capsys.disabled():
             print(
-                f"\n{robot}, {gains}, {where}: of 1000 mink reaches {theirs.sum()}, batched {ours.sum()}, only mink "
-                f"{missed.sum()} (in front of the base {(missed & front).sum()}), only batched {(ours & ~theirs).sum()}"
+                f"\n{robot}, {gains}, {where}: of 1000 mink reaches {theirs.sum()}, batched"
+                f" {ours.sum()}, only mink {missed.sum()} (in front of the base"
+                f" {(missed & front).sum()}), only batched {(ours & ~theirs).sum()}"
             )
             for target, left in zip(mink.targets[missed], distance[missed], strict=True):
                 print(f"  only mink: {target.round(3)} m, batched ends {1e3 * left:.1f} mm off")
@@ -267,33 +327,48 @@ def test_reaches_what_mink_reaches(
         turned = arm.at_home(1000)
         turned[:, 0] = mink.commands[:, 0]
         assert (results(ik, turned, mink.targets)[1][theirs] <= TOLERANCE).all()
-        np.testing.assert_allclose(np.linalg.norm(arm.aperture(command) - mink.targets, axis=1), distance, atol=1e-6)
+        np.testing.assert_allclose(
+            np.linalg.norm(arm.grasp_point(command) - mink.targets, axis=1), distance, atol=1e-6
+        )
 
 
-def test_drawn_home_it_ends_where_mink_does(robot: str, arm: Arm, by_mink: Callable, capsys: pytest.CaptureFixture) -> None:
+def test_drawn_home_it_ends_where_mink_does(
+    robot: str, arm: Arm, by_mink: Callable, capsys: pytest.CaptureFixture
+) -> None:
     """Both draw the arm home, so most solutions are the same one."""
     ik = arm.solver(1000, iterations=40, posture_gain=0.3)
     for where, mink in by_mink(robot).items():
         command, distance = results(ik, arm.at_home(1000), mink.targets)
         both = mink.reached & (distance <= TOLERANCE)
         apart = np.abs(command - mink.commands)[both].max(1)
-        away, mink_away = (np.linalg.norm(c - arm.home, axis=1)[both] for c in (command, mink.commands))
+        away, mink_away = (
+            np.linalg.norm(c - arm.home, axis=1)[both] for c in (command, mink.commands)
+        )
         with capsys.disabled():
             print(
-                f"\n{robot}, {where}: joints apart: median {np.median(apart):.4f} rad, over 0.1 rad in {(apart > 0.1).sum()}; "
-                f"from home on average {away.mean():.4f} rad, mink {mink_away.mean():.4f} rad"
+                f"\n{robot}, {where}: joints apart: median {np.median(apart):.4f} rad, over 0.1 rad"
+                f" in {(apart > 0.1).sum()}; from home on average {away.mean():.4f} rad, mink"
+                f" {mink_away.mean():.4f} rad"
             )
         assert np.median(apart) < 0.005
         assert (apart < 0.1).mean() > 0.9  # the others bend another way to the same point
         assert away.mean() <= mink_away.mean() + 0.001
 
 
-def test_an_approach_gain_leans_less_than_mink(stage: Stage, get_arm: Callable[[str], Arm], by_mink: Callable) -> None:
-    """What SO-101's gain is for: above the table its gripper is nowhere more tilted than where mink is drawn home."""
-    arm, mink = get_arm("so101"), by_mink("so101")["on and above the table"]
-    command, _ = results(arm.solver(1000, iterations=40, **shipped(stage("so101"))), arm.at_home(1000), mink.targets)
+def test_an_approach_gain_leans_less_than_mink(
+    stage: Stage, get_arm: Callable[[str], Arm], by_mink: Callable
+) -> None:
+    """What SO-101's gain is for: above the table its gripper is nowhere more tilted than where mink
+    is drawn home.
+    """
+    arm = get_arm("so101")
+    mink = by_mink("so101")["on and above the table"]
+    command, _ = results(
+        arm.solver(1000, iterations=40, **shipped(stage("so101"))), arm.at_home(1000), mink.targets
+    )
     tilt, mink_tilt = (
-        np.degrees(np.arccos(np.clip(-arm.directions(c[mink.reached])[1][:, 2], -1.0, 1.0))) for c in (command, mink.commands)
+        np.degrees(np.arccos(np.clip(-arm.directions(c[mink.reached])[1][:, 2], -1.0, 1.0)))
+        for c in (command, mink.commands)
     )
     print(f"so101: tilted by {tilt.mean():.1f} degrees on average, mink {mink_tilt.mean():.1f}")
     assert (tilt <= mink_tilt + 1.0).all()
@@ -303,30 +378,36 @@ def test_an_approach_gain_leans_less_than_mink(stage: Stage, get_arm: Callable[[
 def test_follows_minks_way_as_shipped(
     robot: str, stage: Stage, arm: Arm, by_mink: Callable, capsys: pytest.CaptureFixture
 ) -> None:
-    """With the controller's iterations per frame and its gains, along the way from home to each of mink's solutions.
+    """With the controller's iterations per step and its gains, along the way from home to each of
+    mink's solutions.
 
-    Above the table all of it is followed. Elsewhere SO-101 is lost at times where the way comes as near to the base's axis as
-    the arm can, 26 mm: there no joint moves the aperture in or out, the base may turn either way, and on to its limit.
-    """
-    data, frames = mujoco.MjData(arm.model), 200
+    Above the table all of it is followed. Elsewhere SO-101 is lost at times where the way comes as
+    near to the base's axis as the arm can, 26 mm: there no joint moves the grasp_point in or out,
+    the base may turn either way, and on to its limit."""
+    data = mujoco.MjData(arm.model)
+    steps = 200
     mujoco.mj_kinematics(arm.model, data)
     axis = data.joint(arm.names[0]).xanchor[:2]
-    ik = arm.solver(1000, iterations=stage(robot).cfg.controller.frame_iterations, **shipped(stage(robot)))
+    ik = arm.solver(
+        1000, iterations=stage(robot).cfg.controller.step_iterations, **shipped(stage(robot))
+    )
     for where, mink in by_mink(robot).items():
         goal = mink.commands.copy()
         goal[:, len(arm.robot.arm_joints) :] = arm.robot.gripper_open
-        command, worst, radius = torch.as_tensor(arm.at_home(1000)), np.zeros(1000), np.full(1000, np.inf)
-        for u in np.arange(1, frames + 1) / frames:
+        command = torch.as_tensor(arm.at_home(1000))
+        worst = np.zeros(1000)
+        radius = np.full(1000, np.inf)
+        for u in np.arange(1, steps + 1) / steps:
             way = torch.as_tensor(arm.home + u * u * (3.0 - 2.0 * u) * (goal - arm.home))
-            target = ik.aperture(way).clone()
+            target = ik.grasp_point(way).clone()
             command, left = (out.clone() for out in ik.solve(command, target))
             worst = np.maximum(worst, left.numpy())
             radius = np.minimum(radius, np.linalg.norm(target.numpy()[:, :2] - axis, axis=1))
         lost = mink.reached & ~(worst <= TOLERANCE)
         with capsys.disabled():
             print(
-                f"\n{robot}, {where}: {lost.sum()} of {mink.reached.sum()} ways not followed within 0.5 mm, "
-                f"{(mink.reached & ~(left.numpy() <= TOLERANCE)).sum()} targets missed"
+                f"\n{robot}, {where}: {lost.sum()} of {mink.reached.sum()} ways not followed within"
+                f" 0.5 mm, {(mink.reached & ~(left.numpy() <= TOLERANCE)).sum()} targets missed"
             )
         assert (radius[lost] < 0.03).all()
         if where == "on and above the table":
@@ -339,9 +420,16 @@ GAINS = [(0.3, 0.0), (0.0, 0.3), (0.1, 0.3)]
 
 @pytest.mark.parametrize(("posture_gain", "approach_gain"), GAINS)
 def test_gains_do_not_spoil_the_position(
-    robot: str, arm: Arm, device: str, workspace: Callable, posture_gain: float, approach_gain: float
+    robot: str,
+    arm: Arm,
+    device: str,
+    workspace: Callable,
+    posture_gain: float,
+    approach_gain: float,
 ) -> None:
-    """Neither from afar nor on the way: a target that moves 5 mm a frame, from postures far from the one that is wanted."""
+    """Neither from afar nor on the way: a target that moves 5 mm a step, from postures far from the
+    one that is wanted.
+    """
     start, targets = workspace(robot)
     gains = {"posture_gain": posture_gain, "approach_gain": approach_gain}
     ik = arm.solver(1000, device, iterations=40, **gains)
@@ -352,7 +440,8 @@ def test_gains_do_not_spoil_the_position(
     free = arm.free(start, 0.3)
     assert free.sum() > 100
     ik = arm.solver(1000, device, iterations=8, **gains)
-    command, worst = start, np.zeros(1000)
+    command = start
+    worst = np.zeros(1000)
     for k in range(6):
         towards_home = targets + 0.005 * k * np.array([-1.0, 0.0, 0.0])
         command, distance = results(ik, command, towards_home)
@@ -361,8 +450,12 @@ def test_gains_do_not_spoil_the_position(
     assert (worst[free] <= 0.0001).mean() >= 0.98
 
 
-def test_a_posture_is_approached_as_far_as_the_target_allows(robot: str, arm: Arm, device: str, workspace: Callable) -> None:
-    """At the end nothing of the way to it is left that would not move the centre: checked with native MuJoCo's Jacobian."""
+def test_a_posture_is_approached_as_far_as_the_target_allows(
+    robot: str, arm: Arm, device: str, workspace: Callable
+) -> None:
+    """At the end nothing of the way to it is left that would not move the centre: checked with
+    native MuJoCo's Jacobian.
+    """
     start, targets = workspace(robot)
     posture = arm.home.copy()
     posture[arm.moved] += 0.3
@@ -371,9 +464,17 @@ def test_a_posture_is_approached_as_far_as_the_target_allows(robot: str, arm: Ar
     command = ik.solve(given, goal, wanted)[0].cpu().numpy().astype(float)
     plain, _ = results(arm.solver(1000, device, iterations=100), start, targets)
     left = (posture - command)[:, arm.moved]
-    assert (np.linalg.norm(left, axis=1) <= np.linalg.norm((posture - plain)[:, arm.moved], axis=1) + 0.01).mean() > 0.98
-    # Near a stretched arm the damping lets the posture count along what would move the centre, which settling then undoes.
-    supple = [w for w in np.flatnonzero(arm.free(command))[:300] if np.linalg.svd(arm.jacobian(command[w]))[1][-1] > 0.1]
+    assert (
+        np.linalg.norm(left, axis=1)
+        <= np.linalg.norm((posture - plain)[:, arm.moved], axis=1) + 0.01
+    ).mean() > 0.98
+    # Near a stretched arm the damping lets the posture count along what would move the centre,
+    # which settling then undoes.
+    supple = [
+        w
+        for w in np.flatnonzero(arm.free(command))[:300]
+        if np.linalg.svd(arm.jacobian(command[w]))[1][-1] > 0.1
+    ]
     free = np.array(supple)
     assert len(free) > 150
     open_ = [np.abs(arm.spare(command[w]) @ left[w]).max() for w in free]
@@ -386,12 +487,19 @@ def test_a_posture_is_approached_as_far_as_the_target_allows(robot: str, arm: Ar
 def test_the_approach_axis_turns_down_as_far_as_the_target_allows(
     robot: str, arm: Arm, device: str, workspace: Callable
 ) -> None:
-    """At the end no motion that leaves the centre turns it further down, by differences of native MuJoCo's kinematics."""
+    """At the end no motion that leaves the centre turns it further down, by differences of native
+    MuJoCo's kinematics.
+    """
     start, targets = workspace(robot)
-    command, _ = results(arm.solver(1000, device, iterations=200, approach_gain=0.3), start, targets)
+    command, _ = results(
+        arm.solver(1000, device, iterations=200, approach_gain=0.3), start, targets
+    )
     plain, _ = results(arm.solver(1000, device, iterations=40), start, targets)
     down, plain_down = (-arm.directions(c)[1][:, 2] for c in (command, plain))
-    print(f"{robot}: tilted by {np.degrees(np.arccos([down, plain_down])).mean(1).round(1)} degrees with and without")
+    print(
+        f"{robot}: tilted by {np.degrees(np.arccos([down, plain_down])).mean(1).round(1)} degrees"
+        " with and without"
+    )
     assert (down >= plain_down - 1e-3).mean() > 0.97
     assert down.mean() > plain_down.mean() + 0.2
     free = np.flatnonzero(arm.free(command))[:100]
@@ -399,15 +507,20 @@ def test_the_approach_axis_turns_down_as_far_as_the_target_allows(
     slopes = []
     for w in free:
         steps = np.zeros((2 * len(arm.moved), len(arm.names)))
-        steps[::2, arm.moved], steps[1::2, arm.moved] = 1e-4 * np.eye(len(arm.moved)), -1e-4 * np.eye(len(arm.moved))
+        steps[::2, arm.moved] = 1e-4 * np.eye(len(arm.moved))
+        steps[1::2, arm.moved] = -1e-4 * np.eye(len(arm.moved))
         z = -arm.directions(command[w] + steps)[1][:, 2]
         slopes.append(np.abs(arm.spare(command[w]) @ ((z[::2] - z[1::2]) / 2e-4)).max())
     print(f"{robot}: slope {np.quantile(slopes, 0.9):.4f} of {len(free)}")
     assert np.quantile(slopes, 0.9) < 0.01
 
 
-def test_the_approach_axis_turns_where_it_is_wished(robot: str, arm: Arm, device: str, workspace: Callable) -> None:
-    """Each world to a direction of its own, which a posture nearby is known to have at the same target."""
+def test_the_approach_axis_turns_where_it_is_wished(
+    robot: str, arm: Arm, device: str, workspace: Callable
+) -> None:
+    """Each world to a direction of its own, which a posture nearby is known to have at the same
+    target.
+    """
     start, _ = workspace(robot)
     start = start[arm.free(start, 0.5)][:300]
     goal = start.copy()
@@ -415,19 +528,29 @@ def test_the_approach_axis_turns_where_it_is_wished(robot: str, arm: Arm, device
         spare = arm.spare(start[world])
         way = spare[np.argmax(np.linalg.norm(spare, axis=1))]
         goal[world, arm.moved] += 0.3 * way / np.linalg.norm(way)
-    target, wished = arm.aperture(goal), arm.directions(goal)[1]
+    target = arm.grasp_point(goal)
+    wished = arm.directions(goal)[1]
     (direction,) = tensors(device, wished)
     ik = arm.solver(len(start), device, iterations=200, approach_gain=0.3)
-    command, distance = (a.cpu().double().numpy() for a in ik.solve(*tensors(device, start, target), approach=direction))
-    before, after = (np.degrees(np.arccos(np.clip((arm.directions(c)[1] * wished).sum(1), -1, 1))) for c in (start, command))
+    command, distance = (
+        a.cpu().double().numpy()
+        for a in ik.solve(*tensors(device, start, target), approach=direction)
+    )
+    before, after = (
+        np.degrees(np.arccos(np.clip((arm.directions(c)[1] * wished).sum(1), -1, 1)))
+        for c in (start, command)
+    )
     print(
-        f"{robot}: off by {np.median(before):.1f} degrees before, {np.quantile(after, 0.95):.3f} after in 95 % of {len(start)}"
+        f"{robot}: off by {np.median(before):.1f} degrees before, {np.quantile(after, 0.95):.3f}"
+        f" after in 95 % of {len(start)}"
     )
     assert len(start) > 50
     assert np.median(before) > 3.0
     assert (after < 1.0).mean() > 0.95
     assert (distance <= 0.0001).all()
-    down = ik.solve(*tensors(device, start, target))[0].cpu().double().numpy()  # not where it was wished before
+    down = (
+        ik.solve(*tensors(device, start, target))[0].cpu().double().numpy()
+    )  # not where it was wished before
     assert np.mean(arm.directions(down)[1][:, 2]) < np.mean(wished[:, 2]) - 0.1
 
 
@@ -440,12 +563,14 @@ def test_a_wished_approach_needs_a_gain_and_a_direction_per_world(arm: Arm) -> N
         arm.solver(4, "cpu", approach_gain=0.1).solve(start, start[:, :3], approach=down)
 
 
-def test_a_start_at_its_target_still_goes_to_the_posture(robot: str, arm: Arm, device: str, workspace: Callable) -> None:
+def test_a_start_at_its_target_still_goes_to_the_posture(
+    robot: str, arm: Arm, device: str, workspace: Callable
+) -> None:
     """Though no later iterate is nearer to the target than the first one."""
     start, _ = workspace(robot)
     start = start[arm.free(start, 0.2)]
     n = len(start)
-    at = arm.aperture(start)
+    at = arm.grasp_point(start)
     command, distance = results(arm.solver(n, device, iterations=40, posture_gain=0.3), start, at)
     before, after = (np.linalg.norm((c - arm.home)[:, arm.moved], axis=1) for c in (start, command))
     assert (distance <= 0.0001).all()
@@ -454,7 +579,8 @@ def test_a_start_at_its_target_still_goes_to_the_posture(robot: str, arm: Arm, d
 
 
 def test_postures_of_all_worlds_or_each(arm: Arm, device: str) -> None:
-    start, target = arm.anywhere(16, 30), arm.aperture(arm.anywhere(16, 31))
+    start = arm.anywhere(16, 30)
+    target = arm.grasp_point(arm.anywhere(16, 31))
     ik = arm.solver(16, device, iterations=20, posture_gain=0.3)
     given, goal, home, other = tensors(device, start, target, arm.home, arm.anywhere(16, 32))
     by_default = ik.solve(given, goal)[0].clone()
@@ -462,14 +588,15 @@ def test_postures_of_all_worlds_or_each(arm: Arm, device: str) -> None:
     assert torch.equal(ik.solve(given, goal, home.repeat(16, 1))[0], by_default)
     each = ik.solve(given, goal, other)[0].clone()
     assert not torch.allclose(each, by_default, atol=1e-3)
-    (first,) = (ik.solve(given, goal, other[0])[0].clone(),)
+    first = ik.solve(given, goal, other[0])[0].clone()
     assert torch.equal(each[0], first[0])
     assert not torch.allclose(each[1:], first[1:], atol=1e-3)
     assert torch.equal(ik.solve(given, goal)[0], by_default)  # home again
 
 
 def test_a_posture_that_is_not_finite_stays_in_its_world(arm: Arm, device: str) -> None:
-    start, target = arm.at_home(4), arm.aperture(arm.anywhere(4, 33))
+    start = arm.at_home(4)
+    target = arm.grasp_point(arm.anywhere(4, 33))
     ik = arm.solver(4, device, posture_gain=0.3)
     given, goal, posture = tensors(device, start, target, arm.at_home(4))
     clean = ik.solve(given, goal, posture)[0].clone()
@@ -482,8 +609,15 @@ def test_a_posture_that_is_not_finite_stays_in_its_world(arm: Arm, device: str) 
 
 
 @pytest.mark.parametrize("tolerance", [0.0005, 0.02])
-def test_unreachable_is_a_distance_above_the_tolerance(arm: Arm, device: str, tolerance: float) -> None:
-    target = np.vstack([arm.aperture(arm.anywhere(200, 34)), np.random.default_rng(35).uniform(-1.0, 1.0, (200, 3))])
+def test_unreachable_is_a_distance_above_the_tolerance(
+    arm: Arm, device: str, tolerance: float
+) -> None:
+    target = np.vstack(
+        [
+            arm.grasp_point(arm.anywhere(200, 34)),
+            np.random.default_rng(35).uniform(-1.0, 1.0, (200, 3)),
+        ]
+    )
     target[7] = np.nan
     ik = arm.solver(400, device, iterations=20, tolerance=tolerance)
     _, distance = results(ik, arm.at_home(400), target)
@@ -494,7 +628,7 @@ def test_unreachable_is_a_distance_above_the_tolerance(arm: Arm, device: str, to
     assert found[7]
     assert 50 < found.sum() < 350
     address = ik.unreachable.data_ptr()
-    results(ik, arm.at_home(400), arm.aperture(arm.at_home(400)))
+    results(ik, arm.at_home(400), arm.grasp_point(arm.at_home(400)))
     assert ik.unreachable.data_ptr() == address
     assert not ik.unreachable.any()
 
@@ -517,21 +651,28 @@ def test_directions_are_native_mujocos(arm: Arm, device: str, dtype: torch.dtype
 
 
 @pytest.mark.parametrize("source", ["builtin", "menagerie"])
-def test_the_approach_axis_leads_from_the_wrist_to_the_aperture(
+def test_the_approach_axis_leads_from_the_wrist_to_the_grasp_point(
     robot: str, source: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is the axis about which the last arm joint rolls, away from the wrist, and across the way the jaws close."""
+    """It is the axis about which the last arm joint rolls, away from the wrist, and across the way
+    the jaws close.
+    """
     if source == "menagerie":
         upstream(robot)
-        monkeypatch.setenv("MENAGERIE_ROOT", os.environ.get("MENAGERIE_ROOT", str(REPO.parent / "shared" / "menagerie")))
+        monkeypatch.setenv(
+            "MENAGERIE_ROOT",
+            os.environ.get("MENAGERIE_ROOT", str(REPO.parent / "shared" / "menagerie")),
+        )
     cfg = load_config([f"robot={robot}", f"model={source}"])
     arm = Arm(robot_spec(cfg.robot, cfg.model).compile(), cfg.robot)
     data = mujoco.MjData(arm.model)
-    for name, value in zip(arm.names, [*arm.home[: len(cfg.robot.arm_joints)], *cfg.robot.gripper_closed], strict=True):
+    for name, value in zip(
+        arm.names, [*arm.home[: len(cfg.robot.arm_joints)], *cfg.robot.gripper_closed], strict=True
+    ):
         data.joint(name).qpos[0] = value
     mujoco.mj_kinematics(arm.model, data)
     roll = data.joint(cfg.robot.arm_joints[-1])
-    first, second = (data.site(name).xpos for name in cfg.robot.aperture_sites)
+    first, second = (data.site(name).xpos for name in cfg.robot.grasp_sites)
     approach = data.body(cfg.robot.approach_body).xmat.reshape(3, 3) @ cfg.robot.approach_axis
     assert abs(approach @ roll.xaxis) == pytest.approx(1.0, abs=1e-6)
     assert approach @ (0.5 * (first + second) - roll.xanchor) > 0.09
@@ -539,13 +680,15 @@ def test_the_approach_axis_leads_from_the_wrist_to_the_aperture(
 
 
 def test_small_steps_arrive(robot: str, arm: Arm, device: str, workspace: Callable) -> None:
-    """Reachable targets some 5 mm away, made by moving the joints a little in a random direction."""
+    """Reachable targets some 5 mm away, made by moving the joints a little in a random
+    direction.
+    """
     start, here = workspace(robot)
     nudge = np.zeros_like(start)
     nudge[:, arm.moved] = np.random.default_rng(2).normal(size=(len(start), len(arm.moved)))
-    slope = np.linalg.norm(arm.aperture(start + 1e-4 * nudge) - here, axis=1) / 1e-4
+    slope = np.linalg.norm(arm.grasp_point(start + 1e-4 * nudge) - here, axis=1) / 1e-4
     goal = start + nudge * (0.005 / slope)[:, None]
-    target = arm.aperture(goal)
+    target = arm.grasp_point(goal)
     near = np.abs(np.linalg.norm(target - here, axis=1) - 0.005) < 0.0005
     usable = near & ((goal >= arm.low) & (goal <= arm.high)).all(1)
     assert usable.sum() > 800
@@ -553,7 +696,10 @@ def test_small_steps_arrive(robot: str, arm: Arm, device: str, workspace: Callab
     moved = command[:, arm.moved]
     free = ((moved > arm.low[arm.moved] + 1e-3) & (moved < arm.high[arm.moved] - 1e-3)).all(1)
     assert (usable & free).sum() > 700
-    print(f"{robot}: {distance[usable & free].max() * 1e6:.2f} um at most, {distance[usable & ~free]} m at limits")
+    print(
+        f"{robot}: {distance[usable & free].max() * 1e6:.2f} um at most, {distance[usable & ~free]}"
+        " m at limits"
+    )
     assert (distance[usable & free] <= 0.0001).all()
     assert np.abs(command - start)[usable].max() < 0.5
 
@@ -561,27 +707,36 @@ def test_small_steps_arrive(robot: str, arm: Arm, device: str, workspace: Callab
 def test_limits_hold_and_the_other_joints_stay(arm: Arm, device: str) -> None:
     """Even from commands beyond the limits, and towards targets that pull against them."""
     rng = np.random.default_rng(4)
-    start = rng.uniform(arm.low - 0.5, arm.high + 0.5, (500, len(arm.names))).astype(np.float32).astype(float)
+    start = (
+        rng.uniform(arm.low - 0.5, arm.high + 0.5, (500, len(arm.names)))
+        .astype(np.float32)
+        .astype(float)
+    )
     command, distance = results(arm.solver(500, device), start, rng.uniform(-0.6, 0.6, (500, 3)))
-    low, high = arm.low.copy(), arm.high.copy()
+    low = arm.low.copy()
+    high = arm.high.copy()
     for i, name in enumerate(arm.names):
         low[i], high[i] = np.clip(arm.model.actuator(name).ctrlrange, low[i], high[i])
     moved = arm.moved
     assert ((command >= low) & (command <= high))[:, moved].all()
-    assert ((command == low.astype(np.float32)) | (command == high.astype(np.float32)))[:, moved].any()
+    assert ((command == low.astype(np.float32)) | (command == high.astype(np.float32)))[
+        :, moved
+    ].any()
     others = [i for i in range(len(arm.names)) if i not in moved]
     np.testing.assert_array_equal(command[:, others], start[:, others])
     assert np.isfinite(distance).all()
 
 
 def test_small_steps_arrive_from_limits(robot: str, arm: Arm) -> None:
-    """Joints that cannot follow leave the work to the others; solving for all and cutting the step would stall."""
+    """Joints that cannot follow leave the work to the others; solving for all and cutting the step
+    would stall.
+    """
     start = arm.at_limits(2000, 23)
     goal = start.copy()
     goal[:, arm.moved] += np.random.default_rng(24).normal(scale=0.02, size=(2000, len(arm.moved)))
     goal = np.clip(goal, arm.low, arm.high)
-    target = arm.aperture(goal)
-    near = np.linalg.norm(target - arm.aperture(start), axis=1) < 0.01
+    target = arm.grasp_point(goal)
+    near = np.linalg.norm(target - arm.grasp_point(start), axis=1) < 0.01
     assert near.sum() > 500
     _, distance = results(arm.solver(2000), start, target)
     print(f"{robot}: {(distance[near] <= 0.0001).mean():.2%} of {near.sum()} within 0.1 mm")
@@ -593,12 +748,14 @@ def test_never_farther_than_the_start(arm: Arm, device: str, iterations: int) ->
     """The cases are those where a single step can overshoot: near a limit, and far away."""
     rng = np.random.default_rng(6)
     start = arm.at_limits(2000, 5)
-    at = arm.aperture(start)
+    at = arm.grasp_point(start)
     target = np.where(
-        np.arange(2000)[:, None] < 1500, at + rng.normal(scale=0.003, size=(2000, 3)), rng.uniform(-0.8, 0.8, (2000, 3))
+        np.arange(2000)[:, None] < 1500,
+        at + rng.normal(scale=0.003, size=(2000, 3)),
+        rng.uniform(-0.8, 0.8, (2000, 3)),
     )
     command, distance = results(arm.solver(2000, device, iterations=iterations), start, target)
-    before, after = (np.linalg.norm(a - target, axis=1) for a in (at, arm.aperture(command)))
+    before, after = (np.linalg.norm(a - target, axis=1) for a in (at, arm.grasp_point(command)))
     assert (after <= before + 1e-6).all()
     assert (after < before - 1e-4).mean() > 0.5
     np.testing.assert_allclose(distance, after, atol=1e-6)
@@ -616,13 +773,14 @@ def test_unreachable_target_shows_in_the_distance(arm: Arm, device: str) -> None
 def test_a_start_at_its_target_stays(arm: Arm, device: str) -> None:
     ik = arm.solver(50, device)
     start = np.clip(arm.anywhere(50, 7), arm.low + 1e-3, arm.high - 1e-3)
-    command, distance = results(ik, start, ik.aperture(*tensors(device, start)).cpu().numpy())
+    command, distance = results(ik, start, ik.grasp_point(*tensors(device, start)).cpu().numpy())
     np.testing.assert_allclose(command, start, atol=1e-5)
     assert (distance <= 1e-6).all()
 
 
 def test_an_approach_that_is_not_finite_stays_in_its_world(arm: Arm, device: str) -> None:
-    start, target = arm.at_home(4), arm.aperture(arm.anywhere(4, 33))
+    start = arm.at_home(4)
+    target = arm.grasp_point(arm.anywhere(4, 33))
     ik = arm.solver(4, device, approach_gain=0.3)
     given, goal, down = tensors(device, start, target, np.tile([0.0, 0.0, -1.0], (4, 1)))
     clean = ik.solve(given, goal, approach=down)[0].clone()
@@ -635,24 +793,31 @@ def test_an_approach_that_is_not_finite_stays_in_its_world(arm: Arm, device: str
 
 
 def test_not_finite_input_stays_in_its_world(arm: Arm, device: str) -> None:
-    start, target = arm.at_home(8), arm.aperture(arm.anywhere(8, 8))
+    start = arm.at_home(8)
+    target = arm.grasp_point(arm.anywhere(8, 8))
     ik = arm.solver(8, device)
     clean_command, clean_distance = results(ik, start, target)
-    start[1, arm.moved[0]], start[2, -1], start[4, 1] = np.nan, np.nan, np.inf
-    target[5, 0], target[6, 2] = np.nan, -np.inf
-    bad, good = [1, 2, 4, 5, 6], [0, 3, 7]
+    start[1, arm.moved[0]] = np.nan
+    start[2, -1] = np.nan
+    start[4, 1] = np.inf
+    target[5, 0] = np.nan
+    target[6, 2] = -np.inf
+    bad = [1, 2, 4, 5, 6]
+    good = [0, 3, 7]
     command, distance = results(ik, start, target)
     assert np.isnan(distance[bad]).all()
     np.testing.assert_array_equal(command[good], clean_command[good])
     np.testing.assert_array_equal(distance[good], clean_distance[good])
     assert np.isnan(command[1, arm.moved[0]])
     np.testing.assert_allclose(command[[5, 6]], start[[5, 6]], atol=1e-6)
-    start, target = arm.at_home(8), arm.aperture(arm.anywhere(8, 8))
+    start = arm.at_home(8)
+    target = arm.grasp_point(arm.anywhere(8, 8))
     np.testing.assert_array_equal(results(ik, start, target)[0], clean_command)
 
 
 def test_world_k_of_n_is_world_k_of_one(robot: str, arm: Arm, workspace: Callable) -> None:
-    start, target = arm.anywhere(64, 9), workspace(robot)[1][:64]
+    start = arm.anywhere(64, 9)
+    target = workspace(robot)[1][:64]
     command, distance = results(arm.solver(64), start, target)
     alone = arm.solver(1)
     for k in range(64):
@@ -663,24 +828,32 @@ def test_world_k_of_n_is_world_k_of_one(robot: str, arm: Arm, workspace: Callabl
 
 def test_outputs_are_rewritten_in_place(arm: Arm, device: str) -> None:
     """Whatever the last call left, of outputs or of working memory, does not show in the next."""
-    start, target = arm.anywhere(20, 10), arm.aperture(arm.anywhere(20, 11))
+    start = arm.anywhere(20, 10)
+    target = arm.grasp_point(arm.anywhere(20, 11))
     ik = arm.solver(20, device)
     tensors_in = tensors(device, start, target)
-    centre, (command, distance) = ik.aperture(tensors_in[0]), ik.solve(*tensors_in)
+    centre, (command, distance) = ik.grasp_point(tensors_in[0]), ik.solve(*tensors_in)
     before = [t.clone() for t in (centre, command, distance)]
 
     for t in (centre, command, distance):
         t.fill_(torch.nan)
-    again_centre, (again_command, again_distance) = ik.aperture(tensors_in[0]), ik.solve(*tensors_in)
+    again_centre, (again_command, again_distance) = (
+        ik.grasp_point(tensors_in[0]),
+        ik.solve(*tensors_in),
+    )
     for old, new, expected in zip(
-        (centre, command, distance), (again_centre, again_command, again_distance), before, strict=True
+        (centre, command, distance),
+        (again_centre, again_command, again_distance),
+        before,
+        strict=True,
     ):
         assert new.data_ptr() == old.data_ptr()
         assert torch.equal(new, expected)
 
 
 def test_its_own_output_can_be_its_input(arm: Arm) -> None:
-    start, target = arm.anywhere(20, 12), arm.aperture(arm.anywhere(20, 13))
+    start = arm.anywhere(20, 12)
+    target = arm.grasp_point(arm.anywhere(20, 13))
     ik = arm.solver(20)
     first, _ = results(ik, start, target)
     second, _ = results(ik, first, target)
@@ -690,7 +863,9 @@ def test_its_own_output_can_be_its_input(arm: Arm) -> None:
 
 
 def test_float32_and_float64_agree(arm: Arm) -> None:
-    start, target = (a.astype(np.float32) for a in (arm.anywhere(20, 14), arm.aperture(arm.anywhere(20, 15))))
+    start, target = (
+        a.astype(np.float32) for a in (arm.anywhere(20, 14), arm.grasp_point(arm.anywhere(20, 15)))
+    )
     ik = arm.solver(20)
     single = results(ik, start, target)
     double = results(ik, start.astype(float), target.astype(float))
@@ -700,8 +875,13 @@ def test_float32_and_float64_agree(arm: Arm) -> None:
 
 def test_the_robot_alone_is_the_robot_in_its_scene(robot: str, stage: Stage, arm: Arm) -> None:
     alone = Arm(robot_spec(stage(robot).cfg.robot, stage(robot).cfg.model).compile(), arm.robot)
-    start, target = arm.anywhere(20, 16), arm.aperture(arm.anywhere(20, 17))
-    for a, b in zip(results(alone.solver(20), start, target), results(arm.solver(20), start, target), strict=True):
+    start = arm.anywhere(20, 16)
+    target = arm.grasp_point(arm.anywhere(20, 17))
+    for a, b in zip(
+        results(alone.solver(20), start, target),
+        results(arm.solver(20), start, target),
+        strict=True,
+    ):
         np.testing.assert_array_equal(a, b)
 
 
@@ -746,7 +926,9 @@ ODD = """
 
 
 def odd_arm() -> Arm:
-    """Slides and hinges beside their body's origin, two in one body, reference angles, one without a command, a fork."""
+    """Slides and hinges beside their body's origin, two in one body, reference angles, one without
+    a command, a fork.
+    """
     robot = RobotCfg(
         arm_joints=["lift", "turn", "bend", "first_finger", "second_finger"],
         gripper_joints=[],
@@ -755,7 +937,7 @@ def odd_arm() -> Arm:
         gripper_closed=[],
         ik_joints=["lift", "turn", "bend", "first_finger", "second_finger"],
         locked={},
-        aperture_sites=["a", "b"],
+        grasp_sites=["a", "b"],
         approach_body="palm",
         approach_axis=[0.0, 0.6, 0.8],
     )
@@ -769,14 +951,20 @@ def test_any_chain_of_hinges_and_slides(device: str) -> None:
     commands[:, 0] = np.clip(commands[:, 0], -0.09, 0.29)
     ik = arm.solver(100, device, iterations=5)
     (given,) = tensors(device, commands)
-    assert np.abs(ik.aperture(given).cpu().numpy() - arm.aperture(commands)).max() <= 1e-6
+    assert np.abs(ik.grasp_point(given).cpu().numpy() - arm.grasp_point(commands)).max() <= 1e-6
     for found, expected in zip(ik.directions(given), arm.directions(commands), strict=True):
         assert np.abs(found.cpu().numpy() - expected).max() <= 2e-6
-    near = np.clip(commands + np.random.default_rng(19).normal(scale=0.005, size=commands.shape), arm.low, arm.high)
+    near = np.clip(
+        commands + np.random.default_rng(19).normal(scale=0.005, size=commands.shape),
+        arm.low,
+        arm.high,
+    )
     near[:, 0] = np.clip(near[:, 0], -0.1, 0.3)
-    command, distance = results(ik, commands, arm.aperture(near))
+    command, distance = results(ik, commands, arm.grasp_point(near))
     assert np.quantile(distance, 0.95) <= 1e-6
-    assert (command[:, 0] >= -0.1).all()  # its actuator's range is narrower below, the joint's above
+    assert (
+        command[:, 0] >= -0.1
+    ).all()  # its actuator's range is narrower below, the joint's above
     _, distance = results(ik, commands, np.tile([0.0, 0.0, -5.0], (100, 1)))
     assert np.isfinite(distance).all()
 
@@ -784,7 +972,9 @@ def test_any_chain_of_hinges_and_slides(device: str) -> None:
 def test_the_narrower_of_both_ranges_holds() -> None:
     arm = odd_arm()
     for z, limit in ((5.0, 0.3), (-5.0, -0.1)):
-        command, _ = results(arm.solver(1, iterations=60), arm.at_home(1), np.array([[0.0, 0.0, z]]))
+        command, _ = results(
+            arm.solver(1, iterations=60), arm.at_home(1), np.array([[0.0, 0.0, z]])
+        )
         assert command[0, 0] == pytest.approx(limit, abs=1e-6)
         assert -0.1 <= command[0, 0] <= 0.3
 
@@ -792,7 +982,7 @@ def test_the_narrower_of_both_ranges_holds() -> None:
 @pytest.mark.parametrize(
     ("change", "name"),
     [
-        ({"aperture_sites": ["a", "lost_site"]}, "site 'lost_site'"),
+        ({"grasp_sites": ["a", "lost_site"]}, "site 'lost_site'"),
         ({"arm_joints": ["lift", "lost_joint"]}, "joint 'lost_joint'"),
         ({"arm_joints": ["lift", "passive"], "ik_joints": ["passive"]}, "actuator 'passive'"),
         ({"ik_joints": ["lift", "benf"]}, "arm joint 'benf' does not exist. Did you mean 'bend'"),
@@ -809,16 +999,20 @@ def test_missing_names_are_named(change: dict[str, list[str]], name: str) -> Non
 def test_an_approach_body_that_not_every_joint_moves_is_refused() -> None:
     arm = odd_arm()
     for body in ("shoulder", "finger"):
-        with pytest.raises(ConfigError, match=f"robot.approach_body={body}: expected .* moves: palm"):
+        with pytest.raises(
+            ConfigError, match=f"robot.approach_body={body}: expected .* moves: palm"
+        ):
             BatchedIk(arm.model, replace(arm.robot, approach_body=body), 2, "cpu")
 
 
 def test_a_gain_counts_in_any_chain(device: str) -> None:
-    """With moved joints on one side of the fork, a slide among them, and an approach axis that is none of theirs."""
+    """With moved joints on one side of the fork, a slide among them, and an approach axis that is
+    none of theirs.
+    """
     arm = odd_arm()
     start = np.random.default_rng(37).uniform(0.5 * arm.low, 0.5 * arm.high, (100, 5))
     start[:, 0] = np.clip(start[:, 0], -0.05, 0.1)
-    at = arm.aperture(start)
+    at = arm.grasp_point(start)
     for gains in ({"posture_gain": 0.2}, {"approach_gain": 0.2}):
         command, distance = results(arm.solver(100, device, iterations=100, **gains), start, at)
         assert (distance <= 0.0001).mean() >= 0.95
@@ -862,15 +1056,19 @@ def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
 
 def test_shapes_are_not_broadcast() -> None:
     ik = odd_arm().solver(3)
-    with pytest.raises(ArgumentError, match=r"command: found shape \(1, 5\), expected shape \(3, 5\)"):
+    with pytest.raises(
+        ArgumentError, match=r"command: found shape \(1, 5\), expected shape \(3, 5\)"
+    ):
         ik.solve(torch.zeros(1, 5), torch.zeros(3, 3))
     with pytest.raises(ArgumentError, match=r"target: found shape \(3,\), expected shape \(3, 3\)"):
         ik.solve(torch.zeros(3, 5), torch.zeros(3))
     with pytest.raises(ArgumentError, match="command: found shape"):
-        ik.aperture(torch.zeros(3, 4))
+        ik.grasp_point(torch.zeros(3, 4))
     with pytest.raises(ArgumentError, match="command: found shape"):
         ik.directions(torch.zeros(3, 4))
-    with pytest.raises(ArgumentError, match="posture: found one, expected None, because posture_gain is 0"):
+    with pytest.raises(
+        ArgumentError, match="posture: found one, expected None, because posture_gain is 0"
+    ):
         ik.solve(torch.zeros(3, 5), torch.zeros(3, 3), torch.zeros(5))
     drawn = odd_arm().solver(3, posture_gain=0.1)
     for shape in ((4,), (1, 5), (3, 4), (1, 3, 5)):
@@ -884,14 +1082,17 @@ def test_a_cuda_graph_holds_it(arm: Arm, cuda: str, gain: float) -> None:
     """Replays follow their inputs, among torch's own operations, as eager calls do."""
     ik = arm.solver(256, cuda, posture_gain=gain, approach_gain=gain)
     posture = tensors(cuda, arm.home)[0] if gain else None
-    command, goal = tensors(cuda, arm.at_home(256), arm.aperture(arm.anywhere(256, 20)))
+    command, goal = tensors(cuda, arm.at_home(256), arm.grasp_point(arm.anywhere(256, 20)))
     out = torch.zeros_like(ik.solve(command, goal)[0])
     flags = torch.zeros_like(ik.unreachable)
-    stream, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
+    stream = torch.cuda.Stream()
+    graph = torch.cuda.CUDAGraph()
 
     def follow_goal() -> None:
-        here = ik.aperture(command)
-        new, _ = ik.solve(command, here + 0.5 * (goal - here) + 0.0 * sum(ik.directions(command)), posture)
+        here = ik.grasp_point(command)
+        new, _ = ik.solve(
+            command, here + 0.5 * (goal - here) + 0.0 * sum(ik.directions(command)), posture
+        )
         out.copy_(new)
         flags.copy_(ik.unreachable)
         command.copy_(new)
@@ -910,11 +1111,12 @@ def test_a_cuda_graph_holds_it(arm: Arm, cuda: str, gain: float) -> None:
     finally:
         gc.enable()
     for seed in (21, 22):
-        goal.copy_(tensors(cuda, arm.aperture(arm.anywhere(256, seed)))[0])
+        goal.copy_(tensors(cuda, arm.grasp_point(arm.anywhere(256, seed)))[0])
         command.copy_(start)
         for _ in range(3):
             graph.replay()
-        replayed, flagged = out.clone(), flags.clone()
+        replayed = out.clone()
+        flagged = flags.clone()
         command.copy_(start)
         for _ in range(3):
             follow_goal()
@@ -924,16 +1126,42 @@ def test_a_cuda_graph_holds_it(arm: Arm, cuda: str, gain: float) -> None:
         assert torch.equal(flags, flagged)
 
 
-def test_the_benchmark_prints_a_table_and_writes_its_figures(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_benchmark_prints_a_table_and_writes_its_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     out = tmp_path / "ik.json"
-    arguments = ["sim.device=cpu", "--nworld", "8", "--iterations", "4", "8", "--repetitions", "2", "--out", str(out)]
+    arguments = [
+        "sim.device=cpu",
+        "--nworld",
+        "8",
+        "--iterations",
+        "4",
+        "8",
+        "--repetitions",
+        "2",
+        "--out",
+        str(out),
+    ]
     benchmark_ik.main(arguments)
     assert "SO-101, cpu" in capsys.readouterr().out
     results = json.loads(out.read_text())["results"]
-    assert [(r["iterations"], r["gained"]) for r in results] == [(4, False), (4, True), (8, False), (8, True)]
-    assert all(len(r["eager_ms"]) == 2 and min(r["eager_ms"]) > 0.0 and r["graph_ms"] == [] for r in results)
+    assert [(r["iterations"], r["gained"]) for r in results] == [
+        (4, False),
+        (4, True),
+        (8, False),
+        (8, True),
+    ]
+    assert all(
+        len(r["eager_ms"]) == 2 and min(r["eager_ms"]) > 0.0 and r["graph_ms"] == []
+        for r in results
+    )
     assert results[2]["reached"] == 1.0
-    for bad in (["--repetitions", "0"], ["--nworld", "0"], ["--iterations", "3"], ["--out", str(tmp_path / "no" / "file")]):
+    for bad in (
+        ["--repetitions", "0"],
+        ["--nworld", "0"],
+        ["--iterations", "3"],
+        ["--out", str(tmp_path / "no" / "file")],
+    ):
         with pytest.raises(SystemExit) as caught:
             benchmark_ik.main(["sim.device=cpu", "--nworld", "2", *bad])
         assert caught.value.code == 2

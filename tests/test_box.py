@@ -15,13 +15,13 @@ from box_checker import BoxRecording, lowest_geometry
 from mjstack import make_env
 from mjstack.config import load_config
 from mjstack.config.schema import Config
-from mjstack.control.planner import ScriptedPlanner
+from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
 from mjstack.math import quat_to_matrix
 from mjstack.scene import BLUE, RED, LowestPoint, SceneIndex, build_model
 from mjstack.scene.phases import build_phases
-from mjstack.tasks.box import BoxEvidence, BoxSuccess
+from mjstack.tasks.box import BoxCheck, BoxSuccess
 from mjstack.tasks.box_terms import GraspNext, InBox, Place, ReachNext, ToSlot
 
 X0 = {"so101": 0.305, "rebot": 0.47}
@@ -29,7 +29,7 @@ TOP = {"so101": 0.024, "rebot": 0.212}
 PARTS = ("floor", "near", "far", "right", "left")
 
 _composed = cache(lambda robot: load_config(["task=box", f"robot={robot}", "sim=native"]))
-_planner = cache(lambda robot: ScriptedPlanner(_composed(robot)))
+_planner = cache(lambda robot: OpenLoopPlanner(_composed(robot)))
 
 
 def configured(robot: str) -> Config:
@@ -51,7 +51,9 @@ def extent(model: mujoco.MjModel, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_scene_is_the_protocols(robot: str) -> None:
-    model, x0, top = build_model(configured(robot)), X0[robot], TOP[robot]
+    model = build_model(configured(robot))
+    x0 = X0[robot]
+    top = TOP[robot]
     low, high = extent(model, "table")
     np.testing.assert_allclose([low[:2], high[:2]], [[x0 - 0.18, -0.28], [x0 + 0.18, 0.28]])
     assert high[2] == pytest.approx(top)
@@ -74,30 +76,35 @@ def test_the_scene_is_the_protocols(robot: str) -> None:
         geom = model.geom(f"box_{part}")
         assert (int(geom.bodyid[0]), int(geom.condim[0])) == (0, 3)
         np.testing.assert_allclose(geom.friction, [0.8, 0.005, 0.0005])
-        np.testing.assert_allclose(geom.solref, [-4444.444444, -266.666667] if part == "floor" else [0.01, 1.0])
+        np.testing.assert_allclose(
+            geom.solref, [-4444.444444, -266.666667] if part == "floor" else [0.01, 1.0]
+        )
     np.testing.assert_allclose(model.body(RED).pos, [x0 - 0.035, -0.15, top + 0.022])
     np.testing.assert_allclose(model.body(BLUE).pos, [x0 + 0.045, -0.15, top + 0.022])
     assert model.opt.timestep == 0.001
 
 
 def test_the_motion_is_the_protocols(robot: str) -> None:
-    cfg, x0 = configured(robot), X0[robot]
+    cfg = configured(robot)
+    x0 = X0[robot]
     assert cfg.scene.red_slot == pytest.approx([x0 + 0.055, 0.15])
     assert cfg.scene.blue_slot == pytest.approx([x0 - 0.030, 0.15])
     assert cfg.scene.grasp_offset == {"so101": 0.0, "rebot": 0.006}[robot]
     seconds = [phase.seconds for phase in cfg.controller.phases.values()]
     assert seconds == [1.6, 1.6, 2.2, 2.0, 3.0, 2.4, 1.6, 1.4, 1.4] * 2 + [5.6]
-    assert _planner(robot).phases[-1].stop == cfg.task.episode_frames == 2000
+    assert _planner(robot).phases[-1].stop == cfg.task.episode_steps == 2000
     t = cfg.gate.box
-    assert (t.force, t.grasp_frames, t.open_fraction) == (1e-5, 10, 0.8)
-    assert (t.lift_height, t.lift_frames, t.carry_frames, t.carry_distance) == (0.010, 25, 10, 0.05)
+    assert (t.force, t.grasp_steps, t.open_fraction) == (1e-5, 10, 0.8)
+    assert (t.lift_height, t.lift_steps, t.carry_steps, t.carry_distance) == (0.010, 25, 10, 0.05)
     assert (t.inside, t.rest_speed, t.window, t.jaw_clearance) == (0.003, 0.04, 50, 0.02)
 
 
 def test_other_scenes_have_no_box_and_pay_for_no_sensor_of_it(robot: str) -> None:
     cfg = load_config([f"robot={robot}"])
     model = build_model(cfg)
-    assert not [model.geom(i).name for i in range(model.ngeom) if model.geom(i).name.startswith("box_")]
+    assert not [
+        model.geom(i).name for i in range(model.ngeom) if model.geom(i).name.startswith("box_")
+    ]
     assert model.nsensor == 4
     assert SceneIndex(model, cfg.robot).support_force == {}
 
@@ -106,7 +113,8 @@ def test_sensors_tell_supports_from_jaws(robot: str) -> None:
     """A cube on the table, in the box and on the other cube; and one in the air."""
     cfg = configured(robot)
     model = build_model(cfg)
-    index, data = SceneIndex(model, cfg.robot), mujoco.MjData(model)
+    index = SceneIndex(model, cfg.robot)
+    data = mujoco.MjData(model)
     top, (red, blue) = TOP[robot], index.cube_qpos
 
     def forces() -> list[list[bool]]:
@@ -114,8 +122,15 @@ def test_sensors_tell_supports_from_jaws(robot: str) -> None:
         for _ in range(60):  # until what stands carries its weight
             data.qvel[index.robot_qvel] = 0.0
             mujoco.mj_step(model, data)
-        found = [[np.linalg.norm(data.sensordata[a : a + 3]) > 1e-5 for a in index.support_force[n]] for n in (RED, BLUE)]
-        assert all(np.linalg.norm(data.sensordata[a : a + 3]) < 1e-5 for n in (RED, BLUE) for a in index.jaw_force[n])
+        found = [
+            [np.linalg.norm(data.sensordata[a : a + 3]) > 1e-5 for a in index.support_force[n]]
+            for n in (RED, BLUE)
+        ]
+        assert all(
+            np.linalg.norm(data.sensordata[a : a + 3]) < 1e-5
+            for n in (RED, BLUE)
+            for a in index.jaw_force[n]
+        )
         return found
 
     assert forces() == [[True, False], [True, False]]
@@ -135,14 +150,15 @@ def test_home_is_the_first_approach_and_clear_of_everything(robot: str) -> None:
     cfg = configured(robot)
     first = _planner(robot).plan_world(0, np.array([*cfg.scene.red_xy, *cfg.scene.blue_xy]))[0][0]
     np.testing.assert_allclose(cfg.robot.home, first, atol=2e-6)
-    assert cfg.robot.start == cfg.robot.home == cfg.robot.layouts["box"].home
+    assert cfg.robot.start == cfg.robot.home == cfg.robot.placements["box"].home
     model = build_model(cfg)
-    index, data = SceneIndex(model, cfg.robot), mujoco.MjData(model)
+    index = SceneIndex(model, cfg.robot)
+    data = mujoco.MjData(model)
     data.qpos[index.robot_qpos] = cfg.robot.home
     mujoco.mj_forward(model, data)
     touching = {model.geom(g).name for c in data.contact for g in c.geom}
     assert touching <= {"table", RED, BLUE}
-    at = _planner(robot).ik.aperture(np.array(cfg.robot.home))
+    at = _planner(robot).ik.grasp_point(np.array(cfg.robot.home))
     assert at == pytest.approx([*cfg.scene.red_xy, TOP[robot] + 0.19], abs=5e-6)
 
 
@@ -158,11 +174,15 @@ def test_random_actions_from_every_start(robot: str, reset: str) -> None:
     spread = {"nominal": (0.0, 0.0), "jitter": (0.002, 0.002), "randomized": scene.random_xy}[reset]
     for name, place in ((RED, scene.red_xy), (BLUE, scene.blue_xy)):
         address, _ = env.index.object_address(name)
-        off = (env.sim.qpos[:, address : address + 2] - torch.tensor(place, dtype=torch.float64)).abs()
+        off = (
+            env.sim.qpos[:, address : address + 2] - torch.tensor(place, dtype=torch.float64)
+        ).abs()
         assert bool((off <= torch.tensor(spread, dtype=torch.float64) + 1e-9).all())
     generator = torch.Generator().manual_seed(0)
     for _ in range(15):
-        action = 2.0 * torch.rand((env.nworld, env.action_manager.action_dim), generator=generator) - 1.0
+        action = (
+            2.0 * torch.rand((env.nworld, env.action_manager.action_dim), generator=generator) - 1.0
+        )
         obs, reward, _, _, _ = env.step(action.to(env.device))
     assert set(obs) == {"policy", "privileged"}
     assert all(bool(torch.isfinite(x).all()) for x in (*obs.values(), reward))
@@ -175,7 +195,9 @@ def test_random_actions_from_every_start(robot: str, reset: str) -> None:
 def put(env: Env, name: str, place: list[float] | np.ndarray, worlds: list[int]) -> None:
     address, velocity = env.index.object_address(name)
     for world in worlds:
-        env.sim.qpos[world, address : address + 7] = torch.tensor([*place, 1.0, 0.0, 0.0, 0.0], dtype=env.sim.qpos.dtype)
+        env.sim.qpos[world, address : address + 7] = torch.tensor(
+            [*place, 1.0, 0.0, 0.0, 0.0], dtype=env.sim.qpos.dtype
+        )
         env.sim.qvel[world, velocity : velocity + 6] = 0.0
 
 
@@ -189,7 +211,9 @@ def rests(env: Env) -> dict[str, list[float]]:
 
 
 def test_terms_know_the_box(robot: str) -> None:
-    """World 0: both on the table. 1: red in the box. 2: both in it. 3: red over its place, on the rim's height and above."""
+    """World 0: both on the table. 1: red in the box. 2: both in it. 3: red over its place, on the
+    rim's height and above.
+    """
     env = small_env("reset=nominal", robot=robot, nworld=4)
     places = rests(env)
     put(env, RED, places[RED], [1, 2])
@@ -199,20 +223,28 @@ def test_terms_know_the_box(robot: str) -> None:
     wanted = np.subtract(places[BLUE], env.sim.model.body(BLUE).pos)
     np.testing.assert_allclose(ToSlot(env, object=BLUE)(env)[0], wanted, atol=1e-6)
     assert InBox(env)(env).tolist() == [0.0, 0.5, 1.0, 0.0]
-    evidence = BoxEvidence(env.cfg, env.index, build_phases(env.cfg), 4, env.device)
-    assert evidence.placed(env.sim).tolist() == [[False, False], [True, False], [True, True], [False, False]]
+    check = BoxCheck(env.cfg, env.index, build_phases(env.cfg), 4, env.device)
+    assert check.placed(env.sim).tolist() == [
+        [False, False],
+        [True, False],
+        [True, True],
+        [False, False],
+    ]
     place = Place(env, object=RED, scale=0.1)(env)
     assert place.tolist() == pytest.approx([0.0, 1.0, 1.0, 1.0 - math.tanh(1.0)], abs=1e-6)
     reach = ReachNext(env, scale=0.1)(env)
-    aperture = 0.5 * sum(env.sim.site_xpos[0, s] for s in env.index.aperture_sites)
+    grasp_point = 0.5 * sum(env.sim.site_xpos[0, s] for s in env.index.grasp_sites)
     for world, name in ((0, RED), (1, BLUE), (3, RED)):
         address, _ = env.index.object_address(name)
-        distance = float((env.sim.qpos[world, address : address + 3] - aperture).norm())
+        distance = float((env.sim.qpos[world, address : address + 3] - grasp_point).norm())
         assert float(reach[world]) == pytest.approx(1.0 - math.tanh(distance / 0.1), abs=1e-6)
     assert float(reach[2]) == 1.0
     grasp = GraspNext(env)
     assert grasp(env).tolist() == [0.0, 0.0, 1.0, 0.0]
-    for cube, worlds in ((RED, [0, 1]), (BLUE, [3])):  # in world 1 red is in the box: pressing on it pays nothing
+    for cube, worlds in (
+        (RED, [0, 1]),
+        (BLUE, [3]),
+    ):  # in world 1 red is in the box: pressing on it pays nothing
         for address in env.index.jaw_force[cube]:
             env.sim.sensordata[worlds, address] = 1.0
     assert grasp(env).tolist() == [1.0, 0.0, 1.0, 0.0]
@@ -220,7 +252,9 @@ def test_terms_know_the_box(robot: str) -> None:
 
 
 def test_a_place_counts_off_the_table_whatever_the_boxs_floor() -> None:
-    """Red over its place, its lowest corner 0.5 mm below and above half the floor, and at rest on the floor; all else alike."""
+    """Red over its place, its lowest corner 0.5 mm below and above half the floor, and at rest on
+    the floor; all else alike.
+    """
     for floor in (0.004, 0.006):
         env = small_env("reset=nominal", f"scene.box.floor={floor}")
         for world, height in enumerate((0.5 * floor - 0.0005, 0.5 * floor + 0.0005, floor)):
@@ -233,10 +267,13 @@ def test_a_place_counts_off_the_table_whatever_the_boxs_floor() -> None:
 
 
 def test_success_needs_rest_in_the_box_an_open_gripper_and_the_whole_window(robot: str) -> None:
-    """World 0 has all of it. In 1 blue is on the table, in 2 the gripper is closed, in 3 red moves now and then, in 4 a jaw
-    touches blue in the first frame, in 5 a corner of red is above the rim."""
+    """World 0 has all of it. In 1 blue is on the table, in 2 the gripper is closed, in 3 red moves
+    now and then, in 4 a jaw touches blue in the first step, in 5 a corner of red is above the
+    rim."""
     env = small_env("reset=nominal", robot=robot, nworld=6)
-    success, places, window = BoxSuccess(env, open_fraction=0.8), rests(env), env.cfg.gate.box.window
+    success = BoxSuccess(env, open_fraction=0.8)
+    places = rests(env)
+    window = env.cfg.gate.box.window
     put(env, RED, places[RED], [0, 1, 2, 3, 4])
     put(env, BLUE, places[BLUE], [0, 2, 3, 4, 5])
     put(env, RED, np.add(places[RED], [0.0, 0.0, 0.0085]), [5])
@@ -245,9 +282,9 @@ def test_success_needs_rest_in_the_box_an_open_gripper_and_the_whole_window(robo
     env.sim.sensordata.zero_()
     _, velocity = env.index.object_address(RED)
     seen = []
-    for frame in range(window + 1):
-        env.sim.qvel[3, velocity] = 0.05 if frame % 20 == 10 else 0.0
-        env.sim.sensordata[4, env.index.jaw_force[BLUE][0]] = 1.0 if frame == 0 else 0.0
+    for step in range(window + 1):
+        env.sim.qvel[3, velocity] = 0.05 if step % 20 == 10 else 0.0
+        env.sim.sensordata[4, env.index.jaw_force[BLUE][0]] = 1.0 if step == 0 else 0.0
         seen.append(success(env).tolist())
     assert not any(any(row) for row in seen[: window - 1])
     assert seen[window - 1] == [True, False, False, False, False, False]
@@ -272,8 +309,10 @@ def test_matrix_of_a_quaternion() -> None:
 def test_lowest_point_of_the_jaws(robot: str) -> None:
     cfg = configured(robot)
     model = build_model(cfg)
-    index, data = SceneIndex(model, cfg.robot), mujoco.MjData(model)
-    low, high = index.robot_range[:, 0], index.robot_range[:, 1]
+    index = SceneIndex(model, cfg.robot)
+    data = mujoco.MjData(model)
+    low = index.robot_range[:, 0]
+    high = index.robot_range[:, 1]
     measure = LowestPoint(model, cfg.robot.jaw_bodies, torch.device("cpu"))
     draw = np.random.default_rng(0)
     empty = np.zeros((0, 2, 0))
@@ -281,28 +320,38 @@ def test_lowest_point_of_the_jaws(robot: str) -> None:
         data.qpos[index.robot_qpos] = draw.uniform(low, high)
         mujoco.mj_kinematics(model, data)
         wanted = lowest_geometry(
-            BoxRecording(empty, empty, empty, empty, empty, empty, data.xpos, data.xquat, 0), cfg.robot.jaw_bodies, model
+            BoxRecording(empty, empty, empty, empty, empty, empty, data.xpos, data.xquat, 0),
+            cfg.robot.jaw_bodies,
+            model,
         )
         got = measure.height(torch.tensor(data.xpos)[None], torch.tensor(data.xquat)[None])
         assert float(got[0]) == pytest.approx(wanted, abs=1e-6)
 
 
 def turned(geom: dict, quats: np.ndarray) -> tuple[np.ndarray, mujoco.MjModel, list[np.ndarray]]:
-    """What `LowestPoint` says of a body with one geom at each orientation, the model, and the geom's axes and place."""
+    """What `LowestPoint` says of a body with one geom at each orientation, the model, and the
+    geom's axes and place.
+    """
     spec = mujoco.MjSpec()
     stone = np.random.default_rng(1).normal(size=(40, 3)) * [0.03, 0.05, 0.02]
     spec.add_mesh(name="stone", uservert=stone.ravel())
     body = spec.worldbody.add_body(name="jaw")
     body.add_freejoint()
     body.add_geom(**geom)
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.5] * 3, contype=0, conaffinity=0)  # touches nothing
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.5] * 3, contype=0, conaffinity=0
+    )  # touches nothing
     model = spec.compile()
-    data, found, turns = mujoco.MjData(model), [], []
+    data = mujoco.MjData(model)
+    found = []
+    turns = []
     measure = LowestPoint(model, ["jaw"], torch.device("cpu"))
     for quat in quats:
         data.qpos[:7] = [0.0, 0.0, 0.0, *quat]
         mujoco.mj_kinematics(model, data)
-        found.append(float(measure.height(torch.tensor(data.xpos)[None], torch.tensor(data.xquat)[None])[0]))
+        found.append(
+            float(measure.height(torch.tensor(data.xpos)[None], torch.tensor(data.xquat)[None])[0])
+        )
         turns.append(np.column_stack((data.geom_xmat[0].reshape(3, 3), data.geom_xpos[0])))
     return np.array(found), model, turns
 
@@ -311,9 +360,16 @@ QUATS = np.random.default_rng(2).normal(size=(20, 4))
 
 
 def test_lowest_point_of_a_cylinder() -> None:
-    geom = {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [0.02, 0.05, 0.0], "pos": [0.0, 0.1, 0.0]}
+    geom = {
+        "type": mujoco.mjtGeom.mjGEOM_CYLINDER,
+        "size": [0.02, 0.05, 0.0],
+        "pos": [0.0, 0.1, 0.0],
+    }
     angle = np.linspace(0.0, 2.0 * np.pi, 5000)
-    ends = [np.stack([0.02 * np.cos(angle), 0.02 * np.sin(angle), np.full_like(angle, end)], 1) for end in (-0.05, 0.05)]
+    ends = [
+        np.stack([0.02 * np.cos(angle), 0.02 * np.sin(angle), np.full_like(angle, end)], 1)
+        for end in (-0.05, 0.05)
+    ]
     found, _, turns = turned(geom, QUATS)
     wanted = [min(float((end @ t[:, :3].T)[:, 2].min()) for end in ends) + t[2, 3] for t in turns]
     np.testing.assert_allclose(found, wanted, atol=1e-6)
@@ -335,7 +391,7 @@ def test_lowest_point_of_a_mesh_is_never_too_high() -> None:
     [
         (["scene=stack"], ["red_slot", "scene stack", "no box"]),
         (["phases=stack"], ["gate.parity.states", "approach_red"]),
-        (["~controller.phases.settle_blue"], ["task.evidence", "settle_blue"]),
+        (["~controller.phases.settle_blue"], ["task.check", "settle_blue"]),
         (["scene.box.center=[0.305,0.2]"], ["scene.box.center", "on the table with all its walls"]),
         (["scene.box.height=0.005"], ["scene.box.height=0.005", "0.006 m"]),
         (["scene.box.wall=-0.006"], ["scene.box.wall=-0.006", "positive"]),
@@ -350,10 +406,10 @@ def test_lowest_point_of_a_mesh_is_never_too_high() -> None:
         (["gate.box.open_fraction=1.2"], ["gate.box.open_fraction=1.2", "up to 1"]),
         (["gate.box.force=0"], ["gate.box.force=0", "positive"]),
         (["gate.box.inside=-0.001"], ["gate.box.inside=-0.001", "not negative"]),
-        (["gate.box.lift_frames=0"], ["gate.box.lift_frames=0", "at least 1"]),
+        (["gate.box.lift_steps=0"], ["gate.box.lift_steps=0", "at least 1"]),
         (["gate.box.rest_sped=1"], ["rest_sped", "rest_speed"]),
         (["scene.box.heigth=1"], ["scene.box.heigth"]),
-        (["timing=default", "timing.substeps=11"], ["50 Hz"]),
+        (["timing=default", "timing.decimation=11"], ["50 Hz"]),
     ],
 )
 def test_bad_input_is_one_line(overrides: list[str], parts: list[str]) -> None:

@@ -1,4 +1,6 @@
-"""Sizing the buffers: peaks that resets do not erase, sizes that are enough and not more, and who uses them."""
+"""Sizing the buffers: peaks that resets do not erase, sizes that are enough and not more, and who
+uses them.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ import mjstack
 from mjstack.config import load_config
 from mjstack.config.schema import Backend
 from mjstack.envs import Env, build_env
-from mjstack.envs.probe import (
+from mjstack.envs.buffers import (
     Peaks,
     join_peaks,
     measure_peaks,
@@ -24,13 +26,13 @@ from mjstack.envs.probe import (
     recommend_sizes,
     require_physics,
 )
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.rollout import start_worlds
+from mjstack.episodes.workloads import Workload, play_task
 from mjstack.errors import FaultError, MjstackError, Unreachable
 from mjstack.gates import capacity as capacity_module
 from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import run_capacity
-from mjstack.gates.episode import start_worlds
-from mjstack.gates.gate import GateContext
-from mjstack.gates.sizing import Workload, play_task
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, Overflow, Simulation, make_simulation, resolve_sizes
 from mjstack.sim.sizes import apply_configured, resolve_env_sizes, resolve_measuring_sizes
@@ -58,7 +60,9 @@ def start(sim: Simulation, context: GateContext) -> None:
 # What the simulations keep
 
 
-def test_peaks_survive_masked_resets(backend: str, make_sim: Make, stage: Callable[[str], GateContext]) -> None:
+def test_peaks_survive_masked_resets(
+    backend: str, make_sim: Make, stage: Callable[[str], GateContext]
+) -> None:
     sim = make_sim(backend, 3)
     start(sim, stage("so101"))
     sim.step(10)
@@ -68,7 +72,12 @@ def test_peaks_survive_masked_resets(backend: str, make_sim: Make, stage: Callab
     assert (before["most_constraints"] > 100).all()
     mask = torch.tensor([False, True, False], device=sim.device)
     sim.reset(mask)
-    assert sim.peak_contacts.tolist()[1] == sim.peak_constraints.tolist()[1] == sim.overflow.tolist()[1] == 0
+    assert (
+        sim.peak_contacts.tolist()[1]
+        == sim.peak_constraints.tolist()[1]
+        == sim.overflow.tolist()[1]
+        == 0
+    )
     for name in KEPT:
         assert torch.equal(getattr(sim, name), before[name]), name
     sim.step(1)  # at qpos0, with fewer contacts: the peak stays that of the first episode
@@ -82,7 +91,9 @@ def test_peaks_survive_masked_resets(backend: str, make_sim: Make, stage: Callab
         assert getattr(sim, name).tolist() == [0, 0, 0], name
 
 
-def test_a_peak_after_a_reset_counts(backend: str, make_sim: Make, stage: Callable[[str], GateContext]) -> None:
+def test_a_peak_after_a_reset_counts(
+    backend: str, make_sim: Make, stage: Callable[[str], GateContext]
+) -> None:
     sim = make_sim(backend, 2)
     sim.step(1)
     quiet = sim.most_constraints.clone()
@@ -95,10 +106,12 @@ def test_a_peak_after_a_reset_counts(backend: str, make_sim: Make, stage: Callab
 
 
 def test_peaks_of_an_environment_outlive_its_episodes(backend: str) -> None:
-    """Every world ends in every third frame; the loop keeps what it sees before each reset."""
-    cfg = load_config(["termination.time_out.params.frames=3", "seed=3"])
+    """Every world ends in every third step; the loop keeps what it sees before each reset."""
+    cfg = load_config(["termination.time_out.params.steps=3", "seed=3"])
     kind = Backend.native if backend == "native" else Backend.mjwarp
-    env = build_env(cfg, nworld=2, backend=kind, device="cuda:0" if backend == "mjwarp-cuda" else "cpu")
+    env = build_env(
+        cfg, nworld=2, backend=kind, device="cuda:0" if backend == "mjwarp-cuda" else "cpu"
+    )
     env.reset(seed=3)
     seen = torch.zeros(2, dtype=torch.int32, device=env.device)
     for _ in range(8):
@@ -119,7 +132,10 @@ def test_recommended_sizes_have_the_margin_in_multiples_of_eight() -> None:
     assert (found.njmax, found.nconmax, found.nccdmax) == (184, 40, None)  # 180 and 33.75, up
     assert found.as_overrides() == "batch.nconmax=40 batch.njmax=184"
     assert found.source == "here"
-    assert recommend_sizes(peaks(rows=0, contacts=0), 1.0, "").as_overrides() == "batch.nconmax=8 batch.njmax=8"
+    assert (
+        recommend_sizes(peaks(rows=0, contacts=0), 1.0, "").as_overrides()
+        == "batch.nconmax=8 batch.njmax=8"
+    )
 
 
 @pytest.mark.parametrize("margin", [1.0, 1.25, 2.0])
@@ -138,7 +154,13 @@ def test_peaks_join() -> None:
     a = peaks(rows=10, contacts=9, pool_pairs=5, pool_ccd_pairs=1)
     b = peaks(rows=20, contacts=3, pool_pairs=50, overflow=np.array([0, 1, 0, 2]))
     both = join_peaks(a, b)
-    assert (both.rows.max(), both.contacts.max(), both.pool, both.pool_pairs, both.pool_ccd_pairs) == (20, 9, 50, 50, None)
+    assert (
+        both.rows.max(),
+        both.contacts.max(),
+        both.pool,
+        both.pool_pairs,
+        both.pool_ccd_pairs,
+    ) == (20, 9, 50, 50, None)
     assert both.overflow.tolist() == [0, 1, 0, 2]
 
 
@@ -176,7 +198,10 @@ def test_room_to_measure_in_does_not_grow_for_ever() -> None:
     [
         (Overflow.NEFC, "Set batch.njmax higher still."),
         (Overflow.NEFC | Overflow.BROADPHASE, "Set batch.njmax and batch.nconmax higher still."),
-        (Overflow.CCD, "Set batch.nconmax higher still."),  # with nccdmax alone the room to measure in would not grow
+        (
+            Overflow.CCD,
+            "Set batch.nconmax higher still.",
+        ),  # with nccdmax alone the room to measure in would not grow
         (Overflow.EPA_HORIZON, "Simplify the model, or run sim=native."),
     ],
 )
@@ -212,9 +237,18 @@ def test_what_is_set_wins() -> None:
         (BatchSizes(nconmax=16, njmax=8), 3, 48),
     ],
 )
-def test_convex_room_is_within_the_pool(sizes: BatchSizes, nworld: int, room: int, stage: Callable[[str], GateContext]) -> None:
+def test_convex_room_is_within_the_pool(
+    sizes: BatchSizes, nworld: int, room: int, stage: Callable[[str], GateContext]
+) -> None:
     """MJWarp refuses more, and one world of parity has less than thousands."""
-    sim = make_simulation(stage("so101").model, load_config([]), nworld, backend=Backend.mjwarp, device="cpu", sizes=sizes)
+    sim = make_simulation(
+        stage("so101").model,
+        load_config([]),
+        nworld,
+        backend=Backend.mjwarp,
+        device="cpu",
+        sizes=sizes,
+    )
     assert sim._d.naccdmax == sizes.convex_pool(nworld) == room  # type: ignore[attr-defined]
 
 
@@ -222,13 +256,17 @@ def test_convex_room_is_within_the_pool(sizes: BatchSizes, nworld: int, room: in
 
 
 @pytest.fixture(scope="module")
-def first_frames(stage: Callable[[str], GateContext]) -> Iterator[Callable[[BatchSizes], Peaks]]:
-    """The first frames of two MJWarp worlds, in which SO-101 needs the most rows."""
+def first_steps(stage: Callable[[str], GateContext]) -> Iterator[Callable[[BatchSizes], Peaks]]:
+    """The first steps of two MJWarp worlds, in which SO-101 needs the most rows."""
     context = stage("so101")
 
     def run(sizes: BatchSizes) -> Peaks:
-        sim = make_simulation(context.model, context.cfg, 2, backend=Backend.mjwarp, device="cpu", sizes=sizes)
-        env, controller = start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+        sim = make_simulation(
+            context.model, context.cfg, 2, backend=Backend.mjwarp, device="cpu", sizes=sizes
+        )
+        env, controller = start_worlds(
+            sim, context.index, context.cfg, context.cfg.reset, context.planner
+        )
         for _ in range(3):
             env.step(controller.command())
         found = read_peaks(sim)
@@ -238,18 +276,22 @@ def first_frames(stage: Callable[[str], GateContext]) -> Iterator[Callable[[Batc
     return run
 
 
-def test_sizes_at_the_peak_are_enough_and_one_less_is_not(first_frames: Callable[[BatchSizes], Peaks]) -> None:
-    free = first_frames(BatchSizes(nconmax=128, njmax=300))
+def test_sizes_at_the_peak_are_enough_and_one_less_is_not(
+    first_steps: Callable[[BatchSizes], Peaks],
+) -> None:
+    free = first_steps(BatchSizes(nconmax=128, njmax=300))
     assert not free.overflow.any()
     assert free.pool == free.pool_contacts >= (free.pool_pairs or 0) > 0
     rows = int(free.rows.max())
     exact = BatchSizes(nconmax=64, naconmax=free.pool, njmax=rows)
-    at_peak = first_frames(exact)
+    at_peak = first_steps(exact)
     assert not at_peak.overflow.any()
     assert at_peak.rows.tolist() == free.rows.tolist()
-    assert (first_frames(replace(exact, njmax=rows - 1)).overflow & int(Overflow.NEFC)).any()
-    assert (first_frames(replace(exact, naconmax=free.pool - 1)).overflow & int(Overflow.NARROWPHASE)).all()
-    assert not first_frames(recommend_sizes(free, 1.0, "")).overflow.any()
+    assert (first_steps(replace(exact, njmax=rows - 1)).overflow & int(Overflow.NEFC)).any()
+    assert (
+        first_steps(replace(exact, naconmax=free.pool - 1)).overflow & int(Overflow.NARROWPHASE)
+    ).all()
+    assert not first_steps(recommend_sizes(free, 1.0, "")).overflow.any()
 
 
 # The gate
@@ -259,7 +301,7 @@ def test_sizes_at_the_peak_are_enough_and_one_less_is_not(first_frames: Callable
 def too_small(new_context: NewContext) -> tuple[GateContext, GateResult, list[str]]:
     """The gate on Warp's CPU device with too few rows, and what it said."""
     said: list[str] = []
-    few = ("nworld=2", "gate.capacity.random_frames=20", *brisk())
+    few = ("nworld=2", "gate.capacity.random_steps=20", *brisk())
     context = new_context("sim=mjwarp", "sim.device=cpu", "batch.njmax=100", *few)
     context.say = said.append
     (result,) = run_capacity(context)
@@ -275,30 +317,42 @@ def test_too_small_is_found_and_the_printed_override_cures_it(
     task = next(line for line in said if line.startswith("scripted task: "))
     overrides = task.removeprefix("scripted task: ").split()
     assert f"batch.njmax={result.metrics['recommended.njmax']}" in overrides
-    cured = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch.njmax=100", *overrides, *brisk())
+    cured = new_context(
+        "sim=mjwarp", "sim.device=cpu", "nworld=2", "batch.njmax=100", *overrides, *brisk()
+    )
     run = play_task(cured, cured.cfg.reset, resolve_sizes(cured.cfg))
     assert not run.peaks.overflow.any()
-    assert run.accepted == 2
+    assert run.succeeded == 2
     ill = play_task(context, context.cfg.reset, resolve_sizes(context.cfg))
     assert (ill.peaks.overflow & int(Overflow.NEFC)).all()
-    assert ill.accepted == 0
+    assert ill.succeeded == 0
 
 
-def test_sizes_were_tried_with_the_same_outcome(too_small: tuple[GateContext, GateResult, list[str]]) -> None:
+def test_sizes_were_tried_with_the_same_outcome(
+    too_small: tuple[GateContext, GateResult, list[str]],
+) -> None:
     m = too_small[1].metrics
     assert m["rerun.task.overflow_worlds"] == m["rerun.random_actions.overflow_worlds"] == 0
     assert m["rerun.randomized.overflow_worlds"] == 0
-    assert m["rerun.task.accepted"] == 2
+    assert m["rerun.task.succeeded"] == 2
     assert m["rerun.task.flipped_worlds"] == m["rerun.randomized.flipped_worlds"] == 0
-    assert all(m[f"rerun.{name}.same_final_state"] is True for name in ("task", "random_actions", "randomized"))
+    assert all(
+        m[f"rerun.{name}.same_final_state"] is True
+        for name in ("task", "random_actions", "randomized")
+    )
     assert m["rerun.randomized.sizes"] == m["rerun.random_actions.sizes"]
-    assert m["rerun.task.sizes"].startswith(f"batch.nconmax={m['recommended.nconmax']} batch.njmax={m['recommended.njmax']}")
+    assert m["rerun.task.sizes"].startswith(
+        f"batch.nconmax={m['recommended.nconmax']} batch.njmax={m['recommended.njmax']}"
+    )
     assert m["rerun.task.peak_constraint_rows_per_world"] == m["peak_constraint_rows_per_world"]
     assert m["recommended.naconmax"] == 2 * m["recommended.nconmax"]
     for prefix in ("", "random_actions.", "randomized."):
         assert m[f"{prefix}pool_contacts"] > 0
         assert m[f"{prefix}pool_pairs"] > 0
-    needed = max(m[f"{prefix}peak_constraint_rows_per_world"] for prefix in ("random_actions.", "randomized."))
+    needed = max(
+        m[f"{prefix}peak_constraint_rows_per_world"]
+        for prefix in ("random_actions.", "randomized.")
+    )
     assert m["recommended_env.njmax"] >= 1.25 * needed
 
 
@@ -307,7 +361,10 @@ def test_environments_with_too_few_rows_by_choice_are_a_remark(
 ) -> None:
     _, result, _ = too_small
     assert "environments" not in result.reason
-    assert any(line.startswith("environments: njmax overflow") and "batch.njmax=" in line for line in result.details)
+    assert any(
+        line.startswith("environments: njmax overflow") and "batch.njmax=" in line
+        for line in result.details
+    )
 
 
 def test_memory_is_that_of_the_arrays(
@@ -316,19 +373,31 @@ def test_memory_is_that_of_the_arrays(
     from mjstack.sim.memory import data_bytes
 
     context, result, _ = too_small
-    m, model = result.metrics, stage("so101").model
+    m = result.metrics
+    model = stage("so101").model
     assert m["memory.task.measuring.data_mb"] > 2 * m["memory.task.rerun.data_mb"] > 0
     assert m["memory.task.recommended_mb"] == pytest.approx(m["memory.task.rerun.data_mb"])
-    assert m["memory.task.current_mb"] == pytest.approx(data_bytes(model, 2, resolve_sizes(context.cfg)) / 1e6)
-    for sizes in (BatchSizes(nconmax=40, njmax=184), BatchSizes(nconmax=24, njmax=77, naconmax=101, nccdmax=8)):
+    assert m["memory.task.current_mb"] == pytest.approx(
+        data_bytes(model, 2, resolve_sizes(context.cfg)) / 1e6
+    )
+    for sizes in (
+        BatchSizes(nconmax=40, njmax=184),
+        BatchSizes(nconmax=24, njmax=77, naconmax=101, nccdmax=8),
+    ):
         for nworld in (1, 5):
-            sim = make_simulation(model, context.cfg, nworld, backend=Backend.mjwarp, device="cpu", sizes=sizes)
+            sim = make_simulation(
+                model, context.cfg, nworld, backend=Backend.mjwarp, device="cpu", sizes=sizes
+            )
             assert data_bytes(model, nworld, sizes) == sim.memory_bytes()  # type: ignore[attr-defined]
 
 
 def test_defaults_too_small_for_environments_fail(new_context: NewContext) -> None:
     context = new_context(
-        "sim=native", "nworld=2", "gate.capacity.random_frames=40", "robot.layouts.stack.env_njmax=60", *brisk()
+        "sim=native",
+        "nworld=2",
+        "gate.capacity.random_steps=40",
+        "robot.placements.stack.env_njmax=60",
+        *brisk(),
     )
     (result,) = run_capacity(context)
     assert result.status is Status.failed
@@ -337,18 +406,24 @@ def test_defaults_too_small_for_environments_fail(new_context: NewContext) -> No
 
 def test_native_says_what_it_cannot_know(new_context: NewContext) -> None:
     said: list[str] = []
-    context = new_context("sim=native", "nworld=2", "gate.capacity.random_frames=5", *brisk())
+    context = new_context("sim=native", "nworld=2", "gate.capacity.random_steps=5", *brisk())
     context.say = said.append
     (result,) = run_capacity(context)
     assert result.status is Status.passed
     assert "native MuJoCo has no fixed buffers" in str(result.metrics["rerun"])
-    assert result.metrics["pool_pairs"] == result.metrics["pool_ccd_pairs"] == "not counted by native MuJoCo"
+    assert (
+        result.metrics["pool_pairs"]
+        == result.metrics["pool_ccd_pairs"]
+        == "not counted by native MuJoCo"
+    )
     assert not [name for name in result.metrics if name.startswith(("rerun.", "memory."))]
     assert any("does not count the collision pairs" in line for line in said)
 
 
-def test_a_layout_out_of_reach_leaves_the_other_workloads(new_context: NewContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    context = new_context("sim=native", "nworld=1", "gate.capacity.random_frames=5", *brisk())
+def test_a_layout_out_of_reach_leaves_the_other_workloads(
+    new_context: NewContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = new_context("sim=native", "nworld=1", "gate.capacity.random_steps=5", *brisk())
     measure = capacity_module.measure_task
 
     def unreachable(context: GateContext, reset: dict) -> Workload:
@@ -359,7 +434,9 @@ def test_a_layout_out_of_reach_leaves_the_other_workloads(new_context: NewContex
     monkeypatch.setattr(capacity_module, "measure_task", unreachable)
     (result,) = run_capacity(context)
     assert result.status is Status.passed
-    assert any(line.startswith("randomised starts: not measured: world 0") for line in result.details)
+    assert any(
+        line.startswith("randomised starts: not measured: world 0") for line in result.details
+    )
     assert "randomized.pool_contacts" not in result.metrics
 
 
@@ -382,20 +459,29 @@ def workload(**changes: object) -> Workload:
     ("again", "on_cpu", "on_cuda"),
     [
         ({}, "", ""),
-        ({"final": np.array([[0.0, 0.0, 0.0], [0.0, 1e-6, 0.0]])}, "another final state in 1 of 2 worlds (1)", ""),
-        ({"failed": np.array([4, 0])}, "another verdict in 1 of 2 worlds (0)", ""),
-        ({"peaks": peaks(nworld=2, overflow=np.array([0, 1]))}, *["overflow in 1 of 2 worlds (1)"] * 2),
+        (
+            {"final": np.array([[0.0, 0.0, 0.0], [0.0, 1e-6, 0.0]])},
+            "another final state in 1 of 2 worlds (1)",
+            "",
+        ),
+        ({"failed": np.array([4, 0])}, "another result in 1 of 2 worlds (0)", ""),
+        (
+            {"peaks": peaks(nworld=2, overflow=np.array([0, 1]))},
+            *["overflow in 1 of 2 worlds (1)"] * 2,
+        ),
     ],
 )
 def test_a_second_run_that_differs(again: dict, on_cpu: str, on_cuda: str) -> None:
     for exact, says in ((True, on_cpu), (False, on_cuda)):
-        found = capacity_module._compare("task", workload(), workload(**again), judged=True, exact=exact)
+        found = capacity_module._compare(
+            "task", workload(), workload(**again), judged=True, exact=exact
+        )
         assert bool(found.problem) is bool(says)
         assert says in found.problem
         flipped = int("failed" in again)
         assert found.metrics["rerun.task.flipped_worlds"] == flipped
         assert bool(found.remark) is bool(flipped and not exact)
-        assert flipped == 0 or "another verdict in 1 of 2 worlds (0)" in found.problem + found.remark
+        assert flipped == 0 or "another result in 1 of 2 worlds (0)" in found.problem + found.remark
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda:0"])
@@ -422,9 +508,13 @@ def test_each_workload_is_played_again_and_a_flip_fails_where_runs_repeat(
     monkeypatch.setattr(capacity_module, "play_task", play_task)
     monkeypatch.setattr(capacity_module, "play_random", play_random)
     (result,) = run_capacity(context)
-    assert {name: sizes.njmax for name, sizes in played} == {"randomized": 256, "random_actions": 256, "task": 128}
+    assert {name: sizes.njmax for name, sizes in played} == {
+        "randomized": 256,
+        "random_actions": 256,
+        "task": 128,
+    }
     assert {sizes for name, sizes in played if name != "task"} == {context.measured_env}
-    flip = "randomized at batch.nconmax=32 batch.njmax=256: another verdict in 1 of 2 worlds (1)"
+    flip = "randomized at batch.nconmax=32 batch.njmax=256: another result in 1 of 2 worlds (1)"
     assert result.metrics["rerun.randomized.flipped_worlds"] == 1
     if device == "cpu":
         assert (result.status, result.reason) == (Status.failed, flip)
@@ -443,10 +533,14 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     monkeypatch.setattr(capacity_module, "measure_task", lambda _, reset: workload())
     monkeypatch.setattr(capacity_module, "measure_random", lambda _: lost)
     monkeypatch.setattr(capacity_module, "play_task", lambda *_: workload())
-    monkeypatch.setattr(capacity_module, "play_random", lambda *_: pytest.fail("tried sizes that are not known"))
+    monkeypatch.setattr(
+        capacity_module, "play_random", lambda *_: pytest.fail("tried sizes that are not known")
+    )
     (result,) = run_capacity(context)
     assert result.status is Status.failed
-    assert result.reason.startswith("environments: NEFC overflow in 1 of 2 worlds (1) even with batch.nconmax=128")
+    assert result.reason.startswith(
+        "environments: NEFC overflow in 1 of 2 worlds (1) even with batch.nconmax=128"
+    )
     assert context.measured is not None
     assert context.measured_env is None
     assert said[1].endswith("not known, physics was lost")
@@ -459,7 +553,10 @@ def test_convex_pairs_and_whole_pools_are_held_against_their_keys() -> None:
     cfg = load_config(["nworld=4", "batch.naconmax=60", "batch.naccdmax=12"])
     seen = peaks(nworld=4, contacts=20, pool_ccd_pairs=40)
     wanted = recommend_sizes(seen, 1.25, "")
-    found = [shortage.text for shortage in capacity_module._shortages(cfg, seen, resolve_sizes(cfg), wanted)]
+    found = [
+        shortage.text
+        for shortage in capacity_module._shortages(cfg, seen, resolve_sizes(cfg), wanted)
+    ]
     assert any("contact pool overflow" in text and "batch.naconmax=128" in text for text in found)
     assert any("convex pairs overflow" in text and "batch.naccdmax=64" in text for text in found)
     pasted = capacity_module._overrides(cfg, wanted)
@@ -471,58 +568,72 @@ def test_convex_pairs_and_whole_pools_are_held_against_their_keys() -> None:
 
 
 def test_environment_is_sized_by_a_probe() -> None:
-    overrides = ["batch=auto", "sim=mjwarp", "gate.capacity.probe_frames=4"]
+    overrides = ["batch=auto", "sim=mjwarp", "gate.capacity.probe_steps=4"]
     env = mjstack.make_env([*overrides], nworld=2, device="cpu")
     sizes = env.sim.sizes
-    assert sizes.source == "batch=auto: 4 frames of random actions in 2 worlds, times 1.25"
+    assert sizes.source == "batch=auto: 4 steps of random actions in 2 worlds, times 1.25"
     env.reset(seed=0)
     play_random_actions(env, 4)
     used = read_peaks(env.sim)
     assert not used.overflow.any()
     assert used.rows.max() <= sizes.njmax < resolve_env_sizes(env.cfg).njmax
     assert sizes.njmax == recommend_sizes(used, 1.25, "").njmax
-    chosen = mjstack.make_env([*overrides, "batch.njmax=400", "gate.capacity.probe_frames=1"], nworld=1, device="cpu")
+    chosen = mjstack.make_env(
+        [*overrides, "batch.njmax=400", "gate.capacity.probe_steps=1"], nworld=1, device="cpu"
+    )
     assert chosen.sim.sizes.njmax == 400
     assert chosen.sim.sizes.nconmax < 128
 
 
 def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     small = BatchSizes(nconmax=128, njmax=4)  # and 32 after the last growth
-    monkeypatch.setattr("mjstack.envs.probe.resolve_measuring_sizes", lambda _: small)
+    monkeypatch.setattr("mjstack.envs.buffers.resolve_measuring_sizes", lambda _: small)
     made: list[weakref.ref[Env]] = []
 
     def keep(*args: object, **kwargs: object) -> Env:
         env = Env(*args, **kwargs)  # type: ignore[arg-type]
-        assert not [ref for ref in made if ref() is not None], "the worlds of the run before are still there"
+        assert not [ref for ref in made if ref() is not None], (
+            "the worlds of the run before are still there"
+        )
         made.append(weakref.ref(env))
         return env
 
-    monkeypatch.setattr("mjstack.envs.probe.Env", keep)
-    overrides = ["batch=auto", "sim=mjwarp", "gate.capacity.probe_frames=1"]
+    monkeypatch.setattr("mjstack.envs.buffers.Env", keep)
+    overrides = ["batch=auto", "sim=mjwarp", "gate.capacity.probe_steps=1"]
     with pytest.raises(
-        FaultError, match=r"^batch=auto: what an environment of 1 worlds needs .*Set batch\.njmax higher still\.$"
+        FaultError,
+        match=(
+            r"^batch=auto: what an environment of 1 worlds needs .*Set batch\.njmax higher still\.$"
+        ),
     ):
         mjstack.make_env(overrides, nworld=1, device="cpu")
     assert len(made) == 4
     assert not [ref for ref in made if ref() is not None]
 
 
-def test_gates_get_no_sizes_from_a_task_that_lost_physics(new_context: NewContext, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gates_get_no_sizes_from_a_task_that_lost_physics(
+    new_context: NewContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([int(Overflow.NEFC), 0])))
-    monkeypatch.setattr("mjstack.gates.sizing.measure_task", lambda *_: lost)
+    monkeypatch.setattr("mjstack.episodes.workloads.measure_task", lambda *_: lost)
     context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
-    with pytest.raises(FaultError, match="what the scripted task needs cannot be measured: NEFC overflow in 1 of 2 worlds"):
+    with pytest.raises(
+        FaultError,
+        match="what the scripted task needs cannot be measured: NEFC overflow in 1 of 2 worlds",
+    ):
         context.sizes  # noqa: B018
     assert context.measured is None
 
 
 def test_native_environment_measures_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mjstack.envs.probe.measure_peaks", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr("mjstack.envs.buffers.measure_peaks", lambda *_: pytest.fail("measured"))
     mjstack.make_env(["batch=auto", "sim=native"], nworld=1).reset(seed=0)
 
 
 def test_batch_uses_what_capacity_measured(new_context: NewContext) -> None:
-    context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto", "batch.nconmax=48")
+    context = new_context(
+        "sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto", "batch.nconmax=48"
+    )
     context.measured = BatchSizes(nconmax=40, njmax=184, source="batch=auto: somewhere")
     sim = context.batch_simulation(2)
     assert sim.sizes == BatchSizes(nconmax=48, njmax=184)  # type: ignore[attr-defined]
@@ -537,13 +648,16 @@ def test_batch_uses_what_capacity_measured(new_context: NewContext) -> None:
 
 def test_batch_measures_where_capacity_does_not_run(new_context: NewContext) -> None:
     said: list[str] = []
-    context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=1", "batch=auto", "gates=[batch]", *brisk())
+    context = new_context(
+        "sim=mjwarp", "sim.device=cpu", "nworld=1", "batch=auto", "gates=[batch]", *brisk()
+    )
     context.say = said.append
     (result,) = run_batch(context)
     assert result.status is Status.passed, result.reason
     assert (
         result.metrics["sizes"]
-        == "batch.nconmax=40 batch.njmax=184 batch.nccdmax=8 (batch=auto: the scripted task in 1 worlds, times 1.25)"
+        == "batch.nconmax=40 batch.njmax=184 batch.nccdmax=8 (batch=auto: the scripted task in 1"
+        " worlds, times 1.25)"
     )
     assert said == [result.metrics["sizes"]]
     assert int(result.metrics["peak_constraint_rows_per_world"]) <= 184
@@ -553,8 +667,8 @@ BAD = [
     ("gate.capacity.margin=0.9", "gate.capacity.margin=0.9"),
     ("gate.capacity.margin=nan", "gate.capacity.margin=nan"),
     ("gate.capacity.margin=inf", "gate.capacity.margin=inf"),
-    ("gate.capacity.random_frames=0", "gate.capacity.random_frames=0"),
-    ("gate.capacity.probe_frames=0", "gate.capacity.probe_frames=0"),
+    ("gate.capacity.random_steps=0", "gate.capacity.random_steps=0"),
+    ("gate.capacity.probe_steps=0", "gate.capacity.probe_steps=0"),
     ("gate.capacity.probe_nworld=-1", "gate.capacity.probe_nworld=-1"),
     ("gate.capacity.cpu_nworld=0", "gate.capacity.cpu_nworld=0"),
     ("gate.capacity.reset.cubes.parms.yaw=1", "parms"),
@@ -575,7 +689,7 @@ def test_bad_values_give_one_line(override: str, says: str) -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_gate_on_cuda(new_context: NewContext) -> None:
-    context = new_context("sim=mjwarp", "nworld=64", "batch=auto", "gate.capacity.random_frames=100")
+    context = new_context("sim=mjwarp", "nworld=64", "batch=auto", "gate.capacity.random_steps=100")
     (result,) = run_capacity(context)
     assert result.status is Status.passed, result.reason
     m = result.metrics
@@ -584,4 +698,6 @@ def test_gate_on_cuda(new_context: NewContext) -> None:
     assert m["rerun.randomized.overflow_worlds"] == 0
     assert "no fixed order" in str(m["rerun.task.same_final_state"])
     assert float(m["memory.task.rerun.data_mb"]) <= float(m["memory.task.rerun.device_mb"])
-    assert context.batch_simulation(64).sizes.source.startswith("batch=auto: gate capacity, 64 worlds")  # type: ignore[attr-defined]
+    assert context.batch_simulation(64).sizes.source.startswith(
+        "batch=auto: gate capacity, 64 worlds"
+    )  # type: ignore[attr-defined]

@@ -22,7 +22,15 @@ from mjstack.config import load_config
 
 CONF = Path(next(iter(mjstack.conf.__path__)))
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
-PROVENANCE = {"versions", "device", "driver", "cpu_count", "git_commit", "config_sha256", "model_sha256"}
+PROVENANCE = {
+    "versions",
+    "device",
+    "driver",
+    "cpu_count",
+    "git_commit",
+    "config_sha256",
+    "model_sha256",
+}
 
 
 @pytest.fixture
@@ -45,7 +53,7 @@ BAD = [
     ["nworld=0"],
     ["nworld=many"],
     ["batch.njmax=-1"],
-    ["timing.substeps=0"],
+    ["timing.decimation=0"],
     ["gates=[parityy]"],
     ["sim.nworlds=3"],
     ["sim=mjwarp", "sim.device=cuda:77"],
@@ -70,7 +78,7 @@ BAD = [
     ["task.control_hz=0"],
     ["hydra.run.dir=${foo}"],
     ["robot.gripper_open=[9.0]"],
-    ["robot.aperture_sites=[x,y]"],
+    ["robot.grasp_sites=[x,y]"],
     ["robot.locked.wrist_roll=nan"],
     ["scene.red_xy=[nan,0]"],
     ["scene.red_xy=[0.48,-0.2]"],
@@ -107,7 +115,9 @@ def test_bad_input_exits_2_in_one_line_and_writes_nothing(
 
 @pytest.mark.parametrize("args", [["robot=so100"], ["nworld=many"]], ids=" ".join)
 def test_bad_input_in_a_process_of_its_own(args: list[str], folder: Path) -> None:
-    done = subprocess.run([sys.executable, SCRIPT, *args], cwd=folder, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, SCRIPT, *args], cwd=folder, capture_output=True, text=True, timeout=60
+    )
     assert done.returncode == 2
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     assert len(lines) == 1, done.stderr
@@ -134,13 +144,23 @@ main()
 def starting(folder: Path, module: str, before: str, *args: str) -> subprocess.CompletedProcess:
     """A command line on which somebody presses Ctrl-C as a module is loaded."""
     program = STARTING.format(module=module, before=before)
-    return subprocess.run([sys.executable, "-c", program, *args], cwd=folder, capture_output=True, text=True, timeout=120)
+    return subprocess.run(
+        [sys.executable, "-c", program, *args],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
 
 
 @pytest.mark.parametrize("module", ["hydra", "torch"])
 def test_ctrl_c_while_modules_load_is_a_line(module: str, folder: Path) -> None:
     done = starting(folder, module, "default_int_handler", "gates=[baseline]")
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "mjstack: interrupted before anything ran\n")
+    assert (done.returncode, done.stdout, done.stderr) == (
+        130,
+        "",
+        "mjstack: interrupted before anything ran\n",
+    )
     assert everything(folder) == []
 
 
@@ -152,8 +172,17 @@ def test_ctrl_c_stays_ignored_where_it_was(folder: Path) -> None:
 def test_what_is_misspelt_does_not_wait_for_torch(folder: Path) -> None:
     for args in (["robo=so101"], ["nworld=many"], ["--nworld=3"], ["--version"], ["--help"]):
         program = "import sys; from mjstack.__main__ import main; import atexit; "
-        program += "atexit.register(lambda: print('torch' in sys.modules, 'warp' in sys.modules, file=sys.stderr)); main()"
-        done = subprocess.run([sys.executable, "-c", program, *args], cwd=folder, capture_output=True, text=True, timeout=60)
+        program += (
+            "atexit.register(lambda: print('torch' in sys.modules, 'warp' in sys.modules,"
+            " file=sys.stderr)); main()"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", program, *args],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
         assert done.stderr.splitlines()[-1] == "False False", args
 
 
@@ -169,8 +198,9 @@ def test_an_override_with_dashes_is_told_without(
     args: list[str], wrong: str, meant: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(args) == 2
-    assert capsys.readouterr().err.strip() == (
-        f"mjstack: flag '{wrong}' does not exist. Write {meant}, an override without dashes."
+    assert (
+        capsys.readouterr().err.strip()
+        == f"mjstack: flag '{wrong}' does not exist. Write {meant}, an override without dashes."
     )
 
 
@@ -195,15 +225,24 @@ try:
 except KeyboardInterrupt:
     print("mine")
 """
-    done = subprocess.run([sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, timeout=60
+    )
     assert done.stdout.split() == ["2", "2", "mine"], done.stderr
 
 
 def test_packages_are_there_after_a_plain_import(folder: Path) -> None:
-    program = "import mjstack; print(mjstack.scene.build_model.__name__, mjstack.errors.MjstackError.__name__); mjstack.no_such"
-    done = subprocess.run([sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, timeout=60)
+    program = (
+        "import mjstack; print(mjstack.scene.build_model.__name__,"
+        " mjstack.errors.MjstackError.__name__); mjstack.no_such"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, timeout=60
+    )
     assert done.stdout.split() == ["build_model", "MjstackError"]
-    assert done.stderr.strip().endswith("AttributeError: module 'mjstack' has no attribute 'no_such'")
+    assert done.stderr.strip().endswith(
+        "AttributeError: module 'mjstack' has no attribute 'no_such'"
+    )
 
 
 def test_help_says_what_there_is_to_choose(
@@ -216,7 +255,10 @@ def test_help_says_what_there_is_to_choose(
     said = " ".join(out.split())
     for group in CONF.iterdir():
         for choice in group.glob("*.yaml"):
-            assert re.search(rf" {group.name} [^:]*: .*\b{choice.stem}\b", said), (group.name, choice.stem)
+            assert re.search(rf" {group.name} [^:]*: .*\b{choice.stem}\b", said), (
+                group.name,
+                choice.stem,
+            )
     keys = {name for name, value in asdict(load_config()).items() if not isinstance(value, dict)}
     for name in keys:
         assert re.search(rf"^  {name} ", out, re.MULTILINE), name
@@ -241,7 +283,9 @@ def test_version(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert everything(folder) == []
 
 
-def test_a_part_of_the_configuration_is_shown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_part_of_the_configuration_is_shown(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["job=collect", "job.episodes=7", "--cfg", "job", "-p", "job"]) == 0
     assert "episodes: 7\n" in capsys.readouterr().out
     assert everything(folder) == []
@@ -262,7 +306,14 @@ def test_baseline_leaves_a_whole_report(folder: Path) -> None:
     assert all(isinstance(v, float | int | str | bool | None) for v in gate["metrics"].values())
     (job,) = {path.parent for path in folder.rglob("report.json")}
     assert job.relative_to(folder).parts[0] == "outputs"
-    for name in ("report.md", "run.log", "scene.png", "trajectories.png", ".hydra/config.yaml", ".hydra/overrides.yaml"):
+    for name in (
+        "report.md",
+        "run.log",
+        "scene.png",
+        "trajectories.png",
+        ".hydra/config.yaml",
+        ".hydra/overrides.yaml",
+    ):
         assert (job / name).stat().st_size > 0, name
     assert [path.name for path in folder.iterdir()] == ["outputs"]
 
@@ -289,7 +340,9 @@ def test_sweep_reports_each_job_and_a_summary(folder: Path) -> None:
 
 def test_sweep_exits_with_its_worst_job(folder: Path) -> None:
     assert run(["-m", "gate.acceptance.xy_err=0.015,1e-6", "gates=[baseline]"]) == 1
-    statuses = [json.loads(path.read_text())["status"] for path in sorted(folder.rglob("report.json"))]
+    statuses = [
+        json.loads(path.read_text())["status"] for path in sorted(folder.rglob("report.json"))
+    ]
     assert statuses == ["pass", "fail"]
 
 
@@ -312,11 +365,13 @@ def in_the_batch(folder: Path) -> Iterator[Callable[[], subprocess.Popen]]:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            # A runner in the background may have been started with Ctrl-C ignored, and Python would take that over.
+            # A runner in the background may have been started with Ctrl-C ignored, and Python would
+            # take that over.
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         processes.append(process)
-        path, until = folder / "out" / "report.json", time.monotonic() + 60
+        path = folder / "out" / "report.json"
+        until = time.monotonic() + 60
         while time.monotonic() < until and process.poll() is None:
             if path.exists() and json.loads(path.read_text())["gates"]:
                 time.sleep(1.0)
@@ -331,7 +386,9 @@ def in_the_batch(folder: Path) -> Iterator[Callable[[], subprocess.Popen]]:
         process.communicate()
 
 
-def test_ctrl_c_leaves_the_finished_gates(folder: Path, in_the_batch: Callable[[], subprocess.Popen]) -> None:
+def test_ctrl_c_leaves_the_finished_gates(
+    folder: Path, in_the_batch: Callable[[], subprocess.Popen]
+) -> None:
     process = in_the_batch()
     os.kill(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=30)
@@ -342,7 +399,9 @@ def test_ctrl_c_leaves_the_finished_gates(folder: Path, in_the_batch: Callable[[
     assert [(gate["name"], gate["status"]) for gate in report["gates"]] == [("baseline", "pass")]
 
 
-def test_kill_leaves_a_readable_report(folder: Path, in_the_batch: Callable[[], subprocess.Popen]) -> None:
+def test_kill_leaves_a_readable_report(
+    folder: Path, in_the_batch: Callable[[], subprocess.Popen]
+) -> None:
     process = in_the_batch()
     process.kill()
     process.wait(timeout=30)

@@ -1,4 +1,6 @@
-"""Demonstrations of the scripted expert: what a frame holds, which episodes count, and that nothing is lost or there twice."""
+"""Demonstrations of the scripted expert: what a step holds, which episodes count, and that nothing
+is lost or there twice.
+"""
 
 from __future__ import annotations
 
@@ -23,18 +25,18 @@ from pretended import episodes_of, pairs, pretended
 
 from mjstack.cli import run
 from mjstack.config import load_config
-from mjstack.config.content import config_hash
+from mjstack.config.fingerprint import config_hash
 from mjstack.config.schema import Backend, Config
 from mjstack.datasets import DatasetWriter, Feature, read_dataset
 from mjstack.datasets.shard import Shard
 from mjstack.envs import build_env, demonstration_config
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.rollout import Episode, run_episode
 from mjstack.errors import ConfigError
-from mjstack.gates.episode import Episode, run_episode
-from mjstack.gates.gate import GateContext
 from mjstack.jobs import collection
 from mjstack.jobs.collect import collect_folder, run_collect_job
 from mjstack.jobs.collect_record import FILE
-from mjstack.jobs.demonstration import FrameRecorder, Played
+from mjstack.jobs.demonstration import Played, StepRecorder
 from mjstack.jobs.demonstration_spec import episode_config, first_difference, make_spec
 from mjstack.managers.reset import required_fields
 from mjstack.report.collect import LOADING
@@ -45,13 +47,17 @@ COMMAND = ["job=collect", "sim=native", "job.folder=outputs/demos"]
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
 
 
-def frames_of(dataset: Path, number: int) -> dict[str, np.ndarray]:
+def steps_of(dataset: Path, number: int) -> dict[str, np.ndarray]:
     table = pq.read_table(dataset / "data", filters=[("episode_index", "==", number)])
     return {name: np.array(table[name].to_pylist()) for name in table.column_names}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 def report_of(folder: Path) -> dict:
@@ -61,7 +67,9 @@ def report_of(folder: Path) -> dict:
 def gate_episode(cfg: Config) -> Episode:
     """What the gates' own loop makes of the same worlds."""
     context = GateContext(cfg=cfg)
-    sim = make_simulation(context.model, cfg, cfg.nworld, backend=Backend.native, fields=required_fields(cfg.reset))
+    sim = make_simulation(
+        context.model, cfg, cfg.nworld, backend=Backend.native, fields=required_fields(cfg.reset)
+    )
     try:
         return run_episode(sim, context.index, cfg, context.planner, cfg.reset, keep_commands=True)
     finally:
@@ -70,9 +78,17 @@ def gate_episode(cfg: Config) -> Episode:
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
-    """Four real episodes. The stacks' offsets are 0.2, 0.7, 1.2 and 1.3 mm: by the threshold two of them fail, and are kept."""
+    """Four real episodes. The stacks' offsets are 0.2, 0.7, 1.2 and 1.3 mm: by the threshold two of
+    them fail, and are kept.
+    """
     folder = tmp_path_factory.mktemp("collect")
-    args = [*COMMAND, "nworld=4", "job.episodes=4", "job.keep_failures=true", "gate.acceptance.xy_err=0.001"]
+    args = [
+        *COMMAND,
+        "nworld=4",
+        "job.episodes=4",
+        "job.keep_failures=true",
+        "gate.acceptance.xy_err=0.001",
+    ]
     before = os.getcwd()
     os.chdir(folder)
     try:
@@ -82,7 +98,13 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     home = folder / "outputs" / "demos"
     cfg = load_config(args)
     return SimpleNamespace(
-        code=code, args=args, cfg=cfg, cwd=folder, home=home, dataset=home / "dataset", judged=gate_episode(cfg)
+        code=code,
+        args=args,
+        cfg=cfg,
+        cwd=folder,
+        home=home,
+        dataset=home / "dataset",
+        judged=gate_episode(cfg),
     )
 
 
@@ -95,21 +117,42 @@ def test_the_dataset_keeps_its_promises(demos: SimpleNamespace) -> None:
 
 def test_names_and_units(demos: SimpleNamespace) -> None:
     info = json.loads((demos.dataset / "meta/info.json").read_text())
-    features, units = info["features"], info["mjstack"]["units"]
+    features = info["features"]
+    units = info["mjstack"]["units"]
     assert info["fps"] == 50
-    assert features["observation.state"]["names"] == features["action"]["names"] == [f"{name}.pos" for name in JOINTS]
+    assert (
+        features["observation.state"]["names"]
+        == features["action"]["names"]
+        == [f"{name}.pos" for name in JOINTS]
+    )
     assert units["observation.state"] == units["action"] == ["rad"] * 6
-    policy = dict(zip(features["observation.policy"]["names"], units["observation.policy"], strict=True))
+    policy = dict(
+        zip(features["observation.policy"]["names"], units["observation.policy"], strict=True)
+    )
     assert len(policy) == 24
     assert policy["joint_pos.0"] == policy["last_action.5"] == "rad"
     assert policy["joint_vel.3"] == "10 rad/s"
-    assert policy["aperture_to_red.2"] == "m"
-    privileged = dict(zip(features["observation.privileged"]["names"], units["observation.privileged"], strict=True))
-    assert (privileged["red_pose.2"], privileged["red_pose.3"], privileged["jaw_force.1"]) == ("m", "1", "10 N")
+    assert policy["grasp_point_to_red.2"] == "m"
+    privileged = dict(
+        zip(
+            features["observation.privileged"]["names"],
+            units["observation.privileged"],
+            strict=True,
+        )
+    )
+    assert (privileged["red_pose.2"], privileged["red_pose.3"], privileged["jaw_force.1"]) == (
+        "m",
+        "1",
+        "10 N",
+    )
     assert (privileged["red_velocity.0"], privileged["red_velocity.5"]) == ("m/s", "rad/s")
     assert {"next.reward", "next.done", "next.success", "timestamp"} <= set(features)
     config = info["mjstack"]["provenance"][0]["config"]
-    assert config_hash(config) == info["mjstack"]["config_sha256"] == config_hash(episode_config(demos.cfg))
+    assert (
+        config_hash(config)
+        == info["mjstack"]["config_sha256"]
+        == config_hash(episode_config(demos.cfg))
+    )
 
 
 @pytest.mark.parametrize("robot", ["so101", "rebot"])
@@ -127,17 +170,17 @@ def test_every_number_has_a_name_and_a_unit(robot: str, task: str) -> None:
 
 
 def test_names_of_a_history_and_of_a_strange_term() -> None:
-    history = "+observation.policy.terms.aperture_to_red.history=2"
+    history = "+observation.policy.terms.grasp_point_to_red.history=2"
     strange = "+observation.policy.terms.count={func: mjstack.mdp.reward.success}"
     cfg = load_config([*COMMAND, history, strange])
     env = build_env(demonstration_config(cfg), nworld=1, backend=Backend.native, device="cpu")
     feature: Feature = make_spec(env, cfg, {}).features["observation.policy"]
-    first = feature.names.index("aperture_to_red.0.t-1")
+    first = feature.names.index("grasp_point_to_red.0.t-1")
     assert feature.names[first : first + 4] == (
-        "aperture_to_red.0.t-1",
-        "aperture_to_red.1.t-1",
-        "aperture_to_red.2.t-1",
-        "aperture_to_red.0",
+        "grasp_point_to_red.0.t-1",
+        "grasp_point_to_red.1.t-1",
+        "grasp_point_to_red.2.t-1",
+        "grasp_point_to_red.0",
     )
     assert feature.units[feature.names.index("count")] == "unknown"
     env.close()
@@ -149,59 +192,82 @@ def test_actions_are_what_the_gates_command(demos: SimpleNamespace) -> None:
     given.rewind()
     commands = torch.stack([given.command() for _ in range(600)], dim=1).numpy()
     for number, row in enumerate(episodes_of(demos.dataset)):
-        assert np.array_equal(frames_of(demos.dataset, number)["action"].astype(np.float32), commands[row["world"]])
+        assert np.array_equal(
+            steps_of(demos.dataset, number)["action"].astype(np.float32), commands[row["world"]]
+        )
 
 
 def test_success_is_the_evidence(demos: SimpleNamespace) -> None:
-    failed = demos.judged.verdict.failed.numpy()
+    failed = demos.judged.result.failed.numpy()
     assert 0 < (failed == 0).sum() < 4  # some of each, or nothing is shown
     rows = episodes_of(demos.dataset)
     assert [row["world"] for row in rows] == [0, 1, 2, 3]
     for number, row in enumerate(rows):
         good = failed[row["world"]] == 0
-        frames = frames_of(demos.dataset, number)
+        steps = steps_of(demos.dataset, number)
         assert row["success"] == good
         assert (row["failed_rules"] == "") == good
-        assert frames["next.success"].tolist() == [False] * 599 + [bool(good)]
-        assert frames["next.done"].tolist() == [False] * 599 + [True]
-        assert frames["timestamp"] == pytest.approx(np.arange(600) / 50.0)
+        assert steps["next.success"].tolist() == [False] * 599 + [bool(good)]
+        assert steps["next.done"].tolist() == [False] * 599 + [True]
+        assert steps["timestamp"] == pytest.approx(np.arange(600) / 50.0)
         assert (row["seed"], row["length"]) == (0, 600)
         assert row["config_sha256"] == config_hash(episode_config(demos.cfg))
 
 
-def test_a_frame_is_the_state_before_its_action(demos: SimpleNamespace) -> None:
-    """The actions, played in the environment, bring the same observations before and the same rewards after each of them."""
+def test_a_step_is_the_state_before_its_action(demos: SimpleNamespace) -> None:
+    """The actions, played in the environment, bring the same observations before and the same
+    rewards after each of them.
+    """
     env = build_env(demonstration_config(demos.cfg), nworld=4, backend=Backend.native, device="cpu")
-    episodes = [frames_of(demos.dataset, number) for number in range(4)]
+    episodes = [steps_of(demos.dataset, number) for number in range(4)]
 
-    def stored(name: str, frame: int) -> np.ndarray:
-        return np.stack([episode[name][frame] for episode in episodes]).astype(np.float32)
+    def stored(name: str, step: int) -> np.ndarray:
+        return np.stack([episode[name][step] for episode in episodes]).astype(np.float32)
 
     obs, _ = env.reset(seed=0)
     env.sim.forward()
     robot = env.index.on(env.device, env.sim.qpos.dtype)
-    for frame in range(600):
-        assert np.array_equal(stored("observation.state", frame), robot.qpos.read(env.sim.qpos).float().numpy()), frame
+    for step in range(600):
+        assert np.array_equal(
+            stored("observation.state", step), robot.qpos.read(env.sim.qpos).float().numpy()
+        ), step
         for group in ("policy", "privileged"):
-            assert np.array_equal(stored(f"observation.{group}", frame), obs[group].numpy()), (group, frame)
-        obs, reward, terminated, truncated, _ = env.step(torch.from_numpy(stored("action", frame)))
+            assert np.array_equal(stored(f"observation.{group}", step), obs[group].numpy()), (
+                group,
+                step,
+            )
+        obs, reward, terminated, truncated, _ = env.step(torch.from_numpy(stored("action", step)))
         assert not (terminated | truncated).any()
-        assert np.array_equal(stored("next.reward", frame), reward.numpy()), frame
+        assert np.array_equal(stored("next.reward", step), reward.numpy()), step
     assert np.ptp([episode["next.reward"].sum() for episode in episodes]) > 0.0
     env.close()
 
 
 def test_what_is_left_beside_the_dataset(demos: SimpleNamespace) -> None:
     (gate,) = report_of(demos.home)["gates"]
-    metrics, accepted = gate["metrics"], int((demos.judged.verdict.failed == 0).sum())
-    assert (metrics["episodes"], metrics["frames"], metrics["accepted"], metrics["worlds_played"]) == (4, 2400, accepted, 4)
+    metrics = gate["metrics"]
+    succeeded = int((demos.judged.result.failed == 0).sum())
+    assert (
+        metrics["episodes"],
+        metrics["steps"],
+        metrics["succeeded"],
+        metrics["worlds_played"],
+    ) == (4, 2400, succeeded, 4)
     assert metrics["success_rate_low95"] < metrics["success_rate"] < metrics["success_rate_high95"]
     assert metrics["simulation_s"] > metrics["copy_s"] > 0.0
-    assert metrics["megabytes"] == pytest.approx(sum(map(len, contents(demos.dataset).values())) / 1e6)
-    assert any(line.startswith(f"not stacked: {4 - accepted} of 4 worlds") for line in gate["details"])
+    assert metrics["megabytes"] == pytest.approx(
+        sum(map(len, contents(demos.dataset).values())) / 1e6
+    )
+    assert any(
+        line.startswith(f"not stacked: {4 - succeeded} of 4 worlds") for line in gate["details"]
+    )
     text = (demos.home / "dataset.md").read_text()
-    state = frames_of(demos.dataset, 0)["observation.state"]
-    (line,) = [line for line in text.splitlines() if line.startswith("| observation.state gripper.pos | rad |")]
+    state = steps_of(demos.dataset, 0)["observation.state"]
+    (line,) = [
+        line
+        for line in text.splitlines()
+        if line.startswith("| observation.state gripper.pos | rad |")
+    ]
     low, _, high = (float(cell) for cell in line.split("|")[3:6])
     assert low - 1e-4 <= state[:, 5].min() < state[:, 5].max() <= high + 1e-4
     assert LOADING.format(folder="outputs/demos/dataset") in text
@@ -210,7 +276,9 @@ def test_what_is_left_beside_the_dataset(demos: SimpleNamespace) -> None:
 def test_readme_lines_load_it(demos: SimpleNamespace) -> None:
     (block,) = re.findall(r"```python\n([^`]*?pq\.read_table[^`]*?)```", README.read_text())
     assert block == LOADING.format(folder="outputs/demos/dataset")
-    done = subprocess.run([sys.executable, "-c", block], cwd=demos.cwd, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", block], cwd=demos.cwd, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     state, action = done.stdout.splitlines()
     assert state.startswith("observation.state (600, 6) ['shoulder_pan.pos'")
@@ -218,7 +286,9 @@ def test_readme_lines_load_it(demos: SimpleNamespace) -> None:
     assert action.endswith("'rad']")
 
 
-def test_the_same_command_again_does_nothing(demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_command_again_does_nothing(
+    demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(demos.cwd)
     monkeypatch.setattr(collection, "play_demonstrations", None)
     before = contents(demos.dataset / "data")
@@ -236,9 +306,10 @@ def test_another_configuration_is_refused(
     before = contents(demos.cwd)
     assert run([*demos.args, "job.episodes=5", "reward.lift.weight=2.5"]) == 2
     err = capsys.readouterr().err.strip()
-    assert err == (
-        "mjstack: outputs/demos/dataset has episodes of another configuration: reward.lift.weight=2.0, expected 2.5. Set "
-        "job.folder to another folder, or reward.lift.weight to 2.0."
+    assert (
+        err == "mjstack: outputs/demos/dataset has episodes of another configuration:"
+        " reward.lift.weight=2.0, expected 2.5. Set job.folder to another folder, or"
+        " reward.lift.weight to 2.0."
     )
     assert contents(demos.cwd) == before
 
@@ -248,7 +319,9 @@ def test_a_dataset_that_is_being_written_is_refused(
 ) -> None:
     monkeypatch.chdir(demos.cwd)
     env = build_env(demonstration_config(demos.cfg), nworld=1, backend=Backend.native, device="cpu")
-    with DatasetWriter(demos.dataset, make_spec(env, demos.cfg, {"config": episode_config(demos.cfg)})):
+    with DatasetWriter(
+        demos.dataset, make_spec(env, demos.cfg, {"config": episode_config(demos.cfg)})
+    ):
         assert run([*demos.args, "job.episodes=5"]) == 2
     assert "is open in another writer" in capsys.readouterr().err
     env.close()
@@ -268,12 +341,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["reset=nominal"], "reset=[home]: expected starts that differ"),
         (["video=true"], "video=true: expected false with job=collect"),
         (["task=reach"], "task=reach"),
-        (["+observation.state={terms: {q: {func: mjstack.mdp.observation.joint_pos}}}"], "observation.state=a group"),
+        (
+            ["+observation.state={terms: {q: {func: mjstack.mdp.observation.joint_pos}}}"],
+            "observation.state=a group",
+        ),
         (["job.folder=taken"], "taken is a file"),
         (["job.folder=earlier"], "earlier has a run of job=gates"),
     ],
 )
-def test_bad_input_is_one_line(args: list[str], words: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(
+    args: list[str], words: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     cwd = Path.cwd()
     (cwd / "taken").write_text("")
     (cwd / "earlier" / ".hydra").mkdir(parents=True)
@@ -292,14 +370,38 @@ def test_what_the_hash_is_of() -> None:
 
     base = home()
     assert base.parent == Path("outputs/collect")
-    assert home("job.episodes=7", "nworld=3", "gates=[batch]", "graph=off", "batch.njmax=300", "job.buffer_gib=1") == base
-    assert home("gate.throughput.frames=3", "gate.success.seeds=2", "~termination.success") == base
-    others = ["robot=rebot", "task=box", "model=menagerie", "timing=fine", "controller=planned", "reset=jitter", "seed=1"]
-    others += ["+observation.policy.noise=false", "reward.lift.weight=3", "gate.acceptance.xy_err=0.01"]
+    assert (
+        home(
+            "job.episodes=7",
+            "nworld=3",
+            "gates=[batch]",
+            "graph=off",
+            "batch.njmax=300",
+            "job.buffer_gib=1",
+        )
+        == base
+    )
+    assert home("gate.throughput.steps=3", "gate.success.seeds=2", "~termination.success") == base
+    others = [
+        "robot=rebot",
+        "task=box",
+        "model=menagerie",
+        "timing=fine",
+        "controller=open_loop",
+        "reset=jitter",
+        "seed=1",
+    ]
+    others += [
+        "+observation.policy.noise=false",
+        "reward.lift.weight=3",
+        "gate.acceptance.xy_err=0.01",
+    ]
     others += ["job.keep_failures=true", "controller.phases.done.seconds=2.0"]
     assert len({base, *(home(other) for other in others)}) == 1 + len(others)
     on_cpu = collect_folder(load_config(["job=collect", "sim=mjwarp", "sim.device=cpu"]))
-    assert on_cpu != base  # the backend changes episodes in their last digits, the device does not count
+    assert (
+        on_cpu != base
+    )  # the backend changes episodes in their last digits, the device does not count
 
 
 @pytest.mark.parametrize(
@@ -307,8 +409,18 @@ def test_what_the_hash_is_of() -> None:
     [
         ({"a": {"b": 1, "c": [1]}}, {"a": {"b": 1, "c": [2]}}, "a.c=[1], expected [2]", True),
         ({"a": {"b": True, "c": 2}}, {"a": {"b": None, "c": 3}}, "a.b=true, expected null", False),
-        ({"a": {"b": {"c": {}}, "d": 1}}, {"a": {"b": {"c": {"e": 1}}, "d": 1}}, "a.b.c has nothing, expected e", False),
-        ({"a": {"b": {"c": {"e": 1}}}}, {"a": {"b": {"c": {}}}}, "a.b.c has e, expected nothing", False),
+        (
+            {"a": {"b": {"c": {}}, "d": 1}},
+            {"a": {"b": {"c": {"e": 1}}, "d": 1}},
+            "a.b.c has nothing, expected e",
+            False,
+        ),
+        (
+            {"a": {"b": {"c": {"e": 1}}}},
+            {"a": {"b": {"c": {}}}},
+            "a.b.c has e, expected nothing",
+            False,
+        ),
         ({"a": {"b": 1, "c": 2}}, {"a": {"b": 3}}, "a has b, c, expected b", False),
         ({"a": {"b": None}}, {"a": {"b": {"c": 1}}}, 'a.b=null, expected {"c": 1}', True),
     ],
@@ -328,8 +440,9 @@ def test_another_group_is_refused_by_its_names(
     assert run([*demos.args, "reset=jitter"]) == 2
     err = capsys.readouterr().err.strip()
     assert err.startswith(
-        "mjstack: outputs/demos/dataset has episodes of another configuration: reset has home, joints, cubes, mass, friction, "
-        "gains, expected home, cubes. Set job.folder to another folder, or give what it was made with: job=collect "
+        "mjstack: outputs/demos/dataset has episodes of another configuration: reset has home,"
+        " joints, cubes, mass, friction, gains, expected home, cubes. Set job.folder to another"
+        " folder, or give what it was made with: job=collect "
     )
     back = shlex.split(err.partition("made with: ")[2].removesuffix("."))
     monkeypatch.setattr(collection, "play_demonstrations", None)
@@ -337,29 +450,43 @@ def test_another_group_is_refused_by_its_names(
 
 
 def collect(*overrides: str) -> int:
-    """Runs the job as the command line does once it has checked everything, and returns its exit status."""
+    """Runs the job as the command line does once it has checked everything, and returns its exit
+    status.
+    """
     cfg = load_config([*COMMAND, *overrides])
     home = collect_folder(cfg)
     home.mkdir(parents=True, exist_ok=True)
     return run_collect_job(cfg, home, []).exit_code
 
 
-def test_seeds_go_on_until_the_episodes_are_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: world == 1))
+def test_seeds_go_on_until_the_episodes_are_there(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        collection, "play_demonstrations", pretended(lambda seed, world: world == 1)
+    )
     assert collect("nworld=4", "job.episodes=7", "seed=5") == 0
     found = pairs(folder / "dataset")
     # What is missing decides how many worlds: 7, then 4, then 1 and one to spare.
     assert found == [(5, 0), (5, 2), (5, 3), (6, 0), (6, 2), (6, 3), (7, 0)]
     batches = json.loads((folder / FILE).read_text())
-    assert [(batch["worlds"], batch["accepted"], batch["kept"]) for batch in batches] == [(4, 3, 3), (4, 3, 3), (2, 1, 1)]
-    frames = frames_of(folder / "dataset", 5)
-    assert frames["action"] == pytest.approx(1e-3 * 6 + 1e-6 * 3)
+    assert [(batch["worlds"], batch["succeeded"], batch["kept"]) for batch in batches] == [
+        (4, 3, 3),
+        (4, 3, 3),
+        (2, 1, 1),
+    ]
+    steps = steps_of(folder / "dataset", 5)
+    assert steps["action"] == pytest.approx(1e-3 * 6 + 1e-6 * 3)
     # More are wanted: seed 8 is next, whatever nworld is.
     assert collect("nworld=16", "job.episodes=9", "seed=5") == 0
     assert pairs(folder / "dataset") == [*found, (8, 0), (8, 2)]
     assert not any(row["failed_rules"] for row in episodes_of(folder / "dataset"))
     metrics = report_of(folder)["gates"][0]["metrics"]
-    assert (metrics["worlds_played"], metrics["accepted"], metrics["episodes_of_this_call"]) == (13, 9, 2)
+    assert (metrics["worlds_played"], metrics["succeeded"], metrics["episodes_of_this_call"]) == (
+        13,
+        9,
+        2,
+    )
     read_dataset(folder / "dataset")
 
 
@@ -367,29 +494,39 @@ LAYOUT = """world,red_x_m,red_y_m,red_yaw_rad,blue_x_m,blue_y_m,blue_yaw_rad
 0,0.33,-0.13,0,0.33,0.06,0
 1,0.31,-0.10,0.3,0.34,0.08,-0.5
 """
-FROM_LAYOUT = ["reset=layout", "+reset.noise={func: mjstack.mdp.reset.JointNoise, params: {arm: 0.01}}", "nworld=2"]
+FROM_LAYOUT = [
+    "reset=starts_file",
+    "+reset.noise={func: mjstack.mdp.reset.JointNoise, params: {arm: 0.01}}",
+    "nworld=2",
+]
 
 
 def test_a_layout_counts_by_its_content(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
-    first, moved = Path("worlds.csv"), Path("elsewhere.csv")
+    first = Path("worlds.csv")
+    moved = Path("elsewhere.csv")
     first.write_text(LAYOUT)
     args = [*COMMAND, *FROM_LAYOUT]
-    assert run([*args, "layout=worlds.csv", "job.episodes=2"]) == 0
+    assert run([*args, "starts=worlds.csv", "job.episodes=2"]) == 0
     first.rename(moved)
-    assert run([*args, "layout=elsewhere.csv", "job.episodes=4"]) == 0
+    assert run([*args, "starts=elsewhere.csv", "job.episodes=4"]) == 0
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1)]
-    assert len(json.loads((folder / "dataset/meta/info.json").read_text())["mjstack"]["provenance"]) == 1
+    assert (
+        len(json.loads((folder / "dataset/meta/info.json").read_text())["mjstack"]["provenance"])
+        == 1
+    )
     moved.write_text(LAYOUT.replace("0.31", "0.32"))
     before = contents(Path.cwd())
     capsys.readouterr()
-    assert run([*args, "layout=elsewhere.csv", "job.episodes=6"]) == 2
+    assert run([*args, "starts=elsewhere.csv", "job.episodes=6"]) == 2
     was, now = (hashlib.sha256(text.encode()).hexdigest() for text in (LAYOUT, moved.read_text()))
-    assert capsys.readouterr().err.strip() == (
-        f"mjstack: outputs/demos/dataset has episodes of another configuration: layout=sha256:{was}, expected sha256:{now}. "
-        "Set job.folder to another folder, or layout to a file with that content."
+    assert (
+        capsys.readouterr().err.strip()
+        == "mjstack: outputs/demos/dataset has episodes of another configuration:"
+        f" starts=sha256:{was}, expected sha256:{now}. Set job.folder to another folder, or"
+        " layout to a file with that content."
     )
     assert contents(Path.cwd()) == before
 
@@ -398,11 +535,19 @@ def test_a_layout_that_only_the_term_names_counts_too(folder: Path) -> None:
     homes = set()
     for path, text in (("a.csv", LAYOUT), ("b.csv", LAYOUT), ("b.csv", LAYOUT + "\n")):
         Path(path).write_text(text)
-        homes.add(collect_folder(load_config(["job=collect", "reset=layout", f"reset.layout.params.path={path}"])))
+        homes.add(
+            collect_folder(
+                load_config(
+                    ["job=collect", "reset=starts_file", f"reset.starts.params.path={path}"]
+                )
+            )
+        )
     assert len(homes) == 2
 
 
-def test_a_layout_that_changes_while_it_is_played(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_layout_that_changes_while_it_is_played(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     layout = Path("worlds.csv")
     layout.write_text(LAYOUT)
 
@@ -410,15 +555,19 @@ def test_a_layout_that_changes_while_it_is_played(folder: Path, monkeypatch: pyt
         if seed == 1:
             layout.write_text(LAYOUT + "\n")
 
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False, edit))
-    assert collect(*FROM_LAYOUT, "layout=worlds.csv", "job.episodes=4") == 1
+    monkeypatch.setattr(
+        collection, "play_demonstrations", pretended(lambda seed, world: False, edit)
+    )
+    assert collect(*FROM_LAYOUT, "starts=worlds.csv", "job.episodes=4") == 1
     (result,) = report_of(folder)["gates"]
     assert result["status"] == "fail"
-    assert result["reason"].startswith("the file of reset=layout changed while seed 1 was played: ")
+    assert result["reason"].startswith(
+        "the file of reset=starts_file changed while seed 1 was played: "
+    )
     assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
     monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
     layout.write_text(LAYOUT)
-    assert collect(*FROM_LAYOUT, "layout=worlds.csv", "job.episodes=4") == 0
+    assert collect(*FROM_LAYOUT, "starts=worlds.csv", "job.episodes=4") == 0
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1)]
 
 
@@ -426,7 +575,9 @@ def test_failures_are_kept_and_marked(folder: Path, monkeypatch: pytest.MonkeyPa
     def break_two(seed: int, values: torch.Tensor) -> None:
         values[3, 2:3] = torch.nan  # a world that diverged: of no use
 
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: world in (1, 2), break_two))
+    monkeypatch.setattr(
+        collection, "play_demonstrations", pretended(lambda seed, world: world in (1, 2), break_two)
+    )
     assert collect("nworld=4", "job.episodes=5", "job.keep_failures=true") == 0
     rows = episodes_of(folder / "dataset")
     assert [(row["seed"], row["world"], row["success"]) for row in rows] == [
@@ -441,7 +592,9 @@ def test_failures_are_kept_and_marked(folder: Path, monkeypatch: pytest.MonkeyPa
     assert any(line.startswith("1 episodes with a number that is not finite") for line in details)
 
 
-def test_an_expert_that_never_succeeds_is_given_up(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_expert_that_never_succeeds_is_given_up(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: True))
     args = ["nworld=2", "job.episodes=3"]
     assert collect(*args) == 1
@@ -462,11 +615,14 @@ def test_worlds_of_which_none_is_finite_are_given_up(
     def diverge(seed: int, values: torch.Tensor) -> None:
         values[3] = torch.nan
 
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False, diverge))
+    monkeypatch.setattr(
+        collection, "play_demonstrations", pretended(lambda seed, world: False, diverge)
+    )
     assert collect("nworld=2", "job.episodes=3", f"job.keep_failures={keep_failures}") == 1
     (gate,) = report_of(folder)["gates"]
     assert gate["reason"].startswith(
-        "3 seeds in a row brought no episode, the last because of: a number that is not finite in 2 of 2 worlds"
+        "3 seeds in a row brought no episode, the last because of: a number that is not finite in 2"
+        " of 2 worlds"
     )
     assert gate["metrics"]["episodes"] == 0
 
@@ -477,7 +633,9 @@ def test_ctrl_c_keeps_finished_batches(folder: Path, monkeypatch: pytest.MonkeyP
             raise KeyboardInterrupt
 
     args = ["nworld=2", "job.episodes=5"]
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False, stop))
+    monkeypatch.setattr(
+        collection, "play_demonstrations", pretended(lambda seed, world: False, stop)
+    )
     assert collect(*args) == 130
     assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
     found = report_of(folder)
@@ -488,7 +646,9 @@ def test_ctrl_c_keeps_finished_batches(folder: Path, monkeypatch: pytest.MonkeyP
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
 
 
-def test_a_full_disk_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_full_disk_is_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     add = Shard.add
 
     def full(self: Shard, *args: object) -> None:
@@ -512,7 +672,9 @@ def test_a_full_disk_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_a_kill_in_the_middle_of_a_batch(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed when the batch's first data file is committed and an episode of the second one is on the disk."""
+    """Killed when the batch's first data file is committed and an episode of the second one is on
+    the disk.
+    """
     kill = """
 import os, signal
 from functools import partial
@@ -535,8 +697,15 @@ run(ARGS)
 """
     args = ["nworld=7", "job.episodes=8"]
     program = f"ARGS = {[*COMMAND, *args]!r}\n{kill}"
-    found = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])}
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, env=found)
+    found = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(
+            [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+        ),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, env=found
+    )
     assert done.returncode == -signal.SIGKILL, done.stderr
     left = contents(folder / "dataset" / "data")
     before = {name: data for name, data in left.items() if "/." not in name}
@@ -546,18 +715,27 @@ run(ARGS)
     assert 2 <= kept < 6
     assert pairs(folder / "dataset") == whole[:kept]
     assert report_of(folder)["status"] == "interrupted"
-    (folder / ".hydra" / "config.yaml").write_text("")  # and so would be left by a kill a little later, in a second call
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: world == 1, noise=True))
+    (folder / ".hydra" / "config.yaml").write_text(
+        ""
+    )  # and so would be left by a kill a little later, in a second call
+    monkeypatch.setattr(
+        collection, "play_demonstrations", pretended(lambda seed, world: world == 1, noise=True)
+    )
     assert run([*COMMAND, *args]) == 0
     assert pairs(folder / "dataset") == whole
     assert before.items() <= contents(folder / "dataset" / "data").items()
     read_dataset(folder / "dataset")
     batches = json.loads((folder / FILE).read_text())
-    assert [(batch["worlds"], batch["accepted"], batch["kept"]) for batch in batches] == [(7, 6, 6), (3, 2, 2)]
-    assert report_of(folder)["gates"][0]["metrics"]["accepted"] == 8
+    assert [(batch["worlds"], batch["succeeded"], batch["kept"]) for batch in batches] == [
+        (7, 6, 6),
+        (3, 2, 2),
+    ]
+    assert report_of(folder)["gates"][0]["metrics"]["succeeded"] == 8
 
 
-def test_damaged_notes_are_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_notes_are_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
     assert collect("nworld=2", "job.episodes=1") == 0
     (folder / FILE).write_text("[{]")
@@ -581,11 +759,11 @@ def test_the_buffer_bounds_the_worlds() -> None:
     env.close()
 
 
-def test_frames_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     values = torch.randn(5, 7, 4)
-    frames = cast(FrameRecorder, SimpleNamespace(values=values, layout={"a": 3, "b": 1}))
+    steps = cast(StepRecorder, SimpleNamespace(values=values, starts={"a": 3, "b": 1}))
     none = np.zeros(7, dtype=np.int32)
-    played = Played(seed=0, worlds=range(7), frames=frames, failed=none, retries=none, seconds=0.0)
+    played = Played(seed=0, worlds=range(7), steps=steps, failed=none, retries=none, seconds=0.0)
     for size in (1, 2 * 5 * 4 * 4, 10**6):  # one world, two and all at once
         monkeypatch.setattr("mjstack.jobs.demonstration._CHUNK_BYTES", size)
         found = dict(played.episodes([6, 0, 3]))
@@ -596,27 +774,44 @@ def test_frames_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_mjwarp_demonstrations(folder: Path) -> None:
-    assert run([*COMMAND, "sim=mjwarp", "sim.device=cpu", "nworld=1", "job.episodes=1", "robot=rebot", *brisk("rebot")]) == 0
+    assert (
+        run(
+            [
+                *COMMAND,
+                "sim=mjwarp",
+                "sim.device=cpu",
+                "nworld=1",
+                "job.episodes=1",
+                "robot=rebot",
+                *brisk("rebot"),
+            ]
+        )
+        == 0
+    )
     stored = read_dataset(folder / "dataset")
     assert stored.episodes["success"] == [True]
-    frames = frames_of(folder / "dataset", 0)
-    # The servos follow, once they are on their way: a joint is close to what the frame before commanded.
-    assert np.abs(frames["observation.state"][51:, :6] - frames["action"][50:-1, :6]).max() < 0.1
+    steps = steps_of(folder / "dataset", 0)
+    # The servos follow, once they are on their way: a joint is close to what the step before
+    # commanded.
+    assert np.abs(steps["observation.state"][51:, :6] - steps["action"][50:-1, :6]).max() < 0.1
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_demonstrations_on_cuda(folder: Path) -> None:
-    """Captured frames are the eager ones, as far as two runs on CUDA agree, and the last frame is one of rest on the stack."""
+    """Captured steps are the eager ones, as far as two runs on CUDA agree, and the last step is one
+    of rest on the stack.
+    """
     short = ["job.episodes=8", "nworld=16", "sim=mjwarp", "sim.device=cuda:0"]
     assert run([*COMMAND, *short, "graph=require"]) == 0
     assert run(["job=collect", "job.folder=outputs/eager", *short, "graph=off"]) == 0
-    captured, eager = folder / "dataset", folder.parent / "eager" / "dataset"
+    captured = folder / "dataset"
+    eager = folder.parent / "eager" / "dataset"
     assert len(episodes_of(captured)) == 8
     both = sorted(set(pairs(captured)) & set(pairs(eager)))
     assert len(both) >= 6
     for pair in both:
-        a, b = (frames_of(dataset, pairs(dataset).index(pair)) for dataset in (captured, eager))
+        a, b = (steps_of(dataset, pairs(dataset).index(pair)) for dataset in (captured, eager))
         for name in ("observation.state", "action", "observation.policy"):
             assert np.allclose(a[name][:100], b[name][:100], atol=2e-3), name
         assert a["next.success"][-1]

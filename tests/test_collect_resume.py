@@ -1,4 +1,6 @@
-"""Demonstrations that were stopped anywhere: what the next call leaves is what an uninterrupted one does."""
+"""Demonstrations that were stopped anywhere: what the next call leaves is what an uninterrupted one
+does.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +21,18 @@ from environments import configure
 from pretended import episodes_of, pairs, pretended
 
 from mjstack.cli import run
-from mjstack.config.content import config_content
+from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetWriter, layout, read_dataset
 from mjstack.datasets.shard import Shard
 from mjstack.datasets.staging import Staging
+from mjstack.episodes.context import GateContext
 from mjstack.errors import DatasetError, UnwrittenError
-from mjstack.gates.gate import GateContext
 from mjstack.jobs import collection, demonstration_spec
 from mjstack.jobs.collect_record import FILE
 from mjstack.jobs.collection import Collection
 from mjstack.jobs.demonstration import play_demonstrations
-from mjstack.jobs.reported import run_provenance
+from mjstack.jobs.runner import run_provenance
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import build_model
 
@@ -42,16 +44,26 @@ def some_fail(seed: int, world: int) -> bool:
 
 
 _model = cache(lambda: build_model(configure(*COMMAND)))
-_provenance = cache(lambda: run_provenance(configure(*COMMAND), GateContext(cfg=configure(*COMMAND))))
-_content = cache(lambda keep_failures: config_content(configure(*COMMAND, f"job.keep_failures={keep_failures}")))
+_provenance = cache(
+    lambda: run_provenance(configure(*COMMAND), GateContext(cfg=configure(*COMMAND)))
+)
+_content = cache(
+    lambda keep_failures: config_content(configure(*COMMAND, f"job.keep_failures={keep_failures}"))
+)
 
 
 def patch_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody plays; a data file has room for four episodes, so batches are committed in between; what is slow is made once."""
+    """Nobody plays; a data file has room for four episodes, so batches are committed in between;
+    what is slow is made once.
+    """
     monkeypatch.setattr(collection, "DatasetWriter", partial(DatasetWriter, file_mb=1))
     monkeypatch.setattr(collection, "play_demonstrations", pretended(some_fail, noise=True))
     monkeypatch.setattr(collection, "run_provenance", lambda cfg, context: dict(_provenance()))
-    monkeypatch.setattr(demonstration_spec, "config_content", lambda cfg: copy.deepcopy(_content(cfg.job.keep_failures)))
+    monkeypatch.setattr(
+        demonstration_spec,
+        "config_content",
+        lambda cfg: copy.deepcopy(_content(cfg.job.keep_failures)),
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -59,11 +71,15 @@ def _patched(monkeypatch: pytest.MonkeyPatch) -> None:
     patch_all(monkeypatch)
 
 
-def collection_at(home: Path, *, nworld: int = 9, episodes: int = 10, keep_failures: bool = False) -> Collection:
+def collection_at(
+    home: Path, *, nworld: int = 9, episodes: int = 10, keep_failures: bool = False
+) -> Collection:
     """A collection, ready to play."""
     cfg = configure(*COMMAND)
     assert isinstance(cfg.job, CollectJobCfg)
-    cfg.nworld, cfg.job.episodes, cfg.job.keep_failures = nworld, episodes, keep_failures
+    cfg.nworld = nworld
+    cfg.job.episodes = episodes
+    cfg.job.keep_failures = keep_failures
     context = GateContext(cfg=cfg)
     context.model = _model()
     home.mkdir(parents=True, exist_ok=True)
@@ -78,21 +94,34 @@ def collect(home: Path, **kwargs: Any) -> GateResult:
 
 
 def left_in(home: Path, result: GateResult) -> dict[str, Any]:
-    """Everything that must not depend on interruptions: episodes, frames, notes and figures."""
+    """Everything that must not depend on interruptions: episodes, steps, notes and figures."""
     where = ("data/", "meta/episodes/")  # which of the files an episode is in does depend
-    rows = [{name: value for name, value in row.items() if not name.startswith(where)} for row in episodes_of(home / "dataset")]
-    frames: pa.Table = pq.read_table(home / "dataset" / "data").combine_chunks()
+    rows = [
+        {name: value for name, value in row.items() if not name.startswith(where)}
+        for row in episodes_of(home / "dataset")
+    ]
+    steps: pa.Table = pq.read_table(home / "dataset" / "data").combine_chunks()
     notes = json.loads((home / FILE).read_text())
     timed = [name for name in result.metrics if name.endswith("_s")]
     return {
         "rows": rows,
-        "frames": {name: frames[name].combine_chunks() for name in frames.column_names},
+        "steps": {name: steps[name].combine_chunks() for name in steps.column_names},
         "statistics": json.loads((home / "dataset" / layout.STATS).read_text()),
-        "notes": [{name: value for name, value in note.items() if not name.endswith("_s")} for note in notes],
+        "notes": [
+            {name: value for name, value in note.items() if not name.endswith("_s")}
+            for note in notes
+        ],
         "metrics": {
             name: value
             for name, value in result.metrics.items()
-            if name not in (*timed, "dataset", "megabytes", "episodes_of_this_call", "episodes_per_s")
+            if name
+            not in (
+                *timed,
+                "dataset",
+                "megabytes",
+                "episodes_of_this_call",
+                "episodes_per_s",
+            )
         },
         "details": result.details,
     }
@@ -104,7 +133,9 @@ def assert_same(found: dict[str, Any], expected: dict[str, Any]) -> None:
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["successes", "all"])
-def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def whole(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Any]:
     """What is left where nothing interrupts."""
     home = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -114,22 +145,29 @@ def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def test_figures_of_the_uninterrupted_one(whole: dict[str, Any]) -> None:
-    """By hand: worlds 1 and 5 fail of the first nine; three episodes are missing then, for which four worlds are played."""
-    notes, metrics = whole["left"]["notes"], whole["left"]["metrics"]
-    found = [(note["seed"], note["worlds"], note["accepted"], note["kept"], note["missing"]) for note in notes]
+    """By hand: worlds 1 and 5 fail of the first nine; three episodes are missing then, for which
+    four worlds are played.
+    """
+    notes = whole["left"]["notes"]
+    metrics = whole["left"]["metrics"]
+    found = [
+        (note["seed"], note["worlds"], note["succeeded"], note["kept"], note["missing"])
+        for note in notes
+    ]
     if whole["keep_failures"]:
         assert found == [(0, 9, 7, 9, {}), (1, 1, 1, 1, {})]
-        assert (metrics["worlds_played"], metrics["accepted"], metrics["episodes"]) == (10, 8, 10)
+        assert (metrics["worlds_played"], metrics["succeeded"], metrics["episodes"]) == (10, 8, 10)
     else:
         assert found == [(0, 9, 7, 7, {}), (1, 4, 3, 3, {})]
-        assert (metrics["worlds_played"], metrics["accepted"], metrics["episodes"]) == (13, 10, 10)
+        assert (metrics["worlds_played"], metrics["succeeded"], metrics["episodes"]) == (13, 10, 10)
     assert notes[0]["retries"] == sum(world % 3 for world in range(9))
     assert "episodes_without_note" not in metrics
 
 
 def interrupt_at(call: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C comes while an episode is written."""
-    add, calls = Shard.add, []
+    add = Shard.add
+    calls = []
 
     def interrupted(self: Shard, *args: Any) -> None:
         calls.append(args)
@@ -160,21 +198,26 @@ def test_ctrl_c_in_an_episode(call: int, whole: dict[str, Any], tmp_path: Path) 
     assert len(pairs(tmp_path / "dataset")) == call  # the one in which it came is finished too
     found = left_in(tmp_path, result)
     assert found["rows"] == whole["left"]["rows"][:call]
-    assert result.metrics["accepted"] >= sum(row["success"] for row in found["rows"])  # type: ignore[operator]
+    assert result.metrics["succeeded"] >= sum(row["success"] for row in found["rows"])  # type: ignore[operator]
     assert sum(note["kept"] for note in found["notes"]) == call
     for note in found["notes"]:
         there = [row["world"] for row in found["rows"] if row["seed"] == note["seed"]]
         assert not {int(world) for world in note["missing"]} & set(there)
     unfinished = [note for note in found["notes"] if note["missing"]]
     assert sum("is unfinished" in line for line in result.details) == len(unfinished)
-    assert_same(left_in(tmp_path, collect(tmp_path, keep_failures=whole["keep_failures"])), whole["left"])
+    assert_same(
+        left_in(tmp_path, collect(tmp_path, keep_failures=whole["keep_failures"])), whole["left"]
+    )
     read_dataset(tmp_path / "dataset")
 
 
 def test_ctrl_c_after_ctrl_c(tmp_path: Path) -> None:
-    """And each time with another nworld: the seed that was begun has the worlds that it was begun with."""
+    """And each time with another nworld: the seed that was begun has the worlds that it was begun
+    with.
+    """
     one = left_in(tmp_path / "whole", collect(tmp_path / "whole", nworld=16, episodes=20))
-    home, played = tmp_path / "parts", []
+    home = tmp_path / "parts"
+    played = []
     play = pretended(some_fail, noise=True)
 
     def told(context: Any, sim: Any, seed: int, values: torch.Tensor, worlds: list[int]) -> Any:
@@ -186,12 +229,19 @@ def test_ctrl_c_after_ctrl_c(tmp_path: Path) -> None:
         play_interrupted(home, 3, nworld=16, episodes=20)
         play_interrupted(home, 4, nworld=3, episodes=20)
         result = collect(home, nworld=16, episodes=20)
-    assert played[:4] == [(0, list(range(16))), (0, [4, 6, 7]), (0, [8, 10, 11]), (0, [10, 11, 12, 14, 15])]
+    assert played[:4] == [
+        (0, list(range(16))),
+        (0, [4, 6, 7]),
+        (0, [8, 10, 11]),
+        (0, [10, 11, 12, 14, 15]),
+    ]
     assert_same(left_in(home, result), one)
 
 
 def test_fewer_and_more_episodes_in_between(tmp_path: Path) -> None:
-    """A seed that was begun brings the episodes that it was begun for, whatever is asked for in between."""
+    """A seed that was begun brings the episodes that it was begun for, whatever is asked for in
+    between.
+    """
     one = left_in(tmp_path / "whole", collect(tmp_path / "whole", nworld=16, episodes=20))
     home = tmp_path / "parts"
     play_interrupted(home, 3, nworld=16, episodes=20)
@@ -200,10 +250,16 @@ def test_fewer_and_more_episodes_in_between(tmp_path: Path) -> None:
     assert_same(left_in(home, collect(home, nworld=16, episodes=20)), one)
 
 
-def test_a_kill_between_any_two_files(whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a kill would have left is copied before and after each file takes its place, and gone on with."""
-    home, copies = tmp_path / "home", tmp_path / "copies"
-    replace_file, add = os.replace, Shard.add
+def test_a_kill_between_any_two_files(
+    whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a kill would have left is copied before and after each file takes its place, and gone on
+    with.
+    """
+    home = tmp_path / "home"
+    copies = tmp_path / "copies"
+    replace_file = os.replace
+    add = Shard.add
 
     def copied() -> None:
         shutil.copytree(home, copies / str(len(list(copies.iterdir()))))
@@ -223,16 +279,24 @@ def test_a_kill_between_any_two_files(whole: dict[str, Any], tmp_path: Path, mon
         collect(home, keep_failures=whole["keep_failures"])
     copied()
     found = sorted(copies.iterdir(), key=lambda path: int(path.name))
-    committed = [len(pairs(path / "dataset")) if (path / "dataset" / "meta/episodes").exists() else 0 for path in found]
+    committed = [
+        len(pairs(path / "dataset")) if (path / "dataset" / "meta/episodes").exists() else 0
+        for path in found
+    ]
     assert len(set(committed)) >= 4  # the first batch has more than one file
     for path in found:
-        assert_same(left_in(path, collect(path, keep_failures=whole["keep_failures"])), whole["left"])
+        assert_same(
+            left_in(path, collect(path, keep_failures=whole["keep_failures"])), whole["left"]
+        )
     read_dataset(found[0] / "dataset")
 
 
 @pytest.mark.parametrize("call", [1, 6, 10])
-def test_a_full_disk_in_a_batch(call: int, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    add, calls = Shard.add, []
+def test_a_full_disk_in_a_batch(
+    call: int, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add = Shard.add
+    calls = []
 
     def full(self: Shard, *args: Any) -> None:
         calls.append(args)
@@ -249,13 +313,18 @@ def test_a_full_disk_in_a_batch(call: int, whole: dict[str, Any], tmp_path: Path
     assert len(kept) == playing.committed == sum(batch.kept for batch in playing.batches)
     if call == 6:
         assert 0 < len(kept) < 5  # the first file is committed, what was in the second is lost
-    assert_same(left_in(tmp_path, collect(tmp_path, keep_failures=whole["keep_failures"])), whole["left"])
+    assert_same(
+        left_in(tmp_path, collect(tmp_path, keep_failures=whole["keep_failures"])), whole["left"]
+    )
 
 
 @pytest.mark.parametrize("call", [1, 2, 3, 4])
-def test_no_room_for_the_notes(call: int, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_room_for_the_notes(
+    call: int, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Neither before a batch's episodes nor after them."""
-    commit, calls = Staging.commit, []
+    commit = Staging.commit
+    calls = []
 
     def full(self: Staging) -> None:
         if any(path.name == FILE for _, _, path in self._files):
@@ -270,16 +339,24 @@ def test_no_room_for_the_notes(call: int, whole: dict[str, Any], tmp_path: Path,
         with pytest.raises(UnwrittenError, match=rf"{FILE}: cannot be written"):
             playing.play()
     assert len(calls) == call + 1  # it is tried once more on the way out
-    assert_same(left_in(tmp_path, collect(tmp_path, keep_failures=whole["keep_failures"])), whole["left"])
+    assert_same(
+        left_in(tmp_path, collect(tmp_path, keep_failures=whole["keep_failures"])), whole["left"]
+    )
 
 
 @pytest.mark.parametrize("keep_failures", [False, True])
-def test_worlds_that_are_judged_otherwise_the_second_time(keep_failures: bool, tmp_path: Path) -> None:
-    """As on CUDA: what is committed stays, the first verdict counts, and no episode contradicts it."""
+def test_worlds_that_are_judged_otherwise_the_second_time(
+    keep_failures: bool, tmp_path: Path
+) -> None:
+    """As on CUDA: what is committed stays, the first result counts, and no episode
+    contradicts it.
+    """
     play_interrupted(tmp_path, 3, keep_failures=keep_failures)
     first = episodes_of(tmp_path / "dataset")
-    flipped = {0, 4, 5}  # one that is committed, one that was accepted, and one that was rejected
-    otherwise = pretended(lambda seed, world: some_fail(seed, world) != (seed == 0 and world in flipped), noise=True)
+    flipped = {0, 4, 5}  # one that is committed, one that succeeded, and one that was rejected
+    otherwise = pretended(
+        lambda seed, world: some_fail(seed, world) != (seed == 0 and world in flipped), noise=True
+    )
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(collection, "play_demonstrations", otherwise)
         result = collect(tmp_path, keep_failures=keep_failures)
@@ -288,7 +365,7 @@ def test_worlds_that_are_judged_otherwise_the_second_time(keep_failures: bool, t
     notes = left_in(tmp_path, result)["notes"]
     changed = 2 if keep_failures else 1
     assert [note["changed"] for note in notes] == [changed, 0]
-    assert (notes[0]["worlds"], notes[0]["accepted"]) == (9, 7)
+    assert (notes[0]["worlds"], notes[0]["succeeded"]) == (9, 7)
     left_out = {4, 5} if keep_failures else {1, 4, 5}
     assert {row["world"] for row in rows if row["seed"] == 0} == set(range(9)) - left_out
     assert all(row["success"] != some_fail(row["seed"], row["world"]) for row in rows)
@@ -296,23 +373,33 @@ def test_worlds_that_are_judged_otherwise_the_second_time(keep_failures: bool, t
     assert len(rows) == 10 == sum(note["kept"] for note in notes)
 
 
-@pytest.mark.parametrize("world", [0, 1])  # accepted: its own physics is well, and a term's number is not; and failed
-def test_what_is_not_finite_is_left_out(world: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "world", [0, 1]
+)  # succeeded: its own physics is well, and a term's number is not; and failed
+def test_what_is_not_finite_is_left_out(
+    world: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert some_fail(0, world) is bool(world)
 
     def diverge(seed: int, values: torch.Tensor) -> None:
         if seed == 0 and values.shape[1] == 9:
             values[3, world] = torch.nan
 
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(some_fail, diverge, noise=True))
+    monkeypatch.setattr(
+        collection, "play_demonstrations", pretended(some_fail, diverge, noise=True)
+    )
     expected = left_in(tmp_path / "whole", collect(tmp_path / "whole", keep_failures=True))
     assert [note["not_finite"] for note in expected["notes"]] == [1, 0]
     play_interrupted(tmp_path / "parts", 2, keep_failures=True)
-    assert_same(left_in(tmp_path / "parts", collect(tmp_path / "parts", keep_failures=True)), expected)
+    assert_same(
+        left_in(tmp_path / "parts", collect(tmp_path / "parts", keep_failures=True)), expected
+    )
 
 
 def test_notes_that_were_removed(tmp_path: Path) -> None:
-    """The dataset stands and goes on with the next seed, and it is said that some episodes are in no success rate."""
+    """The dataset stands and goes on with the next seed, and it is said that some episodes are in
+    no success rate.
+    """
     play_interrupted(tmp_path, 3)
     (tmp_path / FILE).unlink()
     result = collect(tmp_path)
@@ -320,8 +407,11 @@ def test_notes_that_were_removed(tmp_path: Path) -> None:
     assert found[:3] == [(0, 0), (0, 2), (0, 3)]
     assert [seed for seed, _ in found[3:]] == [1] * 6 + [2]
     assert result.metrics["episodes_without_note"] == 3
-    assert "; 3 episodes are of seeds that batches.json does not have, and in no success rate" in result.reason
-    assert (result.metrics["worlds_played"], result.metrics["accepted"]) == (10, 7)
+    assert (
+        "; 3 episodes are of seeds that batches.json does not have, and in no success rate"
+        in result.reason
+    )
+    assert (result.metrics["worlds_played"], result.metrics["succeeded"]) == (10, 7)
 
 
 def test_a_dataset_that_was_removed(tmp_path: Path) -> None:
@@ -330,7 +420,7 @@ def test_a_dataset_that_was_removed(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "dataset")
     result = collect(tmp_path, episodes=2)
     assert pairs(tmp_path / "dataset") == [(0, 0), (0, 2)]
-    assert (result.metrics["worlds_played"], result.metrics["accepted"]) == (3, 2)
+    assert (result.metrics["worlds_played"], result.metrics["succeeded"]) == (3, 2)
 
 
 @pytest.fixture
@@ -347,9 +437,11 @@ def test_notes_of_other_episodes_are_one_line(capsys: pytest.CaptureFixture[str]
     (home / FILE).write_text(json.dumps(notes))
     before = {path: path.read_bytes() for path in home.rglob("*") if path.is_file()}
     assert run([*COMMAND, "job.folder=demos", "nworld=9", "job.episodes=11"]) == 2
-    assert capsys.readouterr().err.strip() == (
-        "mjstack: demos/batches.json has 9 episodes of seed 1, expected 3 as in the dataset. Restore what was changed. Or: "
-        "remove batches.json: the dataset stands, and the expert's success rate is counted from then on."
+    assert (
+        capsys.readouterr().err.strip()
+        == "mjstack: demos/batches.json has 9 episodes of seed 1, expected 3 as in the dataset."
+        " Restore what was changed. Or: remove batches.json: the dataset stands, and the"
+        " expert's success rate is counted from then on."
     )
     assert {path: path.read_bytes() for path in home.rglob("*") if path.is_file()} == before
     with pytest.raises(DatasetError, match="has 9 episodes of seed 1"):
@@ -363,16 +455,28 @@ def test_real_worlds_are_the_same_alone(tmp_path: Path, monkeypatch: pytest.Monk
     options: dict[str, Any] = {"episodes": 2, "keep_failures": True}
     expected = left_in(tmp_path / "whole", collect(tmp_path / "whole", nworld=2, **options))
     play_interrupted(tmp_path / "parts", 1, nworld=2, **options)
-    assert_same(left_in(tmp_path / "parts", collect(tmp_path / "parts", nworld=1, **options)), expected)
+    assert_same(
+        left_in(tmp_path / "parts", collect(tmp_path / "parts", nworld=1, **options)), expected
+    )
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 @pytest.mark.usefixtures("_in_tmp")
 def test_ctrl_c_on_cuda() -> None:
-    """Two plays agree only nearly there: what was committed stays, and every figure is of the dataset."""
-    args = ["job=collect", "job.folder=demos", "job.episodes=8", "nworld=16", "sim=mjwarp", "sim.device=cuda:0"]
-    home, before = Path("demos"), signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Two plays agree only nearly there: what was committed stays, and every figure is of the
+    dataset.
+    """
+    args = [
+        "job=collect",
+        "job.folder=demos",
+        "job.episodes=8",
+        "nworld=16",
+        "sim=mjwarp",
+        "sim.device=cuda:0",
+    ]
+    home = Path("demos")
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(collection, "play_demonstrations", play_demonstrations)
         monkeypatch.setattr(demonstration_spec, "config_content", config_content)
@@ -382,13 +486,20 @@ def test_ctrl_c_on_cuda() -> None:
                 assert run(args) == 130
         finally:
             signal.signal(signal.SIGINT, before)
-        first, data = episodes_of(home / "dataset"), (home / "dataset/data/chunk-000/file-000.parquet").read_bytes()
+        first = episodes_of(home / "dataset")
+        data = (home / "dataset/data/chunk-000/file-000.parquet").read_bytes()
         assert len(first) == 3
         assert run(args) == 0
     assert episodes_of(home / "dataset")[:3] == first
     assert (home / "dataset/data/chunk-000/file-000.parquet").read_bytes() == data
-    found, notes = pairs(home / "dataset"), json.loads((home / FILE).read_text())
+    found = pairs(home / "dataset")
+    notes = json.loads((home / FILE).read_text())
     assert len(set(found)) == len(found) == 8
-    assert all(not note["missing"] and note["kept"] <= note["accepted"] <= note["worlds"] for note in notes)
-    assert [note["kept"] for note in notes] == [sum(seed == note["seed"] for seed, _ in found) for note in notes]
+    assert all(
+        not note["missing"] and note["kept"] <= note["succeeded"] <= note["worlds"]
+        for note in notes
+    )
+    assert [note["kept"] for note in notes] == [
+        sum(seed == note["seed"] for seed, _ in found) for note in notes
+    ]
     read_dataset(home / "dataset")

@@ -1,4 +1,6 @@
-"""Every configuration file composes, holds the task's figures, and every bad value is refused in one line."""
+"""Every configuration file composes, holds the task's figures, and every bad value is refused in
+one line.
+"""
 
 from __future__ import annotations
 
@@ -39,8 +41,23 @@ def test_every_file_composes(override: str) -> None:
 
 def test_walk_found_the_groups() -> None:
     found = set(choices())
-    assert {"robot=so101", "robot=rebot", "timing=fine", "sim=mjwarp", "experiment=fine", "model=menagerie"} <= found
-    assert GATE_FILES == ["acceptance", "batch", "box", "capacity", "parity", "success", "throughput"]
+    assert {
+        "robot=so101",
+        "robot=rebot",
+        "timing=fine",
+        "sim=mjwarp",
+        "experiment=fine",
+        "model=menagerie",
+    } <= found
+    assert GATE_FILES == [
+        "acceptance",
+        "batch",
+        "box",
+        "capacity",
+        "parity",
+        "success",
+        "throughput",
+    ]
 
 
 def test_every_group_has_an_init_so_that_it_ships() -> None:
@@ -56,17 +73,30 @@ def test_defaults(so101_cfg: Config) -> None:
     assert cfg.nworld == 256
     assert cfg.seed == 0
     assert cfg.gates == ["baseline", "parity", "capacity", "batch", "throughput"]
-    assert (cfg.timing.physics_dt, cfg.timing.substeps) == (0.002, 10)
-    assert cfg.timing.frame_dt == pytest.approx(0.02)
+    assert (cfg.timing.physics_dt, cfg.timing.decimation) == (0.002, 10)
+    assert cfg.timing.step_dt == pytest.approx(0.02)
     solver = cfg.solver
-    assert (solver.iterations, solver.ls_iterations, solver.impratio, solver.tolerance) == (100, 50, 100.0, 1e-6)
+    assert (solver.iterations, solver.ls_iterations, solver.impratio, solver.tolerance) == (
+        100,
+        50,
+        100.0,
+        1e-6,
+    )
     assert cfg.reset["cubes"].params == {"xy": 0.002, "yaw": 0.05}
 
 
 def test_overrides_arrive() -> None:
-    cfg = load_config(["timing=fine", "nworld=7", "gates=[capacity]", "gate.acceptance.xy_err=0.01", "batch.njmax=90"])
-    assert (cfg.timing.physics_dt, cfg.timing.substeps) == (0.001, 20)
-    assert cfg.timing.frame_dt == pytest.approx(0.02)
+    cfg = load_config(
+        [
+            "timing=fine",
+            "nworld=7",
+            "gates=[capacity]",
+            "gate.acceptance.xy_err=0.01",
+            "batch.njmax=90",
+        ]
+    )
+    assert (cfg.timing.physics_dt, cfg.timing.decimation) == (0.001, 20)
+    assert cfg.timing.step_dt == pytest.approx(0.02)
     assert cfg.nworld == 7
     assert cfg.gates == ["capacity"]
     assert cfg.gate.acceptance.xy_err == 0.01
@@ -74,7 +104,7 @@ def test_overrides_arrive() -> None:
 
 
 def test_experiment_is_what_it_changes() -> None:
-    assert load_config(["experiment=fine"]).timing.substeps == 20
+    assert load_config(["experiment=fine"]).timing.decimation == 20
     assert load_config(["experiment=asset_solver"]).solver.iterations is None
 
 
@@ -107,12 +137,21 @@ FIGURES = {
 
 
 def test_task_figures_of_each_robot(robot: str) -> None:
-    cfg, want = load_config([f"robot={robot}"]), FIGURES[robot]
-    for key in ("home", "gripper_open", "gripper_closed", "locked", "ik_joints", "arm_force_limit", "approach_height"):
+    cfg = load_config([f"robot={robot}"])
+    want = FIGURES[robot]
+    for key in (
+        "home",
+        "gripper_open",
+        "gripper_closed",
+        "locked",
+        "ik_joints",
+        "arm_force_limit",
+        "approach_height",
+    ):
         assert getattr(cfg.robot, key) == want[key], key
     assert (cfg.scene.table_center, cfg.scene.table_half) == want["table"]
     assert (cfg.scene.red_xy, cfg.scene.blue_xy) == want["cubes"]
-    layout = cfg.robot.layouts["stack"]
+    layout = cfg.robot.placements["stack"]
     assert (layout.nconmax, layout.njmax) == want["sizes"]
     assert (cfg.scene.cube_half, cfg.scene.cube_mass) == (0.022, 0.08)
     assert cfg.scene.cube_friction == [1.2, 0.005, 0.0005]
@@ -122,7 +161,12 @@ def test_task_figures_of_each_robot(robot: str) -> None:
 def test_acceptance_figures(so101_cfg: Config) -> None:
     t = so101_cfg.gate.acceptance
     assert (t.xy_err, t.dz_min, t.dz_max) == (0.015, 0.035, 0.055)
-    assert (t.airborne_height, t.lift_frames, t.carry_frames, t.carry_distance) == (0.010, 10, 10, 0.05)
+    assert (t.airborne_height, t.lift_steps, t.carry_steps, t.carry_distance) == (
+        0.010,
+        10,
+        10,
+        0.05,
+    )
     assert (t.window, t.support_gap) == (50, 0.005)
     assert (t.rest_speed, t.rest_position, t.rest_rotation_deg) == (0.05, 0.005, 3.0)
     assert (t.lift_phases, t.carry_phase) == (["lift_red", "above_blue"], "above_blue")
@@ -134,8 +178,14 @@ def test_acceptance_figures(so101_cfg: Config) -> None:
 BAD = [
     (["job=collect", "job.episode=3"], "Did you mean 'job.episodes'?"),
     (["job=scaling", "job.retri=true"], "Did you mean 'job.retry'?"),
-    (["job.episodes=3"], "job.episodes is a key of job=collect, and this is job=gates. Set job=collect."),
-    (["job=study", "job.nworlds=[4]"], "job.nworlds is a key of job=scaling, and this is job=study. Set job=scaling."),
+    (
+        ["job.episodes=3"],
+        "job.episodes is a key of job=collect, and this is job=gates. Set job=collect.",
+    ),
+    (
+        ["job=study", "job.nworlds=[4]"],
+        "job.nworlds is a key of job=scaling, and this is job=study. Set job=scaling.",
+    ),
     (["=3"], "override '=3' has no key"),
     (["nworld"], "override 'nworld' has no value"),
     (["~reward.grap"], "~reward.grap: there is none to leave out. Did you mean 'reward.grasp'?"),
@@ -144,7 +194,10 @@ BAD = [
     (["phase=stack"], "Did you mean 'phases'?"),
     (["experimen=fine"], "Did you mean 'experiment'?"),
     (["gate=batch"], "gates=[...]"),
-    (["job=study_schema"], "Did you mean 'study'? Available: collect, gates, reachability, replay, scaling, study."),
+    (
+        ["job=study_schema"],
+        "Did you mean 'study'? Available: collect, gates, reachability, replay, scaling, study.",
+    ),
     (["timing=coarse"], "Available: default, fine"),
     (["nworld=0"], "nworld=0"),
     (["nworld=-3"], "nworld=-3"),
@@ -153,8 +206,8 @@ BAD = [
     (["seed=-1"], "seed=-1"),
     (["batch.njmax=-1"], "batch.njmax=-1"),
     (["batch.nconmax=0"], "batch.nconmax=0"),
-    (["timing.substeps=0"], "timing.substeps=0"),
-    (["timing.substeps=11"], "0.02 s"),
+    (["timing.decimation=0"], "timing.decimation=0"),
+    (["timing.decimation=11"], "0.02 s"),
     (["timing.physics_dt=nan"], "timing.physics_dt"),
     (["gates=[parityy]"], "Did you mean 'parity'?"),
     (["gates=[]"], "gates"),
@@ -167,7 +220,7 @@ BAD = [
     (["scene.red_xy=[0.33]"], "2 numbers"),
     (["scene.red_xy=[0.33,0.06]"], "touch"),
     (["scene.cube_mass=0"], "scene.cube_mass"),
-    (["task.episode_frames=0"], "task.episode_frames=0"),
+    (["task.episode_steps=0"], "task.episode_steps=0"),
     (["reward.lift.wait=1"], "wait"),
     (["solver.tolerance=0"], "solver.tolerance"),
     (["gate.acceptance.carry_phase=above_blu"], "Did you mean 'above_blue'?"),
@@ -176,15 +229,18 @@ BAD = [
     (["gate.throughput.from_phase=lift"], "Did you mean 'lift_red'?"),
     (["gate.acceptance.window=1"], "gate.acceptance.window=1"),
     (["gate.throughput.repetitions=0"], "gate.throughput.repetitions=0"),
-    (["controller.phases.release.seconds=0.013"], "multiple of the frame"),
+    (["controller.phases.release.seconds=0.013"], "multiple of the step"),
     (["controller.phases.release.gripper=ajar"], "open or closed"),
     (["controller.phases.release.anchor=green"], "anchor"),
     (["controller.knots=2"], "controller.knots=2"),
-    (["controller=scripted", "controller.phases.above_blue.look=false"], "above_blue.look=false"),
+    (
+        ["controller=closed_loop", "controller.phases.above_blue.look=false"],
+        "above_blue.look=false",
+    ),
     (["controller.phases.lift_red.retry=above_red"], "lift_red.grasps"),
     (["controller.phases.grasp_red.retry=lift_red"], "this phase or one before it"),
     (["controller.posture_gain=2"], "controller.posture_gain=2"),
-    (["controller.frame_iterations=2"], "controller.frame_iterations=2"),
+    (["controller.step_iterations=2"], "controller.step_iterations=2"),
     (["robot.home=[0,0]"], "robot.home"),
     (["robot.ik_joints=[elbow]"], "elbow_flex"),
     (["robot.approach_axis=[0,0,2]"], "a vector of length 1"),
@@ -202,7 +258,7 @@ BAD = [
     (["robot=null"], "robot=null: expected the name of a choice: so101, rebot."),
     (["robot=[1]"], "robot=[1]: expected the name of a choice: so101, rebot."),
     (["task=1"], "task=1: expected the name of a choice: stack, box, reach."),
-    (["controller=[a]"], "controller=a: 'a' does not exist. Available: planned, scripted."),
+    (["controller=[a]"], "controller=a: 'a' does not exist. Available: closed_loop, open_loop."),
     (["robot={homes:[1]}"], "Did you mean 'robot.home'?"),
     (["scene.box.floor=0.003"], "scene.box is null here"),
     (["nworld=range(1,4)"], "'nworld=range(1,4)': several values are a sweep. Add -m"),
@@ -214,7 +270,10 @@ BAD = [
     (["+nworld=4"], "+nworld: there is one already. Write nworld=VALUE"),
     (["~nworld"], "~nworld: expected a term of"),
     (["~robot"], "~robot: expected a term of"),
-    (["~gate.batch.seeds"], "~gate.batch.seeds: it needs a value and cannot be left out. Write gate.batch.seeds=VALUE."),
+    (
+        ["~gate.batch.seeds"],
+        "~gate.batch.seeds: it needs a value and cannot be left out. Write gate.batch.seeds=VALUE.",
+    ),
     (["~batch.njmax"], "~batch.njmax: it is null, so there is nothing to leave out."),
 ]
 
@@ -243,7 +302,9 @@ def test_native_on_cuda_is_refused() -> None:
     assert caught.value.exit_code == 2
 
 
-def test_missing_menagerie_folder_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_menagerie_folder_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
     with pytest.raises(MjstackError, match="MENAGERIE_ROOT") as caught:
         check_machine(load_config(["model=menagerie"]))

@@ -1,4 +1,6 @@
-"""Failures injected into real simulations: each is caught, in its own world and by its own rule, and no other world is."""
+"""Failures injected into real simulations: each is caught, in its own world and by its own rule,
+and no other world is.
+"""
 
 from __future__ import annotations
 
@@ -10,23 +12,23 @@ import torch
 from comparison import assert_same_run
 from environments import brisk
 
-from mjstack.gates import gate as gate_module
+from mjstack.episodes import context as gate_module
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.rollout import run_episode, start_worlds
 from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import run_capacity
-from mjstack.gates.episode import run_episode, start_worlds
-from mjstack.gates.gate import GateContext
 from mjstack.gates.throughput import run_throughput
 from mjstack.report.record import Status
 from mjstack.sim import Overflow, Simulation
-from mjstack.tasks.stack import StackEvidence, StackRule
+from mjstack.tasks.stack import StackCheck, StackRule
 
 
 def teleport(context: GateContext, world: int) -> Callable[[int, Simulation], None]:
     """Moves red beside the stack, once, when it has been released."""
     released = context.phase_start("retreat")
 
-    def hook(frame: int, sim: Simulation) -> None:
-        if frame == released:
+    def hook(step: int, sim: Simulation) -> None:
+        if step == released:
             sim.qpos[world, context.index.cube_qpos[0]] += 0.08
 
     return hook
@@ -36,23 +38,28 @@ def rules(bits: torch.Tensor) -> list[set[str]]:
     return [{rule.name for rule in StackRule if int(b) & rule} for b in bits]
 
 
-def test_native(robot: str, stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]) -> None:
+def test_native(
+    robot: str, stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]
+) -> None:
     context = stage(robot)
     sim = make_sim("native", 6, robot=robot)
     push = teleport(context, 1)
     kept = {}
 
-    def hook(frame: int, sim: Simulation) -> None:
-        push(frame, sim)
-        if frame == 0:  # world 2 stalls: its steps are counted, and it stays where it is
+    def hook(step: int, sim: Simulation) -> None:
+        push(step, sim)
+        if step == 0:  # world 2 stalls: its steps are counted, and it stays where it is
             kept.update(qpos=sim.qpos[2].clone(), qvel=sim.qvel[2].clone())
-        sim.qpos[2], sim.qvel[2] = kept["qpos"], kept["qvel"]
-        if frame == 300:
+        sim.qpos[2] = kept["qpos"]
+        sim.qvel[2] = kept["qvel"]
+        if step == 300:
             sim.qvel[3, context.index.cube_qvel[1]] = math.nan
             sim.step_count[5] -= 1
 
-    episode = run_episode(sim, context.index, context.cfg, context.planner, context.cfg.reset, on_frame=hook)
-    found = rules(episode.verdict.failed)
+    episode = run_episode(
+        sim, context.index, context.cfg, context.planner, context.cfg.reset, on_step=hook
+    )
+    found = rules(episode.result.failed)
     assert found[0] == found[4] == set()
     assert found[1] == {"STACKED"}
     assert found[2] == {"LIFT", "CARRY", "STACKED"}
@@ -66,13 +73,15 @@ def test_mjwarp(stage: Callable[..., GateContext], make_sim: Callable[..., Simul
     sim = make_sim("mjwarp", 3)
     push = teleport(context, 1)
 
-    def hook(frame: int, sim: Simulation) -> None:
-        push(frame, sim)
-        if frame == context.phase_start("above_blue"):
+    def hook(step: int, sim: Simulation) -> None:
+        push(step, sim)
+        if step == context.phase_start("above_blue"):
             sim.qvel[2, context.index.cube_qvel[1]] = math.nan
 
-    episode = run_episode(sim, context.index, context.cfg, context.planner, context.cfg.reset, on_frame=hook)
-    found = rules(episode.verdict.failed)
+    episode = run_episode(
+        sim, context.index, context.cfg, context.planner, context.cfg.reset, on_step=hook
+    )
+    found = rules(episode.result.failed)
     assert found[0] == set()
     assert found[1] == {"STACKED"}
     assert {"FINITE", "STACKED"} <= found[2]
@@ -86,8 +95,8 @@ def test_nan_leaves_the_other_worlds_alone(
     for poison in (False, True):
         sim = make_sim(backend, 3)
         start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
-        for frame in range(6):
-            if poison and frame == 2:
+        for step in range(6):
+            if poison and step == 2:
                 sim.qvel[1, context.index.cube_qvel[0]] = math.nan
             sim.step(10)
         final.append((sim.qpos.clone(), sim.qvel.clone()))
@@ -97,12 +106,14 @@ def test_nan_leaves_the_other_worlds_alone(
 
 
 def crowd(context: GateContext, sim: Simulation, world: int) -> None:
-    """Puts both cubes of one world into each other, the table and the gripper: far more contacts than elsewhere."""
-    aperture = sim.site_xpos[world, context.index.aperture_sites].mean(0)
+    """Puts both cubes of one world into each other, the table and the gripper: far more contacts
+    than elsewhere.
+    """
+    grasp_point = sim.site_xpos[world, context.index.grasp_sites].mean(0)
     top = context.cfg.scene.table_center[2] + context.cfg.scene.table_half[2]
     red, blue = context.index.cube_qpos
-    sim.qpos[world, red : red + 3] = aperture.to(sim.qpos.dtype)
-    sim.qpos[world, blue : blue + 2] = aperture[:2].to(sim.qpos.dtype) + 0.01
+    sim.qpos[world, red : red + 3] = grasp_point.to(sim.qpos.dtype)
+    sim.qpos[world, blue : blue + 2] = grasp_point[:2].to(sim.qpos.dtype) + 0.01
     sim.qpos[world, blue + 2] = top + 0.015
 
 
@@ -110,27 +121,27 @@ def test_overflow_in_exactly_the_crowded_world(
     stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]
 ) -> None:
     context = stage("so101")
-    # Any world needs up to 144 rows in the first frames, the crowded one 192.
+    # Any world needs up to 144 rows in the first steps, the crowded one 192.
     sim = make_sim("mjwarp", 3, "batch.njmax=160")
     start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
     sim.forward()
     assert int(sim.overflow.abs().sum()) == 0
     crowd(context, sim, 1)
-    evidence = StackEvidence(context.cfg, context.index, context.planner.phases, 3, sim.device)
+    check = StackCheck(context.cfg, context.index, context.planner.phases, 3, sim.device)
     for _ in range(3):
         sim.step(10)
-        evidence.update(sim, torch.zeros(3, dtype=torch.int64))
+        check.update(sim, torch.zeros(3, dtype=torch.int64))
     bits = sim.overflow.tolist()
     assert bits[1] & Overflow.NEFC
     assert bits[0] == bits[2] == 0
-    found = rules(evidence.verdict(sim).failed)
+    found = rules(check.result(sim).failed)
     assert ["OVERFLOW" in broken for broken in found] == [False, True, False]
     sim.reset(torch.tensor([False, True, False]))
     sim.step(1)
     assert sim.overflow.tolist() == [0, 0, 0]
 
 
-FEW = ("sim=native", "nworld=2", "gate.capacity.random_frames=20", *brisk())
+FEW = ("sim=native", "nworld=2", "gate.capacity.random_steps=20", *brisk())
 
 
 def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., GateContext]) -> None:
@@ -144,7 +155,9 @@ def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., GateC
     assert wanted > int(result.metrics["peak_constraint_rows_per_world"]) > 100
 
 
-def test_capacity_gate_passes_with_what_it_recommends(new_context: Callable[..., GateContext]) -> None:
+def test_capacity_gate_passes_with_what_it_recommends(
+    new_context: Callable[..., GateContext],
+) -> None:
     (result,) = run_capacity(new_context(*FEW, "batch.njmax=184", "batch.nconmax=40"))
     assert result.status is Status.passed, result.reason
     assert int(result.metrics["recommended.njmax"]) <= 184
@@ -164,14 +177,14 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
     context = new_context(
         "sim=native",
         "nworld=4",
-        "gate.throughput.frames=2",
+        "gate.throughput.steps=2",
         "gate.throughput.repetitions=1",
         "gates=[batch,throughput]",
         *brisk(),
     )
 
     def broken_episode(*args: object, **kwargs: object) -> object:
-        return run_episode(*args, **kwargs, on_frame=teleport(context, 2))
+        return run_episode(*args, **kwargs, on_step=teleport(context, 2))
 
     monkeypatch.setattr(gate_module, "run_episode", broken_episode)
     (batch,) = run_batch(context)
@@ -179,7 +192,7 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
     assert "1 of 4 worlds (2) failed" in batch.reason
     assert "not stacked" in batch.reason
     assert batch.details == ["not stacked: 1 of 4 worlds (2)"]
-    assert batch.metrics["accepted"] == 3
+    assert batch.metrics["succeeded"] == 3
     assert batch.metrics["success_rate"] == pytest.approx(0.75)
     assert batch.metrics["failed.STACKED"] == 1
 
@@ -192,7 +205,7 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
     batch.status = Status.passed  # and the episode it timed is not: that alone voids every figure
     throughput, _ = run_throughput(context)
     assert throughput.status is Status.failed
-    assert "1 of 4 worlds (2) failed the acceptance" in throughput.reason
+    assert "1 of 4 worlds (2) failed the check" in throughput.reason
     assert throughput.reason.count("no figure") == 3
     assert not [name for name in throughput.metrics if "per_s" in name or "ms_per" in name]
 

@@ -1,4 +1,6 @@
-"""Datasets in the layout of LeRobotDataset v3: what is on disk, and that nothing committed is ever lost."""
+"""Datasets in the layout of LeRobotDataset v3: what is on disk, and that nothing committed is ever
+lost.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from mjstack.datasets import DatasetSpec, DatasetWriter, EpisodeData, Feature, layout, read_dataset, staging
+from mjstack.datasets import (
+    DatasetSpec,
+    DatasetWriter,
+    EpisodeData,
+    Feature,
+    lerobot,
+    read_dataset,
+    staging,
+)
 from mjstack.datasets.shard import Shard
 from mjstack.datasets.statistics import NAMES, QUANTILES
 from mjstack.errors import ArgumentError, DatasetError, MissingExtra, UnwrittenError
@@ -49,20 +59,34 @@ SPEC = DatasetSpec(
 )
 
 
-def episode(world: int, *, frames: int = 0, seed: int = 7, task: str = "stack", **changed: Any) -> EpisodeData:
-    """Random frames that depend on the world alone; the number of frames too, unless it is given."""
+def episode(
+    world: int, *, frames: int = 0, seed: int = 7, task: str = "stack", **changed: Any
+) -> EpisodeData:
+    """Random frames that depend on the world alone; the number of frames too, unless it
+    is given.
+    """
     frames = frames or 20 + 3 * (world % 5)
     random = np.random.default_rng(world)
     arrays = {
-        "observation.state": random.normal(size=(frames, 3)) * (1.0, 1e-3, 100.0) + (0.0, 5.0, -3.0),
+        "observation.state": (
+            random.normal(size=(frames, 3)) * (1.0, 1e-3, 100.0) + (0.0, 5.0, -3.0)
+        ),
         "action": random.normal(size=(frames, 2)).astype(np.float32),
         "next.reward": random.random(frames),
         "next.done": np.arange(frames) == frames - 1,
         "count": np.arange(frames)[::-1],
     }
-    values = {"xy_err": 1e-3 * world, "peak": np.int32(world), "settled": np.bool_(world % 2 == 0), "note": f"w{world}"}
+    values = {
+        "xy_err": 1e-3 * world,
+        "peak": np.int32(world),
+        "settled": np.bool_(world % 2 == 0),
+        "note": f"w{world}",
+    }
     return replace(
-        EpisodeData(arrays=arrays, task=task, success=world % 3 != 0, seed=seed, world=world, values=values), **changed
+        EpisodeData(
+            arrays=arrays, task=task, success=world % 3 != 0, seed=seed, world=world, values=values
+        ),
+        **changed,
     )
 
 
@@ -75,7 +99,11 @@ def write(folder: Path, worlds: range, *, batch: int = 3, spec: DatasetSpec = SP
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 def frames_of(table: pa.Table, name: str) -> np.ndarray:
@@ -83,13 +111,19 @@ def frames_of(table: pa.Table, name: str) -> np.ndarray:
 
 
 def test_the_files_are_those_of_lerobot(tmp_path: Path) -> None:
-    """What LeRobotDataset v3.0 writes for such features, file by file (from a dataset that lerobot 0.6.1 wrote)."""
+    """What LeRobotDataset v3.0 writes for such features, file by file (from a dataset that lerobot
+    0.6.1 wrote).
+    """
     write(tmp_path, range(5))
     assert set(contents(tmp_path)) == {
         "meta/info.json",
         "meta/stats.json",
         "meta/tasks.parquet",
-        *(f"{kind}/chunk-000/file-00{shard}.parquet" for kind in ("data", "meta/episodes") for shard in (0, 1)),
+        *(
+            f"{kind}/chunk-000/file-00{shard}.parquet"
+            for kind in ("data", "meta/episodes")
+            for shard in (0, 1)
+        ),
     }
     info = json.loads((tmp_path / "meta/info.json").read_text())
     own = info.pop("mjstack")
@@ -109,9 +143,19 @@ def test_the_files_are_those_of_lerobot(tmp_path: Path) -> None:
         "video_path": None,
         "splits": {"train": "0:5"},
     }
-    assert features["observation.state"] == {"dtype": "float32", "shape": [3], "names": list(JOINTS)}
+    assert features["observation.state"] == {
+        "dtype": "float32",
+        "shape": [3],
+        "names": list(JOINTS),
+    }
     assert features["next.done"] == {"dtype": "bool", "shape": [1], "names": ["done"]}
-    assert list(features)[-5:] == ["timestamp", "frame_index", "episode_index", "index", "task_index"]
+    assert list(features)[-5:] == [
+        "timestamp",
+        "frame_index",
+        "episode_index",
+        "index",
+        "task_index",
+    ]
     assert features["timestamp"] == {"dtype": "float32", "shape": [1], "names": None}
     assert own["config_sha256"] == "c" * 64
     assert own["units"]["action"] == ["rad", "rad"]
@@ -120,9 +164,17 @@ def test_the_files_are_those_of_lerobot(tmp_path: Path) -> None:
     schema = pq.read_schema(tmp_path / "data/chunk-000/file-000.parquet")
     assert schema.names == list(features)
     assert schema.field("observation.state").type == pa.list_(pa.float32(), 3)
-    assert [str(schema.field(name).type) for name in ("next.reward", "next.done", "index")] == ["float", "bool", "int64"]
+    assert [str(schema.field(name).type) for name in ("next.reward", "next.done", "index")] == [
+        "float",
+        "bool",
+        "int64",
+    ]
     told = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
-    assert told["action"] == {"feature": {"dtype": "float32", "_type": "Value"}, "length": 2, "_type": "List"}
+    assert told["action"] == {
+        "feature": {"dtype": "float32", "_type": "Value"},
+        "length": 2,
+        "_type": "List",
+    }
     assert told["next.done"] == {"dtype": "bool", "_type": "Value"}
 
     tasks = pq.read_table(tmp_path / "meta/tasks.parquet")
@@ -132,12 +184,17 @@ def test_the_files_are_those_of_lerobot(tmp_path: Path) -> None:
     rows = pq.read_table(tmp_path / "meta/episodes")
     statistics = [f"stats/{name}/{kind}" for name in features for kind in (*NAMES, "count")]
     own_columns = ["success", "seed", "world", "xy_err", "peak", "settled", "note"]
-    places = [f"{kind}/{index}_index" for kind in ("data", "meta/episodes") for index in ("chunk", "file")]
+    places = [
+        f"{kind}/{index}_index" for kind in ("data", "meta/episodes") for index in ("chunk", "file")
+    ]
     ranges = ["dataset_from_index", "dataset_to_index"]
     assert sorted(rows.column_names) == sorted(
         ["episode_index", "tasks", "length", *ranges, *places, *own_columns, *statistics]
     )
-    assert {str(rows.schema.field(name).type) for name in statistics} == {"list<element: double>", "list<element: int64>"}
+    assert {str(rows.schema.field(name).type) for name in statistics} == {
+        "list<element: double>",
+        "list<element: int64>",
+    }
     assert rows["tasks"].to_pylist() == [["stack"]] * 5
     assert rows["data/file_index"].to_pylist() == [0, 0, 0, 1, 1]
     assert rows["note"].to_pylist() == [f"w{world}" for world in range(5)]
@@ -154,7 +211,9 @@ def test_what_is_read_is_what_was_added(tmp_path: Path) -> None:
         for name, array in added.arrays.items():
             expected = array.astype(SPEC.features[name].dtype)
             assert np.array_equal(frames_of(part, name), expected)
-        assert np.array_equal(frames_of(part, "timestamp"), (np.arange(length) / 50).astype(np.float32))
+        assert np.array_equal(
+            frames_of(part, "timestamp"), (np.arange(length) / 50).astype(np.float32)
+        )
         assert part["episode_index"].unique().to_pylist() == [world]
         start += length
     assert table["index"].to_pylist() == list(range(start))
@@ -166,7 +225,9 @@ def test_what_is_read_is_what_was_added(tmp_path: Path) -> None:
 
 
 def test_statistics_are_those_of_all_frames(tmp_path: Path) -> None:
-    """Episodes of unequal length, over several commits and a resumed writer; a column far from zero that hardly moves."""
+    """Episodes of unequal length, over several commits and a resumed writer; a column far from zero
+    that hardly moves.
+    """
     write(tmp_path, range(4))
     write(tmp_path, range(4, 11))
     stats = json.loads((tmp_path / "meta/stats.json").read_text())
@@ -185,8 +246,12 @@ def test_statistics_are_those_of_all_frames(tmp_path: Path) -> None:
         episodes = np.split(frames, np.cumsum(lengths)[:-1])
         for kind, quantile in QUANTILES.items():
             each = np.array([np.quantile(one, quantile, axis=0) for one in episodes])
-            assert np.allclose(rows[f"stats/{name}/{kind}"].to_pylist(), each, rtol=1e-12, atol=1e-12)
-            assert np.allclose(found[kind], np.average(each, axis=0, weights=lengths), rtol=1e-9, atol=1e-12)
+            assert np.allclose(
+                rows[f"stats/{name}/{kind}"].to_pylist(), each, rtol=1e-12, atol=1e-12
+            )
+            assert np.allclose(
+                found[kind], np.average(each, axis=0, weights=lengths), rtol=1e-9, atol=1e-12
+            )
 
 
 def test_a_resumed_dataset_is_the_uninterrupted_one(tmp_path: Path) -> None:
@@ -205,7 +270,10 @@ def test_writers_that_differ_are_on_record(tmp_path: Path) -> None:
     write(tmp_path, range(2, 3), spec=newest)
     write(tmp_path, range(3, 4), spec=newest)
     found = read_dataset(tmp_path).info["mjstack"]["provenance"]
-    assert [(one["from_episode"], one["versions"]["mujoco"]) for one in found] == [(0, "4.0.0"), (2, "4.2.0")]
+    assert [(one["from_episode"], one["versions"]["mujoco"]) for one in found] == [
+        (0, "4.0.0"),
+        (2, "4.2.0"),
+    ]
 
 
 def test_tasks_keep_their_indices(tmp_path: Path) -> None:
@@ -215,7 +283,10 @@ def test_tasks_keep_their_indices(tmp_path: Path) -> None:
         writer.add([episode(2, task="reach"), episode(3, task="box")])
     assert read_dataset(tmp_path).tasks == ["stack", "box", "reach"]
     table = pq.read_table(tmp_path / "data")
-    assert [table.filter(pa.compute.equal(table["episode_index"], k))["task_index"][0].as_py() for k in range(4)] == [
+    assert [
+        table.filter(pa.compute.equal(table["episode_index"], k))["task_index"][0].as_py()
+        for k in range(4)
+    ] == [
         0,
         1,
         2,
@@ -223,8 +294,10 @@ def test_tasks_keep_their_indices(tmp_path: Path) -> None:
     ]
 
 
-def test_a_full_file_is_committed_and_chunks_follow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(layout, "CHUNK", 2)
+def test_a_full_file_is_committed_and_chunks_follow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lerobot, "CHUNK", 2)
     with DatasetWriter(tmp_path, SPEC, file_mb=1) as writer:
         writer.add([episode(world, frames=8000) for world in range(25)])
         assert writer.committed
@@ -242,7 +315,9 @@ def test_a_full_file_is_committed_and_chunks_follow(tmp_path: Path, monkeypatch:
 
 
 def test_frames_are_not_held(tmp_path: Path) -> None:
-    """Nothing refers to the caller's arrays when `add` returns, and writing into them does no harm."""
+    """Nothing refers to the caller's arrays when `add` returns, and writing into them
+    does no harm.
+    """
     with DatasetWriter(tmp_path, SPEC) as writer:
         added = episode(1)
         kept = added.arrays["action"].copy()
@@ -254,7 +329,9 @@ def test_frames_are_not_held(tmp_path: Path) -> None:
         before = pa.total_allocated_bytes()
         writer.add([episode(2, frames=600) for _ in range(20)])
         assert pa.total_allocated_bytes() - before < 2**20
-    assert np.array_equal(frames_of(pq.read_table(tmp_path / "data").slice(0, len(kept)), "action"), kept)
+    assert np.array_equal(
+        frames_of(pq.read_table(tmp_path / "data").slice(0, len(kept)), "action"), kept
+    )
 
 
 KILLED = """
@@ -283,9 +360,17 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 @pytest.mark.parametrize("survive", range(6))
 def test_a_kill_at_any_moment_keeps_what_was_committed(survive: int, tmp_path: Path) -> None:
-    """SIGKILL before each file of the second commit takes its place: data, tasks, episodes, statistics, info; and after."""
+    """SIGKILL before each file of the second commit takes its place: data, tasks, episodes,
+    statistics, info; and after.
+    """
     folder = tmp_path / "dataset"
-    program = [sys.executable, "-c", KILLED.format(tests=str(Path(__file__).parent)), str(folder), str(survive)]
+    program = [
+        sys.executable,
+        "-c",
+        KILLED.format(tests=str(Path(__file__).parent)),
+        str(folder),
+        str(survive),
+    ]
     killed = subprocess.run(program, capture_output=True, text=True, timeout=300)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert killed.stdout.split()[-1] == ("committed" if survive == 5 else "added")
@@ -334,14 +419,18 @@ def second_batch(writer: DatasetWriter) -> None:
 
 
 def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
-    """Wherever in the second batch the room ends: in each of its frames' files and in each of the small ones."""
+    """Wherever in the second batch the room ends: in each of its frames' files and in each of the
+    small ones.
+    """
     write(tmp_path / "probe", range(3))
     with DatasetWriter(tmp_path / "probe", SPEC) as writer, pytest.MonkeyPatch.context() as patch:
         disk = FullDisk(patch, 10**9)
         second_batch(writer)
         needed = 10**9 - disk.room
     failed = 0
-    for number, room in enumerate([*np.linspace(0, needed - 1, 12).astype(int), needed - 2000, needed]):
+    for number, room in enumerate(
+        [*np.linspace(0, needed - 1, 12).astype(int), needed - 2000, needed]
+    ):
         folder = tmp_path / str(number)
         write(folder, range(3))
         before = contents(folder)
@@ -351,7 +440,9 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
             if room >= needed:
                 second_batch(writer)
                 break
-            with pytest.raises(UnwrittenError, match=r"No space left on device\): 3 committed episodes are kept") as caught:
+            with pytest.raises(
+                UnwrittenError, match=r"No space left on device\): 3 committed episodes are kept"
+            ) as caught:
                 second_batch(writer)
             assert "\n" not in str(caught.value)
             with pytest.raises(DatasetError, match="the writer is closed"):
@@ -393,7 +484,8 @@ except t.UnwrittenError as error:
 
 def test_ctrl_c_waits_for_the_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It comes in the middle of the second of three: two are kept."""
-    add, calls = Shard.add, []
+    add = Shard.add
+    calls = []
 
     def interrupted(self: Shard, *args: Any) -> None:
         calls.append(args)
@@ -402,7 +494,9 @@ def test_ctrl_c_waits_for_the_episode(tmp_path: Path, monkeypatch: pytest.Monkey
         add(self, *args)
 
     monkeypatch.setattr(Shard, "add", interrupted)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs start with it ignored
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell's background jobs start with it ignored
     try:
         with pytest.raises(KeyboardInterrupt), DatasetWriter(tmp_path, SPEC) as writer:
             writer.add([episode(world) for world in range(3)])
@@ -425,14 +519,28 @@ def test_an_error_elsewhere_keeps_what_was_added(tmp_path: Path) -> None:
 def test_another_configuration_is_refused(tmp_path: Path) -> None:
     write(tmp_path, range(1))
     before = contents(tmp_path)
-    with pytest.raises(DatasetError, match=f"episodes of configuration {'c' * 64}, expected {'d' * 64}. Give another folder"):
+    with pytest.raises(
+        DatasetError,
+        match=f"episodes of configuration {'c' * 64}, expected {'d' * 64}. Give another folder",
+    ):
         DatasetWriter(tmp_path, replace(SPEC, config_sha256="d" * 64))
     others = [
         (replace(SPEC, fps=25), "has fps=50, expected 25"),
         (replace(SPEC, robot_type="rebot"), "has robot_type=so101, expected rebot"),
-        (replace(SPEC, features={**SPEC.features, "action": vector("shoulder", "hand")}), r"has features\['action'\]=.*jaw"),
-        (replace(SPEC, features={**SPEC.features, "next.success": vector("s")}), r"has features\['next.success'\]=None"),
-        (replace(SPEC, features={**SPEC.features, "action": vector("shoulder", "jaw", unit="m")}), r"has units\['action'\]"),
+        (
+            replace(SPEC, features={**SPEC.features, "action": vector("shoulder", "hand")}),
+            r"has features\['action'\]=.*jaw",
+        ),
+        (
+            replace(SPEC, features={**SPEC.features, "next.success": vector("s")}),
+            r"has features\['next.success'\]=None",
+        ),
+        (
+            replace(
+                SPEC, features={**SPEC.features, "action": vector("shoulder", "jaw", unit="m")}
+            ),
+            r"has units\['action'\]",
+        ),
         (replace(SPEC, values={}), "has values"),
     ]
     for spec, message in others:
@@ -482,20 +590,32 @@ NOT_FINITE[5, 1] = np.nan
 BAD_EPISODES = {
     r"action has shape \(23, 3\), expected \(23, 2\)": with_array("action", np.zeros((23, 3))),
     r"action has shape \(22, 2\), expected \(23, 2\)": with_array("action", np.zeros((22, 2))),
-    r"observation.state has shape \(0, 3\), expected \(frames, 3\)": with_array("observation.state", np.zeros((0, 3))),
+    r"observation.state has shape \(0, 3\), expected \(frames, 3\)": with_array(
+        "observation.state", np.zeros((0, 3))
+    ),
     r"action has shape \(23,\)": with_array("action", np.zeros(23)),
     r"next.done is float64, expected bool": with_array("next.done", np.zeros(23)),
     r"action is not finite in 1 of 23 frames \(first: 5\)": with_array("action", NOT_FINITE),
-    r"observation.state is not finite in 23 of 23": with_array("observation.state", np.full((23, 3), 1e300)),
-    r"feature 'acton' is not in the DatasetSpec. Did you mean 'action'": with_array("acton", np.zeros((23, 2))),
+    r"observation.state is not finite in 23 of 23": with_array(
+        "observation.state", np.full((23, 3), 1e300)
+    ),
+    r"feature 'acton' is not in the DatasetSpec. Did you mean 'action'": with_array(
+        "acton", np.zeros((23, 2))
+    ),
     r"no feature 'observation.state', expected": replace(
         episode(1), arrays={k: v for k, v in episode(1).arrays.items() if k != "observation.state"}
     ),
     r"no value 'xy_err'": replace(episode(1), values={}),
-    r"value 'xy' is not in the DatasetSpec": replace(episode(1), values={**episode(1).values, "xy": 1.0}),
-    r"xy_err is 'small', expected float64": replace(episode(1), values={**episode(1).values, "xy_err": "small"}),
+    r"value 'xy' is not in the DatasetSpec": replace(
+        episode(1), values={**episode(1).values, "xy": 1.0}
+    ),
+    r"xy_err is 'small', expected float64": replace(
+        episode(1), values={**episode(1).values, "xy_err": "small"}
+    ),
     r"peak is 1.5, expected int64": replace(episode(1), values={**episode(1).values, "peak": 1.5}),
-    r"peak is 9223372036854775808, expected int64": replace(episode(1), values={**episode(1).values, "peak": 2**63}),
+    r"peak is 9223372036854775808, expected int64": replace(
+        episode(1), values={**episode(1).values, "peak": 2**63}
+    ),
     r"settled is 1, expected bool": replace(episode(1), values={**episode(1).values, "settled": 1}),
     r"note is 3, expected string": replace(episode(1), values={**episode(1).values, "note": 3}),
     r"success is 'yes', expected bool": replace(episode(1), success="yes"),
@@ -505,9 +625,13 @@ BAD_EPISODES = {
 
 
 @pytest.mark.parametrize("message", BAD_EPISODES)
-def test_an_episode_that_does_not_fit_is_refused_with_its_batch(message: str, tmp_path: Path) -> None:
+def test_an_episode_that_does_not_fit_is_refused_with_its_batch(
+    message: str, tmp_path: Path
+) -> None:
     with DatasetWriter(tmp_path, SPEC) as writer:
-        with pytest.raises(DatasetError, match=rf"^episode of seed 7, world 1: .*{message}") as caught:
+        with pytest.raises(
+            DatasetError, match=rf"^episode of seed 7, world 1: .*{message}"
+        ) as caught:
             writer.add([episode(0), BAD_EPISODES[message]])
         assert "\n" not in str(caught.value)
         assert writer.pending == 0
@@ -523,7 +647,10 @@ def test_an_episode_that_does_not_fit_is_refused_with_its_batch(message: str, tm
         ({"features": {}}, "features: found none"),
         ({"features": {"a/b": vector("x")}}, "without /"),
         ({"features": {"index": vector("x")}}, "which the writer adds"),
-        ({"features": {"a": vector("x", dtype="float16")}}, r"features\['a'\].dtype: found float16"),
+        (
+            {"features": {"a": vector("x", dtype="float16")}},
+            r"features\['a'\].dtype: found float16",
+        ),
         ({"features": {"a": vector()}}, "at least one name"),
         ({"features": {"a": vector("x", "x")}}, "each once"),
         ({"features": {"a": Feature(dtype="bool", names=("x",), units=())}}, "1 units"),
@@ -539,7 +666,9 @@ def test_a_spec_that_cannot_be_is_refused(change: dict[str, Any], message: str) 
         replace(SPEC, **change)
 
 
-def test_without_pyarrow_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pyarrow_one_line_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     for use in (lambda: DatasetWriter(tmp_path / "new", SPEC), lambda: read_dataset(tmp_path)):
         with pytest.raises(MissingExtra, match=re.escape("pip install 'mjstack[datasets]'")):
@@ -561,10 +690,14 @@ def edit_table(path: Path, change: Callable[[pa.Table], pa.Table], rows: int | N
             start += length
 
 
-def set_column(name: str, change: Callable[[list], list], kind: pa.DataType | None = None) -> Callable[[pa.Table], pa.Table]:
+def set_column(
+    name: str, change: Callable[[list], list], kind: pa.DataType | None = None
+) -> Callable[[pa.Table], pa.Table]:
     def edit(table: pa.Table) -> pa.Table:
         column = table.schema.get_field_index(name)
-        values = pa.array(change(table[name].to_pylist()), type=kind or table.schema.field(name).type)
+        values = pa.array(
+            change(table[name].to_pylist()), type=kind or table.schema.field(name).type
+        )
         return table.set_column(column, table.schema.field(name).with_type(values.type), values)
 
     return edit
@@ -580,12 +713,10 @@ def swap(values: list) -> list:
     return [values[1], values[0], *values[2:]]
 
 
-DATA, ROWS, INFO, STATS = (
-    "data/chunk-000/file-000.parquet",
-    "meta/episodes/chunk-000/file-000.parquet",
-    layout.INFO,
-    layout.STATS,
-)
+DATA = "data/chunk-000/file-000.parquet"
+ROWS = "meta/episodes/chunk-000/file-000.parquet"
+INFO = lerobot.INFO
+STATS = lerobot.STATS
 DAMAGE: dict[str, tuple[str, Any]] = {
     "index of episode 0, frame 0": (DATA, set_column("index", swap)),
     "timestamp of episode 0, frame 0": (DATA, set_column("timestamp", swap)),
@@ -593,10 +724,22 @@ DAMAGE: dict[str, tuple[str, Any]] = {
     "episode_index of episode 0": (DATA, set_column("episode_index", lambda v: [1, *v[1:]])),
     "task_index of episode 0": (DATA, set_column("task_index", lambda v: [3 for _ in v])),
     "(min|max|mean) of action": (DATA, set_column("action", lambda v: [[9.0, 9.0], *v[1:]])),
-    "q10 of action|mean of action": (DATA, set_column("action", lambda v: [[1.0001 * a for a in v[0]], *v[1:]])),
-    "next.reward of episode 0: found empty places": (DATA, set_column("next.reward", lambda v: [None, *v[1:]])),
-    "action of episode 0: found empty places": (DATA, set_column("action", lambda v: [None, *v[1:]])),
-    "numbers that are not finite": (DATA, set_column("next.reward", lambda v: [float("nan"), *v[1:]])),
+    "q10 of action|mean of action": (
+        DATA,
+        set_column("action", lambda v: [[1.0001 * a for a in v[0]], *v[1:]]),
+    ),
+    "next.reward of episode 0: found empty places": (
+        DATA,
+        set_column("next.reward", lambda v: [None, *v[1:]]),
+    ),
+    "action of episode 0: found empty places": (
+        DATA,
+        set_column("action", lambda v: [None, *v[1:]]),
+    ),
+    "numbers that are not finite": (
+        DATA,
+        set_column("next.reward", lambda v: [float("nan"), *v[1:]]),
+    ),
     "type of next.reward: found double": (DATA, set_column("next.reward", list, pa.float64())),
     "type of action": (DATA, set_column("action", list, pa.list_(pa.float32()))),
     "found .*expected .*'action'": (DATA, lambda table: table.drop_columns(["action"])),
@@ -604,20 +747,32 @@ DAMAGE: dict[str, tuple[str, Any]] = {
     "types for Hugging Face": (DATA, lambda table: table.replace_schema_metadata({})),
     "has 69 frames": (ROWS, set_column("length", lambda v: [v[0] + 1, *v[1:]])),
     "data/file_index of episode 0": (ROWS, set_column("data/file_index", lambda v: [1, *v[1:]])),
-    "dataset_to_index of episode 0": (ROWS, set_column("dataset_from_index", lambda v: [1, *v[1:]])),
+    "dataset_to_index of episode 0": (
+        ROWS,
+        set_column("dataset_from_index", lambda v: [1, *v[1:]]),
+    ),
     "other episodes than from 0": (ROWS, set_column("episode_index", swap)),
     r"task_index of episode 0.*\['box'\]": (ROWS, set_column("tasks", lambda v: [["box"], *v[1:]])),
-    "std of action": (ROWS, set_column("stats/action/std", lambda v: [[2.0 * v[0][0], v[0][1]], *v[1:]])),
+    "std of action": (
+        ROWS,
+        set_column("stats/action/std", lambda v: [[2.0 * v[0][0], v[0][1]], *v[1:]]),
+    ),
     "count of episode 0": (ROWS, set_column("stats/action/count", lambda v: [[1], *v[1:]])),
     "damaged .*stats/action/q99": (ROWS, lambda table: table.drop_columns(["stats/action/q99"])),
-    "3 episodes and 69 frames, expected 4 and 69": (INFO, lambda info: info.update(total_episodes=4, splits={"train": "0:4"})),
+    "3 episodes and 69 frames, expected 4 and 69": (
+        INFO,
+        lambda info: info.update(total_episodes=4, splits={"train": "0:4"}),
+    ),
     "expected 3 and 70": (INFO, lambda info: info.update(total_frames=70)),
     "has 1 tasks, expected 2": (INFO, lambda info: info.update(total_tasks=2)),
     "splits": (INFO, lambda info: info["splits"].update(train="0:2")),
     "no usable 'robot_type'": (INFO, lambda info: info.pop("robot_type")),
     "codebase_version: found v2.1": (INFO, lambda info: info.update(codebase_version="v2.1")),
     "total_videos: found 0": (INFO, lambda info: info.update(total_videos=0)),
-    "stats.json: count: found": (STATS, lambda stats: [one.update(count=[70]) for one in stats.values()]),
+    "stats.json: count: found": (
+        STATS,
+        lambda stats: [one.update(count=[70]) for one in stats.values()],
+    ),
     "mean of action": (STATS, lambda stats: stats["action"]["mean"].__setitem__(1, 0.5)),
     "stats.json cannot be read": (STATS, lambda stats: stats.pop("action")),
 }
@@ -637,7 +792,7 @@ def test_the_reader_finds_damage(message: str, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("file", [DATA, ROWS, layout.TASKS, INFO, STATS])
+@pytest.mark.parametrize("file", [DATA, ROWS, lerobot.TASKS, INFO, STATS])
 def test_missing_and_cut_files_are_named(file: str, tmp_path: Path) -> None:
     write(tmp_path, range(3))
     whole = (tmp_path / file).read_bytes()
@@ -645,7 +800,9 @@ def test_missing_and_cut_files_are_named(file: str, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=re.escape(file)):
         read_dataset(tmp_path)
     (tmp_path / file).unlink()
-    for use in [read_dataset] + ([lambda folder: DatasetWriter(folder, SPEC)] if file != STATS else []):
+    for use in [read_dataset] + (
+        [lambda folder: DatasetWriter(folder, SPEC)] if file != STATS else []
+    ):
         with pytest.raises(DatasetError, match=re.escape(file)):
             use(tmp_path)
     if file == STATS:  # it follows from the episodes' own: the next writer writes it anew
@@ -655,11 +812,17 @@ def test_missing_and_cut_files_are_named(file: str, tmp_path: Path) -> None:
 
 def test_the_guides_lines_read_it_in_another_process(tmp_path: Path) -> None:
     """The guide's reading lines, and nothing else, on a dataset in the folder that they name."""
-    (lines,) = [block for block in re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.S) if "DatasetWriter" not in block]
+    (lines,) = [
+        block
+        for block in re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.S)
+        if "DatasetWriter" not in block
+    ]
     assert "mjstack" not in re.sub(r'info\["mjstack"\]', "", lines)
     (folder,) = re.findall(r'^folder = Path\("(.+)"\)$', lines, re.M)
     write(tmp_path / folder, range(3))
-    done = subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr
     first, second = done.stdout.splitlines()
     assert first == "{'episode_index': 0, 'length': 20, 'success': False, 'seed': 7, 'world': 0}"

@@ -36,12 +36,14 @@ N = 4
 scenes = pytest.mark.parametrize(("task", "robot"), SCENES)
 
 
-def randomized(task: str, robot: str, *, frames: int | None = None) -> Config:
-    """Everything differs from world to world; episodes end after some frames, if given."""
+def randomized(task: str, robot: str, *, steps: int | None = None) -> Config:
+    """Everything differs from world to world; episodes end after some steps, if given."""
     cfg = configure(f"task={task}", "reset=randomized", robot=robot)
-    cfg.action["arm"].params["scale"] = 0.5  # rad: nothing but the clock ends an episode in these tests
-    if frames is not None:
-        cfg.termination["time_out"].params["frames"] = frames
+    cfg.action["arm"].params["scale"] = (
+        0.5  # rad: nothing but the clock ends an episode in these tests
+    )
+    if steps is not None:
+        cfg.termination["time_out"].params["steps"] = steps
     return cfg
 
 
@@ -64,7 +66,8 @@ def test_a_masked_reset_touches_nobody_else(backend: str, task: str, robot: str)
     env.reset(seed=3)
     before_reset = play(env, moves[:6])
     assert_traces(before_reset, undisturbed[:6], slice(None), slice(None), backend)
-    others, chosen = [0, 2], [1, 3]
+    others = [0, 2]
+    chosen = [1, 3]
     env.sim.sensordata.fill_(1.0)  # as if they had touched something
     before = held(env)
     start = returned(env.reset(mask=mask_of(env, *chosen)))
@@ -74,9 +77,18 @@ def test_a_masked_reset_touches_nobody_else(backend: str, task: str, robot: str)
     for name, value in start.items():
         assert torch.equal(value[others], before_reset[-1][name][others]), name
     assert after["episode"].tolist() == [0, 1, 0, 1]
-    assert after["frame"].tolist() == [6, 0, 6, 0]
+    assert after["step"].tolist() == [6, 0, 6, 0]
     assert before["action"][chosen].any()
-    for name in ("action", "previous_action", "sensordata", "qvel", "episode_sums", "success", *COUNTS[:1], *COUNTS[2:]):
+    for name in (
+        "action",
+        "previous_action",
+        "sensordata",
+        "qvel",
+        "episode_sums",
+        "success",
+        *COUNTS[:1],
+        *COUNTS[2:],
+    ):
         assert not after[name][chosen].any(), name
     later = play(env, moves[6:])
     assert_traces(later, undisturbed[6:], others, others, backend)
@@ -99,7 +111,11 @@ def test_starts_depend_on_seed_world_and_episode_alone(robot: str) -> None:
 
     def starts(env: Env) -> dict[str, torch.Tensor]:
         kept = held(env, names)
-        return {name: v.double().cpu() for name, v in kept.items() if name in names or name.startswith("fields.")}
+        return {
+            name: v.double().cpu()
+            for name, v in kept.items()
+            if name in names or name.startswith("fields.")
+        }
 
     runs = {}
     for backend, nworld in (("native", N), ("native", 2), ("mjwarp", N)):
@@ -128,7 +144,7 @@ def test_starts_depend_on_seed_world_and_episode_alone(robot: str) -> None:
 @scenes
 def test_world_k_of_n_is_world_k_of_one(backend: str, task: str, robot: str) -> None:
     """Over random actions and two automatic resets each."""
-    cfg = randomized(task, robot, frames=5)
+    cfg = randomized(task, robot, steps=5)
     many = on_shared_sim(backend, N, cfg)
     many.reset(seed=1)
     many_trace = play(many, actions(many, 13))
@@ -147,7 +163,7 @@ def test_world_k_of_n_is_world_k_of_one(backend: str, task: str, robot: str) -> 
 
 @scenes
 def test_the_seed_decides_the_episode(backend: str, task: str, robot: str) -> None:
-    cfg = randomized(task, robot, frames=6)
+    cfg = randomized(task, robot, steps=6)
     cfg.seed = 11
     env = on_shared_sim(backend, 3, cfg)
     moves = actions(env, 8)
@@ -174,22 +190,40 @@ def test_the_seed_decides_the_episode(backend: str, task: str, robot: str) -> No
 
 @scenes
 def test_outputs_filled_with_nan_change_nothing(backend: str, task: str, robot: str) -> None:
-    cfg = randomized(task, robot, frames=4)
+    cfg = randomized(task, robot, steps=4)
     env = on_shared_sim(backend, 3, cfg)
-    sim, moves = env.sim, actions(env, 10)
+    sim = env.sim
+    moves = actions(env, 10)
     model = sim.model
     # Geoms of the world are placed once, when the data is made.
-    moving = torch.from_numpy(np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)).to(env.device)
+    moving = torch.from_numpy(np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)).to(
+        env.device
+    )
 
     def poison(_: int = 0) -> None:
         sim.geom_xpos[:, moving] = math.nan
         managers = env.reward_manager, env.termination_manager
-        for view in (sim.xpos[:, 1:], sim.xquat[:, 1:], sim.site_xpos, sim.sensordata, sim.qfrc_actuator):
+        for view in (
+            sim.xpos[:, 1:],
+            sim.xquat[:, 1:],
+            sim.site_xpos,
+            sim.sensordata,
+            sim.qfrc_actuator,
+        ):
             view.fill_(math.nan)
-        for view in (*env.observation_manager.groups.values(), managers[0].reward, managers[0].values):
+        for view in (
+            *env.observation_manager.groups.values(),
+            managers[0].reward,
+            managers[0].values,
+        ):
             view.fill_(math.nan)
         env.action_manager.previous_action.fill_(math.nan)
-        for flags in (managers[1].terminated, managers[1].truncated, managers[1].values, env.success):
+        for flags in (
+            managers[1].terminated,
+            managers[1].truncated,
+            managers[1].values,
+            env.success,
+        ):
             flags.fill_(True)
         sim.contact_count.fill_(-1)
         sim.constraint_count.fill_(-1)
@@ -212,7 +246,9 @@ def test_outputs_filled_with_nan_change_nothing(backend: str, task: str, robot: 
 
 
 @scenes
-def test_terminal_observation_and_the_one_to_go_on_with(backend: str, task: str, robot: str) -> None:
+def test_terminal_observation_and_the_one_to_go_on_with(
+    backend: str, task: str, robot: str
+) -> None:
     env = on_shared_sim(backend, 3, without_ends(randomized(task, robot)))
     moves = actions(env, 9)
     env.reset(seed=4)
@@ -220,15 +256,20 @@ def test_terminal_observation_and_the_one_to_go_on_with(backend: str, task: str,
     env.reset(seed=4)
     next_start = returned(env.reset())
 
-    env = on_shared_sim(backend, 3, randomized(task, robot, frames=5))
+    env = on_shared_sim(backend, 3, randomized(task, robot, steps=5))
     env.reset(seed=4)
     trace = play(env, moves[:2])
     env.reset(mask=mask_of(env, 1))  # so that world 1 is not done with the others
     trace += play(env, moves[2:])
-    assert [row["truncated"].tolist() for row in trace[4:7]] == [[True, False, True], [False] * 3, [False, True, False]]
+    assert [row["truncated"].tolist() for row in trace[4:7]] == [
+        [True, False, True],
+        [False] * 3,
+        [False, True, False],
+    ]
     done = trace[4]
     for group in env.observation_manager.groups:
-        obs, final = done[f"obs.{group}"], done[f"final.{group}"]
+        obs = done[f"obs.{group}"]
+        final = done[f"final.{group}"]
         assert_same_run(final[[0, 2]], endless[4][f"obs.{group}"][[0, 2]], backend)
         assert_same_run(obs[[0, 2]], next_start[f"obs.{group}"][[0, 2]], backend)
         assert torch.equal(final[1], obs[1])
@@ -238,9 +279,12 @@ def test_terminal_observation_and_the_one_to_go_on_with(backend: str, task: str,
 
 
 def test_returned_tensors_are_the_callers(backend: str) -> None:
-    env = on_shared_sim(backend, 3, randomized("stack", "so101", frames=3))
+    env = on_shared_sim(backend, 3, randomized("stack", "so101", steps=3))
     moves = actions(env, 7)
-    kept = [returned(env.reset(seed=0)), *(returned(env.step(move)) for move in moves[:3])]  # the last one with resets
+    kept = [
+        returned(env.reset(seed=0)),
+        *(returned(env.step(move)) for move in moves[:3]),
+    ]  # the last one with resets
     copies = [{name: value.clone() for name, value in row.items()} for row in kept]
     play(env, moves[3:])
     env.reset(mask=mask_of(env, 0))
@@ -260,8 +304,8 @@ def split(env: Env, group: str, obs: torch.Tensor) -> dict[str, torch.Tensor]:
         "joint_pos": n,
         "joint_pos_relative": n,
         "joint_vel": n,
-        "aperture_pos": 3,
-        "aperture_to_object": 3,
+        "grasp_point_pos": 3,
+        "grasp_point_to_object": 3,
         "object_to_object": 3,
         "object_pose": 7,
         "object_velocity": 6,
@@ -274,29 +318,29 @@ def split(env: Env, group: str, obs: torch.Tensor) -> dict[str, torch.Tensor]:
 
 
 def test_history_starts_full_and_slides(backend: str) -> None:
-    cfg = randomized("reach", "so101", frames=4)
+    cfg = randomized("reach", "so101", steps=4)
     terms = cfg.observation["policy"].terms
     terms["joint_pos"].history = 3
     env = on_shared_sim(backend, 3, cfg)
 
     def read(obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         parts = split(env, "policy", obs)
-        return parts["joint_pos"].reshape(3, 3, -1), parts["aperture_to_goal"].reshape(3, 2, -1)
+        return parts["joint_pos"].reshape(3, 3, -1), parts["grasp_point_to_goal"].reshape(3, 2, -1)
 
     trace = [returned(env.reset(seed=0)), *(returned(env.step(move)) for move in actions(env, 6))]
-    frames = [read(row["obs.policy"]) for row in trace]
-    for t in (0, 4):  # the first frame, also of the second episode
-        for part in frames[t]:
+    steps = [read(row["obs.policy"]) for row in trace]
+    for t in (0, 4):  # the first step, also of the second episode
+        for part in steps[t]:
             assert (part == part[:, :1]).all()
     for t in (1, 2, 3, 5, 6):
-        for new, old in zip(frames[t], frames[t - 1], strict=True):
+        for new, old in zip(steps[t], steps[t - 1], strict=True):
             assert torch.equal(new[:, :-1], old[:, 1:])
             assert not torch.equal(new[:, -1], old[:, -1])
     # The terminal observation slides too: it is the old episode's.
-    for final, old in zip(read(trace[4]["final.policy"]), frames[3], strict=True):
+    for final, old in zip(read(trace[4]["final.policy"]), steps[3], strict=True):
         assert torch.equal(final[:, :-1], old[:, 1:])
     # A masked reset fills the history of its worlds alone.
-    old = frames[-1]
+    old = steps[-1]
     new = read(env.reset(mask=mask_of(env, 1))[0]["policy"])
     for a, b in zip(new, old, strict=True):
         assert (a[1] == a[1, :1]).all()
@@ -305,7 +349,7 @@ def test_history_starts_full_and_slides(backend: str) -> None:
 
 
 def test_noise_is_keyed_and_within_its_width() -> None:
-    base = randomized("reach", "so101", frames=5)
+    base = randomized("reach", "so101", steps=5)
     env = on_shared_sim("native", 3, base)
     moves = actions(env, 8)
 
@@ -316,7 +360,8 @@ def test_noise_is_keyed_and_within_its_width() -> None:
         out = []
         for move in moves:
             obs = env.step(move)[0]
-            pos, clean = split(env, "policy", obs["policy"])["joint_pos"], split(env, "privileged", obs["privileged"])
+            pos = split(env, "policy", obs["policy"])["joint_pos"]
+            clean = split(env, "privileged", obs["privileged"])
             out.append(pos - clean["joint_pos"])
         return torch.stack(out)
 
@@ -325,17 +370,20 @@ def test_noise_is_keyed_and_within_its_width() -> None:
     assert (noise.abs() <= width + 1e-6).all()
     assert 0.8 * width < noise.abs().max()
     assert abs(float(noise.mean())) < 0.25 * width
-    # Each frame, each world and each episode has its own: frame 5 is the start of episode 1, so it differs from frame 0's.
+    # Each step, each world and each episode has its own: step 5 is the start of episode 1, so it
+    # differs from step 0's.
     flat = noise.flatten(0, 1)
     assert len({tuple(row) for row in (flat * 1e4).round().int().tolist()}) == len(flat)
     torch.testing.assert_close(noises(env, 0), noise, rtol=0, atol=0)
     assert not torch.isclose(noises(env, 1), noise, atol=1e-5, rtol=0).all(-1).any()
 
-    # In worlds that start alike and do alike, the noise is all that differs; a world's number alone decides its own.
+    # In worlds that start alike and do alike, the noise is all that differs; a world's number alone
+    # decides its own.
     cfg = configure("task=reach", "reset=nominal")
     env = on_shared_sim("native", 3, cfg)
     moves = [move[:1].expand(3, -1) for move in moves]
-    a, b = noises(env, 0), noises(env, 0, [2, 0, 7])
+    a = noises(env, 0)
+    b = noises(env, 0, [2, 0, 7])
     torch.testing.assert_close(b[:, 0], a[:, 2], rtol=0, atol=1e-6)
     torch.testing.assert_close(b[:, 1], a[:, 0], rtol=0, atol=1e-6)
 
@@ -354,10 +402,15 @@ def test_noise_then_clip_then_scale(backend: str) -> None:
         ("clipped", 0.3, [-0.5, 0.25], 1.0),
         ("all", 0.3, [-0.5, 0.25], 0.1),
     ):
-        term.noise, term.clip, term.scale = noise, clip, scale
+        term.noise = noise
+        term.clip = clip
+        term.scale = scale
         env = on_shared_sim(backend, 2, cfg)
         env.reset(seed=0)
-        rows = [split(env, "policy", row["obs.policy"])["joint_vel"] for row in play(env, actions(env, 6))]
+        rows = [
+            split(env, "policy", row["obs.policy"])["joint_vel"]
+            for row in play(env, actions(env, 6))
+        ]
         seen[name] = torch.stack(rows)
     added = (seen["noisy"] - seen["plain"]).abs()
     assert (added <= 0.3 + 1e-4).all()
@@ -390,7 +443,9 @@ def assert_layout(env: Env, row: dict[str, torch.Tensor]) -> None:
 def test_every_action_group_steps(backend: str, robot: str, action: str) -> None:
     cfg = without_ends(configure("task=stack", f"action={action}", "reset=jitter", robot=robot))
     env = on_shared_sim(backend, 3, cfg)
-    n, n_arm, scale = len(env.cfg.robot.home), len(env.cfg.robot.arm_joints), cfg.action["arm"].params.get("scale")
+    n = len(env.cfg.robot.home)
+    n_arm = len(env.cfg.robot.arm_joints)
+    scale = cfg.action["arm"].params.get("scale")
     manager = env.action_manager
     assert manager.action_dim == {"joint_absolute": n, "ee_delta": 4}.get(action, n_arm + 1)
     assert manager.low.shape == manager.high.shape == (manager.action_dim,)
@@ -406,7 +461,9 @@ def test_every_action_group_steps(backend: str, robot: str, action: str) -> None
     if action == "joint_absolute":
         rest[:] = home
     env.step(rest)  # the arm's commands stay where they are
-    held = start.expand(3, -1) if action == "joint_relative" else before  # relative commands count from the start
+    held = (
+        start.expand(3, -1) if action == "joint_relative" else before
+    )  # relative commands count from the start
     torch.testing.assert_close(env.sim.ctrl[:, ctrl[:n_arm]], held[:, :n_arm], rtol=0, atol=1e-4)
     before = env.sim.ctrl[:, ctrl].clone()
     for move in actions(env, 6):
@@ -419,14 +476,21 @@ def test_every_action_group_steps(backend: str, robot: str, action: str) -> None
         if action == "joint_delta":
             assert (moved <= scale + 1e-6).all()
         if action == "joint_relative":
-            expected = (start[:n_arm] + scale * move[:, :n_arm]).clamp(limits[:n_arm, 0], limits[:n_arm, 1])
+            expected = (start[:n_arm] + scale * move[:, :n_arm]).clamp(
+                limits[:n_arm, 0], limits[:n_arm, 1]
+            )
             torch.testing.assert_close(command[:, :n_arm], expected.to(command))
         if action == "joint_absolute":
             torch.testing.assert_close(command, move.to(command))
         else:  # the gripper's fraction of its way from closed to open
-            closed, opened = (torch.tensor(v).to(command) for v in (env.cfg.robot.gripper_closed, env.cfg.robot.gripper_open))
+            closed, opened = (
+                torch.tensor(v).to(command)
+                for v in (env.cfg.robot.gripper_closed, env.cfg.robot.gripper_open)
+            )
             part = 0.5 * (move[:, -1:] + 1.0)
-            torch.testing.assert_close(command[:, n_arm:], (closed + part * (opened - closed)).to(command))
+            torch.testing.assert_close(
+                command[:, n_arm:], (closed + part * (opened - closed)).to(command)
+            )
         before = command.clone()
     if action != "joint_absolute":  # more than one is one
         commands = []
@@ -437,9 +501,11 @@ def test_every_action_group_steps(backend: str, robot: str, action: str) -> None
         assert_same_run(*commands, backend)
 
 
-def test_end_effector_delta_moves_the_commanded_aperture(backend: str, robot: str) -> None:
+def test_end_effector_delta_moves_the_commanded_grasp_point(backend: str, robot: str) -> None:
     """The command's forward kinematics, by native MuJoCo, moves by 1 cm along each axis in turn."""
-    env = on_shared_sim(backend, 3, configure("task=stack", "action=ee_delta", "reset=jitter", robot=robot))
+    env = on_shared_sim(
+        backend, 3, configure("task=stack", "action=ee_delta", "reset=jitter", robot=robot)
+    )
     env.reset(seed=0)
     model = env.sim.model
     data = mujoco.MjData(model)
@@ -450,19 +516,24 @@ def test_end_effector_delta_moves_the_commanded_aperture(backend: str, robot: st
             data.qpos[:] = model.qpos0
             data.qpos[env.index.robot_qpos] = env.sim.ctrl[k].double().cpu().numpy()[env.index.ctrl]
             mujoco.mj_kinematics(model, data)
-            rows.append(np.mean([data.site(name).xpos for name in env.cfg.robot.aperture_sites], axis=0))
+            rows.append(
+                np.mean([data.site(name).xpos for name in env.cfg.robot.grasp_sites], axis=0)
+            )
         return np.array(rows)
 
     move = torch.zeros((3, 4), device=env.device)
     move[:, :3] = 0.8 * torch.eye(3, device=env.device)
     move[:, 2] -= 0.2
-    # The commands are IK targets with the gripper where it was last: the gripper's own command comes after the arm's.
+    # The commands are IK targets with the gripper where it was last: the gripper's own command
+    # comes after the arm's.
     env.step(torch.cat((torch.zeros_like(move[:, :3]), torch.ones_like(move[:, 3:])), dim=1))
     move[:, 3] = 1.0
     for _ in range(3):
         before = commanded()
         env.step(move)
-        np.testing.assert_allclose(commanded() - before, 0.01 * move[:, :3].cpu().numpy(), atol=5e-4)
+        np.testing.assert_allclose(
+            commanded() - before, 0.01 * move[:, :3].cpu().numpy(), atol=5e-4
+        )
 
 
 @pytest.mark.parametrize("reset", ["nominal", "jitter", "randomized"])
@@ -503,7 +574,7 @@ def assert_ends(env: Env, term: str, worlds: list[int]) -> None:
     assert torch.equal(terminated, expected if term != "time_out" else ~expected & False)
     assert torch.equal(truncated, expected if term == "time_out" else ~expected & False)
     assert torch.equal(env.episode - before, expected.long())
-    assert not env.frame[expected].any()
+    assert not env.episode_step[expected].any()
     assert torch.isfinite(reward).all()
     for group in obs.values():
         assert torch.isfinite(group).all()
@@ -514,7 +585,8 @@ def assert_ends(env: Env, term: str, worlds: list[int]) -> None:
 
 def test_end_by_a_cube_beside_the_table(ended: Env) -> None:
     red, blue = ended.index.cube_qpos
-    center, half = ended.cfg.scene.table_center, ended.cfg.scene.table_half
+    center = ended.cfg.scene.table_center
+    half = ended.cfg.scene.table_half
     ended.sim.qpos[1, blue + 1] = center[1] + half[1] + 0.002
     assert_ends(ended, "cube_off_table", [1])
     ended.sim.qpos[1, blue + 1] = center[1] + half[1] - 0.002  # on its edge, but on it
@@ -526,12 +598,14 @@ def test_end_by_a_cube_beside_the_table(ended: Env) -> None:
 def test_end_by_a_cube_below_the_table(ended: Env) -> None:
     red, _ = ended.index.cube_qpos
     top = ended.cfg.scene.table_center[2] + ended.cfg.scene.table_half[2]
-    ended.sim.qpos[0, red + 2] = top - ended.cfg.scene.table_half[2] * 2 - 0.03  # under the table top
+    ended.sim.qpos[0, red + 2] = (
+        top - ended.cfg.scene.table_half[2] * 2 - 0.03
+    )  # under the table top
     assert_ends(ended, "cube_off_table", [0])
 
 
 def test_end_by_a_joint_beyond_its_range(ended: Env) -> None:
-    """With more margin than a frame can bring back: MuJoCo pushes with all its might."""
+    """With more margin than a step can bring back: MuJoCo pushes with all its might."""
     index = ended.index
     low, high = index.robot_range[0]
     ended.sim.qpos[2, index.robot_qpos[0]] = high + 0.5 * (high - low)
@@ -548,37 +622,40 @@ def test_end_by_overflow(ended: Env) -> None:
     assert_ends(ended, "overflow", [0])
 
 
-def test_time_out_at_exactly_its_frame(backend: str) -> None:
-    env = on_shared_sim(backend, 3, randomized("stack", "so101", frames=5))
+def test_time_out_at_exactly_its_step(backend: str) -> None:
+    env = on_shared_sim(backend, 3, randomized("stack", "so101", steps=5))
     env.reset(seed=0)
-    for frame in range(1, 12):
-        if frame == 3:
-            env.reset(mask=mask_of(env, 1))  # after two frames
+    for step in range(1, 12):
+        if step == 3:
+            env.reset(mask=mask_of(env, 1))  # after two steps
         _, _, terminated, truncated, _ = env.step(hold(env))
         assert not terminated.any()
-        assert truncated.tolist() == [frame in (5, 10), frame == 7, frame in (5, 10)]
+        assert truncated.tolist() == [step in (5, 10), step == 7, step in (5, 10)]
 
 
 def test_what_happened_outweighs_the_clock(backend: str) -> None:
-    env = on_shared_sim(backend, 3, randomized("stack", "so101", frames=2))
+    env = on_shared_sim(backend, 3, randomized("stack", "so101", steps=2))
     env.reset(seed=0)
     env.step(hold(env))
     env.sim.qpos[1, env.index.cube_qpos[0] + 1] += 1.0
     _, _, terminated, truncated, _ = env.step(hold(env))
     assert terminated.tolist() == [False, True, False]
     assert truncated.tolist() == [True, False, True]
-    said = dict(zip(env.termination_manager.names, env.termination_manager.values.unbind(1), strict=True))
+    said = dict(
+        zip(env.termination_manager.names, env.termination_manager.values.unbind(1), strict=True)
+    )
     assert said["time_out"].tolist() == [True] * 3
 
 
 def test_statistics_are_those_of_the_episodes_that_ended(backend: str) -> None:
-    cfg = randomized("reach", "so101", frames=4)
+    cfg = randomized("reach", "so101", steps=4)
     env = on_shared_sim(backend, 3, cfg)
     env.read_statistics()
     env.reset(seed=0)
     moves = actions(env, 9)
     totals = torch.zeros(3)
-    returns, lengths = [], []
+    returns = []
+    lengths = []
     for t, move in enumerate(moves):
         if t == 5:
             env.sim.qpos[0, env.index.cube_qpos[0] + 1] += 1.0
@@ -591,7 +668,7 @@ def test_statistics_are_those_of_the_episodes_that_ended(backend: str) -> None:
     assert sorted(lengths) == [2, 4, 4, 4, 4, 4]
     read = env.read_statistics()
     assert read["episodes"] == 6
-    assert read["frames"] == pytest.approx(22 / 6)
+    assert read["steps"] == pytest.approx(22 / 6)
     assert read["return"] == pytest.approx(sum(returns) / 6, rel=1e-5)
     parts = [value for name, value in read.items() if name.startswith("reward/")]
     assert len(parts) == len(cfg.reward)
@@ -608,7 +685,7 @@ def test_statistics_are_those_of_the_episodes_that_ended(backend: str) -> None:
 @pytest.mark.parametrize(("kind", "nworld", "steps"), [("native", 16, 300), ("mjwarp", 4, 60)])
 def test_random_actions_for_a_while(kind: str, nworld: int, steps: int) -> None:
     """`python tests/env_soak.py` makes it long."""
-    found = soak(kind, nworld, steps, episode_frames=40)
+    found = soak(kind, nworld, steps, episode_steps=40)
     assert found["finite"]
     assert found["steps"] == steps
     assert found["episodes"] >= nworld * (steps // 40)

@@ -1,4 +1,6 @@
-"""What a user can do wrong with an environment: one line each, that names the term or argument and says what to do."""
+"""What a user can do wrong with an environment: one line each, that names the term or argument and
+says what to do.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +77,9 @@ def fails(kind: type[MjstackError], call: Callable[[], object], *words: str) -> 
         (lambda env: None, ["NoneType", "float32 tensor"]),
     ],
 )
-def test_action_of_the_wrong_kind(env: Env, action: Callable[[Env], object], words: list[str]) -> None:
+def test_action_of_the_wrong_kind(
+    env: Env, action: Callable[[Env], object], words: list[str]
+) -> None:
     fails(ArgumentError, lambda: env.step(action(env)), "action: found", "expected", *words)  # type: ignore[arg-type]
 
 
@@ -90,7 +94,8 @@ def test_argument_errors_leave_the_environment_as_it_was(env: Env) -> None:
     action = 0.3 * torch.ones_like(zeros(env))
     expected = [returned(env.step(action)), returned(env.step(-action))]
     env.reset(seed=0)
-    nan, meta = action.clone(), action.to("meta")
+    nan = action.clone()
+    meta = action.to("meta")
     nan[0, 0] = float("nan")
     attempts: list[Callable[[], object]] = [
         lambda: env.step(nan),
@@ -121,7 +126,13 @@ def test_argument_errors_leave_the_environment_as_it_was(env: Env) -> None:
     ],
 )
 def test_reset_mask_of_the_wrong_kind(env: Env, mask: object, words: list[str]) -> None:
-    fails(ArgumentError, lambda: env.reset(mask=mask), "mask: found", "bool tensor of shape (3,) on cpu", *words)  # type: ignore[arg-type]
+    fails(
+        ArgumentError,
+        lambda: env.reset(mask=mask),
+        "mask: found",
+        "bool tensor of shape (3,) on cpu",
+        *words,
+    )  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("seed", [-1, 1 << 32, 1.5, "7", True])
@@ -150,11 +161,23 @@ def test_configured_seed_out_of_range(seed: int) -> None:
 
 
 def test_overrides_as_a_string() -> None:
-    fails(ArgumentError, lambda: make_env("task=reach"), "overrides", "'task=reach'", "['task=reach', 'robot=rebot']")
+    fails(
+        ArgumentError,
+        lambda: make_env("task=reach"),
+        "overrides",
+        "'task=reach'",
+        "['task=reach', 'robot=rebot']",
+    )
 
 
 def test_overrides_as_a_configuration() -> None:
-    fails(ArgumentError, lambda: make_env(load_config([])), "overrides", "a Config", "['task=reach', 'robot=rebot']")  # type: ignore[arg-type]
+    fails(
+        ArgumentError,
+        lambda: make_env(load_config([])),
+        "overrides",
+        "a Config",
+        "['task=reach', 'robot=rebot']",
+    )  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -168,7 +191,7 @@ def test_overrides_as_a_configuration() -> None:
         ("~reward.graps", ["graps", "grasp"]),
         ("reward.lift.wait=3", ["wait", "weight"]),
         ("reward.lfit.weight=3", ["lfit", "lift"]),
-        ("termination.time_out.params.frame=3", ["frame", "frames"]),
+        ("termination.time_out.params.step=3", ["step", "steps"]),
     ],
 )
 def test_unknown_group_or_key(override: str, words: list[str]) -> None:
@@ -215,7 +238,7 @@ def raises(env: Env, mask: torch.Tensor | None = None) -> torch.Tensor:
 
 
 def nan_after_start(env: Env) -> torch.Tensor:
-    return torch.where((env.frame > 1) & (env.world == 2), float("nan"), 1.0)
+    return torch.where((env.episode_step > 1) & (env.world == 2), float("nan"), 1.0)
 
 
 class NeedsScale:
@@ -229,10 +252,16 @@ class NeedsScale:
 
 
 KINDS: dict[str, Callable[[Config, str, dict], None]] = {
-    "reward.mine": lambda cfg, func, p: cfg.reward.update(mine=RewardTermCfg(func=func, params=p, weight=1.0)),
-    "termination.mine": lambda cfg, func, p: cfg.termination.update(mine=TerminationTermCfg(func=func, params=p)),
-    "observation.policy.terms.mine": lambda cfg, func, p: cfg.observation["policy"].terms.update(
-        mine=ObservationTermCfg(func=func, params=p)
+    "reward.mine": lambda cfg, func, p: cfg.reward.update(
+        mine=RewardTermCfg(func=func, params=p, weight=1.0)
+    ),
+    "termination.mine": lambda cfg, func, p: cfg.termination.update(
+        mine=TerminationTermCfg(func=func, params=p)
+    ),
+    "observation.policy.terms.mine": (
+        lambda cfg, func, p: cfg.observation["policy"].terms.update(
+            mine=ObservationTermCfg(func=func, params=p)
+        )
     ),
     "task.success": lambda cfg, func, p: setattr(cfg.task, "success", TermCfg(func=func, params=p)),
     "reset.mine": lambda cfg, func, p: cfg.reset.update(mine=TermCfg(func=func, params=p)),
@@ -248,7 +277,11 @@ def build(cfg: Config) -> Env:
 def test_misspelt_function(cfg: Config, kind: str) -> None:
     KINDS[kind](cfg, "mjstack.mdp.reward.lfit", {})
     fails(
-        TermError, lambda: build(cfg), f"{kind}: func=mjstack.mdp.reward.lfit", "'lfit' does not exist", "Did you mean 'lift'?"
+        TermError,
+        lambda: build(cfg),
+        f"{kind}: func=mjstack.mdp.reward.lfit",
+        "'lfit' does not exist",
+        "Did you mean 'lift'?",
     )
 
 
@@ -256,7 +289,12 @@ def test_misspelt_function(cfg: Config, kind: str) -> None:
 @pytest.mark.parametrize("func", ["mjstack.mdp.rewards.lift", "no_such_package.term"])
 def test_misspelt_module(cfg: Config, kind: str, func: str) -> None:
     KINDS[kind](cfg, func, {})
-    fails(TermError, lambda: build(cfg), f"{kind}: func={func}", f"'{func.rpartition('.')[0]}' cannot be imported")
+    fails(
+        TermError,
+        lambda: build(cfg),
+        f"{kind}: func={func}",
+        f"'{func.rpartition('.')[0]}' cannot be imported",
+    )
 
 
 def test_function_without_a_module(cfg: Config) -> None:
@@ -264,10 +302,14 @@ def test_function_without_a_module(cfg: Config) -> None:
     fails(TermError, lambda: build(cfg), "reward.mine: func=lift", "dotted name")
 
 
-def test_module_that_cannot_be_read(cfg: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_module_that_cannot_be_read(
+    cfg: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A user's own module by name: what is wrong in it is said, in a line."""
     (tmp_path / "terms_with_a_typo.py").write_text("import torhc\n")
-    (tmp_path / "terms_that_work.py").write_text("import torch\ndef one(env):\n    return torch.ones(env.nworld)\n")
+    (tmp_path / "terms_that_work.py").write_text(
+        "import torch\ndef one(env):\n    return torch.ones(env.nworld)\n"
+    )
     monkeypatch.syspath_prepend(str(tmp_path))
     KINDS["reward.mine"](cfg, "terms_with_a_typo.one", {})
     fails(TermError, lambda: build(cfg), "reward.mine", "terms_with_a_typo", "torhc")
@@ -287,36 +329,89 @@ def test_module_that_raises(cfg: Config, tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("kind", KINDS)
 def test_missing_and_misspelt_parameters(cfg: Config, kind: str) -> None:
     KINDS[kind](cfg, f"{HERE}.NeedsScale", {})
-    fails(TermError, lambda: build(cfg), f"{kind}: parameter 'scale' is missing", f"{kind}.params.scale")
+    fails(
+        TermError,
+        lambda: build(cfg),
+        f"{kind}: parameter 'scale' is missing",
+        f"{kind}.params.scale",
+    )
     KINDS[kind](cfg, f"{HERE}.NeedsScale", {"scael": 1.0})
-    fails(TermError, lambda: build(cfg), f"{kind}: parameter 'scael' does not exist", "Did you mean 'scale'?")
+    fails(
+        TermError,
+        lambda: build(cfg),
+        f"{kind}: parameter 'scael' does not exist",
+        "Did you mean 'scale'?",
+    )
 
 
 def test_parameters_of_functions_and_actions(cfg: Config) -> None:
     cfg.reward["lift"].params = {"object": "red_cube"}
     fails(TermError, lambda: build(cfg), "reward.lift: parameter 'height' is missing")
     cfg.reward["lift"].params = {"object": "red_cube", "hieght": 0.05}
-    fails(TermError, lambda: build(cfg), "reward.lift: parameter 'hieght' does not exist", "Did you mean 'height'?")
+    fails(
+        TermError,
+        lambda: build(cfg),
+        "reward.lift: parameter 'hieght' does not exist",
+        "Did you mean 'height'?",
+    )
     cfg.reward["lift"].params = {"object": "red_cub", "height": 0.05}
-    fails(TermError, lambda: build(cfg), "reward.lift", "'red_cub' does not exist", "Did you mean 'red_cube'?")
+    fails(
+        TermError,
+        lambda: build(cfg),
+        "reward.lift",
+        "'red_cub' does not exist",
+        "Did you mean 'red_cube'?",
+    )
     cfg.reward.pop("lift")
     cfg.action["arm"].params["sacle"] = 1.0
-    fails(TermError, lambda: build(cfg), "action.arm: parameter 'sacle' does not exist", "Did you mean 'scale'?")
+    fails(
+        TermError,
+        lambda: build(cfg),
+        "action.arm: parameter 'sacle' does not exist",
+        "Did you mean 'scale'?",
+    )
 
 
 @pytest.mark.parametrize(
     ("group", "name", "params", "words"),
     [
         ("action", "arm", {"joints": "arms"}, ["action.arm", "'arms' does not exist", "arm"]),
-        ("action", "arm", {"joints": ["elbow"]}, ["action.arm", "'elbow' does not exist", "elbow_flex"]),
-        ("action", "arm", {"joints": "arm", "mode": "absolut"}, ["action.arm", "'absolut' does not exist", "absolute"]),
-        ("action", "arm", {"joints": "arm", "scale": 0.0}, ["action.arm.params.scale=0.0", "positive"]),
-        ("termination", "joint_limit", {"margin": -0.1}, ["termination.joint_limit.params.margin=-0.1", "not negative"]),
-        ("reset", "cubes", {"xy": -0.1, "yaw": 0.0}, ["reset.cubes.params.xy=-0.1", "not negative"]),
+        (
+            "action",
+            "arm",
+            {"joints": ["elbow"]},
+            ["action.arm", "'elbow' does not exist", "elbow_flex"],
+        ),
+        (
+            "action",
+            "arm",
+            {"joints": "arm", "mode": "absolut"},
+            ["action.arm", "'absolut' does not exist", "absolute"],
+        ),
+        (
+            "action",
+            "arm",
+            {"joints": "arm", "scale": 0.0},
+            ["action.arm.params.scale=0.0", "positive"],
+        ),
+        (
+            "termination",
+            "joint_limit",
+            {"margin": -0.1},
+            ["termination.joint_limit.params.margin=-0.1", "not negative"],
+        ),
+        (
+            "reset",
+            "cubes",
+            {"xy": -0.1, "yaw": 0.0},
+            ["reset.cubes.params.xy=-0.1", "not negative"],
+        ),
         ("reset", "cubes", {"xy": 0.2, "yaw": 0.0}, ["reset.cubes.params.xy=0.2", "table"]),
     ],
 )
-def test_parameters_out_of_range(cfg: Config, group: str, name: str, params: dict, words: list[str]) -> None:
+def test_parameters_out_of_range(
+    cfg: Config, group: str, name: str, params: dict, words: list[str]
+) -> None:
     getattr(cfg, group)[name].params = params
     with pytest.raises(MjstackError) as caught:
         build(cfg)
@@ -335,7 +430,12 @@ def test_end_effector_action_out_of_range() -> None:
 def test_success_out_of_range(cfg: Config, open_fraction: float) -> None:
     assert cfg.task.success is not None
     cfg.task.success.params["open_fraction"] = open_fraction
-    fails(ConfigError, lambda: build(cfg), f"task.success.params.open_fraction={open_fraction}", "0 to 1")
+    fails(
+        ConfigError,
+        lambda: build(cfg),
+        f"task.success.params.open_fraction={open_fraction}",
+        "0 to 1",
+    )
 
 
 def test_action_that_is_no_action_term(cfg: Config) -> None:
@@ -354,7 +454,9 @@ def test_action_that_is_no_action_term(cfg: Config) -> None:
         ("raises", ["raised ValueError: first line"]),
     ],
 )
-def test_term_that_returns_what_its_manager_cannot_use(cfg: Config, kind: str, func: str, words: list[str]) -> None:
+def test_term_that_returns_what_its_manager_cannot_use(
+    cfg: Config, kind: str, func: str, words: list[str]
+) -> None:
     KINDS[kind](cfg, f"{HERE}.{func}", {})
     fails(TermError, lambda: build(cfg), f"{kind}: ", *words)
 
@@ -363,11 +465,18 @@ def test_term_of_the_wrong_type_or_width(cfg: Config) -> None:
     for kind in ("reward.mine", "termination.mine", "task.success"):
         spoilt = configure("task=stack", "reset=jitter")
         KINDS[kind](spoilt, f"{HERE}.wide", {})
-        fails(TermError, lambda spoilt=spoilt: build(spoilt), f"{kind}: returned shape (3, 1)", "(3,)")
+        fails(
+            TermError, lambda spoilt=spoilt: build(spoilt), f"{kind}: returned shape (3, 1)", "(3,)"
+        )
     for kind in ("termination.mine", "task.success"):
         spoilt = configure("task=stack", "reset=jitter")
         KINDS[kind](spoilt, f"{HERE}.number", {})
-        fails(TermError, lambda spoilt=spoilt: build(spoilt), f"{kind}: returned torch.float32", "expected a bool tensor")
+        fails(
+            TermError,
+            lambda spoilt=spoilt: build(spoilt),
+            f"{kind}: returned torch.float32",
+            "expected a bool tensor",
+        )
     KINDS["reward.mine"](cfg, f"{HERE}.elsewhere", {})
     fails(TermError, lambda: build(cfg), "reward.mine: returned a tensor on meta", "cpu")
 
@@ -397,7 +506,9 @@ def test_reset_term_without_its_fields(cfg: Config) -> None:
         ("clip", [1.0], ["clip=[1.0]", "two numbers"]),
     ],
 )
-def test_observation_settings_out_of_range(cfg: Config, key: str, value: object, words: list[str]) -> None:
+def test_observation_settings_out_of_range(
+    cfg: Config, key: str, value: object, words: list[str]
+) -> None:
     setattr(cfg.observation["policy"].terms["joint_pos"], key, value)
     fails(TermError, lambda: build(cfg), "observation.policy.terms.joint_pos", *words)
 
@@ -420,7 +531,13 @@ def test_reward_that_becomes_nan_is_named(cfg: Config) -> None:
     env = build(cfg)
     env.reset()
     env.step(zeros(env))
-    message = fails(FaultError, lambda: env.step(zeros(env)), "reward is not finite", "reward.mine", "1 of 3 worlds (2)")
+    message = fails(
+        FaultError,
+        lambda: env.step(zeros(env)),
+        "reward is not finite",
+        "reward.mine",
+        "1 of 3 worlds (2)",
+    )
     assert "reward.lift" not in message
 
 
@@ -429,7 +546,13 @@ def test_observation_that_becomes_nan_is_named(cfg: Config) -> None:
     env = build(cfg)
     env.reset()
     env.step(zeros(env))
-    fails(FaultError, lambda: env.step(zeros(env)), "observation", "observation.policy.terms.mine", "1 of 3 worlds (2)")
+    fails(
+        FaultError,
+        lambda: env.step(zeros(env)),
+        "observation",
+        "observation.policy.terms.mine",
+        "1 of 3 worlds (2)",
+    )
     env.reset(seed=0)  # a full reset clears what has been reported
     env.step(zeros(env))
 
@@ -439,17 +562,32 @@ def test_state_that_becomes_nan_is_named_without_its_termination(cfg: Config) ->
     env = build(cfg)
     env.reset()
     env.sim.qvel[1, 0] = float("nan")
-    fails(FaultError, lambda: env.step(zeros(env)), "state is not finite", "1 of 3 worlds (1)", "non_finite")
+    fails(
+        FaultError,
+        lambda: env.step(zeros(env)),
+        "state is not finite",
+        "1 of 3 worlds (1)",
+        "non_finite",
+    )
 
 
 @pytest.mark.parametrize("xy", [[0.5, 0.5], [0.14, 0.3]])
 def test_randomisation_that_leaves_no_free_place(xy: list[float]) -> None:
     cfg = configure("reset=randomized")
     cfg.reset["cubes"].params.update(xy=xy, gap=0.12, candidates=2)
-    fails(ConfigError, lambda: build(cfg), "reset.cubes.params.xy", "free place", "20000 trials", "smaller")
+    fails(
+        ConfigError,
+        lambda: build(cfg),
+        "reset.cubes.params.xy",
+        "free place",
+        "20000 trials",
+        "smaller",
+    )
 
 
-@pytest.mark.parametrize(("key", "value"), [("xy", [0.05]), ("gap", -0.01), ("candidates", 0), ("yaw", float("nan"))])
+@pytest.mark.parametrize(
+    ("key", "value"), [("xy", [0.05]), ("gap", -0.01), ("candidates", 0), ("yaw", float("nan"))]
+)
 def test_randomisation_out_of_range(key: str, value: object) -> None:
     cfg = configure("reset=randomized")
     cfg.reset["cubes"].params[key] = value
@@ -457,13 +595,23 @@ def test_randomisation_out_of_range(key: str, value: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "params"), [("mass", {"scale": [1.3, 0.7]}), ("friction", {"sliding": [0.0, 1.0]}), ("gains", {"scale": [1.0]})]
+    ("name", "params"),
+    [
+        ("mass", {"scale": [1.3, 0.7]}),
+        ("friction", {"sliding": [0.0, 1.0]}),
+        ("gains", {"scale": [1.0]}),
+    ],
 )
 def test_randomisation_bounds(name: str, params: dict) -> None:
     cfg = configure("reset=randomized")
     cfg.reset["cubes"] = configure("reset=jitter").reset["cubes"]  # builds faster
     cfg.reset[name].params = params
-    fails(ConfigError, lambda: build(cfg), f"reset.{name}.params.{next(iter(params))}=", "smaller one first")
+    fails(
+        ConfigError,
+        lambda: build(cfg),
+        f"reset.{name}.params.{next(iter(params))}=",
+        "smaller one first",
+    )
 
 
 def warp_env(cfg: Config, **batch: int) -> Env:
@@ -474,10 +622,18 @@ def warp_env(cfg: Config, **batch: int) -> Env:
 
 def test_contact_pool_too_small_for_the_start() -> None:
     env = warp_env(configure("reset=randomized"), nconmax=1)
-    message = fails(FaultError, env.reset, "batch.nconmax=1", "the start of 2 worlds", "Raise it to more than batch.nconmax=")
+    message = fails(
+        FaultError,
+        env.reset,
+        "batch.nconmax=1",
+        "the start of 2 worlds",
+        "Raise it to more than batch.nconmax=",
+    )
     fails(ArgumentError, lambda: env.step(zeros(env)), "before reset()")
     sizes = [1]
-    while message:  # pairs that did not fit had no contacts, so that the advice has to be followed twice
+    while (
+        message
+    ):  # pairs that did not fit had no contacts, so that the advice has to be followed twice
         wanted = re.search(r"more than batch\.nconmax=(\d+)", message)
         assert wanted is not None
         sizes.append(int(wanted[1]) + 1)
@@ -490,18 +646,30 @@ def test_contact_pool_too_small_for_the_start() -> None:
     assert len(sizes) <= 3, sizes
     assert sizes == sorted(set(sizes))
     # The start fits now; what comes after it does not, which is said too.
-    fails(FaultError, lambda: env.step(zeros(env)), "NARROWPHASE", f"Raise batch.nconmax (nconmax={sizes[-1]};", "per world")
+    fails(
+        FaultError,
+        lambda: env.step(zeros(env)),
+        "NARROWPHASE",
+        f"Raise batch.nconmax (nconmax={sizes[-1]};",
+        "per world",
+    )
     whole = warp_env(configure("reset=randomized"), naconmax=2)
     fails(FaultError, whole.reset, "batch.naconmax=2", "Raise it to more than batch.naconmax=")
 
 
 def test_constraint_rows_too_few_without_the_termination(cfg: Config) -> None:
-    """Each frame of a resting start needs some 100 rows; the environment says so at the first step."""
+    """Each step of a resting start needs some 100 rows; the environment says so at the
+    first step.
+    """
     cfg.termination.pop("overflow")
     env = warp_env(cfg, njmax=40)
     env.reset()
     message = fails(
-        FaultError, lambda: env.step(zeros(env)), "NEFC overflow in 2 of 2 worlds (0, 1)", "Raise batch.njmax", "njmax=40"
+        FaultError,
+        lambda: env.step(zeros(env)),
+        "NEFC overflow in 2 of 2 worlds (0, 1)",
+        "Raise batch.njmax",
+        "njmax=40",
     )
     rows = re.search(r"up to (\d+) rows", message)
     assert rows is not None
@@ -513,5 +681,7 @@ def test_constraint_rows_too_few_end_episodes_with_the_termination(cfg: Config) 
     env.reset()
     _, _, terminated, _, _ = env.step(zeros(env))
     assert terminated.all()
-    said = dict(zip(env.termination_manager.names, env.termination_manager.values.unbind(1), strict=True))
+    said = dict(
+        zip(env.termination_manager.names, env.termination_manager.values.unbind(1), strict=True)
+    )
     assert said["overflow"].all()

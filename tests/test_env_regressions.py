@@ -14,8 +14,8 @@ import torch
 import mjstack
 from mjstack.config.schema import ObservationTermCfg, TermCfg
 from mjstack.envs import Env, build_env
+from mjstack.episodes.context import GateContext
 from mjstack.errors import ConfigError, FaultError, MissingField, TermError
-from mjstack.gates.gate import GateContext
 
 
 def native(*overrides: str, nworld: int = 2) -> Env:
@@ -53,25 +53,33 @@ class Counter:
 def test_an_observation_with_a_memory_is_refused() -> None:
     cfg = mjstack.load_config(["sim=native"])
     cfg.observation["policy"].terms["counter"] = ObservationTermCfg(func=f"{__name__}.Counter")
-    with pytest.raises(TermError, match=r"observation\.policy\.terms\.counter: has a reset\(mask\).*use history"):
+    with pytest.raises(
+        TermError, match=r"observation\.policy\.terms\.counter: has a reset\(mask\).*use history"
+    ):
         build_env(cfg, nworld=1)
 
 
 def test_a_reset_after_an_overflow_counts_the_start_alone() -> None:
     """Most contacts of a run are more than those of its start."""
-    env = mjstack.make_env(["sim=mjwarp", "sim.device=cpu", "batch.naconmax=54", "reset=nominal"], nworld=2)
+    env = mjstack.make_env(
+        ["sim=mjwarp", "sim.device=cpu", "batch.naconmax=54", "reset=nominal"], nworld=2
+    )
     env.reset(seed=0)
     env.sim.peak_pool.fill_(1000)
     env.reset(seed=0)
 
 
 def test_an_overflow_names_the_size_that_is_in_force() -> None:
-    env = mjstack.make_env(["sim=mjwarp", "sim.device=cpu", "batch.naconmax=40", "reset=randomized"], nworld=2)
+    env = mjstack.make_env(
+        ["sim=mjwarp", "sim.device=cpu", "batch.naconmax=40", "reset=randomized"], nworld=2
+    )
     env.reset(seed=0)
     env.sim.overflow.fill_(8)  # NARROWPHASE; latched as if a step had raised it
     env._faults._overflow |= 8
     env.sim.peak_pool.fill_(77)
-    with pytest.raises(FaultError, match=r"Raise batch\.naconmax \(naconmax=40; all worlds together needed 77"):
+    with pytest.raises(
+        FaultError, match=r"Raise batch\.naconmax \(naconmax=40; all worlds together needed 77"
+    ):
         env.raise_faults()
 
 
@@ -97,9 +105,12 @@ def test_ctrl_c_leaves_no_thread_at_work(stage: Callable[[str], GateContext]) ->
 @pytest.mark.parametrize("robot", ["so101", "rebot"])
 def test_drawn_friction_is_that_of_the_contact(robot: str) -> None:
     """MuJoCo combines two geoms' coefficients, so a field alone says little."""
-    env = native(f"robot={robot}", "reset=randomized", "reset.friction.params.sliding=[0.3,0.5]", nworld=8)
+    env = native(
+        f"robot={robot}", "reset=randomized", "reset.friction.params.sliding=[0.3,0.5]", nworld=8
+    )
     env.reset(seed=0)
-    model, grips = env.sim.model, set()
+    model = env.sim.model
+    grips = set()
     data = mujoco.MjData(model)
     table = model.geom("table").id
     for w in range(env.nworld):
@@ -107,7 +118,9 @@ def test_drawn_friction_is_that_of_the_contact(robot: str) -> None:
         data.qpos[:] = env.sim.qpos[w].numpy()
         red = env.index.cube_qpos[0]
         # One cube in the jaws, the other one on the table.
-        data.qpos[red : red + 3] = (0.5 * env.sim.site_xpos[w, env.index.aperture_sites].sum(0)).numpy()
+        data.qpos[red : red + 3] = (
+            0.5 * env.sim.site_xpos[w, env.index.grasp_sites].sum(0)
+        ).numpy()
         mujoco.mj_forward(model, data)
         cubes = {geoms[0]: name for name, geoms in env.index.geoms.items()}
         for contact in data.contact:
@@ -117,7 +130,9 @@ def test_drawn_friction_is_that_of_the_contact(robot: str) -> None:
                 continue
             (other,) = pair - {cube}
             if other == table:
-                assert contact.friction[0] == pytest.approx(float(env.sim.fields["geom_friction"][w, cube, 0]))
+                assert contact.friction[0] == pytest.approx(
+                    float(env.sim.fields["geom_friction"][w, cube, 0])
+                )
             else:
                 grips.add(round(float(contact.friction[0]), 6))
     assert len(grips) > 1 or robot == "rebot"  # the reBot's open fingers do not touch the cube
@@ -139,7 +154,9 @@ def test_randomized_starts_touch_nothing(robot: str) -> None:
 
 
 def test_action_zero_holds_the_start() -> None:
-    env = native("task=stack", "action=joint_relative", "reset=randomized", "~reset.joints", "~reset.gains")
+    env = native(
+        "task=stack", "action=joint_relative", "reset=randomized", "~reset.joints", "~reset.gains"
+    )
     env.reset(seed=0)
     begin = env.sim.qpos[:, :5].clone()
     for _ in range(50):
@@ -148,7 +165,9 @@ def test_action_zero_holds_the_start() -> None:
 
 
 def test_two_terms_of_one_class_draw_different_numbers() -> None:
-    once = native("reset=nominal", "+reset.a={func: mjstack.mdp.reset.JointNoise, params: {arm: 0.01}}")
+    once = native(
+        "reset=nominal", "+reset.a={func: mjstack.mdp.reset.JointNoise, params: {arm: 0.01}}"
+    )
     twice = native(
         "reset=nominal",
         "+reset.a={func: mjstack.mdp.reset.JointNoise, params: {arm: 0.01}}",
@@ -157,7 +176,8 @@ def test_two_terms_of_one_class_draw_different_numbers() -> None:
     plain = native("reset=nominal")
     for env in (once, twice, plain):
         env.reset(seed=0)
-    first, both = once.sim.ctrl - plain.sim.ctrl, twice.sim.ctrl - plain.sim.ctrl
+    first = once.sim.ctrl - plain.sim.ctrl
+    both = twice.sim.ctrl - plain.sim.ctrl
     assert not torch.allclose(both, 2.0 * first, atol=1e-6)
 
 
@@ -173,20 +193,38 @@ def test_a_diverged_world_leaves_no_nan_behind() -> None:
 
 
 def test_episode_length_is_the_time_out_terms() -> None:
-    assert native("termination.time_out.params.frames=50").max_episode_frames == 50
-    assert native("~termination.time_out").max_episode_frames == 600
+    assert native("termination.time_out.params.steps=50").max_episode_steps == 50
+    assert native("~termination.time_out").max_episode_steps == 600
 
 
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["reset=randomized", "reset.cubes.params.xy=0.05"], "reset.cubes.params.xy=0.05: expected a list"),
-        (["reset=randomized", "reset.mass.params.scale=2"], "reset.mass.params.scale=2: expected a list"),
+        (
+            ["reset=randomized", "reset.cubes.params.xy=0.05"],
+            "reset.cubes.params.xy=0.05: expected a list",
+        ),
+        (
+            ["reset=randomized", "reset.mass.params.scale=2"],
+            "reset.mass.params.scale=2: expected a list",
+        ),
         (["reward.reach.params.scale=abc"], "reward.reach.params.scale=abc: expected a number"),
-        (["reward.reach.params.scale=0"], "reward.reach.params.scale=0: expected a positive number"),
-        (["reward.lift.params.height=-1"], "reward.lift.params.height=-1: expected a positive number"),
-        (["termination.time_out.params.frames=0"], "termination.time_out.params.frames=0: expected an integer of at least 1"),
-        (["action=ee_delta", "action.arm.params.iterations=2.5"], "action.arm.params.iterations=2.5: expected an integer"),
+        (
+            ["reward.reach.params.scale=0"],
+            "reward.reach.params.scale=0: expected a positive number",
+        ),
+        (
+            ["reward.lift.params.height=-1"],
+            "reward.lift.params.height=-1: expected a positive number",
+        ),
+        (
+            ["termination.time_out.params.steps=0"],
+            "termination.time_out.params.steps=0: expected an integer of at least 1",
+        ),
+        (
+            ["action=ee_delta", "action.arm.params.iterations=2.5"],
+            "action.arm.params.iterations=2.5: expected an integer",
+        ),
         (["action.arm.params.joints=[shoulder_pan,shoulder_pan]"], "action.arm.params.joints"),
     ],
 )
@@ -197,19 +235,25 @@ def test_parameter_values_are_checked(overrides: list[str], words: str) -> None:
 
 
 def test_two_actions_on_one_actuator_are_refused() -> None:
-    with pytest.raises(TermError, match=r"action\.gripper: drives actuator 5, which action\.arm drives too"):
+    with pytest.raises(
+        TermError, match=r"action\.gripper: drives actuator 5, which action\.arm drives too"
+    ):
         native("action.arm.params.joints=all")
 
 
 def test_a_value_function_is_no_reset_term() -> None:
     cfg = mjstack.load_config(["sim=native"])
     cfg.reset["x"] = TermCfg(func="mjstack.mdp.reward.success")
-    with pytest.raises(TermError, match=r"reset\.x: success does not take .* expected \(env, mask, \*, \.\.\.\)"):
+    with pytest.raises(
+        TermError, match=r"reset\.x: success does not take .* expected \(env, mask, \*, \.\.\.\)"
+    ):
         build_env(cfg, nworld=1)
 
 
 def test_keys_that_can_be_added_say_how() -> None:
-    with pytest.raises(mjstack.MjstackError, match=r"To add it, write \+reward\.grasp\.params\.force=\.\.\."):
+    with pytest.raises(
+        mjstack.MjstackError, match=r"To add it, write \+reward\.grasp\.params\.force=\.\.\."
+    ):
         native("reward.grasp.params.force=0.5")
 
 

@@ -1,4 +1,6 @@
-"""Captured work: what replays is what ran, what cannot be captured is named, and what changed is captured anew."""
+"""Captured work: what replays is what ran, what cannot be captured is named, and what changed is
+captured anew.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,11 @@ DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
 
 def make(backend: str, graph: str, nworld: int, *overrides: str) -> Env:
     device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
-    return mjstack.make_env(["sim=mjwarp", "reset=randomized", f"graph={graph}", *overrides], nworld=nworld, device=device)
+    return mjstack.make_env(
+        ["sim=mjwarp", "reset=randomized", f"graph={graph}", *overrides],
+        nworld=nworld,
+        device=device,
+    )
 
 
 def reads_the_device(env: EnvView) -> torch.Tensor:
@@ -36,38 +42,48 @@ def reads_the_device(env: EnvView) -> torch.Tensor:
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
-    """300 steps. On the CPU device bit for bit; on CUDA, where two runs of the same differ, the starts are equal."""
-    frames = 20
-    only_time_out = ["~termination.success", "~termination.cube_off_table", "~termination.joint_limit"]
-    common = ["task=reach", *only_time_out, f"termination.time_out.params.frames={frames}"]
+    """300 steps. On the CPU device bit for bit; on CUDA, where two runs of the same differ, the
+    starts are equal.
+    """
+    steps = 20
+    only_time_out = [
+        "~termination.success",
+        "~termination.cube_off_table",
+        "~termination.joint_limit",
+    ]
+    common = ["task=reach", *only_time_out, f"termination.time_out.params.steps={steps}"]
     nworld = 64
     if backend == "mjwarp":  # an eager substep takes 10 ms there, whatever nworld is
         nworld = 2
-        common += ["timing.physics_dt=0.01", "timing.substeps=2"]
-    eager, replayed = make(backend, "off", nworld, *common), make(backend, "require", nworld, *common)
+        common += ["timing.physics_dt=0.01", "timing.decimation=2"]
+    eager = make(backend, "off", nworld, *common)
+    replayed = make(backend, "require", nworld, *common)
     starts = []
     for a, b in ((eager.reset(seed=3), replayed.reset(seed=3)),):
         for name in a[0]:
             assert torch.equal(a[0][name], b[0][name])
     spread = 0.0
     for t, action in enumerate(actions(eager, 300)):
-        a, b = returned(eager.step(action)), returned(replayed.step(action))
+        a = returned(eager.step(action))
+        b = returned(replayed.step(action))
         assert torch.equal(eager.episode, replayed.episode)
-        assert torch.equal(eager.frame, replayed.frame)
+        assert torch.equal(eager.episode_step, replayed.episode_step)
         if backend == "mjwarp":
             assert all(torch.equal(a[name], b[name]) for name in a), t
             assert torch.equal(eager.sim.qpos, replayed.sim.qpos)
             continue
-        if (t + 1) % frames == 0:
+        if (t + 1) % steps == 0:
             assert a["truncated"].all()
             assert b["truncated"].all()
             # The new episodes' starts come from random numbers alone.
             assert torch.equal(eager.sim.qpos, replayed.sim.qpos)
             starts.append(replayed.sim.qpos.clone())
-        if t % frames < 5:  # later, contacts have drawn two runs of the same apart
+        if t % steps < 5:  # later, contacts have drawn two runs of the same apart
             spread = max(spread, float((a["reward"] - b["reward"]).abs().quantile(0.95)))
     assert torch.isfinite(eager.sim.qpos).all()
-    assert eager.read_statistics()["episodes"] == replayed.read_statistics()["episodes"] == 15 * nworld
+    assert (
+        eager.read_statistics()["episodes"] == replayed.read_statistics()["episodes"] == 15 * nworld
+    )
     if backend == "mjwarp-cuda":
         assert replayed.graph.captured
         assert spread < 1e-4
@@ -77,11 +93,15 @@ def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_kernel_draws_what_the_generator_draws(device: str) -> None:
-    n, size = 33, 11
+    n = 33
+    size = 11
     world = torch.arange(n)
-    episode, step = world * 7 + 1, world * 1000003 + 5
+    episode = world * 7 + 1
+    step = world * 1000003 + 5
     for seed, stream in ((0, 0), (4294967295, 0x9ABCDEF0)):
-        expected = uniform(seed=seed, world=world, episode=episode, step=step, stream=stream, size=size)
+        expected = uniform(
+            seed=seed, world=world, episode=episode, step=step, stream=stream, size=size
+        )
         out = draw_uniform(
             key=torch.tensor([seed], device=device),
             stream=stream,
@@ -101,14 +121,23 @@ def test_the_kernel_draws_what_the_generator_draws(device: str) -> None:
             low=0.7,
             high=1.3,
         )
-        plain = uniform(seed=seed, world=world, episode=episode, step=torch.zeros_like(world), stream=stream, size=size)
+        plain = uniform(
+            seed=seed,
+            world=world,
+            episode=episode,
+            step=torch.zeros_like(world),
+            stream=stream,
+            size=size,
+        )
         torch.testing.assert_close(scaled.cpu(), 0.7 + 0.3 * (plain + 1.0), rtol=1e-6, atol=0.0)
 
 
 @pytest.mark.gpu
 @CUDA
 @pytest.mark.parametrize("graph", ["require", "auto"])
-def test_a_term_that_reads_the_device_is_named(graph: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_term_that_reads_the_device_is_named(
+    graph: str, caplog: pytest.LogCaptureFixture
+) -> None:
     bad = "+termination.spy={func: test_graph.reads_the_device}"
     env = make("mjwarp-cuda", graph, 8, bad)
     env.reset(seed=0)
@@ -116,12 +145,14 @@ def test_a_term_that_reads_the_device_is_named(graph: str, caplog: pytest.LogCap
     env.step(zero)
     with caplog.at_level(logging.WARNING):
         if graph == "require":
-            with pytest.raises(CaptureError, match=r"env\.step cannot be captured because of termination\.spy"):
+            with pytest.raises(
+                CaptureError, match=r"env\.step cannot be captured because of termination\.spy"
+            ):
                 env.step(zero)
         else:
             for _ in range(3):
                 env.step(zero)
-            assert int(env.frame[0]) == 4
+            assert int(env.episode_step[0]) == 4
             said = [r.message for r in caplog.records if "termination.spy" in r.message]
             assert len(said) == 1
     # The device works on.
@@ -140,7 +171,8 @@ def test_a_new_size_is_captured_anew(backend: str) -> None:
     zero = torch.zeros((4, env.action_manager.action_dim), device=env.device)
     for _ in range(3):
         env.step(zero)
-    before, steps = env.sim.qpos.clone(), int(env.sim.step_count[0])
+    before = env.sim.qpos.clone()
+    steps = int(env.sim.step_count[0])
     env.sim.resize(BatchSizes(nconmax=64, njmax=8))  # type: ignore[attr-defined]
     assert torch.equal(env.sim.qpos, before)
     with pytest.raises(mjstack.MjstackError, match="NEFC overflow in 4 of 4 worlds"):
@@ -223,12 +255,12 @@ def test_without_capture_the_work_just_runs() -> None:
 @pytest.mark.gpu
 @CUDA
 def test_an_episode_of_the_gate_is_captured_and_accepted() -> None:
-    from mjstack.gates.gate import GateContext
+    from mjstack.episodes.context import GateContext
 
     context = GateContext(cfg=configure("nworld=32", "sim=mjwarp", "graph=require"))
     sim = context.batch_simulation(32)
     episode = context.run(sim, context.cfg.reset)
-    assert not episode.verdict.failed.any()
+    assert not episode.result.failed.any()
     assert episode.capture_seconds > 0.0
 
 

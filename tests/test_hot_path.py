@@ -1,4 +1,6 @@
-"""What a captured step runs reads nothing back to the host and copies nothing from it: the source is checked."""
+"""What a captured step runs reads nothing back to the host and copies nothing from it: the source
+is checked.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ PATHS: dict[str, list[str] | None] = {
     "envs/faults.py": ["FaultLatch.latch"],
     "envs/statistics.py": ["EpisodeStatistics.update"],
     "envs/outputs.py": ["Outputs.copy", "Outputs._views"],
-    "managers/action.py": [f"ActionManager.{n}" for n in ("take", "accept", "write_commands", "reset")],
+    "managers/action.py": [
+        f"ActionManager.{n}" for n in ("take", "accept", "write_commands", "reset")
+    ],
     "managers/observation.py": [
         *(f"_Group.{n}" for n in ("compute", "append", "restart")),
         "ObservationManager.compute",
@@ -44,48 +48,82 @@ PATHS: dict[str, list[str] | None] = {
     "mdp/observation.py": None,
     "mdp/reward.py": None,
     "mdp/geometry.py": None,
-    "mdp/termination.py": ["time_out", "success", "non_finite", "overflow", "CubeOffTable.__call__", "JointLimit.__call__"],
-    "mdp/action.py": ["JointPosition.write_commands", "Gripper.write_commands", "EndEffectorDelta.write_commands"],
+    "mdp/termination.py": [
+        "time_out",
+        "success",
+        "non_finite",
+        "overflow",
+        "CubeOffTable.__call__",
+        "JointLimit.__call__",
+    ],
+    "mdp/action.py": [
+        "JointPosition.write_commands",
+        "Gripper.write_commands",
+        "EndEffectorDelta.write_commands",
+    ],
     "mdp/reset.py": [
         *("home", "_write", "_write_robot", "_write_cube"),
         *(
             f"{name}.__call__"
-            for name in ("JointNoise", "JitterCubes", "RandomizeCubes", "CubeMass", "CubeFriction", "ActuatorGains")
+            for name in (
+                "JointNoise",
+                "JitterCubes",
+                "RandomizeCubes",
+                "CubeMass",
+                "CubeFriction",
+                "ActuatorGains",
+            )
         ),
     ],
     "mdp/variation.py": [
-        *(f"{name}.{n}" for name in ("CubeMasses", "SlidingFriction", "ServoGains") for n in ("read", "write")),
+        *(
+            f"{name}.{n}"
+            for name in ("CubeMasses", "SlidingFriction", "ServoGains")
+            for n in ("read", "write")
+        ),
         *(f"_Elements.{n}" for n in ("read", "write", "scale")),
     ],
-    "mdp/layout.py": ["FromLayout.__call__"],
+    "mdp/layout.py": ["FromStartsFile.__call__"],
     "mdp/placement.py": ["Placement.choose", "Placement._choose"],
     "tasks/stack.py": [
-        *(f"CubePair.{n}" for n in ("pose", "speed", "clearance", "offset", "stacked", "supported")),
-        "StackEvidence.update",
-        "StackEvidence.placed",
+        *(
+            f"CubePair.{n}"
+            for n in ("pose", "speed", "clearance", "offset", "stacked", "supported")
+        ),
+        "StackCheck.update",
+        "StackCheck.placed",
         "StackSuccess.__call__",
         "StackSuccess.reset",
     ],
     "tasks/box.py": [
-        *(f"CubesAndBox.{n}" for n in ("pose", "bounds", "speed", "beyond", "over", "inside", "off_slot")),
+        *(
+            f"CubesAndBox.{n}"
+            for n in ("pose", "bounds", "speed", "beyond", "over", "inside", "off_slot")
+        ),
         *(f"CubesAndBox.{n}" for n in ("pressed", "supported", "opening", "_forces")),
-        *(f"BoxEvidence.{n}" for n in ("update", "placed")),
+        *(f"BoxCheck.{n}" for n in ("update", "placed")),
         "BoxSuccess.__call__",
         "BoxSuccess.reset",
     ],
-    "tasks/box_terms.py": [*(f"{n}.__call__" for n in ("ToSlot", "Place", "InBox", "ReachNext", "GraspNext")), "cubes_inside"],
+    "tasks/box_terms.py": [
+        *(f"{n}.__call__" for n in ("ToSlot", "Place", "InBox", "ReachNext", "GraspNext")),
+        "cubes_inside",
+    ],
     "tasks/runs.py": None,
     "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
-    "control/planner.py": ["CommandTape.command"],
-    "control/controller.py": ["Recorded.append", "Recorded.command", "TapeController.command"],
+    "control/planner.py": ["JointTrajectory.command"],
+    "control/controller.py": ["Recorded.append", "Recorded.command", "OpenLoopDriver.command"],
     "control/scripted.py": [
-        *(f"ScriptedController.{n}" for n in ("command", "_advance", "_aim", "_judge_grasp", "_look", "_turn"))
+        *(
+            f"ClosedLoopDriver.{n}"
+            for n in ("command", "_advance", "_aim", "_judge_grasp", "_look", "_turn")
+        )
     ],
     "control/tilt.py": ["CarryTilt.wish"],
-    "gates/watch.py": ["FailureWatch.update", "_of"],
+    "gates/watch.py": ["FailureMonitor.update", "_of"],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",
-        "BatchedIk.aperture",
+        "BatchedIk.grasp_point",
         "BatchedIk.directions",
         "BatchedIk._launch",
         "BatchedIk._take",
@@ -93,7 +131,16 @@ PATHS: dict[str, list[str] | None] = {
     "scene/index.py": ["Columns.read", "Columns.write", "Columns.write_masked"],
     "sim/mjwarp.py": [
         f"MjwarpSimulation.{n}"
-        for n in ("step", "reset", "kinematics", "_substeps", "_keep_peaks", "_count", "_pose", "_place")
+        for n in (
+            "step",
+            "reset",
+            "kinematics",
+            "_decimation",
+            "_keep_peaks",
+            "_count",
+            "_pose",
+            "_place",
+        )
     ],
     "sim/substep.py": ["rearranged_step"],
     "sim/graph.py": ["side_by_side"],
@@ -106,16 +153,24 @@ def functions(tree: ast.Module) -> dict[str, ast.FunctionDef]:
     """Functions and methods by their qualified names."""
     found = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
     for cls in (node for node in tree.body if isinstance(node, ast.ClassDef)):
-        found |= {f"{cls.name}.{node.name}": node for node in cls.body if isinstance(node, ast.FunctionDef)}
+        found |= {
+            f"{cls.name}.{node.name}": node
+            for node in cls.body
+            if isinstance(node, ast.FunctionDef)
+        }
     return found
 
 
 def cpu_only(function: ast.FunctionDef) -> set[ast.AST]:
-    """What only the CPU gets to: after `not x.is_cuda and`, after `x.is_cuda or`, and in `if not x.is_cuda:`."""
+    """What only the CPU gets to: after `not x.is_cuda and`, after `x.is_cuda or`, and in `if not
+    x.is_cuda:`.
+    """
     skipped: set[ast.AST] = set()
 
     def asks(node: ast.expr) -> bool:
-        return isinstance(node, ast.Name | ast.Attribute) and ast.unparse(node).endswith(("is_cuda", "on_cuda"))
+        return isinstance(node, ast.Name | ast.Attribute) and ast.unparse(node).endswith(
+            ("is_cuda", "on_cuda")
+        )
 
     def denies(node: ast.expr) -> bool:
         return isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not) and asks(node.operand)
@@ -127,8 +182,12 @@ def cpu_only(function: ast.FunctionDef) -> set[ast.AST]:
             guarded = denies(first) if isinstance(node.op, ast.And) else asks(first)
             parts = [*node.values[1:]] if guarded else []
         elif isinstance(node, ast.If):
-            test = node.test.values if isinstance(node.test, ast.BoolOp) and isinstance(node.test.op, ast.And) else [node.test]
-            # A frame that is given as a number is the host's own.
+            test = (
+                node.test.values
+                if isinstance(node.test, ast.BoolOp) and isinstance(node.test.op, ast.And)
+                else [node.test]
+            )
+            # A step that is given as a number is the host's own.
             ours = any(denies(part) or ast.unparse(part).startswith("isinstance(") for part in test)
             parts = [*node.body] if ours else []
         skipped |= {inner for part in parts for inner in ast.walk(part)}
@@ -151,7 +210,11 @@ def host_accesses(function: ast.FunctionDef) -> list[str]:
         elif isinstance(node, ast.If | ast.While | ast.IfExp):
             # A tensor's own truth: `if mask.any():`.
             test = node.test
-            called = isinstance(test, ast.Call) and isinstance(test.func, ast.Attribute) and test.func.attr in {"any", "all"}
+            called = (
+                isinstance(test, ast.Call)
+                and isinstance(test.func, ast.Attribute)
+                and test.func.attr in {"any", "all"}
+            )
             bad = called and test not in skipped
         elif isinstance(node, ast.Subscript):
             bad = isinstance(node.slice, ast.Name) and node.slice.id in {"mask", "done", "broken"}

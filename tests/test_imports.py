@@ -20,9 +20,9 @@ LAYERS = [
     {"mdp"},
     {"tasks"},
     {"envs"},
-    {"control"},
+    {"drivers"},
+    {"episodes", "bench"},
     {"adapters", "datasets", "gates"},
-    {"benchmark", "benchmark_physics", "benchmark_ik"},
     {"jobs"},
     {"cli"},
     {"__main__"},
@@ -35,14 +35,19 @@ HOMES = {
     "mujoco_menagerie": ("robots/source.py",),
     "hydra": ("config/", "cli.py"),
     "omegaconf": ("config/", "cli.py", "jobs/"),
-    "matplotlib": ("report/picture.py", "report/curves.py", "report/reachability.py", "report/success.py"),
+    "matplotlib": (
+        "report/picture.py",
+        "report/curves.py",
+        "report/reachability.py",
+        "report/success.py",
+    ),
     "imageio_ffmpeg": ("report/picture.py",),
-    "pynvml": ("gates/power.py",),
+    "pynvml": ("bench/power.py",),
     "gymnasium": ("adapters/",),
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),
     "pyarrow": ("datasets/",),
-    "rich": ("jobs/", "cli.py", "benchmark.py", "benchmark_physics.py", "benchmark_ik.py", "managers/base.py"),
+    "rich": ("jobs/", "cli.py", "bench/", "managers/base.py"),
 }
 
 
@@ -55,7 +60,9 @@ def imports(path: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             base = node.module or ""
-            found |= {f"{base}.{alias.name}" for alias in node.names} if base == "mjstack" else {base}
+            found |= (
+                {f"{base}.{alias.name}" for alias in node.names} if base == "mjstack" else {base}
+            )
     return found
 
 
@@ -81,7 +88,11 @@ def test_layers_import_downwards_only() -> None:
             if parts[0] != "mjstack" or len(parts) < 2 or here == "__init__":
                 continue
             there = parts[1]
-            allowed = LEAVES[here] if here in LEAVES else LEAVES.keys() | {n for n in level if level[n] <= level[here]}
+            allowed = (
+                LEAVES[here]
+                if here in LEAVES
+                else LEAVES.keys() | {n for n in level if level[n] <= level[here]}
+            )
             if there not in allowed:
                 wrong.append(f"{file} imports {name}")
     assert not wrong

@@ -13,9 +13,9 @@ from comparison import assert_worlds_step_alone
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.rollout import start_worlds
 from mjstack.errors import RebindError, UnknownName
-from mjstack.gates.episode import start_worlds
-from mjstack.gates.gate import GateContext
 from mjstack.sim import BatchSizes, Simulation, make_simulation
 from mjstack.sim.fields import FIELD_NAMES
 
@@ -37,16 +37,22 @@ Stage = Callable[[str], GateContext]
 
 @pytest.fixture(scope="module")
 def make_fields(stage: Stage) -> Make:
-    """Simulations of the SO-101 scene with fields, reset and with the model's values, shared by the tests of this file."""
+    """Simulations of the SO-101 scene with fields, reset and with the model's values, shared by the
+    tests of this file.
+    """
     made: dict[tuple, Simulation] = {}
 
-    def make(backend: str, nworld: int = N, fields: tuple[str, ...] = FIELDS, *overrides: str) -> Simulation:
+    def make(
+        backend: str, nworld: int = N, fields: tuple[str, ...] = FIELDS, *overrides: str
+    ) -> Simulation:
         key = (backend, nworld, fields, overrides)
         model = stage("so101").model
         if key not in made:
             kind = Backend.native if backend == "native" else Backend.mjwarp
             device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
-            made[key] = make_simulation(model, load_config([*overrides]), nworld, backend=kind, device=device, fields=fields)
+            made[key] = make_simulation(
+                model, load_config([*overrides]), nworld, backend=kind, device=device, fields=fields
+            )
         for name, field in made[key].fields.items():
             field[:] = torch.from_numpy(getattr(model, name)).to(field)
         made[key].reset()
@@ -57,7 +63,8 @@ def make_fields(stage: Stage) -> Make:
 
 def cube(context: GateContext) -> tuple[int, int, int]:
     """First cube: its body, and where its position and velocity begin."""
-    q, v = int(context.index.cube_qpos[0]), int(context.index.cube_qvel[0])
+    q = int(context.index.cube_qpos[0])
+    v = int(context.index.cube_qvel[0])
     return int(context.model.dof_bodyid[v]), q, v
 
 
@@ -87,8 +94,11 @@ def start(sim: Simulation, context: GateContext) -> None:
     sim.ctrl[:, torch.from_numpy(context.index.ctrl)] += 0.05
 
 
-def test_every_field_has_mujocos_shape_and_values(backend: str, make_fields: Make, stage: Stage) -> None:
-    sim, m = make_fields(backend, N, FIELD_NAMES), stage("so101").model
+def test_every_field_has_mujocos_shape_and_values(
+    backend: str, make_fields: Make, stage: Stage
+) -> None:
+    sim = make_fields(backend, N, FIELD_NAMES)
+    m = stage("so101").model
     assert tuple(sim.fields) == FIELD_NAMES
     for name, field in sim.fields.items():
         value = getattr(m, name)
@@ -99,7 +109,9 @@ def test_every_field_has_mujocos_shape_and_values(backend: str, make_fields: Mak
             np.testing.assert_allclose(field[k].cpu().numpy(), value, rtol=1e-6, err_msg=name)
 
 
-def test_the_models_values_change_nothing(backend: str, make_fields: Make, make_sim: Make, stage: Stage) -> None:
+def test_the_models_values_change_nothing(
+    backend: str, make_fields: Make, make_sim: Make, stage: Stage
+) -> None:
     finals = []
     for sim in (make_sim(backend, N), make_fields(backend, N, FIELD_NAMES)):
         start(sim, stage("so101"))
@@ -134,21 +146,35 @@ def test_fields_keep_their_address(backend: str, make_fields: Make) -> None:
     sim.reset()
     sim.fields["body_mass"] *= 2.0  # Python sets the item to the very same tensor
     assert {name: field.data_ptr() for name, field in sim.fields.items()} == before
-    with pytest.raises(RebindError, match=r"^sim\.fields\['body_mass'\] is a view .* write sim\.fields\['body_mass'\]\[:\] = "):
+    with pytest.raises(
+        RebindError,
+        match=r"^sim\.fields\['body_mass'\] is a view .* write sim\.fields\['body_mass'\]\[:\] = ",
+    ):
         sim.fields["body_mass"] = torch.zeros(N)
     with pytest.raises(KeyError, match=r"geom_size.* is not a per-world field of this simulation"):
         sim.fields["geom_size"]
 
 
 @pytest.mark.parametrize(
-    ("name", "nearest"), [("body_mas", "body_mass"), ("geom_frictoin", "geom_friction"), ("bodymass", "body_mass")]
+    ("name", "nearest"),
+    [("body_mas", "body_mass"), ("geom_frictoin", "geom_friction"), ("bodymass", "body_mass")],
 )
-def test_an_unknown_field_names_the_nearest(backend: str, stage: Stage, name: str, nearest: str) -> None:
+def test_an_unknown_field_names_the_nearest(
+    backend: str, stage: Stage, name: str, nearest: str
+) -> None:
     kind = Backend.native if backend == "native" else Backend.mjwarp
     with pytest.raises(
-        UnknownName, match=rf"^per-world model field '{name}' does not exist. Did you mean '{nearest}'\? "
+        UnknownName,
+        match=rf"^per-world model field '{name}' does not exist. Did you mean '{nearest}'\? ",
     ) as caught:
-        make_simulation(stage("so101").model, load_config([]), 1, backend=kind, device="cpu", fields=("body_mass", name))
+        make_simulation(
+            stage("so101").model,
+            load_config([]),
+            1,
+            backend=kind,
+            device="cpu",
+            fields=("body_mass", name),
+        )
     assert caught.value.exit_code == 2
 
 
@@ -156,11 +182,15 @@ def test_an_unknown_field_names_the_nearest(backend: str, stage: Stage, name: st
 def test_a_field_that_cannot_differ_is_refused(stage: Stage, name: str) -> None:
     for kind in (Backend.native, Backend.mjwarp):
         with pytest.raises(UnknownName):
-            make_simulation(stage("so101").model, load_config([]), 1, backend=kind, device="cpu", fields=(name,))
+            make_simulation(
+                stage("so101").model, load_config([]), 1, backend=kind, device="cpu", fields=(name,)
+            )
 
 
 def test_a_heavy_cube_is_slowed_less(backend: str, make_fields: Make, stage: Stage) -> None:
-    """Damping c stops mass m as exp(-c t / m): the implicit integrator divides the speed by 1 + c dt / m in every step."""
+    """Damping c stops mass m as exp(-c t / m): the implicit integrator divides the speed by 1 + c
+    dt / m in every step.
+    """
     context = stage("so101")
     body, q, v = cube(context)
     sim = make_fields(backend)
@@ -170,13 +200,18 @@ def test_a_heavy_cube_is_slowed_less(backend: str, make_fields: Make, stage: Sta
     sim.fields["dof_damping"][:, v + 3 : v + 6] = 1e-4
     scale_cube(sim, context, 1, 4.0)
     sim.qpos[:, q + 2] = 2.0
-    sim.qvel[:, v], sim.qvel[:, v + 5] = 1.0, 1.0
+    sim.qvel[:, v] = 1.0
+    sim.qvel[:, v + 5] = 1.0
     sim.step(10)
     mass, inertia = (getattr(context.model, name)[body] for name in ("body_mass", "body_inertia"))
     dt = context.model.opt.timestep
     for k, s in enumerate((1.0, 4.0, 1.0)):
-        assert float(sim.qvel[k, v]) == pytest.approx((1 + 0.8 * dt / (s * mass)) ** -10, rel=1e-4), k
-        assert float(sim.qvel[k, v + 5]) == pytest.approx((1 + 1e-4 * dt / (s * inertia[2])) ** -10, rel=1e-4), k
+        assert float(sim.qvel[k, v]) == pytest.approx(
+            (1 + 0.8 * dt / (s * mass)) ** -10, rel=1e-4
+        ), k
+        assert float(sim.qvel[k, v + 5]) == pytest.approx(
+            (1 + 1e-4 * dt / (s * inertia[2])) ** -10, rel=1e-4
+        ), k
         # Gravity pulls a heavy cube as fast as a light one, apart from the damping.
         fall = 0.0
         for _ in range(10):
@@ -184,7 +219,9 @@ def test_a_heavy_cube_is_slowed_less(backend: str, make_fields: Make, stage: Sta
         assert float(sim.qvel[k, v + 2]) == pytest.approx(fall, rel=1e-3), k
 
 
-def test_friction_stops_a_cube_in_one_world_only(backend: str, make_fields: Make, stage: Stage) -> None:
+def test_friction_stops_a_cube_in_one_world_only(
+    backend: str, make_fields: Make, stage: Stage
+) -> None:
     context = stage("so101")
     _, _, v = cube(context)
     sim = make_fields(backend)
@@ -197,7 +234,8 @@ def test_friction_stops_a_cube_in_one_world_only(backend: str, make_fields: Make
     for _ in range(6):
         sim.step(10)
     slid = (sim.qpos - before)[:, q : q + 2].norm(dim=1).tolist()
-    # v^2 / (2 mu g) is 4.6 mm on the rough table; on the smooth one the cube has kept most of its 0.3 m/s for 0.12 s.
+    # v^2 / (2 mu g) is 4.6 mm on the rough table; on the smooth one the cube has kept most of its
+    # 0.3 m/s for 0.12 s.
     assert slid[0] < 0.008
     assert slid[2] < 0.008
     assert slid[1] > 0.025
@@ -221,7 +259,9 @@ def test_static_geoms_follow_their_fields(backend: str) -> None:
     """MJWarp by itself places geoms that never move once, when the data is made."""
     m = mujoco.MjModel.from_xml_string(STATIC)
     kind, device = (
-        (Backend.native, "cpu") if backend == "native" else (Backend.mjwarp, "cuda:0" if "cuda" in backend else "cpu")
+        (Backend.native, "cpu")
+        if backend == "native"
+        else (Backend.mjwarp, "cuda:0" if "cuda" in backend else "cpu")
     )
     names = ("body_pos", "geom_pos", "geom_quat", "site_pos")
     sim = make_simulation(m, load_config([]), N, backend=kind, device=device, fields=names)
@@ -230,7 +270,12 @@ def test_static_geoms_follow_their_fields(backend: str) -> None:
     sim.fields["geom_pos"][2] += 0.01
     sim.fields["geom_quat"][2] = torch.tensor([0.8, 0.0, 0.0, 0.6]).to(sim.qpos)
     sim.fields["site_pos"][2] += 0.01
-    for refresh in (sim.forward, sim.kinematics, lambda: sim.step(1), lambda: sim.step(1, kinematics=True)):
+    for refresh in (
+        sim.forward,
+        sim.kinematics,
+        lambda: sim.step(1),
+        lambda: sim.step(1, kinematics=True),
+    ):
         sim.reset()
         sim.geom_xpos.fill_(float("nan"))
         refresh()
@@ -248,7 +293,8 @@ def test_static_geoms_follow_their_fields(backend: str) -> None:
 
 
 def test_world_k_of_n_is_world_k_of_one(backend: str, make_fields: Make, stage: Stage) -> None:
-    many, context = make_fields(backend), stage("so101")
+    many = make_fields(backend)
+    context = stage("so101")
     randomise(many, context)
     start(many, context)
     assert_worlds_step_alone(many, make_fields(backend, 1), backend)
@@ -291,11 +337,15 @@ def test_backends_agree(make_fields: Make, stage: Stage, device: str) -> None:
 
 
 def test_a_scaled_free_body_is_what_set_const_computes(stage: Stage) -> None:
-    """All that mj_setConst derives for a body of its own scales with its mass, or with one over it."""
+    """All that mj_setConst derives for a body of its own scales with its mass, or with
+    one over it.
+    """
     context = stage("so101")
     body, _, v = cube(context)
-    s, dofs = 1.7, slice(v, v + 6)
-    scaled, derived = copy.copy(context.model), copy.copy(context.model)
+    s = 1.7
+    dofs = slice(v, v + 6)
+    scaled = copy.copy(context.model)
+    derived = copy.copy(context.model)
     for name, where, factor in (
         ("body_mass", body, s),
         ("body_inertia", body, s),
@@ -307,13 +357,17 @@ def test_a_scaled_free_body_is_what_set_const_computes(stage: Stage) -> None:
     derived.body_mass[body] *= s
     derived.body_inertia[body] *= s
     mujoco.mj_setConst(derived, mujoco.MjData(derived))
-    derived.body_subtreemass[0] = scaled.body_subtreemass[0]  # the mass of the whole scene, which no physics reads
+    derived.body_subtreemass[0] = scaled.body_subtreemass[
+        0
+    ]  # the mass of the whole scene, which no physics reads
     compared = 0
     for name in dir(derived):
         value = getattr(derived, name)
         # Native worlds take care of dof_M0 themselves: the next test.
         if isinstance(value, np.ndarray) and value.dtype.kind == "f" and name != "dof_M0":
-            np.testing.assert_allclose(getattr(scaled, name), value, rtol=1e-9, atol=1e-12, err_msg=name)
+            np.testing.assert_allclose(
+                getattr(scaled, name), value, rtol=1e-9, atol=1e-12, err_msg=name
+            )
             compared += 1
     assert compared > 100
     assert derived.body_mass[body] == s * context.model.body_mass[body]
@@ -330,8 +384,13 @@ def test_a_scaled_free_body_is_what_set_const_computes(stage: Stage) -> None:
     ],
 )
 def test_native_mass_matrix_of_a_simple_body_follows_its_mass(joints: str) -> None:
-    """MuJoCo reads the inertia of such a body from dof_M0, made at compile time, and its weight from body_mass."""
-    xml = f"<mujoco><worldbody><body pos='0 0 1'>{joints}<geom type='box' size='.1 .2 .3'/></body></worldbody></mujoco>"
+    """MuJoCo reads the inertia of such a body from dof_M0, made at compile time, and its weight
+    from body_mass.
+    """
+    xml = (
+        f"<mujoco><worldbody><body pos='0 0 1'>{joints}<geom type='box' size='.1 .2"
+        " .3'/></body></worldbody></mujoco>"
+    )
     m = mujoco.MjModel.from_xml_string(xml)
     fields = ("body_mass", "body_inertia", "dof_armature")
     sim = make_simulation(m, load_config([]), 2, backend=Backend.native, fields=fields)
@@ -355,5 +414,7 @@ def test_native_mass_matrix_of_a_simple_body_follows_its_mass(joints: str) -> No
 
 def test_buffer_sizes_can_be_given(make_fields: Make, stage: Stage) -> None:
     sizes = BatchSizes(nconmax=40, njmax=200)
-    sim = make_simulation(stage("so101").model, load_config([]), 2, backend=Backend.mjwarp, device="cpu", sizes=sizes)
+    sim = make_simulation(
+        stage("so101").model, load_config([]), 2, backend=Backend.mjwarp, device="cpu", sizes=sizes
+    )
     assert sim.sizes is sizes  # type: ignore[attr-defined]

@@ -1,4 +1,6 @@
-"""Planning with worker processes against planning alone. Here every world of the parent waits until a worker has answered."""
+"""Planning with worker processes against planning alone. Here every world of the parent waits until
+a worker has answered.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +12,12 @@ import numpy as np
 import pytest
 
 from mjstack.config.schema import Config
-from mjstack.control import planner as planner_module
-from mjstack.control import planning_pool
-from mjstack.control.planner import ScriptedPlanner
-from mjstack.control.planning_pool import Plan
+from mjstack.drivers import planner as planner_module
+from mjstack.drivers import planning_pool
+from mjstack.drivers.open_loop import OpenLoopPlanner
+from mjstack.drivers.planning_pool import Plan
+from mjstack.episodes.context import GateContext
 from mjstack.errors import Unreachable, WorkerLost
-from mjstack.gates.gate import GateContext
 
 Stage = Callable[[str], GateContext]
 Workers = list[planning_pool._Worker]
@@ -40,7 +42,7 @@ def workers(monkeypatch: pytest.MonkeyPatch) -> Iterator[Workers]:
         assert worker.socket.closed
 
 
-class PatientPlanner(ScriptedPlanner):
+class PatientPlanner(OpenLoopPlanner):
     """Plans a world of its own only when some worker has answered, and keeps the world's number."""
 
     def __init__(self, cfg: Config, workers: Workers, processes: int) -> None:
@@ -52,7 +54,9 @@ class PatientPlanner(ScriptedPlanner):
 
     def plan_world(self, world: int, xy: np.ndarray) -> tuple[np.ndarray, float]:
         if self.workers:
-            assert wait([worker.socket for worker in self.workers], timeout=60.0), "no worker answers"
+            assert wait([worker.socket for worker in self.workers], timeout=60.0), (
+                "no worker answers"
+            )
         self.own.append(world)
         self.at.pop(world, lambda: None)()
         return super().plan_world(world, xy)
@@ -60,7 +64,9 @@ class PatientPlanner(ScriptedPlanner):
 
 def layouts(context: GateContext, nworld: int) -> np.ndarray:
     scene = context.cfg.scene
-    return np.array([*scene.red_xy, *scene.blue_xy]) + np.random.default_rng(7).uniform(-0.002, 0.002, (nworld, 4))
+    return np.array([*scene.red_xy, *scene.blue_xy]) + np.random.default_rng(7).uniform(
+        -0.002, 0.002, (nworld, 4)
+    )
 
 
 def test_plans_are_those_of_one_process(robot: str, stage: Stage, workers: Workers) -> None:
@@ -70,7 +76,8 @@ def test_plans_are_those_of_one_process(robot: str, stage: Stage, workers: Worke
     xy[[30, 63]] = xy[[2, 40]]
     planner = PatientPlanner(context.cfg, workers, processes=3)
     told: list[int] = []
-    shared, alone = planner.plan(xy, told.append), ScriptedPlanner(context.cfg).plan(xy)
+    shared = planner.plan(xy, told.append)
+    alone = OpenLoopPlanner(context.cfg).plan(xy)
     assert len(workers) == 2
     assert 0 < len(planner.own) < 32
     assert shared._knots.numpy().tobytes() == alone._knots.numpy().tobytes()
@@ -90,7 +97,7 @@ def test_the_first_unreachable_world_is_named(stage: Stage, workers: Workers) ->
         planner.plan(xy)
     assert planner.own == [0, 17]
     with pytest.raises(Unreachable) as alone:
-        ScriptedPlanner(context.cfg).plan(xy)
+        OpenLoopPlanner(context.cfg).plan(xy)
     assert str(shared.value) == str(alone.value)
     assert (shared.value.world, shared.value.phase) == (12, "above_red")
     assert shared.value.distance == alone.value.distance
@@ -107,9 +114,12 @@ def test_a_killed_worker_is_one_clear_error(stage: Stage, workers: Workers) -> N
 
 
 def test_a_worker_that_cannot_start_is_one_clear_error(
-    stage: Stage, workers: Workers, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    stage: Stage,
+    workers: Workers,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(planning_pool, "_WORKER", "mjstack.control.no_such_worker")
+    monkeypatch.setattr(planning_pool, "_WORKER", "mjstack.drivers.no_such_worker")
     context = stage("so101")
     with pytest.raises(WorkerLost, match="planning worker 1 of 1 ended with exit status 1"):
         PatientPlanner(context.cfg, workers, processes=2).plan(layouts(context, 64))
@@ -125,7 +135,7 @@ def test_interrupt_ends_the_workers(stage: Stage, workers: Workers) -> None:
 
     with pytest.raises(KeyboardInterrupt) as caught:
         PatientPlanner(context.cfg, workers, processes=2).plan(layouts(context, 64), interrupt)
-    # They are gone although the traceback, and with it every frame, is still alive.
+    # They are gone although the traceback, and with it every step, is still alive.
     assert caught.tb is not None
     assert [worker._process.returncode for worker in workers] == [-9]
 
@@ -138,7 +148,9 @@ def test_a_worker_ends_when_nobody_asks_any_more(stage: Stage, workers: Workers)
     assert worker._process.wait(timeout=30.0) == 0
 
 
-def test_where_no_process_can_be_started_one_plans_all(stage: Stage, workers: Workers, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_no_process_can_be_started_one_plans_all(
+    stage: Stage, workers: Workers, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
@@ -147,22 +159,39 @@ def test_where_no_process_can_be_started_one_plans_all(stage: Stage, workers: Wo
     xy = layouts(context, 3)
     tape = PatientPlanner(context.cfg, workers, processes=4).plan(xy)
     assert not workers
-    assert tape._knots.numpy().tobytes() == ScriptedPlanner(context.cfg).plan(xy)._knots.numpy().tobytes()
+    assert (
+        tape._knots.numpy().tobytes()
+        == OpenLoopPlanner(context.cfg).plan(xy)._knots.numpy().tobytes()
+    )
 
 
 @pytest.mark.parametrize(
     ("cores", "nworld", "distinct", "processes"),
-    [(16, 511, 511, 1), (16, 4096, 511, 1), (16, 512, 512, 4), (16, 4096, 4096, 16), (2, 4096, 4096, 2), (1, 4096, 4096, 1)],
+    [
+        (16, 511, 511, 1),
+        (16, 4096, 511, 1),
+        (16, 512, 512, 4),
+        (16, 4096, 4096, 16),
+        (2, 4096, 4096, 2),
+        (1, 4096, 4096, 1),
+    ],
 )
 def test_processes_by_cores_and_distinct_worlds(
-    cores: int, nworld: int, distinct: int, processes: int, stage: Stage, monkeypatch: pytest.MonkeyPatch
+    cores: int,
+    nworld: int,
+    distinct: int,
+    processes: int,
+    stage: Stage,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     context = stage("so101")
-    planner = ScriptedPlanner(context.cfg)
+    planner = OpenLoopPlanner(context.cfg)
     made: list[int] = []
     plan = planner.plan_world(0, layouts(context, 1)[0])
 
-    def parallel(_: Config, __: Callable, worlds: list[int], ___: np.ndarray, processes: int) -> Iterator[Plan]:
+    def parallel(
+        _: Config, __: Callable, worlds: list[int], ___: np.ndarray, processes: int
+    ) -> Iterator[Plan]:
         made.append(processes)
         yield from ((world, *plan) for world in worlds)
 

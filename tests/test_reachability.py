@@ -1,4 +1,6 @@
-"""What the arm reaches: against MuJoCo and mink, regions that are refused, obstacles, and the job's files."""
+"""What the arm reaches: against MuJoCo and mink, regions that are refused, obstacles, and the job's
+files.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +19,13 @@ from environments import configure, on_shared_sim
 import mjstack
 from mjstack.cli import run
 from mjstack.config.schema import Config
+from mjstack.episodes.context import GateContext
 from mjstack.errors import ConfigError, ParameterError
-from mjstack.gates.gate import GateContext
 from mjstack.jobs import check_job, reachability
 from mjstack.jobs.reachability import find_levels, find_region
-from mjstack.kinematics.mink_ik import ApertureIk
+from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.kinematics.reach import PointReach
-from mjstack.mdp.placement import Placement
+from mjstack.mdp.starts.placement import Placement
 from mjstack.report.reachability import ReachLevel
 from mjstack.scene import SceneIndex, build_model, table_top
 
@@ -39,13 +41,13 @@ def points_over(cfg: Config, n: int, seed: int = 0) -> np.ndarray:
     return np.column_stack((xy, table_top(scene) + scene.cube_half + rng.uniform(0.0, 0.15, n)))
 
 
-def aperture(ik: ApertureIk, cfg: Config, q: np.ndarray, gripper: list[float]) -> np.ndarray:
-    """Where mink's model has the aperture centre at a solution."""
+def grasp_point(ik: GraspIk, cfg: Config, q: np.ndarray, gripper: list[float]) -> np.ndarray:
+    """Where mink's model has the grasp point at a solution."""
     command = ik.home.copy()
     command[-len(gripper) :] = gripper
     joints = sorted(cfg.robot.ik_joints, key=cfg.robot.arm_joints.index)
     command[[cfg.robot.arm_joints.index(name) for name in joints]] = q
-    return ik.aperture(command)
+    return ik.grasp_point(command)
 
 
 @pytest.mark.parametrize("grip", ["open", "closed"])
@@ -53,26 +55,31 @@ def test_solutions_are_where_mujoco_says(stage: Stage, robot: str, grip: str) ->
     cfg = stage(robot).cfg
     gripper = cfg.robot.gripper_open if grip == "open" else cfg.robot.gripper_closed
     reach = PointReach(stage(robot).model, cfg.robot, gripper)
-    ik = ApertureIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
+    ik = GraspIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
     points = points_over(cfg, 20)
     for found in (reach.solve(points), reach.solve_upright(points, 5e-4)):
         assert found.distance.max() < 5e-4
         for point, q, distance in zip(points, found.q, found.distance, strict=True):
-            at = aperture(ik, cfg, q, gripper)
+            at = grasp_point(ik, cfg, q, gripper)
             assert np.linalg.norm(at - point) == pytest.approx(distance, abs=1e-9)
             assert ik.solve(point, np.array(gripper), ik.home)[1] < 5e-4  # mink gets there too
 
 
 def test_the_tilt_is_that_of_the_gripper_and_the_smallest(stage: Stage, robot: str) -> None:
-    cfg, model = stage(robot).cfg, stage(robot).model
+    cfg = stage(robot).cfg
+    model = stage(robot).model
     reach = PointReach(model, cfg.robot, cfg.robot.gripper_open)
     points = points_over(cfg, 6)
-    upright, any_ = reach.solve_upright(points, 5e-4), reach.solve(points)
+    upright = reach.solve_upright(points, 5e-4)
+    any_ = reach.solve(points)
     assert (upright.tilt <= any_.tilt + 1e-9).all()
-    data, last = mujoco.MjData(model), model.joint(cfg.robot.arm_joints[-1])
+    data = mujoco.MjData(model)
+    last = model.joint(cfg.robot.arm_joints[-1])
     joints = sorted(cfg.robot.ik_joints, key=cfg.robot.arm_joints.index)
     for point, q, tilt in zip(points, upright.q, upright.tilt, strict=True):
-        for name, value in zip([*cfg.robot.arm_joints, *cfg.robot.gripper_joints], cfg.robot.home, strict=True):
+        for name, value in zip(
+            [*cfg.robot.arm_joints, *cfg.robot.gripper_joints], cfg.robot.home, strict=True
+        ):
             data.qpos[model.joint(name).qposadr[0]] = value
         for name, value in {**cfg.robot.locked, **dict(zip(joints, q, strict=True))}.items():
             data.qpos[model.joint(name).qposadr[0]] = value
@@ -102,7 +109,8 @@ def test_out_of_reach_is_as_far_as_it_is(stage: Stage, robot: str) -> None:
 
 
 def test_joints_stay_within_both_ranges(stage: Stage, robot: str) -> None:
-    cfg, model = stage(robot).cfg, stage(robot).model
+    cfg = stage(robot).cfg
+    model = stage(robot).model
     reach = PointReach(model, cfg.robot, cfg.robot.gripper_open)
     points = np.random.default_rng(1).uniform([-0.3, -0.6, 0.0], [0.8, 0.6, 0.6], (200, 3))
     joints = sorted(cfg.robot.ik_joints, key=cfg.robot.arm_joints.index)
@@ -139,7 +147,7 @@ def test_a_region_beyond_the_arm_is_refused(robot: str, xy: str, says: str | Non
 
 
 def test_randomized_takes_the_layouts_region_and_the_command_line_another() -> None:
-    cfg = mjstack.load_config(["reset=randomized", "robot.layouts.stack.random_xy=[0.02,0.04]"])
+    cfg = mjstack.load_config(["reset=randomized", "robot.placements.stack.random_xy=[0.02,0.04]"])
     assert cfg.reset["cubes"].params["xy"] == [0.02, 0.04]
     cfg = mjstack.load_config(["reset=randomized", "reset.cubes.params.xy=[0.03,0.03]"])
     assert cfg.reset["cubes"].params["xy"] == [0.03, 0.03]
@@ -152,15 +160,22 @@ def test_randomized_takes_the_layouts_region_and_the_command_line_another() -> N
 
 
 def test_finger_room_is_what_the_open_jaws_need(stage: Stage, robot: str) -> None:
-    """Jaws around red, blue beside it at the smallest distance, any yaw. Only the SO-101 hits, towards its base."""
-    cfg, model, index = stage(robot).cfg, stage(robot).model, stage(robot).index
-    scene, data = cfg.scene, mujoco.MjData(model)
+    """Jaws around red, blue beside it at the smallest distance, any yaw. Only the SO-101 hits,
+    towards its base.
+    """
+    cfg = stage(robot).cfg
+    model = stage(robot).model
+    index = stage(robot).index
+    scene = cfg.scene
+    data = mujoco.MjData(model)
     blue = index.geoms["blue_cube"][0]
     distance = 2.0 * math.sqrt(2.0) * scene.cube_half + cfg.robot.finger_room
-    ik = ApertureIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
+    ik = GraspIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
     z = table_top(scene) + scene.cube_half
 
-    def touched(command: np.ndarray, at: np.ndarray, away: float, yaw: float, apart: float) -> set[str]:
+    def touched(
+        command: np.ndarray, at: np.ndarray, away: float, yaw: float, apart: float
+    ) -> set[str]:
         data.qpos[:] = model.qpos0
         data.qpos[index.robot_qpos] = command
         data.qpos[index.cube_qpos[0] : index.cube_qpos[0] + 3] = 5.0, 5.0, 5.0
@@ -184,12 +199,16 @@ def test_finger_room_is_what_the_open_jaws_need(stage: Stage, robot: str) -> Non
                 hit = touched(command, at, away, yaw, distance)
                 assert not hit or (robot == "so101" and base > 0.2), (hit, math.degrees(away))
                 blocked = blocked or bool(hit)
-                closer = closer or (base < 0.0 and bool(touched(command, at, away, yaw, distance - 0.01)))
+                closer = closer or (
+                    base < 0.0 and bool(touched(command, at, away, yaw, distance - 0.01))
+                )
     assert closer  # a centimetre less would not do
     assert blocked is (robot == "so101")
 
 
-def with_wall(cfg: Config, xy: tuple[float, float], half: tuple[float, float], euler: float = 0.0) -> mujoco.MjModel:
+def with_wall(
+    cfg: Config, xy: tuple[float, float], half: tuple[float, float], euler: float = 0.0
+) -> mujoco.MjModel:
     """The scene with one more geom that is fixed to the world."""
     from mjstack.robots import robot_spec
     from mjstack.scene import build_scene
@@ -197,7 +216,13 @@ def with_wall(cfg: Config, xy: tuple[float, float], half: tuple[float, float], e
     spec = robot_spec(cfg.robot, cfg.model)
     z = table_top(cfg.scene) + 0.0275
     quat = [math.cos(0.5 * euler), 0.0, 0.0, math.sin(0.5 * euler)]
-    spec.worldbody.add_geom(name="box_wall", type=mujoco.mjtGeom.mjGEOM_BOX, pos=[*xy, z], size=[*half, 0.0275], quat=quat)
+    spec.worldbody.add_geom(
+        name="box_wall",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=[*xy, z],
+        size=[*half, 0.0275],
+        quat=quat,
+    )
     return build_scene(spec, cfg.scene, cfg.timing, cfg.solver, jaw_bodies=cfg.robot.jaw_bodies)
 
 
@@ -206,9 +231,16 @@ def test_nothing_starts_in_a_wall(robot: str, euler: float) -> None:
     cfg = configure("reset=randomized", robot=robot)
     red_x, red_y = cfg.scene.red_xy
     model = with_wall(cfg, (red_x, red_y + 0.06), (0.05, 0.003), euler)
-    index, wall = SceneIndex(model, cfg.robot), model.geom("box_wall").id
+    index = SceneIndex(model, cfg.robot)
+    wall = model.geom("box_wall").id
     placement = Placement(cfg, model, index, region=(0.05, 0.05), gap=0.01, pose=cfg.robot.start)
-    draws = 2.0 * torch.rand((500, 2, 64, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1.0
+    draws = (
+        2.0
+        * torch.rand(
+            (500, 2, 64, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+        )
+        - 1.0
+    )
     offsets, free = placement._choose(draws)
     assert free.all()
     cube = model.geom("red_cube").id
@@ -218,15 +250,24 @@ def test_nothing_starts_in_a_wall(robot: str, euler: float) -> None:
         data.qpos[index.cube_qpos[0] : index.cube_qpos[0] + 2] = red_x + dx, red_y + dy
         yaw = 0.1 * number
         data.qpos[index.cube_qpos[0] + 2] = model.qpos0[index.cube_qpos[0] + 2]
-        data.qpos[index.cube_qpos[0] + 3 : index.cube_qpos[0] + 7] = math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)
+        data.qpos[index.cube_qpos[0] + 3 : index.cube_qpos[0] + 7] = (
+            math.cos(0.5 * yaw),
+            0.0,
+            0.0,
+            math.sin(0.5 * yaw),
+        )
         mujoco.mj_kinematics(model, data)
         nearest = min(nearest, mujoco.mj_geomDistance(model, data, cube, wall, 1.0, None))
     assert nearest >= 0.01 - 1e-6
-    without = Placement(cfg, build_model(cfg), index, region=(0.05, 0.05), gap=0.01, pose=cfg.robot.start)
+    without = Placement(
+        cfg, build_model(cfg), index, region=(0.05, 0.05), gap=0.01, pose=cfg.robot.start
+    )
     assert float(without._choose(draws)[0][:, 0, 1].max()) > float(offsets[:, 0, 1].max()) + 0.01
 
 
-def touches_arm(model: mujoco.MjModel, index: SceneIndex, command: np.ndarray, xy: Sequence[float], yaw: float) -> bool:
+def touches_arm(
+    model: mujoco.MjModel, index: SceneIndex, command: np.ndarray, xy: Sequence[float], yaw: float
+) -> bool:
     """Whether red, at a place, touches the arm."""
     data = mujoco.MjData(model)
     data.qpos[index.robot_qpos] = command
@@ -244,11 +285,14 @@ def touches_arm(model: mujoco.MjModel, index: SceneIndex, command: np.ndarray, x
 def test_nothing_starts_at_the_arm_wherever_noise_puts_it() -> None:
     """Around the jaws of a SO-101 that has come down to the table."""
     cfg = configure("reset=randomized", "scene.red_xy=[0.26,-0.03]", "scene.blue_xy=[0.42,0.05]")
-    model, noise = build_model(cfg), 0.02
+    model = build_model(cfg)
+    noise = 0.02
     index = SceneIndex(model, cfg.robot)
     pose = np.array(cfg.robot.start)
     pose[1] += 0.15  # the shoulder, so that the jaws are among the cubes
-    placement = Placement(cfg, model, index, region=(0.07, 0.07), gap=0.01, pose=pose.tolist(), noise=noise)
+    placement = Placement(
+        cfg, model, index, region=(0.07, 0.07), gap=0.01, pose=pose.tolist(), noise=noise
+    )
     rng = np.random.default_rng(0)
     places = rng.uniform(-1.0, 1.0, (600, 2))
     draws = torch.zeros(600, 2, 1, 2, dtype=torch.float64)
@@ -269,10 +313,17 @@ def test_all_of_the_region_is_drawn_from(robot: str, stage: Stage) -> None:
     """Nothing but the other cube keeps one from any place of it."""
     for task in ("stack", "box"):
         cfg = configure("reset=randomized", f"task={task}", robot=robot)
-        model, gap = build_model(cfg), cfg.robot.finger_room
+        model = build_model(cfg)
+        gap = cfg.robot.finger_room
         region = (cfg.scene.random_xy[0], cfg.scene.random_xy[1])
         placement = Placement(
-            cfg, model, SceneIndex(model, cfg.robot), region=region, gap=gap, pose=cfg.robot.start, noise=0.02
+            cfg,
+            model,
+            SceneIndex(model, cfg.robot),
+            region=region,
+            gap=gap,
+            pose=cfg.robot.start,
+            noise=0.02,
         )
         placement._apart = 0.0  # the other cube aside
         grid = torch.linspace(-1.0, 1.0, 41, dtype=torch.float64)
@@ -286,21 +337,38 @@ def test_all_of_the_region_is_drawn_from(robot: str, stage: Stage) -> None:
 def test_a_wall_that_leaves_no_room_is_said() -> None:
     cfg = configure("reset=randomized")
     model = with_wall(cfg, (cfg.scene.red_xy[0], cfg.scene.red_xy[1]), (0.1, 0.1))
-    placement = Placement(cfg, model, SceneIndex(model, cfg.robot), region=(0.05, 0.05), gap=0.01, pose=cfg.robot.start)
+    placement = Placement(
+        cfg,
+        model,
+        SceneIndex(model, cfg.robot),
+        region=(0.05, 0.05),
+        gap=0.01,
+        pose=cfg.robot.start,
+    )
     with pytest.raises(ParameterError, match="found none in 20000 of 20000 trials"):
         placement.require_room("xy", [0.05, 0.05], 16)
 
 
 def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
     """Red's first free candidate alone would leave blue no place in some worlds."""
-    overrides = ["scene.red_xy=[0.29,-0.13]", "scene.blue_xy=[0.37,-0.13]", "scene.random_xy=[0.03,0.03]"]
+    overrides = [
+        "scene.red_xy=[0.29,-0.13]",
+        "scene.blue_xy=[0.37,-0.13]",
+        "scene.random_xy=[0.03,0.03]",
+    ]
     cfg = configure("reset=randomized", *overrides)
     cfg.reset["cubes"].params["gap"] = 0.04
     model = build_model(cfg)
     index = SceneIndex(model, cfg.robot)
     placement = Placement(cfg, model, index, region=(0.03, 0.03), gap=0.04, pose=cfg.robot.start)
     placement.require_room("xy", [0.03, 0.03], 16)
-    draws = 2.0 * torch.rand((500, 2, 16, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1.0
+    draws = (
+        2.0
+        * torch.rand(
+            (500, 2, 16, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+        )
+        - 1.0
+    )
     offsets, free = placement._choose(draws)
     places = offsets + torch.tensor([cfg.scene.red_xy, cfg.scene.blue_xy], dtype=torch.float64)
     apart = torch.linalg.vector_norm(places[:, 0] - places[:, 1], dim=1)
@@ -311,7 +379,9 @@ def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
 def level(cfg: Config, reached: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> ReachLevel:
     x, y = np.meshgrid(*reachability.axes(cfg))
     tilt = np.where(reached(x, y), 0.3, np.nan)
-    return ReachLevel(name="grasp", height=0.0, gripper="open", residual=np.zeros_like(tilt), tilt=tilt)
+    return ReachLevel(
+        name="grasp", height=0.0, gripper="open", residual=np.zeros_like(tilt), tilt=tilt
+    )
 
 
 def test_regions_stay_inside_what_is_reached() -> None:
@@ -333,7 +403,11 @@ def test_regions_stay_inside_what_is_reached() -> None:
     everywhere = find_region(cfg, [level(cfg, lambda x, y: x < 9.0)], "red_cube", [x0, y0])
     scene = cfg.scene
     for k in (0, 1):  # the table's edge ends it, for a cube of any yaw
-        edge = scene.table_half[k] - abs((x0, y0)[k] - scene.table_center[k]) - math.sqrt(2.0) * scene.cube_half
+        edge = (
+            scene.table_half[k]
+            - abs((x0, y0)[k] - scene.table_center[k])
+            - math.sqrt(2.0) * scene.cube_half
+        )
         assert 0.0 <= edge - everywhere.largest[k] <= 0.001
 
 
@@ -341,26 +415,35 @@ def test_levels_are_the_controllers(robot: str) -> None:
     cfg = mjstack.load_config([f"robot={robot}", "job=reachability"])
     h = cfg.robot.approach_height
     levels = find_levels(cfg)
-    assert levels == {"grasp": (pytest.approx(0.0), "open"), "approach": (pytest.approx(h), "open"), "carry": levels["carry"]}
+    assert levels == {
+        "grasp": (pytest.approx(0.0), "open"),
+        "approach": (pytest.approx(h), "open"),
+        "carry": levels["carry"],
+    }
     assert levels["carry"] == (pytest.approx(h + 0.09), "open")
     cfg = mjstack.load_config(["job=reachability", "controller.phases.lift_red.offset=0.2"])
     assert find_levels(cfg)["carry"] == (pytest.approx(0.29), "closed")
 
 
-def test_the_job_leaves_a_map(robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_job_leaves_a_map(
+    robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     args = ["job=reachability", f"robot={robot}", "job.step=0.04", f"hydra.run.dir={tmp_path}"]
     status = run([*args, "job.margin=0"])
     report = json.loads((tmp_path / "report.json").read_text())
     gates = {gate["name"]: gate for gate in report["gates"]}
     assert list(gates) == ["grasp", "approach", "carry", "red_cube", "blue_cube"]
-    # Between points that are 40 mm apart the worse counts, which the SO-101's region may not survive.
+    # Between points that are 40 mm apart the worse counts, which the SO-101's region may not
+    # survive.
     assert status == (0 if report["status"] == "pass" else 1)
     with (tmp_path / "reachability.csv").open() as file:
         rows = list(csv.DictReader(file))
     cfg = mjstack.load_config([f"robot={robot}"])
     reach = PointReach(build_model(cfg), cfg.robot, cfg.robot.gripper_open)
     for row in rows[:: len(rows) // 7]:
-        point = np.array([[float(row["x_m"]), float(row["y_m"]), table_top(cfg.scene) + cfg.scene.cube_half]])
+        point = np.array(
+            [[float(row["x_m"]), float(row["y_m"]), table_top(cfg.scene) + cfg.scene.cube_half]]
+        )
         distance = float(reach.solve(point).distance[0])
         assert (row["grasp_reached"] == "1") is (distance <= 5e-4)
         assert float(row["grasp_residual_m"]) == pytest.approx(distance, rel=0.01, abs=2e-6)
@@ -376,15 +459,24 @@ def test_the_job_leaves_a_map(robot: str, tmp_path: Path, capsys: pytest.Capture
     assert "largest square" in capsys.readouterr().out
 
 
-def test_a_region_that_is_not_reached_fails_the_job(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    args = ["job=reachability", "job.step=0.02", "scene.random_xy=[0.12,0.05]", f"hydra.run.dir={tmp_path}"]
+def test_a_region_that_is_not_reached_fails_the_job(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    args = [
+        "job=reachability",
+        "job.step=0.02",
+        "scene.random_xy=[0.12,0.05]",
+        f"hydra.run.dir={tmp_path}",
+    ]
     assert run(args) == 1
     out = " ".join(capsys.readouterr().out.split())
     assert "scene.random_xy 0.12 x 0.05 m is not reached with 10 mm to spare" in out
     assert json.loads((tmp_path / "report.json").read_text())["status"] == "fail"
 
 
-def test_an_interrupted_job_keeps_its_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_job_keeps_its_levels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = reachability.map_level
 
     def stop_later(context: GateContext, name: str, *rest: object) -> ReachLevel:

@@ -1,4 +1,6 @@
-"""Job replay: a world of an earlier run does alone what it did among others, and every rule is explained."""
+"""Job replay: a world of an earlier run does alone what it did among others, and every rule is
+explained.
+"""
 
 from __future__ import annotations
 
@@ -17,25 +19,34 @@ from omegaconf import OmegaConf
 
 from mjstack.cli import run
 from mjstack.config import load_config
+from mjstack.config.load import load_saved
 from mjstack.config.schema import Backend, TermCfg
-from mjstack.config.store import load_saved
-from mjstack.gates.batch_record import BatchRecord
-from mjstack.gates.episode import snapshot, start_worlds
-from mjstack.gates.gate import GateContext
-from mjstack.gates.replay import _sizes_alone
-from mjstack.jobs.kept_layout import STEM, copy_names, keep_layouts
+from mjstack.episodes.batch_record import BatchRecord
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.replay import _sizes_alone
+from mjstack.episodes.rollout import snapshot, start_worlds
+from mjstack.jobs.archived_starts import STEM, archive_starts, copy_names
 from mjstack.jobs.replay import _compare
 from mjstack.sim import BatchSizes
 from mjstack.tasks.stack import StackRule
 
-FAILING, ACCEPTED = "0:4", "1:3"  # of the run below
+FAILING = "0:4"
+SUCCEEDED = "1:3"  # of the run below
 
 
 @pytest.fixture(scope="module")
 def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a native run of seven worlds under two seeds, with a threshold so tight that some fail."""
+    """The folder of a native run of seven worlds under two seeds, with a threshold so tight that
+    some fail.
+    """
     folder = tmp_path_factory.mktemp("earlier") / "run"
-    args = ["gates=[batch]", "sim=native", "nworld=7", "gate.batch.seeds=2", "gate.acceptance.xy_err=0.0015"]
+    args = [
+        "gates=[batch]",
+        "sim=native",
+        "nworld=7",
+        "gate.batch.seeds=2",
+        "gate.acceptance.xy_err=0.0015",
+    ]
     assert run([*args, f"hydra.run.dir={folder}"]) == 1
     return folder
 
@@ -53,10 +64,10 @@ def failing(earlier: Path) -> tuple[Path, int, dict]:
 
 
 @pytest.fixture(scope="module")
-def accepted(earlier: Path) -> tuple[Path, int, dict]:
-    """Likewise of an accepted one, of the other seed."""
-    out = earlier.parent / "accepted"
-    return out, *replay_into(out, earlier, f"world={ACCEPTED}")
+def succeeded(earlier: Path) -> tuple[Path, int, dict]:
+    """Likewise of an succeeded one, of the other seed."""
+    out = earlier.parent / "succeeded"
+    return out, *replay_into(out, earlier, f"world={SUCCEEDED}")
 
 
 @pytest.fixture
@@ -80,7 +91,9 @@ def copy_of(folder: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / "copy"))
 
 
-def test_failing_world_fails_again_bit_for_bit(earlier: Path, failing: tuple[Path, int, dict]) -> None:
+def test_failing_world_fails_again_bit_for_bit(
+    earlier: Path, failing: tuple[Path, int, dict]
+) -> None:
     record = record_of(earlier, 0)
     assert record.failed[4] == StackRule.STACKED
     out, status, report = failing
@@ -88,17 +101,25 @@ def test_failing_world_fails_again_bit_for_bit(earlier: Path, failing: tuple[Pat
     assert report["status"] == "fail"
     (gate,) = report["gates"]
     assert (gate["name"], gate["status"]) == ("replay_native", "fail")
-    assert gate["reason"] == "failed: not stacked; as recorded, and it ends bit for bit where it did"
+    assert (
+        gate["reason"] == "failed: not stacked; as recorded, and it ends bit for bit where it did"
+    )
     assert gate["metrics"]["xy_err_m"] == record.values["xy_err_m"][4]
     assert gate["thresholds"]["xy_err_max_m"] == 0.0015
     broken = [line for line in gate["details"] if "BROKEN" in line]
     assert len(broken) == 1
-    assert broken[0].startswith(f"STACKED: BROKEN, not stacked: xy_err up to {1e3 * record.values['xy_err_m'][4]:.3g} mm")
+    assert broken[0].startswith(
+        f"STACKED: BROKEN, not stacked: xy_err up to {1e3 * record.values['xy_err_m'][4]:.3g} mm"
+    )
     assert "at most 1.5 mm" in broken[0]
     assert len(gate["details"]) == len(StackRule)
     with np.load(out / "trajectory.npz") as held:
         assert np.array_equal(held["qpos"][-1], record.qpos[4])
-        assert (int(held["seed"]), int(held["world"]), int(held["failed"])) == (0, 4, int(StackRule.STACKED))
+        assert (int(held["seed"]), int(held["world"]), int(held["failed"])) == (
+            0,
+            4,
+            int(StackRule.STACKED),
+        )
     assert sorted(path.name for path in (out).iterdir()) == [
         ".hydra",
         "replayed_config.yaml",
@@ -111,10 +132,10 @@ def test_failing_world_fails_again_bit_for_bit(earlier: Path, failing: tuple[Pat
     ]
 
 
-def test_accepted_world_of_another_seed(earlier: Path, accepted: tuple[Path, int, dict]) -> None:
+def test_accepted_world_of_another_seed(earlier: Path, succeeded: tuple[Path, int, dict]) -> None:
     record = record_of(earlier, 1)
     assert record.failed[3] == 0
-    out, status, report = accepted
+    out, status, report = succeeded
     assert status == 0
     (gate,) = report["gates"]
     assert gate["status"] == "pass"
@@ -124,18 +145,27 @@ def test_accepted_world_of_another_seed(earlier: Path, accepted: tuple[Path, int
         assert np.array_equal(held["qpos"][-1], record.qpos[3])
 
 
-def test_trajectory_holds_the_episode(failing: tuple[Path, int, dict], new_context: Callable[..., GateContext]) -> None:
+def test_trajectory_holds_the_episode(
+    failing: tuple[Path, int, dict], new_context: Callable[..., GateContext]
+) -> None:
     context = new_context("sim=native", "gate.acceptance.xy_err=0.0015")
     sim = context.batch_simulation(7)
-    _, controller = start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+    _, controller = start_worlds(
+        sim, context.index, context.cfg, context.cfg.reset, context.planner
+    )
     with np.load(failing[0] / "trajectory.npz") as held:
         assert np.array_equal(held["start_qpos"], snapshot(sim).qpos[4])
         assert not np.array_equal(held["start_qpos"], snapshot(sim).qpos[0])
         assert (held["start_qvel"] == 0.0).all()
-        commands = np.stack([controller.command()[4].numpy() for _ in range(controller.frames)])
+        commands = np.stack([controller.command()[4].numpy() for _ in range(controller.steps)])
         assert np.allclose(held["ctrl"][:, context.index.ctrl], commands)
         assert held["time_s"][[0, -1]] == pytest.approx([0.02, 12.0])
-        assert [str(held["phase"][i]) for i in (0, 59, 60, -1)] == ["above_red", "above_red", "descend_red", "done"]
+        assert [str(held["phase"][i]) for i in (0, 59, 60, -1)] == [
+            "above_red",
+            "above_red",
+            "descend_red",
+            "done",
+        ]
         red, blue = (held["qpos"][:, a : a + 3] for a in context.index.cube_qpos)
         assert held["xy_err_m"] == pytest.approx(np.hypot(*(red - blue)[:, :2].T), abs=1e-6)
         assert held["dz_m"] == pytest.approx((red - blue)[:, 2], abs=1e-6)
@@ -149,19 +179,29 @@ def test_trajectory_holds_the_episode(failing: tuple[Path, int, dict], new_conte
     sim.close()
 
 
-def test_saved_configuration_is_the_runs_own(earlier: Path, accepted: tuple[Path, int, dict]) -> None:
-    out, _, report = accepted
+def test_saved_configuration_is_the_runs_own(
+    earlier: Path, succeeded: tuple[Path, int, dict]
+) -> None:
+    out, _, report = succeeded
     then = json.loads((earlier / "report.json").read_text())["provenance"]
     assert report["provenance"]["model_sha256"] == then["model_sha256"]
     loaded = load_saved(earlier / ".hydra" / "config.yaml")
     assert loaded == load_config(
-        ["gates=[batch]", "sim=native", "nworld=7", "gate.batch.seeds=2", "gate.acceptance.xy_err=0.0015"]
+        [
+            "gates=[batch]",
+            "sim=native",
+            "nworld=7",
+            "gate.batch.seeds=2",
+            "gate.acceptance.xy_err=0.0015",
+        ]
     )
     played = OmegaConf.load(out / "replayed_config.yaml")
     assert (played.seed, played.gate.acceptance.xy_err) == (1, 0.0015)
 
 
-def test_another_verdict_is_said(earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
+def test_another_verdict_is_said(
+    earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path
+) -> None:
     folder = copy_of(earlier, tmp_path)
     record = record_of(folder, 0)
     record.failed[3] = int(StackRule.CARRY)
@@ -170,7 +210,7 @@ def test_another_verdict_is_said(earlier: Path, replay: Callable[..., tuple[int,
     status, report = replay(folder, "world=3")
     (gate,) = report["gates"]
     differs = "NOT as recorded (red not carried): its cubes end 2 mm from where they did, "
-    assert gate["reason"].startswith("accepted, ")
+    assert gate["reason"].startswith("succeeded, ")
     assert gate["reason"].endswith(f"{differs}expected bit for bit there")
     assert gate["metrics"]["recorded"] == "red not carried"
     assert (status, report["status"], gate["status"]) == (1, "fail", "fail")
@@ -190,17 +230,75 @@ def test_another_verdict_is_said(earlier: Path, replay: Callable[..., tuple[int,
     [
         (0, 0.0, "cpu", [], True, "as recorded, and it ends bit for bit where it did"),
         (0, 0.0, "cpu", ["mujoco"], True, "as recorded, and it ends bit for bit where it did"),
-        (0, 1e-9, "cpu", [], False, "NOT as recorded (the same verdict): its cubes end 1e-06 mm from where they did, expected"),
-        (0, 1e-9, "cpu", ["mujoco"], True, "as recorded, but its cubes end 1e-06 mm from where they did, and not all is as"),
-        (0, 1e-9, "cuda:0", [], True, "as recorded, but its cubes end 1e-06 mm from where they did, and runs on CUDA agree"),
-        (StackRule.CARRY, 0.0, "cpu", [], False, "NOT as recorded (red not carried): it ends bit for bit where it did"),
-        (StackRule.CARRY, 0.002, "cpu", [], False, "NOT as recorded (red not carried): its cubes end 2 mm from where they did"),
-        (StackRule.CARRY, 0.002, "cuda:0", [], True, "NOT as recorded (red not carried): its cubes end 2 mm"),
-        (StackRule.OVERFLOW, 0.002, "cpu", [], True, "mm from where they did, and a world alone shares no contact pool"),
+        (
+            0,
+            1e-9,
+            "cpu",
+            [],
+            False,
+            (
+                "NOT as recorded (the same result): its cubes end 1e-06 mm from where they did,"
+                " expected"
+            ),
+        ),
+        (
+            0,
+            1e-9,
+            "cpu",
+            ["mujoco"],
+            True,
+            "as recorded, but its cubes end 1e-06 mm from where they did, and not all is as",
+        ),
+        (
+            0,
+            1e-9,
+            "cuda:0",
+            [],
+            True,
+            "as recorded, but its cubes end 1e-06 mm from where they did, and runs on CUDA agree",
+        ),
+        (
+            StackRule.CARRY,
+            0.0,
+            "cpu",
+            [],
+            False,
+            "NOT as recorded (red not carried): it ends bit for bit where it did",
+        ),
+        (
+            StackRule.CARRY,
+            0.002,
+            "cpu",
+            [],
+            False,
+            "NOT as recorded (red not carried): its cubes end 2 mm from where they did",
+        ),
+        (
+            StackRule.CARRY,
+            0.002,
+            "cuda:0",
+            [],
+            True,
+            "NOT as recorded (red not carried): its cubes end 2 mm",
+        ),
+        (
+            StackRule.OVERFLOW,
+            0.002,
+            "cpu",
+            [],
+            True,
+            "mm from where they did, and a world alone shares no contact pool",
+        ),
     ],
 )
 def test_what_is_promised_of_another_end(
-    bits: int, moved: float, device: str, changes: list[str], kept: bool, says: str, new_context: Callable[..., GateContext]
+    bits: int,
+    moved: float,
+    device: str,
+    changes: list[str],
+    kept: bool,
+    says: str,
+    new_context: Callable[..., GateContext],
 ) -> None:
     """Bit for bit, but on CUDA, with other versions, and where the contact pool was too small."""
     context = new_context("sim=native")
@@ -208,7 +306,14 @@ def test_what_is_promised_of_another_end(
     theirs = ours.copy()
     theirs[context.index.cube_qpos[1]] = moved
     failed = np.array([0, int(bits)], np.int32)
-    record = BatchRecord(seed=0, backend="mjwarp", device=device, failed=failed, values={}, qpos=np.stack((ours, theirs)))
+    record = BatchRecord(
+        seed=0,
+        backend="mjwarp",
+        device=device,
+        failed=failed,
+        values={},
+        qpos=np.stack((ours, theirs)),
+    )
     plan = SimpleNamespace(record=record, world=1, gate="batch")
     done = SimpleNamespace(failed=0, qpos_end=ours)
     found = _compare(plan, done, Backend.mjwarp, device, changes, context)
@@ -217,7 +322,10 @@ def test_what_is_promised_of_another_end(
 
 
 def test_a_start_that_is_not_the_recorded_one_is_refused(
-    earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    earlier: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Such as after random numbers have changed."""
     folder = copy_of(earlier, tmp_path)
@@ -226,8 +334,12 @@ def test_a_start_that_is_not_the_recorded_one_is_refused(
     record.start[3, 14] += 0.002
     record.write(folder)
     monkeypatch.chdir(tmp_path)
-    assert run(["job=replay", f"run={folder}", f"world={ACCEPTED}"]) == 2
-    _refused(capsys, "world 3 of seed 1 would start up to 0.002 (m, rad) from where it did, expected its own start. Use the mj")
+    assert run(["job=replay", f"run={folder}", f"world={SUCCEEDED}"]) == 2
+    _refused(
+        capsys,
+        "world 3 of seed 1 would start up to 0.002 (m, rad) from where it did, expected its own"
+        " start. Use the mj",
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["copy"]
 
 
@@ -239,10 +351,19 @@ CARRY = """world,red_x_m,red_y_m,red_yaw_rad,blue_x_m,blue_y_m,blue_yaw_rad,red_
 
 @pytest.fixture(scope="module")
 def from_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run of both gates from a file and, beside it, random joints. The file is gone."""
+    """The folder of a run of both gates from a file and, beside it, random joints. The file is
+    gone.
+    """
     home = tmp_path_factory.mktemp("from_file")
     noise = ["+reset.noise.func=mjstack.mdp.reset.JointNoise", "+reset.noise.params.arm=0.01"]
-    start = ["reset=layout", "layout=carry.csv", *noise, "nworld=2", "sim=native", "hydra.run.dir=run"]
+    start = [
+        "reset=starts_file",
+        "starts=carry.csv",
+        *noise,
+        "nworld=2",
+        "sim=native",
+        "hydra.run.dir=run",
+    ]
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(home)
         Path("carry.csv").write_text(CARRY)
@@ -255,8 +376,10 @@ def from_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_from_a_file_replays_from_its_own_copy(
     gate: str, from_file: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
-    assert (from_file / "layout_played.csv").read_text() == CARRY
-    (tmp_path / "carry.csv").write_text(CARRY.replace("0.31", "0.32"))  # a file of that name where the replay is called
+    assert (from_file / "starts_played.csv").read_text() == CARRY
+    (tmp_path / "carry.csv").write_text(
+        CARRY.replace("0.31", "0.32")
+    )  # a file of that name where the replay is called
     _, report = replay(from_file, f"world={gate}:1")
     (found,) = report["gates"]
     assert found["reason"].endswith("as recorded, and it ends bit for bit where it did")
@@ -270,10 +393,19 @@ def test_a_run_from_a_file_replays_from_its_own_copy(
     [
         (
             lambda copy: copy.unlink(),
-            "has no layout_played.csv, expected a copy of the layout file that it started from, carry",
+            (
+                "has no starts_played.csv, expected a copy of the layout file that it started from,"
+                " carry"
+            ),
         ),
-        (lambda copy: _replace(copy, "0.31", "0.315"), "would start up to 0.005 (m, rad) from where it did"),
-        (lambda copy: _replace(copy, "0.31", "left"), "layout_played.csv, line 3, column red_x_m: expected a finite number"),
+        (
+            lambda copy: _replace(copy, "0.31", "0.315"),
+            "would start up to 0.005 (m, rad) from where it did",
+        ),
+        (
+            lambda copy: _replace(copy, "0.31", "left"),
+            "starts_played.csv, line 3, column red_x_m: expected a finite number",
+        ),
     ],
     ids=["lost", "edited", "damaged"],
 )
@@ -288,7 +420,7 @@ def test_another_layout_is_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     folder = copy_of(from_file, tmp_path)
-    edit(folder / "layout_played.csv")
+    edit(folder / "starts_played.csv")
     monkeypatch.chdir(tmp_path)
     assert run(["job=replay", f"run={folder}", f"world={gate}:1"]) == 2
     _refused(capsys, says)
@@ -302,25 +434,32 @@ def test_what_the_start_does_not_show_is_found_at_the_end(
     folder = copy_of(from_file, tmp_path)
     replace(record_of(folder, 0), start=None).write(folder)
     assert record_of(folder, 0).start is None
-    _replace(folder / "layout_played.csv", "0.09", "0.1")
+    _replace(folder / "starts_played.csv", "0.09", "0.1")
     status, report = replay(folder, "world=batch:1")
-    assert "; NOT as recorded (the same verdict): its cubes end " in report["gates"][0]["reason"]
+    assert "; NOT as recorded (the same result): its cubes end " in report["gates"][0]["reason"]
     assert status == 1
 
 
 def test_copies_of_layouts(tmp_path: Path) -> None:
-    """Each file once, byte for byte, and those of an earlier run in the folder go unless they are read."""
+    """Each file once, byte for byte, and those of an earlier run in the folder go unless they are
+    read.
+    """
     folder = tmp_path / "run"
     folder.mkdir()
     own = folder / f"{STEM}_3.csv"
     for path in (folder / f"{STEM}.csv", folder / f"{STEM}_2.csv", own):
         path.write_bytes(path.name.encode())
     (tmp_path / "a.csv").write_bytes(b"\xef\xbb\xbfworld\r\n")
-    cfg = load_config(["reset=layout", f"layout={tmp_path}/a.csv"])
-    cfg.reset["own"] = TermCfg(func="mjstack.mdp.layout.FromLayout", params={"path": str(own)})
-    cfg.reset["again"] = TermCfg(func="mjstack.mdp.layout.FromLayout", params={"path": str(own), "pose": "home"})
+    cfg = load_config(["reset=starts_file", f"starts={tmp_path}/a.csv"])
+    cfg.reset["own"] = TermCfg(
+        func="mjstack.mdp.starts.starts_file.FromStartsFile", params={"path": str(own)}
+    )
+    cfg.reset["again"] = TermCfg(
+        func="mjstack.mdp.starts.starts_file.FromStartsFile",
+        params={"path": str(own), "pose": "home"},
+    )
     (folder / f"{STEM}_backup.csv").write_bytes(b"the user's")
-    found = keep_layouts(cfg, folder)
+    found = archive_starts(cfg, folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
         f"{STEM}_backup.csv": b"the user's",
         f"{STEM}.csv": b"\xef\xbb\xbfworld\r\n",
@@ -330,10 +469,12 @@ def test_copies_of_layouts(tmp_path: Path) -> None:
     read = [term.params["path"] for term in found.reset.values()]
     assert read == [str(folder / f"{STEM}{number}.csv") for number in ("", "_2", "_2")]
     assert found.reset["again"].params["pose"] == "home"
-    assert cfg.reset["layout"].params["path"] == f"{tmp_path}/a.csv"  # what is saved and shown stays
+    assert (
+        cfg.reset["starts"].params["path"] == f"{tmp_path}/a.csv"
+    )  # what is saved and shown stays
 
     plain = load_config(["gates=[batch]"])
-    assert keep_layouts(plain, folder) == plain
+    assert archive_starts(plain, folder) == plain
     assert [path.name for path in folder.iterdir()] == [f"{STEM}_backup.csv"]
     plain.gate.success.reset = dict(cfg.reset)
     assert not copy_names(plain)  # of a gate that does not run
@@ -342,9 +483,14 @@ def test_copies_of_layouts(tmp_path: Path) -> None:
 
 
 def test_run_that_did_not_get_to_the_world(
-    earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    earlier: Path,
+    replay: Callable[..., tuple[int, dict]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Nothing recorded, and made with another MuJoCo on another model: it is played, and all of that is said."""
+    """Nothing recorded, and made with another MuJoCo on another model: it is played, and all of
+    that is said.
+    """
     folder = copy_of(earlier, tmp_path)
     (folder / "worlds_seed1.npz").unlink()
     report = json.loads((folder / "report.json").read_text())
@@ -353,7 +499,7 @@ def test_run_that_did_not_get_to_the_world(
     (folder / "report.json").write_text(json.dumps(report))
     _, report = replay(folder, "world=1:0")
     (gate,) = report["gates"]
-    assert "recorded no verdict" in gate["reason"]
+    assert "recorded no result" in gate["reason"]
     printed = capsys.readouterr().out
     for line in ("mujoco was 3.9.9 in that run", "not the same as in that run"):
         assert line in printed
@@ -364,26 +510,49 @@ def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
     replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
     folder = tmp_path / "random"
-    args = ["gates=[batch]", "sim=native", "nworld=3", "reset=randomized", "robot=rebot", *brisk("rebot")]
+    args = [
+        "gates=[batch]",
+        "sim=native",
+        "nworld=3",
+        "reset=randomized",
+        "robot=rebot",
+        *brisk("rebot"),
+    ]
     run([*args, f"hydra.run.dir={folder}"])
     _, report = replay(folder, "world=2", "sim=native")
-    assert report["gates"][0]["reason"].endswith("as recorded, and it ends bit for bit where it did")
+    assert report["gates"][0]["reason"].endswith(
+        "as recorded, and it ends bit for bit where it did"
+    )
     with np.load(tmp_path / "out" / "trajectory.npz") as held:
         assert {"field.body_mass", "field.geom_friction"} <= set(held.files)
         assert not np.isclose(held["field.body_mass"][-2:], 0.08).any()  # scaled
 
 
-def test_mjwarp_world_is_played_on_both_engines(replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
+def test_mjwarp_world_is_played_on_both_engines(
+    replay: Callable[..., tuple[int, dict]], tmp_path: Path
+) -> None:
     folder = tmp_path / "warp"
-    args = ["gates=[batch]", "sim=mjwarp", "sim.device=cpu", "nworld=2", "gate.acceptance.xy_err=1e-6", *brisk()]
+    args = [
+        "gates=[batch]",
+        "sim=mjwarp",
+        "sim.device=cpu",
+        "nworld=2",
+        "gate.acceptance.xy_err=1e-6",
+        *brisk(),
+    ]
     assert run([*args, f"hydra.run.dir={folder}"]) == 1
     status, report = replay(folder, "world=1")
     assert status == 1
     warp, native = report["gates"]
     assert (warp["name"], native["name"]) == ("replay_mjwarp", "replay_native")
-    assert warp["reason"] == "failed: not stacked; as recorded, and it ends bit for bit where it did"
-    assert native["reason"] == "failed: not stacked; that run's mjwarp world had the same verdict"
-    with np.load(tmp_path / "out" / "trajectory.npz") as ours, np.load(tmp_path / "out" / "trajectory_native.npz") as theirs:
+    assert (
+        warp["reason"] == "failed: not stacked; as recorded, and it ends bit for bit where it did"
+    )
+    assert native["reason"] == "failed: not stacked; that run's mjwarp world had the same result"
+    with (
+        np.load(tmp_path / "out" / "trajectory.npz") as ours,
+        np.load(tmp_path / "out" / "trajectory_native.npz") as theirs,
+    ):
         assert "Warp" in str(ours["backend"])
         assert np.abs(ours["start_qpos"] - theirs["start_qpos"]).max() < 1e-6
         assert np.abs(ours["cube_pos_m"][-1] - theirs["cube_pos_m"][-1]).max() < 0.002
@@ -391,9 +560,22 @@ def test_mjwarp_world_is_played_on_both_engines(replay: Callable[..., tuple[int,
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
-def test_cuda_world_ends_near_where_it_did(replay: Callable[..., tuple[int, dict]], tmp_path: Path) -> None:
+def test_cuda_world_ends_near_where_it_did(
+    replay: Callable[..., tuple[int, dict]], tmp_path: Path
+) -> None:
     folder = tmp_path / "cuda"
-    assert run(["gates=[batch]", "sim=mjwarp", "sim.device=cuda:0", "nworld=64", f"hydra.run.dir={folder}"]) == 0
+    assert (
+        run(
+            [
+                "gates=[batch]",
+                "sim=mjwarp",
+                "sim.device=cuda:0",
+                "nworld=64",
+                f"hydra.run.dir={folder}",
+            ]
+        )
+        == 0
+    )
     record = record_of(folder, 0)
     status, report = replay(folder, "world=41")
     assert status == 0
@@ -424,7 +606,10 @@ BAD = [
     (["run={run}", "world=2:1"], "a seed from 0 to 1"),
     (["run={run}", "world=-1"], "world=-1"),
     (["run={run}", "world=1.5"], "world=1.5"),
-    (["run={run}", "world=1", "robot=rebot"], "robot=rebot: expected only run, world, sim, view, video"),
+    (
+        ["run={run}", "world=1", "robot=rebot"],
+        "robot=rebot: expected only run, world, sim, view, video",
+    ),
     (["run={run}", "world=1", "nworld=3"], "nworld=3"),
     (["run={run}", "world=1", "~reset.cubes"], "reset.cubes"),
     (["run={run}", "world=1", "sim.device=cuda:77"], "cuda:77"),
@@ -458,19 +643,43 @@ def _refused(capsys: pytest.CaptureFixture[str], says: str) -> None:
 DAMAGE = {
     "no report": (lambda f: (f / "report.json").unlink(), "has no report.json"),
     "no JSON": (lambda f: (f / "report.json").write_text("{"), "report.json cannot be read"),
-    "another report": (lambda f: (f / "report.json").write_text("[]"), "report.json cannot be read"),
-    "no YAML": (lambda f: (f / ".hydra" / "config.yaml").write_text("a: [1"), "no configuration of this mjstack"),
-    "empty": (lambda f: (f / ".hydra" / "config.yaml").write_text(""), "no configuration of this mjstack"),
+    "another report": (
+        lambda f: (f / "report.json").write_text("[]"),
+        "report.json cannot be read",
+    ),
+    "no YAML": (
+        lambda f: (f / ".hydra" / "config.yaml").write_text("a: [1"),
+        "no configuration of this mjstack",
+    ),
+    "empty": (
+        lambda f: (f / ".hydra" / "config.yaml").write_text(""),
+        "no configuration of this mjstack",
+    ),
     "another tool's": (
         lambda f: (f / ".hydra" / "config.yaml").write_text("model: resnet\n"),
         "no configuration of this mjstack",
     ),
     "a key too many": (lambda f: _append(f / ".hydra" / "config.yaml", "colour: red\n"), "colour"),
-    "a value out of range": (lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 7", "nworld: 0"), "nworld=0"),
-    "a key too few": (lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 7\n", ""), "nworld is missing"),
-    "another nworld": (lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 7", "nworld: 6"), "has 7 worlds"),
-    "another job": (lambda f: _replace(f / ".hydra" / "config.yaml", "name: gates", "name: replay"), "job=replay"),
-    "record": (lambda f: (f / "worlds_seed0.npz").write_bytes(b"PK"), "worlds_seed0.npz: cannot be read"),
+    "a value out of range": (
+        lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 7", "nworld: 0"),
+        "nworld=0",
+    ),
+    "a key too few": (
+        lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 7\n", ""),
+        "nworld is missing",
+    ),
+    "another nworld": (
+        lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 7", "nworld: 6"),
+        "has 7 worlds",
+    ),
+    "another job": (
+        lambda f: _replace(f / ".hydra" / "config.yaml", "name: gates", "name: replay"),
+        "job=replay",
+    ),
+    "record": (
+        lambda f: (f / "worlds_seed0.npz").write_bytes(b"PK"),
+        "worlds_seed0.npz: cannot be read",
+    ),
 }
 
 
@@ -486,7 +695,11 @@ def _replace(path: Path, old: str, new: str) -> None:
 
 @pytest.mark.parametrize("name", DAMAGE)
 def test_damaged_folder_is_one_line_and_writes_nothing(
-    name: str, earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str,
+    earlier: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     folder = copy_of(earlier, tmp_path)
     damage, says = DAMAGE[name]
@@ -498,6 +711,8 @@ def test_damaged_folder_is_one_line_and_writes_nothing(
 
 
 @pytest.mark.parametrize("args", [["run=somewhere"], ["world=3"]])
-def test_keys_of_replay_belong_to_replay(args: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_keys_of_replay_belong_to_replay(
+    args: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(args) == 2
     _refused(capsys, "job=replay")

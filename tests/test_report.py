@@ -93,7 +93,9 @@ def test_conclude(outcomes: list[Status], expected: Status) -> None:
 
 def test_markdown_has_every_gate_and_skip(tmp_path: Path) -> None:
     skip = GateResult(name="throughput_cuda", status=Status.skipped, reason="no CUDA device")
-    Report(provenance={"device": "cpu"}, gates=[gate(Status.passed, "baseline", xy=0.1), skip]).write(tmp_path)
+    Report(
+        provenance={"device": "cpu"}, gates=[gate(Status.passed, "baseline", xy=0.1), skip]
+    ).write(tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert "## baseline: pass" in text
     assert "| xy | 0.1 |" in text
@@ -103,5 +105,9 @@ def test_markdown_has_every_gate_and_skip(tmp_path: Path) -> None:
 def test_table_cells_survive_a_bar_in_a_reason(tmp_path: Path) -> None:
     bad = GateResult(name="baseline", status=Status.failed, reason="a | b")
     Report(provenance={}, gates=[bad]).write(tmp_path)
-    row = next(line for line in (tmp_path / "report.md").read_text().splitlines() if line.startswith("| baseline"))
+    row = next(
+        line
+        for line in (tmp_path / "report.md").read_text().splitlines()
+        if line.startswith("| baseline")
+    )
     assert row.replace("\\|", "").count("|") == 5

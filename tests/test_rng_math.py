@@ -13,9 +13,21 @@ from mjstack.math import lowest_corner, not_finite, quat_angle, quat_from_yaw, q
 from mjstack.rng import philox, uniform
 
 KNOWN = [
-    ("00000000 00000000 00000000 00000000", "00000000 00000000", "6627e8d5 e169c58d bc57ac4c 9b00dbd8"),
-    ("ffffffff ffffffff ffffffff ffffffff", "ffffffff ffffffff", "408f276d 41c83b0e a20bc7c6 6d5451fd"),
-    ("243f6a88 85a308d3 13198a2e 03707344", "a4093822 299f31d0", "d16cfe09 94fdcceb 5001e420 24126ea1"),
+    (
+        "00000000 00000000 00000000 00000000",
+        "00000000 00000000",
+        "6627e8d5 e169c58d bc57ac4c 9b00dbd8",
+    ),
+    (
+        "ffffffff ffffffff ffffffff ffffffff",
+        "ffffffff ffffffff",
+        "408f276d 41c83b0e a20bc7c6 6d5451fd",
+    ),
+    (
+        "243f6a88 85a308d3 13198a2e 03707344",
+        "a4093822 299f31d0",
+        "d16cfe09 94fdcceb 5001e420 24126ea1",
+    ),
 ]
 
 
@@ -30,9 +42,18 @@ def test_philox_known_answers(counter: str, key: str, expected: str) -> None:
     assert philox(rows, (k0, k1)).tolist() == [words(expected)] * 3
 
 
-def draw(n: int, *, seed: int = 0, episode: int = 0, step: int = 0, stream: int = 1, size: int = 6) -> torch.Tensor:
+def draw(
+    n: int, *, seed: int = 0, episode: int = 0, step: int = 0, stream: int = 1, size: int = 6
+) -> torch.Tensor:
     fill = torch.full((n,), 0)
-    return uniform(seed=seed, world=torch.arange(n), episode=fill + episode, step=fill + step, stream=stream, size=size)
+    return uniform(
+        seed=seed,
+        world=torch.arange(n),
+        episode=fill + episode,
+        step=fill + step,
+        stream=stream,
+        size=size,
+    )
 
 
 def test_uniform_range_mean_and_spread() -> None:
@@ -50,7 +71,14 @@ def test_uniform_range_mean_and_spread() -> None:
 
 def test_world_draws_the_same_whatever_nworld() -> None:
     assert torch.equal(draw(2048)[:16], draw(16))
-    one = uniform(seed=0, world=torch.tensor([5]), episode=torch.tensor([0]), step=torch.tensor([0]), stream=1, size=6)
+    one = uniform(
+        seed=0,
+        world=torch.tensor([5]),
+        episode=torch.tensor([0]),
+        step=torch.tensor([0]),
+        stream=1,
+        size=6,
+    )
     assert torch.equal(draw(16)[5:6], one)
 
 
@@ -71,11 +99,14 @@ def quats() -> np.ndarray:
 
 
 def test_quat_mul_is_mujocos(quats: np.ndarray) -> None:
-    a, b = quats, np.roll(quats, 1, axis=0)
+    a = quats
+    b = np.roll(quats, 1, axis=0)
     expected = np.empty_like(a)
     for row, x, y in zip(expected, a, b, strict=True):
         mujoco.mju_mulQuat(row, x, y)
-    np.testing.assert_allclose(quat_mul(torch.from_numpy(a), torch.from_numpy(b)).numpy(), expected, atol=1e-14)
+    np.testing.assert_allclose(
+        quat_mul(torch.from_numpy(a), torch.from_numpy(b)).numpy(), expected, atol=1e-14
+    )
 
 
 def test_quat_from_yaw_is_mujocos() -> None:
@@ -87,8 +118,10 @@ def test_quat_from_yaw_is_mujocos() -> None:
 
 
 def test_quat_angle_is_mujocos_whatever_the_signs(quats: np.ndarray) -> None:
-    a, b = quats, np.roll(quats, 1, axis=0)
-    expected, vel = np.empty(len(a)), np.empty(3)
+    a = quats
+    b = np.roll(quats, 1, axis=0)
+    expected = np.empty(len(a))
+    vel = np.empty(3)
     for k, (x, y) in enumerate(zip(a, b, strict=True)):
         mujoco.mju_subQuat(vel, x, y)
         expected[k] = np.linalg.norm(vel)
@@ -106,7 +139,8 @@ def test_small_angles_keep_their_precision_in_float32() -> None:
 
 
 def test_z_row_is_mujocos(quats: np.ndarray) -> None:
-    expected, mat = np.empty((len(quats), 3)), np.empty(9)
+    expected = np.empty((len(quats), 3))
+    mat = np.empty(9)
     for row, q in zip(expected, quats, strict=True):
         mujoco.mju_quat2Mat(mat, q)
         row[:] = mat[6:]
@@ -114,8 +148,11 @@ def test_z_row_is_mujocos(quats: np.ndarray) -> None:
 
 
 def test_one_number_that_is_not_finite_marks_its_row() -> None:
-    first, second = torch.full((5, 3), 1e30), torch.zeros(5, 2, dtype=torch.float64)
-    first[1, 2], first[2, 0], second[3, 1] = torch.nan, torch.inf, -torch.inf
+    first = torch.full((5, 3), 1e30)
+    second = torch.zeros(5, 2, dtype=torch.float64)
+    first[1, 2] = torch.nan
+    first[2, 0] = torch.inf
+    second[3, 1] = -torch.inf
     assert not_finite(first, second).tolist() == [False, True, True, True, False]
     assert not_finite(second).tolist() == [False, False, False, True, False]
 

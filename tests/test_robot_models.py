@@ -1,7 +1,7 @@
 """The built-in mesh-free robots against MuJoCo Menagerie, and on their own.
 
-The comparison needs Menagerie's files: the folder named by MENAGERIE_ROOT, else `../shared/menagerie` beside the checkout.
-"""
+The comparison needs Menagerie's files: the folder named by MENAGERIE_ROOT, else
+`../shared/menagerie` beside the checkout."""
 
 import os
 from functools import cache
@@ -13,10 +13,13 @@ import pytest
 
 REPO = Path(__file__).resolve().parents[1]
 BUILT_IN = REPO / "mjstack" / "robots"
-UPSTREAM = {"so101": "robotstudio_so101/so101.xml", "rebot": "seeed_rebot_devarm/seeed_rebot_devarm.xml"}
+UPSTREAM = {
+    "so101": "robotstudio_so101/so101.xml",
+    "rebot": "seeed_rebot_devarm/seeed_rebot_devarm.xml",
+}
 ROBOTS = list(UPSTREAM)
 
-APERTURE_SITES = {"so101": ("aperture_fixed", "aperture_moving"), "rebot": ("aperture_left", "aperture_right")}
+GRASP_SITES = {"so101": ("grasp_fixed", "grasp_moving"), "rebot": ("grasp_left", "grasp_right")}
 SO101_TIPS = [[f"{jaw}_jaw_sph_tip{i}" for i in (1, 2, 3)] for jaw in ("fixed", "moving")]
 SO101_JAW_BODIES = {"gripper", "camera_mount", "moving_jaw_so101_v1"}
 # Total mass in kg, generous on both sides.
@@ -24,17 +27,66 @@ MASS_BOUNDS = {"so101": (0.4, 1.0), "rebot": (4.0, 8.0)}
 
 KIND_COUNT = {"body": "nbody", "joint": "njnt", "site": "nsite", "actuator": "nu", "camera": "ncam"}
 
-OPTIONS = ["timestep", "integrator", "cone", "impratio", "iterations", "ls_iterations", "tolerance", "solver"]
-OPTIONS += ["jacobian", "gravity", "noslip_iterations", "disableflags", "enableflags", "density", "viscosity"]
-JOINT_FIELDS = ["jnt_type", "jnt_axis", "jnt_pos", "jnt_range", "jnt_limited", "jnt_stiffness", "jnt_margin"]
-JOINT_FIELDS += ["jnt_solref", "jnt_solimp", "jnt_actfrclimited", "jnt_actfrcrange", "qpos0", "qpos_spring"]
+OPTIONS = [
+    "timestep",
+    "integrator",
+    "cone",
+    "impratio",
+    "iterations",
+    "ls_iterations",
+    "tolerance",
+    "solver",
+]
+OPTIONS += [
+    "jacobian",
+    "gravity",
+    "noslip_iterations",
+    "disableflags",
+    "enableflags",
+    "density",
+    "viscosity",
+]
+JOINT_FIELDS = [
+    "jnt_type",
+    "jnt_axis",
+    "jnt_pos",
+    "jnt_range",
+    "jnt_limited",
+    "jnt_stiffness",
+    "jnt_margin",
+]
+JOINT_FIELDS += [
+    "jnt_solref",
+    "jnt_solimp",
+    "jnt_actfrclimited",
+    "jnt_actfrcrange",
+    "qpos0",
+    "qpos_spring",
+]
 DOF_FIELDS = ["dof_damping", "dof_armature", "dof_frictionloss", "dof_solref", "dof_solimp"]
 ACTUATOR_FIELDS = ["gaintype", "gainprm", "biastype", "biasprm", "dyntype", "gear", "trntype"]
 ACTUATOR_FIELDS += ["ctrllimited", "ctrlrange", "forcelimited", "forcerange"]
 EQUALITY_FIELDS = ["eq_type", "eq_data", "eq_solref", "eq_solimp", "eq_active0"]
-CONTACT_FIELDS = ["type", "pos", "size", "contype", "conaffinity", "condim", "friction", "solref", "solimp"]
+CONTACT_FIELDS = [
+    "type",
+    "pos",
+    "size",
+    "contype",
+    "conaffinity",
+    "condim",
+    "friction",
+    "solref",
+    "solimp",
+]
 CONTACT_FIELDS += ["priority", "solmix", "margin", "gap"]
-CAMERA_FIELDS = ["cam_mode", "cam_pos", "cam_resolution", "cam_sensorsize", "cam_intrinsic", "cam_fovy"]
+CAMERA_FIELDS = [
+    "cam_mode",
+    "cam_pos",
+    "cam_resolution",
+    "cam_sensorsize",
+    "cam_intrinsic",
+    "cam_fovy",
+]
 
 # Name, built-in model, upstream model.
 Pair = tuple[str, mujoco.MjModel, mujoco.MjModel]
@@ -51,14 +103,18 @@ def _compile(path: Path) -> mujoco.MjModel:
 
 
 def upstream(robot: str) -> mujoco.MjModel:
-    """Menagerie's model; skips the test where there is no copy, fails where MENAGERIE_ROOT points beside one."""
+    """Menagerie's model; skips the test where there is no copy, fails where MENAGERIE_ROOT points
+    beside one.
+    """
     named = os.environ.get("MENAGERIE_ROOT")
     path = (Path(named) if named else REPO.parent / "shared" / "menagerie") / UPSTREAM[robot]
     if path.is_file():
         return _compile(path)
     if named:
         pytest.fail(f"MENAGERIE_ROOT is set, but there is no {UPSTREAM[robot]} in it")
-    pytest.skip(f"no copy of MuJoCo Menagerie: set MENAGERIE_ROOT to a folder that holds {UPSTREAM[robot]}")
+    pytest.skip(
+        f"no copy of MuJoCo Menagerie: set MENAGERIE_ROOT to a folder that holds {UPSTREAM[robot]}"
+    )
 
 
 @pytest.fixture(params=ROBOTS)
@@ -75,12 +131,15 @@ def assert_fields(ours: object, theirs: object, fields: list[str], **tolerance: 
     """Every listed array is equal (within 1e-12 unless told)."""
     tol = {"rtol": 1e-12, "atol": 1e-14} | tolerance
     for field in fields:
-        np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), err_msg=field, **tol)
+        np.testing.assert_allclose(
+            getattr(ours, field), getattr(theirs, field), err_msg=field, **tol
+        )
 
 
 def assert_same_rotation(ours: np.ndarray, theirs: np.ndarray, atol: float = 1e-12) -> None:
     """Unit quaternions, row by row, equal up to sign."""
-    a, b = np.atleast_2d(ours), np.atleast_2d(theirs)
+    a = np.atleast_2d(ours)
+    b = np.atleast_2d(theirs)
     sign = np.where(np.sum(a * b, axis=1) < 0, -1.0, 1.0)
     np.testing.assert_allclose(a * sign[:, None], b, rtol=0, atol=atol)
 
@@ -104,7 +163,8 @@ def collision_geoms(model: mujoco.MjModel, body: int) -> list[int]:
     ]
 
 
-# ---- against upstream ----------------------------------------------------------------------------------------------
+# ---- against upstream
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["body", "joint", "actuator", "camera"])
@@ -113,7 +173,7 @@ def test_same_names(pair: Pair, kind: str) -> None:
     assert names(ours, kind) == names(theirs, kind)
 
 
-def test_same_tree_and_frames(pair: Pair) -> None:
+def test_same_tree_and_steps(pair: Pair) -> None:
     _, ours, theirs = pair
     np.testing.assert_array_equal(ours.body_parentid, theirs.body_parentid)
     assert_fields(ours, theirs, ["body_pos", "body_gravcomp"])
@@ -123,13 +183,20 @@ def test_same_tree_and_frames(pair: Pair) -> None:
 def test_same_mass_and_inertia(pair: Pair) -> None:
     _, ours, theirs = pair
     for body, name in enumerate(names(theirs, "body")):
-        # The camera mount's inertia comes from a mesh upstream and may move a little between MuJoCo versions.
+        # The camera mount's inertia comes from a mesh upstream and may move a little between MuJoCo
+        # versions.
         rtol = 1e-7 if name == "camera_mount" else 1e-10
-        np.testing.assert_allclose(ours.body_mass[body], theirs.body_mass[body], rtol=rtol, err_msg=name)
-        np.testing.assert_allclose(ours.body_ipos[body], theirs.body_ipos[body], rtol=0, atol=0.1 * rtol, err_msg=name)
+        np.testing.assert_allclose(
+            ours.body_mass[body], theirs.body_mass[body], rtol=rtol, err_msg=name
+        )
+        np.testing.assert_allclose(
+            ours.body_ipos[body], theirs.body_ipos[body], rtol=0, atol=0.1 * rtol, err_msg=name
+        )
         expected = inertia_tensor(theirs, body)
         atol = rtol * np.abs(expected).max()
-        np.testing.assert_allclose(inertia_tensor(ours, body), expected, rtol=0, atol=atol, err_msg=name)
+        np.testing.assert_allclose(
+            inertia_tensor(ours, body), expected, rtol=0, atol=atol, err_msg=name
+        )
 
 
 def test_same_joints(pair: Pair) -> None:
@@ -140,7 +207,9 @@ def test_same_joints(pair: Pair) -> None:
 
 def test_same_actuators(pair: Pair) -> None:
     _, ours, theirs = pair
-    np.testing.assert_array_equal(ours.actuator_trnid[:, 0], theirs.actuator_trnid[:, 0])  # same joint
+    np.testing.assert_array_equal(
+        ours.actuator_trnid[:, 0], theirs.actuator_trnid[:, 0]
+    )  # same joint
     assert_fields(ours, theirs, [f"actuator_{field}" for field in ACTUATOR_FIELDS])
 
 
@@ -159,7 +228,9 @@ def test_same_options(pair: Pair) -> None:
 
 def test_same_keyframes(pair: Pair) -> None:
     _, ours, theirs = pair
-    assert [ours.key(i).name for i in range(ours.nkey)] == [theirs.key(i).name for i in range(theirs.nkey)]
+    assert [ours.key(i).name for i in range(ours.nkey)] == [
+        theirs.key(i).name for i in range(theirs.nkey)
+    ]
     assert_fields(ours, theirs, ["key_qpos", "key_ctrl"])
 
 
@@ -169,56 +240,67 @@ def test_same_cameras_and_upstream_sites(pair: Pair) -> None:
     np.testing.assert_array_equal(ours.cam_bodyid, theirs.cam_bodyid)
     assert_same_rotation(ours.cam_quat, theirs.cam_quat)
     for name in names(theirs, "site"):
-        a, b = ours.site(name), theirs.site(name)
+        a = ours.site(name)
+        b = theirs.site(name)
         assert a.bodyid == b.bodyid, name
         np.testing.assert_allclose(a.pos, b.pos, rtol=0, atol=1e-14, err_msg=name)
         assert_same_rotation(a.quat, b.quat)
 
 
 def test_so101_keeps_every_primitive_collision_geom() -> None:
-    ours, theirs = built_in("so101"), upstream("so101")
+    ours = built_in("so101")
+    theirs = upstream("so101")
     count = 0
     for body, name in enumerate(names(theirs, "body")):
-        kept, expected = collision_geoms(ours, body), collision_geoms(theirs, body)
+        kept = collision_geoms(ours, body)
+        expected = collision_geoms(theirs, body)
         assert len(kept) == len(expected), name
         for mine, its in zip(kept, expected, strict=True):
             if theirs.geom(its).name:
                 assert ours.geom(mine).name == theirs.geom(its).name
             for field in CONTACT_FIELDS:
-                a, b = getattr(ours, f"geom_{field}")[mine], getattr(theirs, f"geom_{field}")[its]
-                np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14, err_msg=f"{ours.geom(mine).name} {field}")
+                a = getattr(ours, f"geom_{field}")[mine]
+                b = getattr(theirs, f"geom_{field}")[its]
+                np.testing.assert_allclose(
+                    a, b, rtol=1e-12, atol=1e-14, err_msg=f"{ours.geom(mine).name} {field}"
+                )
             assert_same_rotation(ours.geom_quat[mine], theirs.geom_quat[its])
             count += 1
     assert count == 27
 
 
-def upstream_aperture(robot: str, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Aperture centre from first principles: midpoint of the tip centroids, or of the finger bodies."""
+def upstream_grasp_point(robot: str, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Grasp point from first principles: midpoint of the tip centroids, or of the finger bodies."""
     if robot == "so101":
-        return np.mean([np.mean([data.geom(tip).xpos for tip in jaw], axis=0) for jaw in SO101_TIPS], axis=0)
+        return np.mean(
+            [np.mean([data.geom(tip).xpos for tip in jaw], axis=0) for jaw in SO101_TIPS], axis=0
+        )
     return (data.body("gripper_left").xpos + data.body("gripper_right").xpos) / 2
 
 
-def test_same_aperture_centre(pair: Pair) -> None:
+def test_same_grasp_point_centre(pair: Pair) -> None:
     """200 random configurations; the largest distance between the two centres is at most 1 um."""
     robot, ours, theirs = pair
     rng = np.random.default_rng(20240817)
-    mine, its = mujoco.MjData(ours), mujoco.MjData(theirs)
+    mine = mujoco.MjData(ours)
+    its = mujoco.MjData(theirs)
     low, high = theirs.jnt_range.T
-    centres, errors = [], []
+    centres = []
+    errors = []
     for _ in range(200):
         q = rng.uniform(low, high)
         mine.qpos[:] = its.qpos[:] = q
         mujoco.mj_kinematics(ours, mine)
         mujoco.mj_kinematics(theirs, its)
-        centre = np.mean([mine.site(site).xpos for site in APERTURE_SITES[robot]], axis=0)
+        centre = np.mean([mine.site(site).xpos for site in GRASP_SITES[robot]], axis=0)
         centres.append(centre)
-        errors.append(np.linalg.norm(centre - upstream_aperture(robot, theirs, its)))
+        errors.append(np.linalg.norm(centre - upstream_grasp_point(robot, theirs, its)))
     assert np.ptp(centres, axis=0).min() > 0.2  # the configurations do move the hand
     assert max(errors) <= 1e-6
 
 
-# ---- on their own --------------------------------------------------------------------------------------------------
+# ---- on their own
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -260,11 +342,15 @@ def test_so101_contact_parameters() -> None:
         if model.geom_group[g] != 3:
             continue
         geom = model.geom(g)
-        jaw = model.body(geom.bodyid[0]).name in SO101_JAW_BODIES and geom.name != "gripper_neck_box"
+        jaw = (
+            model.body(geom.bodyid[0]).name in SO101_JAW_BODIES and geom.name != "gripper_neck_box"
+        )
         assert (geom.contype[0], geom.conaffinity[0]) == (1, 1), geom.name
         assert geom.condim[0] == (6 if jaw else 3), geom.name
         assert geom.priority[0] == (1 if jaw else 0), geom.name
-        np.testing.assert_allclose(geom.friction, [1, 0.005, 0.0005] if jaw else [1, 0.005, 0.0001], err_msg=geom.name)
+        np.testing.assert_allclose(
+            geom.friction, [1, 0.005, 0.0005] if jaw else [1, 0.005, 0.0001], err_msg=geom.name
+        )
         np.testing.assert_allclose(geom.solref, [0.01 if jaw else 0.02, 1], err_msg=geom.name)
 
 
@@ -284,14 +370,23 @@ def test_rebot_contact_parameters() -> None:
         np.testing.assert_allclose(pad.friction, [1, 0.005, 0.0005])
 
 
-def test_aperture_sites() -> None:
-    """The sites sit at the centroids of the built-in tip spheres, and at the origins of the finger bodies."""
-    so101, rebot = built_in("so101"), built_in("rebot")
-    for site, body, tips in zip(APERTURE_SITES["so101"], ("gripper", "moving_jaw_so101_v1"), SO101_TIPS, strict=True):
+def test_grasp_point_sites() -> None:
+    """The sites sit at the centroids of the built-in tip spheres, and at the origins of the finger
+    bodies.
+    """
+    so101 = built_in("so101")
+    rebot = built_in("rebot")
+    for site, body, tips in zip(
+        GRASP_SITES["so101"], ("gripper", "moving_jaw_so101_v1"), SO101_TIPS, strict=True
+    ):
         assert so101.body(so101.site(site).bodyid[0]).name == body
         centroid = np.mean([so101.geom(tip).pos for tip in tips], axis=0)
         np.testing.assert_allclose(so101.site(site).pos, centroid, rtol=0, atol=1e-15)
-    for site, body in zip(APERTURE_SITES["rebot"], ("gripper_left", "gripper_right"), strict=True):
+    for site, body in zip(GRASP_SITES["rebot"], ("gripper_left", "gripper_right"), strict=True):
         assert rebot.body(rebot.site(site).bodyid[0]).name == body
         np.testing.assert_array_equal(rebot.site(site).pos, 0)
-    assert all(m.site(s).group[0] == 4 for r, m in (("so101", so101), ("rebot", rebot)) for s in APERTURE_SITES[r])
+    assert all(
+        m.site(s).group[0] == 4
+        for r, m in (("so101", so101), ("rebot", rebot))
+        for s in GRASP_SITES[r]
+    )

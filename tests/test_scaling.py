@@ -23,12 +23,25 @@ from mjstack.errors import ConfigError
 from mjstack.jobs import scaling
 from mjstack.jobs.case import OutOfTime, _row, read_case
 from mjstack.jobs.scaling import case_overrides, scaling_folder
+from mjstack.report.csv_table import to_csv
 from mjstack.report.curves import save_scaling_curves
-from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow, crossover, describe_crossover, to_markdown
-from mjstack.report.table import to_csv
+from mjstack.report.scaling import (
+    NOT_RUN,
+    PASS,
+    ScalingRow,
+    crossover,
+    describe_crossover,
+    to_markdown,
+)
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
-TINY = ["job=scaling", "job.repetitions=1", "job.native_frames=2", "job.native_env_frames=1", "gate.throughput.start_worlds=1"]
+TINY = [
+    "job=scaling",
+    "job.repetitions=1",
+    "job.native_steps=2",
+    "job.native_env_steps=1",
+    "gate.throughput.start_worlds=1",
+]
 
 
 @pytest.fixture
@@ -51,15 +64,19 @@ def stamps(folder: Path) -> dict[str, int]:
     return {path.parent.name: path.stat().st_mtime_ns for path in home(folder).rglob("case.json")}
 
 
-def test_cases_resume_and_leave_table_and_plot(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cases_resume_and_leave_table_and_plot(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run([*TINY, "sim=native", "job.nworlds=[1]"]) == 0
-    first, before = table(folder), stamps(folder)
+    first = table(folder)
+    before = stamps(folder)
     assert set(first) == {("native", 1)}
 
     capsys.readouterr()
     assert run([*TINY, "sim=native", "job.nworlds=[1,2]", "nworld=7"]) == 0
     out = capsys.readouterr().out
-    after, both = stamps(folder), table(folder)
+    after = stamps(folder)
+    both = table(folder)
     assert {name: after[name] for name in before} == before
     assert set(after) - set(before) == {"native-2"}
     assert out.count("(done before)") == 1
@@ -68,10 +85,22 @@ def test_cases_resume_and_leave_table_and_plot(folder: Path, capsys: pytest.Capt
     assert set(both) == {("native", 1), ("native", 2)}
     for (_, nworld), row in both.items():
         assert row["status"] == "pass"
-        assert float(row["world_steps_per_s"]) == pytest.approx(1e3 * nworld / float(row["ms_per_step"]))
-        assert float(row["env_steps_per_s"]) == pytest.approx(1e3 * nworld / float(row["ms_per_env_step"]))
-        assert row["bare_ratio"] == row["accepted"] == ""  # native cases play no episode
-    for name in ("scaling.csv", "scaling.md", "scaling.png", "report.json", "report.md", "run.log", ".hydra/config.yaml"):
+        assert float(row["world_steps_per_s"]) == pytest.approx(
+            1e3 * nworld / float(row["ms_per_step"])
+        )
+        assert float(row["env_steps_per_s"]) == pytest.approx(
+            1e3 * nworld / float(row["ms_per_env_step"])
+        )
+        assert row["bare_ratio"] == row["succeeded"] == ""  # native cases play no episode
+    for name in (
+        "scaling.csv",
+        "scaling.md",
+        "scaling.png",
+        "report.json",
+        "report.md",
+        "run.log",
+        ".hydra/config.yaml",
+    ):
         assert (home(folder) / name).stat().st_size > 0, name
     report = json.loads((home(folder) / "report.json").read_text())
     assert report["status"] == "pass"
@@ -79,15 +108,27 @@ def test_cases_resume_and_leave_table_and_plot(folder: Path, capsys: pytest.Capt
     assert [path.name for path in folder.iterdir()] == ["outputs"]
 
 
-def test_failing_case_is_a_gap_and_runs_again_if_asked(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    args = [*TINY, *rushed(), "sim.device=cpu", "job.nworlds=[1]", "job.backends=[mjwarp,native]", "batch.njmax=40"]
-    args += ["gate.throughput.frames=2", "gate.throughput.env_frames=1"]
+def test_failing_case_is_a_gap_and_runs_again_if_asked(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    args = [
+        *TINY,
+        *rushed(),
+        "sim.device=cpu",
+        "job.nworlds=[1]",
+        "job.backends=[mjwarp,native]",
+        "batch.njmax=40",
+    ]
+    args += ["gate.throughput.steps=2", "gate.throughput.env_steps=1"]
     assert run(args) == 1
     rows = table(folder)
     assert rows["mjwarp", 1]["status"] == "fail"
     assert "buffer overflow" in rows["mjwarp", 1]["reason"]
-    assert rows["mjwarp", 1]["accepted"] == "0"
-    assert not any(rows["mjwarp", 1][name] for name in ("ms_per_step", "world_steps_per_s", "env_steps_per_s", "episode_s"))
+    assert rows["mjwarp", 1]["succeeded"] == "0"
+    assert not any(
+        rows["mjwarp", 1][name]
+        for name in ("ms_per_step", "world_steps_per_s", "env_steps_per_s", "episode_s")
+    )
     assert rows["native", 1]["status"] == "pass"
     assert float(rows["native", 1]["world_steps_per_s"]) > 0
     report = json.loads((home(folder) / "report.json").read_text())
@@ -116,18 +157,40 @@ def test_out_of_memory_is_said_as_that_and_the_next_case_runs(folder: Path) -> N
 @pytest.mark.parametrize(
     ("code", "reason", "output", "status", "says"),
     [
-        (1, "RuntimeError: Failed to allocate 99 bytes on device 'cuda:0'", "", "out of memory", "99 bytes"),
-        (1, "internal error, OutOfMemoryError: CUDA out of memory.", "", "out of memory", "CUDA out of memory"),
-        (1, "internal error, RuntimeError: bad", "Warp CUDA error 2: out of memory (in function x)", "out of memory", "bad"),
+        (
+            1,
+            "RuntimeError: Failed to allocate 99 bytes on device 'cuda:0'",
+            "",
+            "out of memory",
+            "99 bytes",
+        ),
+        (
+            1,
+            "internal error, OutOfMemoryError: CUDA out of memory.",
+            "",
+            "out of memory",
+            "CUDA out of memory",
+        ),
+        (
+            1,
+            "internal error, RuntimeError: bad",
+            "Warp CUDA error 2: out of memory (in function x)",
+            "out of memory",
+            "bad",
+        ),
         (1, "3 of 8 worlds failed", "", "fail", "batch: 3 of 8 worlds failed"),
         (2, "", "mjstack: nworld=0: expected", "fail", "nworld=0"),
         (-9, "", "", "out of memory", "killed by signal 9"),
         (-11, "", "", "crashed", "killed by signal 11"),
     ],
 )
-def test_how_a_case_ended(tmp_path: Path, code: int, reason: str, output: str, status: str, says: str) -> None:
+def test_how_a_case_ended(
+    tmp_path: Path, code: int, reason: str, output: str, status: str, says: str
+) -> None:
     gates = [{"name": "batch", "status": "fail", "reason": reason, "metrics": {}}] if reason else []
-    (tmp_path / "report.json").write_text(json.dumps({"gates": gates, "provenance": {"git_commit": "abc"}}))
+    (tmp_path / "report.json").write_text(
+        json.dumps({"gates": gates, "provenance": {"git_commit": "abc"}})
+    )
     (tmp_path / "output.log").write_text(output)
     row = _row(tmp_path, 8, "mjwarp", code)
     assert (row.status, row.git_commit) == (status, "abc")
@@ -155,12 +218,26 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, str]]:
     ran: list[tuple[int, str]] = []
     clock = [0.0]
 
-    def pretend(_: Path, nworld: int, backend: str, __: list[str], *, case_seconds: float, call_seconds: float) -> ScalingRow:
+    def pretend(
+        _: Path,
+        nworld: int,
+        backend: str,
+        __: list[str],
+        *,
+        case_seconds: float,
+        call_seconds: float,
+    ) -> ScalingRow:
         clock[0] += min(40.0, call_seconds)
         if call_seconds < 40.0:
             raise OutOfTime("stopped")
         ran.append((nworld, backend))
-        return ScalingRow(nworld=nworld, backend=backend, status=PASS, seconds=40.0, world_steps_per_s=1.0 * nworld)
+        return ScalingRow(
+            nworld=nworld,
+            backend=backend,
+            status=PASS,
+            seconds=40.0,
+            world_steps_per_s=1.0 * nworld,
+        )
 
     monkeypatch.setattr(scaling, "run_case", pretend)
     monkeypatch.setattr(scaling.time, "monotonic", lambda: clock[0])
@@ -175,7 +252,10 @@ def test_no_case_starts_that_would_not_fit(
     assert run(args) == 1
     assert [nworld for nworld, _ in pretended] == [1, 2, 4]
     out = capsys.readouterr().out
-    assert "incomplete: 1 of 4 cases have not run (4/4 native, 8 worlds needs more than the 30 s that are left)" in out
+    assert (
+        "incomplete: 1 of 4 cases have not run (4/4 native, 8 worlds needs more than the 30 s that"
+        " are left)" in out
+    )
     assert json.loads((home(folder) / "report.json").read_text())["status"] == "interrupted"
     assert "| 8 | native | - | - |" in (home(folder) / "scaling.md").read_text()
 
@@ -189,7 +269,10 @@ def test_a_call_that_is_too_short_still_tries_its_first_case(
 
 
 def test_failed_plot_takes_nothing_back(
-    folder: Path, pretended: list[tuple[int, str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path,
+    pretended: list[tuple[int, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def fail(*_: object) -> None:
         raise RuntimeError("no fonts")
@@ -201,7 +284,10 @@ def test_failed_plot_takes_nothing_back(
 
 
 def test_full_disk_is_one_line(
-    folder: Path, pretended: list[tuple[int, str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path,
+    pretended: list[tuple[int, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -248,7 +334,14 @@ def alive(marker: str) -> list[str]:
 def test_ctrl_c_leaves_the_finished_cases_and_no_process(folder: Path) -> None:
     marker = f"MJSTACK_TEST={folder.name}"
     process = subprocess.Popen(
-        [sys.executable, SCRIPT, *TINY, "sim=native", "job.nworlds=[1,3000]", "job.native_frames=200"],
+        [
+            sys.executable,
+            SCRIPT,
+            *TINY,
+            "sim=native",
+            "job.nworlds=[1,3000]",
+            "job.native_steps=200",
+        ],
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -263,7 +356,9 @@ def test_ctrl_c_leaves_the_finished_cases_and_no_process(folder: Path) -> None:
             assert time.monotonic() < until
             time.sleep(0.1)
         assert len(alive(marker)) == 2
-        os.kill(process.pid, signal.SIGINT)  # this process alone: a terminal would tell its child too
+        os.kill(
+            process.pid, signal.SIGINT
+        )  # this process alone: a terminal would tell its child too
         out, err = process.communicate(timeout=60)
     finally:
         process.kill()
@@ -282,33 +377,71 @@ def test_folder_depends_on_what_a_case_depends_on() -> None:
 
     same = name()
     assert same.startswith("outputs/scaling/")
-    assert name("job.nworlds=[5]", "job.max_minutes=3", "job.retry=true", "nworld=3", "job.backends=[native]") == same
+    assert (
+        name(
+            "job.nworlds=[5]",
+            "job.max_minutes=3",
+            "job.retry=true",
+            "nworld=3",
+            "job.backends=[native]",
+        )
+        == same
+    )
     assert name("sim=native") == same
-    for override in ("robot=rebot", "job.repetitions=2", "batch.njmax=99", "seed=1", "sim.device=cpu", "~reward.grasp"):
+    for override in (
+        "robot=rebot",
+        "job.repetitions=2",
+        "batch.njmax=99",
+        "seed=1",
+        "sim.device=cpu",
+        "~reward.grasp",
+    ):
         assert name(override) != same, override
 
 
 def test_folder_depends_on_a_layouts_content(tmp_path: Path) -> None:
     def name(path: Path) -> str:
-        return str(scaling_folder(load_config(["job=scaling", "reset=layout", f"layout={path}"])))
+        return str(
+            scaling_folder(load_config(["job=scaling", "reset=starts_file", f"starts={path}"]))
+        )
 
-    first, second = tmp_path / "first.csv", tmp_path / "second.csv"
+    first = tmp_path / "first.csv"
+    second = tmp_path / "second.csv"
     first.write_text("world,red_x_m\n0,0.33\n")
     second.write_bytes(first.read_bytes())
     assert name(first) == name(second)
     second.write_text("world,red_x_m\n0,0.34\n")
     assert name(first) != name(second)
-    with pytest.raises(ConfigError, match=r"layout=.*no\.csv.*a file that can be read"):
+    with pytest.raises(ConfigError, match=r"starts=.*no\.csv.*a file that can be read"):
         name(tmp_path / "no.csv")
 
 
 def test_cases_get_the_command_line() -> None:
     cfg = load_config(["job=scaling", "robot=rebot"])
-    given = ["job=scaling", "robot=rebot", "nworld=3", "job.nworlds=[4]", "sim=mjwarp", "sim.device=cpu", "+reward.x={func: f}"]
+    given = [
+        "job=scaling",
+        "robot=rebot",
+        "nworld=3",
+        "job.nworlds=[4]",
+        "sim=mjwarp",
+        "sim.device=cpu",
+        "+reward.x={func: f}",
+    ]
     warp, native = (case_overrides(cfg, given, 4096, backend) for backend in ("mjwarp", "native"))
     assert warp[:3] == ["robot=rebot", "sim.device=cpu", "+reward.x={func: f}"]
-    assert {"job=gates", "sim=mjwarp", "nworld=4096", "gate.throughput.repetitions=1", "gates=[batch,throughput]"} <= set(warp)
-    assert {"sim=native", "sim.device=cpu", "gates=[throughput]", "gate.throughput.frames=60"} <= set(native)
+    assert {
+        "job=gates",
+        "sim=mjwarp",
+        "nworld=4096",
+        "gate.throughput.repetitions=1",
+        "gates=[batch,throughput]",
+    } <= set(warp)
+    assert {
+        "sim=native",
+        "sim.device=cpu",
+        "gates=[throughput]",
+        "gate.throughput.steps=60",
+    } <= set(native)
     assert "gate.throughput.repetitions=5" in case_overrides(cfg, given, 2048, "mjwarp")
     for overrides in (warp, native):
         keys = [override.lstrip("+").partition("=")[0] for override in overrides]
@@ -338,7 +471,9 @@ BAD = [
 
 
 @pytest.mark.parametrize("args", BAD, ids=[" ".join(args) for args in BAD])
-def test_bad_input_is_one_line_and_writes_nothing(args: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line_and_writes_nothing(
+    args: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (folder / "afile").write_text("")
     assert run(["job=scaling", *args]) == 2
     out, err = capsys.readouterr()
@@ -350,7 +485,12 @@ def test_bad_input_is_one_line_and_writes_nothing(args: list[str], folder: Path,
 
 def rows(rates: dict[str, dict[int, float | None]]) -> list[ScalingRow]:
     return [
-        ScalingRow(nworld=n, backend=backend, status="fail" if rate is None else PASS, world_steps_per_s=rate)
+        ScalingRow(
+            nworld=n,
+            backend=backend,
+            status="fail" if rate is None else PASS,
+            world_steps_per_s=rate,
+        )
         for backend, some in rates.items()
         for n, rate in some.items()
     ]
@@ -367,16 +507,24 @@ def rows(rates: dict[str, dict[int, float | None]]) -> list[ScalingRow]:
         ({1: None}, {1: None}, None),
     ],
 )
-def test_crossover(mjwarp: dict[int, float | None], native: dict[int, float | None], at: float | None) -> None:
+def test_crossover(
+    mjwarp: dict[int, float | None], native: dict[int, float | None], at: float | None
+) -> None:
     both = rows({"mjwarp": mjwarp, "native": native})
     found = crossover(both)
     assert found == (None if at is None else pytest.approx(at))
     assert (f"about {at:,.0f} worlds" if at else "do not show") in describe_crossover(both)
 
 
-def test_failed_case_is_a_gap_even_with_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of three cases the middle one measured physics and then failed; its figure would move the crossover."""
-    both = rows({"mjwarp": {1: 1.0, 10: 99.0, 100: 100.0}, "native": {1: 10.0, 10: 10.0, 100: 10.0}})
+def test_failed_case_is_a_gap_even_with_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of three cases the middle one measured physics and then failed; its figure would move the
+    crossover.
+    """
+    both = rows(
+        {"mjwarp": {1: 1.0, 10: 99.0, 100: 100.0}, "native": {1: 10.0, 10: 10.0, 100: 10.0}}
+    )
     both[1].status = "fail"
     assert crossover(both) == pytest.approx(10.0)
     drawn: list[tuple[str, list[float]]] = []
@@ -395,9 +543,22 @@ def test_failed_case_is_a_gap_even_with_figures(tmp_path: Path, monkeypatch: pyt
 
 def test_table_shows_gaps_and_where_rows_come_from() -> None:
     good = ScalingRow(
-        nworld=2048, backend="mjwarp", status=PASS, ms_per_step=1.376, bare_ratio=1.02, git_commit="a", hardware="x"
+        nworld=2048,
+        backend="mjwarp",
+        status=PASS,
+        ms_per_step=1.376,
+        bare_ratio=1.02,
+        git_commit="a",
+        hardware="x",
     )
-    bad = ScalingRow(nworld=4096, backend="mjwarp", status="out of memory", reason="a | b", git_commit="b", hardware="x")
+    bad = ScalingRow(
+        nworld=4096,
+        backend="mjwarp",
+        status="out of memory",
+        reason="a | b",
+        git_commit="b",
+        hardware="x",
+    )
     text = to_markdown([good, bad], "T", ["n"], "p.png")
     lines = text.splitlines()
     assert lines[4].startswith("| 2,048 | mjwarp | - | 1.376 |")
@@ -405,4 +566,6 @@ def test_table_shows_gaps_and_where_rows_come_from() -> None:
     assert lines[5].endswith("| out of memory: a \\| b |")
     assert "- commit: a\n- commit: b\n" in text
     assert text.count("- hardware") == 1
-    assert [row["ms_per_step"] for row in csv.DictReader(to_csv(ScalingRow, [good, bad]).splitlines())] == ["1.376", ""]
+    assert [
+        row["ms_per_step"] for row in csv.DictReader(to_csv(ScalingRow, [good, bad]).splitlines())
+    ] == ["1.376", ""]

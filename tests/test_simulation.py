@@ -12,9 +12,9 @@ from comparison import assert_same_run, assert_worlds_step_alone
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.rollout import start_worlds
 from mjstack.errors import ArgumentError, RebindError, UnsupportedModel
-from mjstack.gates.episode import start_worlds
-from mjstack.gates.gate import GateContext
 from mjstack.math import quat_angle
 from mjstack.scene import build_scene, table_top
 from mjstack.sim import Simulation, make_simulation
@@ -41,7 +41,9 @@ SENSING = """
     <body name="ball" pos="0.5 0 0.5"><freejoint/><geom size="0.03"/></body>
   </worldbody>
   <actuator><position joint="elbow" kp="20" timeconst="0.02"/></actuator>
-  <sensor><jointpos joint="elbow"/><jointvel joint="elbow"/><framepos objtype="site" objname="tip"/></sensor>
+  <sensor>
+    <jointpos joint="elbow"/><jointvel joint="elbow"/><framepos objtype="site" objname="tip"/>
+  </sensor>
 </mujoco>
 """
 
@@ -70,7 +72,8 @@ def start(sim: Simulation, context: GateContext) -> None:
 
 
 def test_shapes_types_and_device(backend: str, make_sim: Make, stage: Stage) -> None:
-    sim, m = make_sim(backend, N), stage("so101").model
+    sim = make_sim(backend, N)
+    m = stage("so101").model
     shapes = {
         "qpos": (N, m.nq),
         "qvel": (N, m.nv),
@@ -123,8 +126,10 @@ def test_views_cannot_be_rebound(backend: str, make_sim: Make, name: str) -> Non
     setattr(sim, name, view)
     assert getattr(sim, name) is view
     written = "sim.fields[name]" if name == "fields" else f"sim.{name}"
-    assert str(caught.value) == (
-        f"{written} is a view of the simulation's memory and cannot be rebound: write {written}[:] = ... instead."
+    assert (
+        str(caught.value)
+        == f"{written} is a view of the simulation's memory and cannot be rebound: write"
+        f" {written}[:] = ... instead."
     )
 
 
@@ -134,7 +139,10 @@ def test_views_cannot_be_rebound(backend: str, make_sim: Make, name: str) -> Non
         (torch.zeros(N), r"a torch.float32 tensor of shape \(3,\) on "),
         (torch.zeros(N + 1, dtype=torch.bool), r"a torch.bool tensor of shape \(4,\) on "),
         (torch.zeros(N, 1, dtype=torch.bool), r"a torch.bool tensor of shape \(3, 1\) on "),
-        (torch.zeros(N, dtype=torch.bool, device="meta"), r"a torch.bool tensor of shape \(3,\) on meta"),
+        (
+            torch.zeros(N, dtype=torch.bool, device="meta"),
+            r"a torch.bool tensor of shape \(3,\) on meta",
+        ),
         ([True] * N, "a list"),
     ],
 )
@@ -145,7 +153,8 @@ def test_a_wrong_mask_is_refused(backend: str, make_sim: Make, mask: object, fou
         mask = mask.to(sim.device)
     for call in (sim.reset, sim.kinematics):
         with pytest.raises(
-            ArgumentError, match=rf"^mask: found {found}.*, expected a torch.bool tensor of shape \(3,\) on "
+            ArgumentError,
+            match=rf"^mask: found {found}.*, expected a torch.bool tensor of shape \(3,\) on ",
         ) as caught:
             call(mask)
         assert "\n" not in str(caught.value)
@@ -167,7 +176,8 @@ def test_step_counts(backend: str, make_sim: Make) -> None:
 
 
 def test_masked_reset(backend: str, make_sim: Make, stage: Stage) -> None:
-    sim, context = make_sim(backend, N), stage("so101")
+    sim = make_sim(backend, N)
+    context = stage("so101")
     fresh = {name: getattr(sim, name).clone() for name in ("qpos", "qvel", "ctrl")}
     start(sim, context)
     sim.step(10)
@@ -219,7 +229,8 @@ def test_world_k_of_n_is_world_k_of_one(backend: str, make_sim: Make, stage: Sta
 
 
 def test_forward_writes_every_derived_number(backend: str, make_sim: Make, stage: Stage) -> None:
-    sim, m = make_sim(backend, N), stage("so101").model
+    sim = make_sim(backend, N)
+    m = stage("so101").model
     start(sim, stage("so101"))
     sim.forward()
     derived = (*POSES, "qfrc_actuator")
@@ -227,9 +238,11 @@ def test_forward_writes_every_derived_number(backend: str, make_sim: Make, stage
     state = [sim.qpos.clone(), sim.qvel.clone()]
     for name in derived:
         getattr(sim, name).fill_(float("nan"))
-    # What never moves MJWarp places once, with the data: the world body and the geoms of bodies without a joint above them.
+    # What never moves MJWarp places once, with the data: the world body and the geoms of bodies
+    # without a joint above them.
     static = torch.from_numpy(m.body_weldid[m.geom_bodyid] == 0).to(sim.device)
-    sim.xpos[:, 0], sim.xquat[:, 0] = expected["xpos"][:, 0], expected["xquat"][:, 0]
+    sim.xpos[:, 0] = expected["xpos"][:, 0]
+    sim.xquat[:, 0] = expected["xquat"][:, 0]
     sim.geom_xpos[:, static] = expected["geom_xpos"][:, static]
     sim.forward()
     for name in derived:
@@ -303,7 +316,12 @@ def test_kinematics_changes_no_physics(backend: str, make_sim: Make, stage: Stag
             sim.step(1, kinematics=kinematics)
             if kinematics:
                 sim.kinematics()
-        finals.append([getattr(sim, name).clone() for name in (*STATE, "qfrc_actuator", *COUNTS, "step_count")])
+        finals.append(
+            [
+                getattr(sim, name).clone()
+                for name in (*STATE, "qfrc_actuator", *COUNTS, "step_count")
+            ]
+        )
     for a, b in zip(*finals, strict=True):
         assert torch.equal(a, b)
 
@@ -323,16 +341,24 @@ def test_native_kinematics_visits_masked_worlds_only(make_sim: Make, stage: Stag
 
 
 def test_forward_agrees_with_mujoco(backend: str, make_sim: Make, stage: Stage) -> None:
-    sim, context = make_sim(backend, N), stage("so101")
+    sim = make_sim(backend, N)
+    context = stage("so101")
     start(sim, context)
     sim.step(10)
     sim.forward()
     data = mujoco.MjData(context.model)
     for k in range(N):
-        data.qpos, data.qvel, data.ctrl = (v[k].double().cpu().numpy() for v in (sim.qpos, sim.qvel, sim.ctrl))
+        data.qpos, data.qvel, data.ctrl = (
+            v[k].double().cpu().numpy() for v in (sim.qpos, sim.qvel, sim.ctrl)
+        )
         mujoco.mj_forward(context.model, data)
         for name, tolerance in (*((name, 1e-5) for name in POSES), ("qfrc_actuator", 5e-3)):
-            np.testing.assert_allclose(getattr(sim, name)[k].double().cpu(), getattr(data, name), atol=tolerance, err_msg=name)
+            np.testing.assert_allclose(
+                getattr(sim, name)[k].double().cpu(),
+                getattr(data, name),
+                atol=tolerance,
+                err_msg=name,
+            )
         assert int(sim.contact_count[k]) == data.ncon
 
 
@@ -404,23 +430,29 @@ def test_unsupported_model_says_so_in_one_line() -> None:
 
 
 def test_random_stacks_come_to_rest_on_mjwarp() -> None:
-    """A few stacks on the CPU device. Only the hundreds of tests/test_resting_stacks.py tell the two box colliders apart."""
-    cfg, n = load_config([]), 16
+    """A few stacks on the CPU device. Only the hundreds of tests/test_resting_stacks.py tell the
+    two box colliders apart.
+    """
+    cfg = load_config([])
+    n = 16
     model = build_scene(mujoco.MjSpec(), cfg.scene, cfg.timing, cfg.solver)
     sim = make_simulation(model, cfg, n, backend=Backend.mjwarp, device="cpu")
     rng = np.random.default_rng(7)
-    top, pose = table_top(cfg.scene), np.zeros((n, 2, 7))
+    top = table_top(cfg.scene)
+    pose = np.zeros((n, 2, 7))
     for cube, height in ((0, 0.0665), (1, 0.0222)):
         yaw = rng.uniform(-np.pi, np.pi, n)
         pose[:, cube, :2] = cfg.scene.table_center[:2] + rng.uniform(-0.006, 0.006, (n, 2))
         pose[:, cube, 2] = top + height
-        pose[:, cube, 3], pose[:, cube, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
+        pose[:, cube, 3] = np.cos(yaw / 2)
+        pose[:, cube, 6] = np.sin(yaw / 2)
     sim.qpos.copy_(torch.from_numpy(pose.reshape(n, 14)))
     sim.forward()
-    quats, speeds = [], []
-    for frame in range(110):
+    quats = []
+    speeds = []
+    for step in range(110):
         sim.step(10)
-        if frame >= 60:
+        if step >= 60:
             quats.append(sim.qpos.view(n, 2, 7)[..., 3:].clone())
             v = sim.qvel.view(n, 2, 6)
             speeds.append(v[..., :3].norm(dim=-1) + 3**0.5 * 0.022 * v[..., 3:].norm(dim=-1))

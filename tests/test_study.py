@@ -1,4 +1,6 @@
-"""The solver study: what it measures, that a broken variant stops no other, and that its settings reach the physics."""
+"""The solver study: what it measures, that a broken variant stops no other, and that its settings
+reach the physics.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,8 @@ import torch
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config, StudyJobCfg
+from mjstack.episodes.context import GateContext
 from mjstack.errors import MjstackError
-from mjstack.gates.gate import GateContext
 from mjstack.gates.parity import compare_options
 from mjstack.jobs import check_job, study
 from mjstack.jobs.study import run_study_job
@@ -24,7 +26,7 @@ from mjstack.report.record import Status
 from mjstack.scene import build_model
 from mjstack.sim import LOST_PHYSICS, Simulation, SolverLimit, make_simulation
 
-QUICK = ("job=study", "sim=native", "nworld=2", "job.repetitions=2", "job.frames=1")
+QUICK = ("job=study", "sim=native", "nworld=2", "job.repetitions=2", "job.steps=1")
 
 
 def configure(*overrides: str, keep: tuple[str, ...]) -> Config:
@@ -50,14 +52,18 @@ def test_native_study(tmp_path: Path) -> None:
     assert outcome.exit_code == 0
     rows = table(tmp_path)
     assert list(rows) == ["base", "iterations_5", "iterations_100", "condim_3", "cone_pyramidal"]
-    assert rows["base"]["accepted"] == rows["condim_3"]["accepted"] == "2"
+    assert rows["base"]["succeeded"] == rows["condim_3"]["succeeded"] == "2"
     # With five iterations the grip is lost. A study says so, and passes: it measured.
-    assert int(rows["iterations_5"]["accepted"]) < 2
+    assert int(rows["iterations_5"]["succeeded"]) < 2
     assert "not stacked" in rows["iterations_5"]["broken_rules"]
     assert rows["iterations_5"]["status"] == "pass"
-    assert (rows["iterations_100"]["status"], rows["iterations_100"]["reason"]) == ("skip", "the same as base")
+    assert (rows["iterations_100"]["status"], rows["iterations_100"]["reason"]) == (
+        "skip",
+        "the same as base",
+    )
     assert rows["condim_3"]["changes"] == "gripper_condim=3"
-    # A contact of the gripper has 6 rows as modelled, 3 with condim 3, and 10 with a pyramidal cone.
+    # A contact of the gripper has 6 rows as modelled, 3 with condim 3, and 10 with a pyramidal
+    # cone.
     peak = {name: int(row["peak_rows"]) for name, row in rows.items() if row["peak_rows"]}
     assert peak["condim_3"] < peak["base"] < peak["cone_pyramidal"]
     for name in ("base", "iterations_5", "condim_3", "cone_pyramidal"):
@@ -93,7 +99,9 @@ def test_a_broken_variant_stops_no_other(tmp_path: Path, monkeypatch: pytest.Mon
     assert outcome.exit_code == 1
     rows = table(tmp_path)
     assert [row["status"] for row in rows.values()] == ["fail", "fail", "pass"]
-    assert rows["iterations_20"]["reason"] == "RuntimeError: out of memory (run.log has the traceback)"
+    assert (
+        rows["iterations_20"]["reason"] == "RuntimeError: out of memory (run.log has the traceback)"
+    )
     assert rows["iterations_10"]["reason"] == "this one cannot be."
     assert rows["iterations_20"]["ratio"] == ""
     assert report(tmp_path)["status"] == "fail"
@@ -141,7 +149,9 @@ def test_limits_are_no_lost_physics() -> None:
     assert LOST_PHYSICS & int(SolverLimit.ITERATIONS | SolverLimit.LS_ITERATIONS) == 0
 
 
-def test_no_time_for_worlds_that_diverged(make_sim: Callable[..., Simulation], backend: str) -> None:
+def test_no_time_for_worlds_that_diverged(
+    make_sim: Callable[..., Simulation], backend: str
+) -> None:
     sim = make_sim(backend, 2)
     sim.step(10)
     study._require_sound(sim, 10)
@@ -176,7 +186,10 @@ def test_gripper_condim_reaches_the_gripper_alone(robot: str, condim: int) -> No
 def test_cone_reaches_both_backends(cone: str) -> None:
     cfg = load_config([f"solver.cone={cone}"])
     model = build_model(cfg)
-    native, mjwarp = (make_simulation(model, cfg, 1, backend=kind, device="cpu") for kind in (Backend.native, Backend.mjwarp))
+    native, mjwarp = (
+        make_simulation(model, cfg, 1, backend=kind, device="cpu")
+        for kind in (Backend.native, Backend.mjwarp)
+    )
     asked, held, uploaded, equal = compare_options(cfg, native, mjwarp)["cone"]
     assert asked == held == uploaded == f"mjCONE_{cone.upper()}"
     assert equal
@@ -195,7 +208,10 @@ BAD = [
     (["job=study", "+job.variants.mine={iterations: 0}"], "job.variants.mine.iterations=0"),
     (["job=study", "+job.variants.mine={iterations: few}"], "job.variants.mine.iterations=few"),
     (["job=study", "+job.variants.mine={cone: round}"], "elliptic or pyramidal"),
-    (["job=study", "job.variants.condim_3.gripper_condim=5"], "job.variants.condim_3.gripper_condim=5"),
+    (
+        ["job=study", "job.variants.condim_3.gripper_condim=5"],
+        "job.variants.condim_3.gripper_condim=5",
+    ),
     (["job=study", "job.variants=null"], "job.variants"),
     (["job=study", "video=true"], "video=true"),
     (["job=study", "task=reach"], "task=reach"),
@@ -204,7 +220,11 @@ BAD = [
 
 @pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
 def test_bad_input_is_one_line_and_nothing_is_written(
-    overrides: list[str], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    overrides: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert run([*overrides, "nworld=2", "sim=native"]) == 2
@@ -215,7 +235,9 @@ def test_bad_input_is_one_line_and_nothing_is_written(
 
 
 def test_an_own_variant_takes_the_rest_from_the_configured_solver() -> None:
-    cfg = load_config(["job=study", "solver=asset", "+job.variants.mine={iterations: 7, cone: pyramidal}"])
+    cfg = load_config(
+        ["job=study", "solver=asset", "+job.variants.mine={iterations: 7, cone: pyramidal}"]
+    )
     assert isinstance(cfg.job, StudyJobCfg)
     mine = cfg.job.variants["mine"]
     assert (mine.iterations, mine.cone.value, mine.impratio) == (7, "pyramidal", None)

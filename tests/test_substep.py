@@ -23,7 +23,9 @@ DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
 def worlds(robot: str, device: str, *overrides: str) -> MjwarpSimulation:
     cfg = configure(*overrides, robot=robot)
     sizes = resolve_env_sizes(cfg)
-    sim = make_simulation(build_model(cfg), cfg, 3, backend=Backend.mjwarp, device=device, sizes=sizes)
+    sim = make_simulation(
+        build_model(cfg), cfg, 3, backend=Backend.mjwarp, device=device, sizes=sizes
+    )
     assert isinstance(sim, MjwarpSimulation)
     return sim
 
@@ -32,29 +34,41 @@ def worlds(robot: str, device: str, *overrides: str) -> MjwarpSimulation:
 @pytest.mark.parametrize("robot", ["so101", "rebot"])
 def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
     """Random commands, cubes thrown about: on the CPU device bit for bit, sensors included."""
-    ours, plain = worlds(robot, device), worlds(robot, device)
+    ours = worlds(robot, device)
+    plain = worlds(robot, device)
     assert ours._can_rearrange
     plain.arrange(Arrangement(own_stages=False))
     low, high = torch.from_numpy(ours.model.actuator_ctrlrange).float().unbind(1)
     generator = torch.Generator().manual_seed(0)
-    most, touched = 0, False
+    most = 0
+    touched = False
     index = SceneIndex(ours.model, configure(robot=robot).robot)
     red = index.cube_qpos[0]
-    for frame in range(40):
+    for step in range(40):
         command = low + (high - low) * torch.rand((3, len(low)), generator=generator)
-        between = ours.site_xpos[:, index.aperture_sites].mean(1)
-        if device != "cpu":  # where runs differ by rounding, each frame starts from the same state
-            plain.qpos[:], plain.qvel[:] = ours.qpos, ours.qvel
+        between = ours.site_xpos[:, index.grasp_sites].mean(1)
+        if device != "cpu":  # where runs differ by rounding, each step starts from the same state
+            plain.qpos[:] = ours.qpos
+            plain.qvel[:] = ours.qvel
         for sim in (ours, plain):
-            if frame == 20:  # a cube between the jaws, for the contact sensors
+            if step == 20:  # a cube between the jaws, for the contact sensors
                 sim.qpos[:, red : red + 3] = between
             sim.ctrl[:] = command.to(device)
-            sim.step(5, kinematics=frame % 2 == 0)
+            sim.step(5, kinematics=step % 2 == 0)
             sim.synchronize()
-        for name in ("qpos", "qvel", "site_xpos", "sensordata", "qfrc_actuator", "contact_count", "constraint_count"):
-            a, b = getattr(ours, name), getattr(plain, name)
+        for name in (
+            "qpos",
+            "qvel",
+            "site_xpos",
+            "sensordata",
+            "qfrc_actuator",
+            "contact_count",
+            "constraint_count",
+        ):
+            a = getattr(ours, name)
+            b = getattr(plain, name)
             if device == "cpu":
-                assert torch.equal(a, b), (frame, name)
+                assert torch.equal(a, b), (step, name)
             elif name in ("qpos", "site_xpos"):
                 torch.testing.assert_close(a, b, rtol=0.0, atol=2e-3)
         assert torch.equal(ours.step_count, plain.step_count)
@@ -72,8 +86,11 @@ def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
 @CUDA
 @pytest.mark.parametrize("robot", ["so101", "rebot"])
 def test_branches_count_and_sense_what_one_after_the_other_does(robot: str) -> None:
-    """Cubes at rest, red between the jaws: a few substeps from one state, where rounding has no time to grow."""
-    ours, plain = worlds(robot, "cuda:0"), worlds(robot, "cuda:0")
+    """Cubes at rest, red between the jaws: a few decimation from one state, where rounding has no
+    time to grow.
+    """
+    ours = worlds(robot, "cuda:0")
+    plain = worlds(robot, "cuda:0")
     plain.arrange(Arrangement(own_stages=False))
     index = SceneIndex(ours.model, configure(robot=robot).robot)
     home = torch.tensor(configure(robot=robot).robot.start, device="cuda:0")
@@ -81,17 +98,20 @@ def test_branches_count_and_sense_what_one_after_the_other_does(robot: str) -> N
         sim.qpos[:, torch.as_tensor(index.robot_qpos, device="cuda:0")] = home
         sim.ctrl[:, torch.as_tensor(index.ctrl, device="cuda:0")] = home
         sim.step(50, kinematics=True)
-    between = plain.site_xpos[:, index.aperture_sites].mean(1)
+    between = plain.site_xpos[:, index.grasp_sites].mean(1)
     red = index.cube_qpos[0]
     plain.qpos[:, red : red + 3] = between
     for n in (1, 1, 2, 3, 1, 2):
-        ours.qpos[:], ours.qvel[:] = plain.qpos, plain.qvel
+        ours.qpos[:] = plain.qpos
+        ours.qvel[:] = plain.qvel
         for sim in (ours, plain):
             sim.step(n, kinematics=True)
         for name in ("contact_count", "constraint_count"):
             assert torch.equal(getattr(ours, name), getattr(plain, name)), name
         for name, size in (("qpos", 1e-4), ("qvel", 2e-2), ("site_xpos", 1e-4)):
-            torch.testing.assert_close(getattr(ours, name), getattr(plain, name), rtol=0.0, atol=size)
+            torch.testing.assert_close(
+                getattr(ours, name), getattr(plain, name), rtol=0.0, atol=size
+            )
         scale = float(plain.sensordata.abs().max()) + 1.0
         torch.testing.assert_close(ours.sensordata, plain.sensordata, rtol=0.0, atol=0.05 * scale)
     assert torch.equal(ours.peak_contacts, plain.peak_contacts)
@@ -106,16 +126,26 @@ def test_branches_count_and_sense_what_one_after_the_other_does(robot: str) -> N
         lambda spec: (
             spec.worldbody.add_body(name="b").add_site(name="s")
             and spec.add_sensor(
-                name="a", type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="s"
+                name="a",
+                type=mujoco.mjtSensor.mjSENS_ACCELEROMETER,
+                objtype=mujoco.mjtObj.mjOBJ_SITE,
+                objname="s",
             )
         ),
         lambda spec: spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_BODY, target="box"),
         lambda spec: (
             spec.worldbody.add_camera(name="c")
-            and spec.add_sensor(type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_CAMERA, objname="c")
+            and spec.add_sensor(
+                type=mujoco.mjtSensor.mjSENS_FRAMEPOS,
+                objtype=mujoco.mjtObj.mjOBJ_CAMERA,
+                objname="c",
+            )
         ),
         lambda spec: spec.add_equality(
-            type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="box", name2="world"
+            type=mujoco.mjtEq.mjEQ_CONNECT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            name1="box",
+            name2="world",
         ),
     ],
 )

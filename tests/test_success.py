@@ -1,4 +1,6 @@
-"""The success gate: rates, where episodes go wrong, what is left of them, and the same starts on both backends."""
+"""The success gate: rates, where episodes go wrong, what is left of them, and the same starts on
+both backends.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +19,15 @@ from environments import brisk, configure, rushed
 
 from mjstack.cli import run
 from mjstack.config import load_config
-from mjstack.gates import gate as gate_module
-from mjstack.gates import watch as watch_module
-from mjstack.gates.batch_record import FAILING, BatchRecord
-from mjstack.gates.episode import Episode, run_episode
-from mjstack.gates.gate import GateContext
-from mjstack.gates.regions import Region, find_regions, radial_yaw_deg
+from mjstack.episodes import context as gate_module
+from mjstack.episodes import failures as watch_module
+from mjstack.episodes.batch_record import FAILING, BatchRecord
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.failures import FailureMonitor, Sign
+from mjstack.episodes.regions import Region, find_regions, radial_yaw_deg
+from mjstack.episodes.rollout import Episode, run_episode
+from mjstack.episodes.success_record import PICTURE, REGIONS, STEM, clear_success
 from mjstack.gates.success import _tables, _Tally, run_success, success_config
-from mjstack.gates.success_record import PICTURE, REGIONS, STEM, clear_success
-from mjstack.gates.watch import FailureWatch, Sign
 from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
@@ -39,7 +41,13 @@ PHASES = list(configure().controller.phases)
 def passed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a native run of six SO-101 worlds in a small region."""
     folder = tmp_path_factory.mktemp("success") / "run"
-    args = ["gates=[success]", "sim=native", "nworld=6", "gate.success.region=[0.03,0.03]", "gate.success.cell_episodes=2"]
+    args = [
+        "gates=[success]",
+        "sim=native",
+        "nworld=6",
+        "gate.success.region=[0.03,0.03]",
+        "gate.success.cell_episodes=2",
+    ]
     assert run([*args, *brisk(), f"hydra.run.dir={folder}"]) == 0
     return folder
 
@@ -48,9 +56,20 @@ def passed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def warp(passed: Path) -> Path:
     """The folder of a run on Warp's CPU device from the native run's layouts."""
     folder = passed.parent / "warp"
-    start = ["reset=layout", f"layout={passed}/layouts_seed0.csv"]
+    start = ["reset=starts_file", f"starts={passed}/starts_seed0.csv"]
     assert (
-        run(["gates=[success]", "sim=mjwarp", "sim.device=cpu", "nworld=6", *start, *brisk(), f"hydra.run.dir={folder}"]) == 0
+        run(
+            [
+                "gates=[success]",
+                "sim=mjwarp",
+                "sim.device=cpu",
+                "nworld=6",
+                *start,
+                *brisk(),
+                f"hydra.run.dir={folder}",
+            ]
+        )
+        == 0
     )
     return folder
 
@@ -76,13 +95,18 @@ def test_small_region_passes(passed: Path) -> None:
     gate = gate_of(passed)
     assert (gate["name"], gate["status"]) == ("success", "pass")
     metrics = gate["metrics"]
-    assert (metrics["episodes"], metrics["accepted"], metrics["distinct_starts"], metrics["unreachable"]) == (6, 6, 6, 0)
+    assert (
+        metrics["episodes"],
+        metrics["succeeded"],
+        metrics["distinct_starts"],
+        metrics["unreachable"],
+    ) == (6, 6, 6, 0)
     assert (metrics["success_rate_low95"], metrics["success_rate_high95"]) == wilson_interval(6, 6)
     assert gate["thresholds"]["success_rate_min"] == 0.99
     assert "cubes within 0.03 x 0.03 m" in metrics["starts"]
     assert sorted(path.name for path in passed.iterdir()) == [
         ".hydra",
-        "layouts_seed0.csv",
+        "starts_seed0.csv",
         "report.json",
         "report.md",
         "run.log",
@@ -106,7 +130,11 @@ def test_rebot_passes(new_context: Callable[..., GateContext], tmp_path: Path) -
     context = new_context("sim=native", "nworld=4", robot="rebot")
     result = play(context, tmp_path)
     assert result.status is Status.passed
-    assert (result.metrics["accepted"], result.metrics["episodes"], result.metrics["distinct_starts"]) == (4, 4, 4)
+    assert (
+        result.metrics["succeeded"],
+        result.metrics["episodes"],
+        result.metrics["distinct_starts"],
+    ) == (4, 4, 4)
     assert not (tmp_path / FAILING).exists()
     assert context.pictures == [PICTURE]
     assert context.cfg.reset == load_config(["robot=rebot"]).reset  # other gates start as they did
@@ -115,16 +143,25 @@ def test_rebot_passes(new_context: Callable[..., GateContext], tmp_path: Path) -
 def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
     """A gripper that never closes: the grasp is empty, is tried again, and is empty again."""
     folder = tmp_path / "broken"
-    args = ["gates=[success]", "sim=native", "nworld=2", "robot.gripper_closed=[0.7]", *brisk(), f"hydra.run.dir={folder}"]
+    args = [
+        "gates=[success]",
+        "sim=native",
+        "nworld=2",
+        "robot.gripper_closed=[0.7]",
+        *brisk(),
+        f"hydra.run.dir={folder}",
+    ]
     assert run(args) == 1
     gate = gate_of(folder)
     assert gate["status"] == "fail"
-    assert "0 of 2 episodes accepted (0 %, 95 % interval 0 to 65.76 %), 99 % wanted" in gate["reason"]
-    assert "2 retried, 0 of them accepted" in gate["reason"]
-    assert f"job=replay run={folder} world=0" in gate["reason"]
-    assert {name: gate["metrics"][f"failed.{name}"] for name in ("LIFT", "CARRY", "STACKED")} == dict.fromkeys(
-        ("LIFT", "CARRY", "STACKED"), 2
+    assert (
+        "0 of 2 episodes succeeded (0 %, 95 % interval 0 to 65.76 %), 99 % wanted" in gate["reason"]
     )
+    assert "2 retried, 0 of them succeeded" in gate["reason"]
+    assert f"job=replay run={folder} world=0" in gate["reason"]
+    assert {
+        name: gate["metrics"][f"failed.{name}"] for name in ("LIFT", "CARRY", "STACKED")
+    } == dict.fromkeys(("LIFT", "CARRY", "STACKED"), 2)
     (table,) = [table for table in gate["tables"] if "first sign of failure" in table["header"]]
     assert table["rows"] == [["grasp_red: grasp empty, and not tried again", "2", "0, 1"]]
     rows = list(csv.DictReader((folder / FAILING).read_text().splitlines()))
@@ -135,7 +172,13 @@ def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
     assert any("no region has 20 episodes" in line for line in gate["details"])
     # It stands alone: where nothing fails, the same folder keeps nothing of this.
     clear_success(folder, keep=None)
-    assert sorted(path.name for path in folder.iterdir()) == [".hydra", FAILING, "report.json", "report.md", "run.log"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        ".hydra",
+        FAILING,
+        "report.json",
+        "report.md",
+        "run.log",
+    ]
 
 
 @pytest.fixture
@@ -143,12 +186,16 @@ def hasty() -> Callable[..., GateContext]:
     """Contexts of episodes that are over, and have failed, after a second."""
 
     def make(*overrides: str) -> GateContext:
-        return GateContext(cfg=load_config(["gates=[success]", "sim=native", "nworld=2", *rushed(), *overrides]))
+        return GateContext(
+            cfg=load_config(["gates=[success]", "sim=native", "nworld=2", *rushed(), *overrides])
+        )
 
     return make
 
 
-def test_seeds_add_up_and_the_rate_decides(hasty: Callable[..., GateContext], tmp_path: Path) -> None:
+def test_seeds_add_up_and_the_rate_decides(
+    hasty: Callable[..., GateContext], tmp_path: Path
+) -> None:
     """The threshold is on the rate itself; what fails is named all the same."""
     context = hasty("gates=[batch,success]", "gate.success.seeds=2", "gate.success.cell_episodes=2")
     lines: list[str] = []
@@ -156,20 +203,31 @@ def test_seeds_add_up_and_the_rate_decides(hasty: Callable[..., GateContext], tm
     result = play(context, tmp_path)
     assert result.status is Status.failed
     failing = "4 of 4 episodes (0:0, 0:1, 1:0, 1:1) failed: "
-    assert "0 of 4 episodes accepted" in result.reason
+    assert "0 of 4 episodes succeeded" in result.reason
     assert failing in result.reason
     assert result.reason.endswith(f"job=replay run={tmp_path} world=success:0:0")
     assert result.metrics["distinct_starts"] == 4
     assert [line.split(":")[0] for line in lines] == ["success, seed 0", "success, seed 1"]
     seeds = next(table for table in result.tables if table.title == "Seeds")
     assert [row[:3] for row in seeds.rows] == [["0", "2", "0"], ["1", "2", "0"]]
-    (worst,) = [table for table in result.tables if table.title.startswith("Worst regions of at least 2 episodes")]
+    (worst,) = [
+        table
+        for table in result.tables
+        if table.title.startswith("Worst regions of at least 2 episodes")
+    ]
     assert worst.title.endswith(f"({len(worst.rows)} of {len(worst.rows)} with a failure)")
     assert not any("had a failure" in line for line in result.details)
     (signs,) = [table for table in result.tables if "first sign" in table.header[0]]
-    assert sum(int(row[1]) for row in signs.rows) == 4  # every failed episode is in one line, with a sign or without
+    assert (
+        sum(int(row[1]) for row in signs.rows) == 4
+    )  # every failed episode is in one line, with a sign or without
     rows = list(csv.DictReader((tmp_path / "success_failing_worlds.csv").read_text().splitlines()))
-    assert [(row["seed"], row["world"]) for row in rows] == [("0", "0"), ("0", "1"), ("1", "0"), ("1", "1")]
+    assert [(row["seed"], row["world"]) for row in rows] == [
+        ("0", "0"),
+        ("0", "1"),
+        ("1", "0"),
+        ("1", "1"),
+    ]
     assert not (tmp_path / FAILING).exists()  # that is the batch gate's
 
     result = play(hasty("gate.success.rate=0"))
@@ -178,21 +236,29 @@ def test_seeds_add_up_and_the_rate_decides(hasty: Callable[..., GateContext], tm
 
 
 def test_both_backends_start_and_end_alike(passed: Path, warp: Path) -> None:
-    native, other = record_of(passed), record_of(warp)
+    native = record_of(passed)
+    other = record_of(warp)
     assert (native.backend, other.backend) == ("native", "mjwarp")
-    with np.load(passed / "success_seed0.npz") as ours, np.load(warp / "success_seed0.npz") as theirs:
+    with (
+        np.load(passed / "success_seed0.npz") as ours,
+        np.load(warp / "success_seed0.npz") as theirs,
+    ):
         assert theirs["start_qpos"].dtype == np.float32
         assert np.abs(ours["start_qpos"] - theirs["start_qpos"]).max() < 1e-7
-        assert np.array_equal(ours["start_places"][..., :2].astype(np.float32), theirs["start_places"][..., :2])
+        assert np.array_equal(
+            ours["start_places"][..., :2].astype(np.float32), theirs["start_places"][..., :2]
+        )
     assert np.array_equal(native.failed, other.failed)
     assert np.abs(native.values["xy_err_m"] - other.values["xy_err_m"]).max() < 0.003
     metrics = gate_of(warp)["metrics"]
-    assert metrics["starts"] == f"layout={passed}/layouts_seed0.csv"
+    assert metrics["starts"] == f"starts={passed}/starts_seed0.csv"
     assert "Warp" in metrics["backend"]
 
 
 def test_replay_plays_the_gates_world(passed: Path, warp: Path, tmp_path: Path) -> None:
-    """Region, controller and file are the run's own: a native world ends bit for bit where it did, MJWarp's too."""
+    """Region, controller and file are the run's own: a native world ends bit for bit where it did,
+    MJWarp's too.
+    """
     out = tmp_path / "out"
     assert run(["job=replay", f"run={passed}", "world=5", f"hydra.run.dir={out}"]) == 0
     gate = gate_of(out)
@@ -204,16 +270,22 @@ def test_replay_plays_the_gates_world(passed: Path, warp: Path, tmp_path: Path) 
     first, second = json.loads((both / "report.json").read_text())["gates"]
     assert (first["name"], second["name"]) == ("replay_mjwarp", "replay_native")
     assert first["reason"].endswith("; as recorded, and it ends bit for bit where it did")
-    assert second["reason"].endswith("that run's mjwarp world had the same verdict")
+    assert second["reason"].endswith("that run's mjwarp world had the same result")
     with np.load(both / "trajectory.npz") as held, np.load(warp / "success_seed0.npz") as theirs:
         assert np.array_equal(held["start_qpos"].astype(np.float32), theirs["start_qpos"][3])
 
 
 @pytest.mark.parametrize(
-    ("world", "says"), [("batch:1", "a gate that run had, success"), ("1:1", "seed 0"), ("6", "a world from 0 to 5")]
+    ("world", "says"),
+    [("batch:1", "a gate that run had, success"), ("1:1", "seed 0"), ("6", "a world from 0 to 5")],
 )
 def test_replay_refuses_worlds_that_were_not(
-    world: str, says: str, passed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    world: str,
+    says: str,
+    passed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert run(["job=replay", f"run={passed}", f"world={world}"]) == 2
@@ -222,11 +294,20 @@ def test_replay_refuses_worlds_that_were_not(
 
 
 BAD = [
-    (["gate.success.region=[0.5,0.02]"], "gate.success.region=[0.5, 0.02]: expected half-widths that leave both cubes on"),
-    (["gate.success.region=[0.1,0.1]"], "gate.success.region=[0.1, 0.1]: expected a region that the arm reaches"),
+    (
+        ["gate.success.region=[0.5,0.02]"],
+        "gate.success.region=[0.5, 0.02]: expected half-widths that leave both cubes on",
+    ),
+    (
+        ["gate.success.region=[0.1,0.1]"],
+        "gate.success.region=[0.1, 0.1]: expected a region that the arm reaches",
+    ),
     (["gate.success.region=[-0.01,0.1]"], "gate.success.region"),
     (["gate.success.region=[0.01]"], "2 numbers"),
-    (["gate.success.region=[0.01,0.01]", "~gate.success.reset.cubes"], "no term of gate.success.reset has a region"),
+    (
+        ["gate.success.region=[0.01,0.01]", "~gate.success.reset.cubes"],
+        "no term of gate.success.reset has a region",
+    ),
     (["gate.success.reset.cubes.params.gap=0.3"], "gate.success.reset.cubes.params.xy"),
     (["gate.success.rate=1.01"], "gate.success.rate=1.01: expected a share from 0 to 1"),
     (["gate.success.rate=nan"], "gate.success.rate=nan"),
@@ -234,9 +315,18 @@ BAD = [
     (["gate.success.seeds=2", "seed=4294967295"], "seeds are 32-bit"),
     (["gate.success.cell=0"], "gate.success.cell"),
     (["gate.success.yaw_cell_deg=91"], "gate.success.yaw_cell_deg"),
-    (["reset=layout", "layout={run}/layouts_seed0.csv", "gate.success.seeds=2"], "start alike under every seed"),
-    (["reset=layout", "layout={run}/layouts_seed0.csv", "gate.success.region=[0.01,0.01]"], "null, because reset=layout"),
-    (["reset=layout", "layout={run}/layouts_seed0.csv", "nworld=7"], "at least 7 worlds, it has 6"),
+    (
+        ["reset=starts_file", "starts={run}/starts_seed0.csv", "gate.success.seeds=2"],
+        "start alike under every seed",
+    ),
+    (
+        ["reset=starts_file", "starts={run}/starts_seed0.csv", "gate.success.region=[0.01,0.01]"],
+        "null, because reset=starts_file",
+    ),
+    (
+        ["reset=starts_file", "starts={run}/starts_seed0.csv", "nworld=7"],
+        "at least 7 worlds, it has 6",
+    ),
 ]
 
 
@@ -250,7 +340,12 @@ def test_bad_input_is_one_line_and_writes_nothing(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run(["gates=[success]", "sim=native", "nworld=2", *(arg.format(run=passed) for arg in args)]) == 2
+    assert (
+        run(
+            ["gates=[success]", "sim=native", "nworld=2", *(arg.format(run=passed) for arg in args)]
+        )
+        == 2
+    )
     err = capsys.readouterr().err.strip()
     assert err.startswith("mjstack: ")
     assert len(err.splitlines()) == 1
@@ -264,7 +359,10 @@ def test_region_is_the_gates_alone() -> None:
     cfg = load_config(["gate.success.region=[0.01,0.02]"])
     assert success_config(cfg).reset["cubes"].params["xy"] == [0.01, 0.02]
     assert cfg.gate.success.reset["cubes"].params["xy"] == [0.05, 0.05]
-    assert (success_config(cfg).controller.name, cfg.controller.name) == ("scripted", "planned")
+    assert (success_config(cfg).controller.name, cfg.controller.name) == (
+        "closed_loop",
+        "open_loop",
+    )
 
 
 class Stop(Exception):
@@ -282,11 +380,13 @@ def test_what_stops_the_second_seed_keeps_the_first(
     monkeypatch.setattr(gate_module, "run_episode", stops)
     result = play(hasty("gate.success.seeds=3", "gate.success.rate=0"), tmp_path)
     assert result.status is Status.failed
-    assert "0 of 2 episodes accepted" in result.reason
+    assert "0 of 2 episodes succeeded" in result.reason
     assert "seeds 1 to 2 not played: the second seed" in result.reason
-    left = {REGIONS, PICTURE, FAILING, "success_seed0.npz", "layouts_seed0.csv", "layouts_seed1.csv"}
+    left = {REGIONS, PICTURE, FAILING, "success_seed0.npz", "starts_seed0.csv", "starts_seed1.csv"}
     assert {path.name for path in tmp_path.iterdir()} <= left
-    assert {FAILING, "success_seed0.npz", "layouts_seed0.csv"} <= {path.name for path in tmp_path.iterdir()}
+    assert {FAILING, "success_seed0.npz", "starts_seed0.csv"} <= {
+        path.name for path in tmp_path.iterdir()
+    }
 
 
 def test_full_disk_takes_no_verdict_back(
@@ -299,102 +399,137 @@ def test_full_disk_takes_no_verdict_back(
     result = play(hasty("gate.success.rate=0"), tmp_path)
     assert result.status is Status.passed
     told = [line for line in result.details if "No space left on device" in line]
-    for name in ("layouts_seed0.csv", "no record of its episodes", REGIONS):
+    for name in ("starts_seed0.csv", "no record of its episodes", REGIONS):
         assert any(name in line for line in told)
     assert [path.name for path in tmp_path.iterdir()] == [PICTURE]
 
 
 def test_an_earlier_runs_files_go_but_not_the_layouts_that_are_read(tmp_path: Path) -> None:
-    names = ["success_seed0.npz", "success_seed12.npz", "layouts_seed0.csv", "layouts_seed1.csv", REGIONS, PICTURE]
+    names = [
+        "success_seed0.npz",
+        "success_seed12.npz",
+        "starts_seed0.csv",
+        "starts_seed1.csv",
+        REGIONS,
+        PICTURE,
+    ]
     for name in [*names, "report.json"]:
         (tmp_path / name).write_text("old")
-    clear_success(tmp_path, keep=tmp_path / "." / "layouts_seed1.csv")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["layouts_seed1.csv", "report.json"]
+    clear_success(tmp_path, keep=tmp_path / "." / "starts_seed1.csv")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["starts_seed1.csv", "report.json"]
 
 
 def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Made-up episodes of 300 worlds, in which anything may happen at any time; the recount goes world by world."""
+    """Made-up episodes of 300 worlds, in which anything may happen at any time; the recount goes
+    world by world.
+    """
     cfg = load_config()
-    n, frames, rng = 300, 90, np.random.default_rng(3)
-    steps = rng.random((frames, n)) < 0.12
-    phase = np.minimum(np.cumsum(steps, axis=0), len(PHASES) - 1)
-    again = rng.random((frames, n)) < 0.3  # out of the grasp and back to the start
+    n = 300
+    total = 90
+    rng = np.random.default_rng(3)
+    moves = rng.random((total, n)) < 0.12
+    phase = np.minimum(np.cumsum(moves, axis=0), len(PHASES) - 1)
+    again = rng.random((total, n)) < 0.3  # out of the grasp and back to the start
     for world in range(n):
-        for frame in range(1, frames):
-            if PHASES[phase[frame - 1, world]] == "grasp_red" and steps[frame, world] and again[frame, world]:
-                phase[frame:, world] -= phase[frame, world]
+        for step in range(1, total):
+            if (
+                PHASES[phase[step - 1, world]] == "grasp_red"
+                and moves[step, world]
+                and again[step, world]
+            ):
+                phase[step:, world] -= phase[step, world]
                 break
-    forces = (rng.random((frames, n, 2, 2)) < 0.93) * 3.0
-    placed = rng.random((frames, n, 2)) < 0.8
-    overflow = (rng.random((frames, n)) < 0.0005).cumsum(axis=0) > 0
-    qpos = np.where(rng.random((frames, n, 1)) < 0.0005, np.inf, 1.0) * np.ones((1, 1, 3))
+    forces = (rng.random((total, n, 2, 2)) < 0.93) * 3.0
+    placed = rng.random((total, n, 2)) < 0.8
+    overflow = (rng.random((total, n)) < 0.0005).cumsum(axis=0) > 0
+    qpos = np.where(rng.random((total, n, 1)) < 0.0005, np.inf, 1.0) * np.ones((1, 1, 3))
 
-    watch, now = FailureWatch(cfg), SimpleNamespace(frame=0)
+    watch = FailureMonitor(cfg)
+    now = SimpleNamespace(step=0)
     device = torch.device("cpu")
-    sim = SimpleNamespace(qpos=torch.zeros(n, 3), qvel=torch.zeros(n, 3), overflow=torch.zeros(n, dtype=torch.int32))
+    sim = SimpleNamespace(
+        qpos=torch.zeros(n, 3), qvel=torch.zeros(n, 3), overflow=torch.zeros(n, dtype=torch.int32)
+    )
     env = SimpleNamespace(nworld=n, device=device, sim=sim, index=None)
     controller = SimpleNamespace(phase=torch.zeros(n, dtype=torch.int64))
-    evidence = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.frame]))
-    monkeypatch.setattr(watch_module, "cubes_in_hand", lambda *_: torch.from_numpy(forces[now.frame] > 0.0).all(2))
+    check = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.step]))
+    monkeypatch.setattr(
+        watch_module, "cubes_in_hand", lambda *_: torch.from_numpy(forces[now.step] > 0.0).all(2)
+    )
     watch.start(env)
-    for frame in range(frames):
-        now.frame = frame
-        controller.phase.copy_(torch.from_numpy(phase[frame]))
-        sim.qpos.copy_(torch.from_numpy(qpos[frame]))
-        sim.overflow.copy_(torch.from_numpy(overflow[frame]))
-        watch.update(env, controller, evidence)
+    for step in range(total):
+        now.step = step
+        controller.phase.copy_(torch.from_numpy(phase[step]))
+        sim.qpos.copy_(torch.from_numpy(qpos[step]))
+        sim.overflow.copy_(torch.from_numpy(overflow[step]))
+        watch.update(env, controller, check)
 
-    found = [tuple(row) for row in torch.stack((watch.sign, watch.phase, watch.frame), dim=1).tolist()]
+    found = [
+        tuple(row) for row in torch.stack((watch.sign, watch.phase, watch.step), dim=1).tolist()
+    ]
     names = [[PHASES[number] for number in phase[:, world]] for world in range(n)]
-    held, lost = (forces[:, :, 0] > 0).all(2), overflow | np.isinf(qpos[:, :, 0])
-    wanted = [recount(names[world], held[:, world], placed[:, world, 0], lost[:, world]) for world in range(n)]
+    held = (forces[:, :, 0] > 0).all(2)
+    lost = overflow | np.isinf(qpos[:, :, 0])
+    wanted = [
+        recount(names[world], held[:, world], placed[:, world, 0], lost[:, world])
+        for world in range(n)
+    ]
     assert found == wanted
-    assert {sign for sign, _, _ in wanted} == {int(sign) for sign in Sign}  # else this would show less than it seems to
+    assert {sign for sign, _, _ in wanted} == {
+        int(sign) for sign in Sign
+    }  # else this would show less than it seems to
 
 
-def recount(phases: list[str], held: np.ndarray, placed: np.ndarray, lost: np.ndarray) -> tuple[int, int, int]:
-    """The first sign of one world of the stack task, its phase, and the frame."""
+def recount(
+    phases: list[str], held: np.ndarray, placed: np.ndarray, lost: np.ndarray
+) -> tuple[int, int, int]:
+    """The first sign of one world of the stack task, its phase, and the step."""
     gone = 0
-    for frame, name in enumerate(phases):
-        before = phases[frame - 1] if frame else name
+    for step, name in enumerate(phases):
+        before = phases[step - 1] if step else name
         onward = PHASES.index(name) > PHASES.index(before)
-        gone = gone + 1 if name in ("lift_red", "above_blue", "place_stack") and not held[frame] else 0
-        if lost[frame]:
-            return Sign.PHYSICS, PHASES.index(name), frame
-        if before == "grasp_red" and onward and not held[frame - 1]:
-            return Sign.EMPTY, PHASES.index(before), frame
+        gone = (
+            gone + 1 if name in ("lift_red", "above_blue", "place_stack") and not held[step] else 0
+        )
+        if lost[step]:
+            return Sign.PHYSICS, PHASES.index(name), step
+        if before == "grasp_red" and onward and not held[step - 1]:
+            return Sign.EMPTY, PHASES.index(before), step
         if gone >= 3:
-            return Sign.DROPPED, PHASES.index(name), frame
-        if before == "release" and onward and not placed[frame - 1]:
-            return Sign.MISSED, PHASES.index(before), frame
-        if name in ("retreat", "done") and placed[frame - 1] and not placed[frame]:
-            return Sign.LEFT, PHASES.index(name), frame
+            return Sign.DROPPED, PHASES.index(name), step
+        if before == "release" and onward and not placed[step - 1]:
+            return Sign.MISSED, PHASES.index(before), step
+        if name in ("retreat", "done") and placed[step - 1] and not placed[step]:
+            return Sign.LEFT, PHASES.index(name), step
     return Sign.NONE, -1, -1
 
 
 def test_signs_in_real_episodes(new_context: Callable[..., GateContext]) -> None:
-    """Worlds that somebody interferes with: each shows its own sign, in its phase, and one is undisturbed."""
+    """Worlds that somebody interferes with: each shows its own sign, in its phase, and one is
+    undisturbed.
+    """
     base = new_context("sim=native", "nworld=6")
     context = base.with_config(success_config(base.cfg))
     red, _ = context.index.cube_qpos
     at = {name: context.phase_start(name) for name in PHASES}
 
-    def interfere(frame: int, sim: Simulation) -> None:
-        if frame == at["lift_red"] + 30:
+    def interfere(step: int, sim: Simulation) -> None:
+        if step == at["lift_red"] + 30:
             sim.qpos[1, red + 1] -= 0.1  # out of the hand
-        if frame == at["grasp_red"] + 60:
+        if step == at["grasp_red"] + 60:
             sim.qpos[2, red + 1] -= 0.03  # out of the jaws: tried again, and found
-        if frame == at["release"] + 30:
+        if step == at["release"] + 30:
             sim.qpos[3, red] += 0.018  # it still stands on blue, too far off
-        if frame == at["done"] + 5:
+        if step == at["done"] + 5:
             sim.qpos[4, red : red + 3] += torch.tensor([0.1, 0.0, -0.044])  # down on the table
-        if frame == at["above_blue"]:
+        if step == at["above_blue"]:
             sim.qvel[5] = torch.nan
 
-    watch = FailureWatch(context.cfg)
+    watch = FailureMonitor(context.cfg)
     sim = context.batch_simulation(6)
-    episode = context.run(sim, context.cfg.reset, watch=watch, on_frame=interfere)
-    failed, retries = episode.verdict.failed.tolist(), episode.retries.tolist()
+    episode = context.run(sim, context.cfg.reset, watch=watch, on_step=interfere)
+    failed = episode.result.failed.tolist()
+    retries = episode.retries.tolist()
     sim.close()
     signs = [Sign(sign).name for sign in watch.sign.tolist()]
     phases = [PHASES[number] if number >= 0 else "" for number in watch.phase.tolist()]
@@ -409,15 +544,15 @@ def test_signs_in_real_episodes(new_context: Callable[..., GateContext]) -> None
     assert [bits == 0 for bits in failed] == [True, False, True, False, False, False]
     assert failed[5] & StackRule.FINITE
     assert retries == [0, 0, 1, 0, 0, 0]
-    assert watch.frame.tolist()[4] == at["done"] + 6
+    assert watch.step.tolist()[4] == at["done"] + 6
 
 
 def test_each_cube_of_the_box_has_its_own_release(monkeypatch: pytest.MonkeyPatch) -> None:
-    """World by world: all well; red misses, blue does not; red is let go well and leaves under blue's approach; blue misses;
-    blue leaves at the end."""
+    """World by world: all well; red misses, blue does not; red is let go well and leaves under
+    blue's approach; blue misses; blue leaves at the end."""
     cfg = load_config(["task=box"])
     names = list(cfg.controller.phases)
-    at = {name: 2 * number for number, name in enumerate(names)}  # two frames a phase
+    at = {name: 2 * number for number, name in enumerate(names)}  # two steps a phase
     placed = np.zeros((2 * len(names), 5, 2), dtype=bool)
     placed[at["open_red"] + 1 :, :, 0] = True
     placed[at["open_blue"] + 1 :, :, 1] = True
@@ -426,21 +561,36 @@ def test_each_cube_of_the_box_has_its_own_release(monkeypatch: pytest.MonkeyPatc
     placed[:, 3, 1] = False
     placed[at["done"] + 1 :, 4, 1] = False
 
-    watch, now = FailureWatch(cfg), SimpleNamespace(frame=0)
-    sim = SimpleNamespace(qpos=torch.zeros(5, 3), qvel=torch.zeros(5, 3), overflow=torch.zeros(5, dtype=torch.int32))
+    watch = FailureMonitor(cfg)
+    now = SimpleNamespace(step=0)
+    sim = SimpleNamespace(
+        qpos=torch.zeros(5, 3), qvel=torch.zeros(5, 3), overflow=torch.zeros(5, dtype=torch.int32)
+    )
     env = SimpleNamespace(nworld=5, device=torch.device("cpu"), sim=sim, index=None)
     controller = SimpleNamespace(phase=torch.zeros(5, dtype=torch.int64))
-    evidence = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.frame]))
-    monkeypatch.setattr(watch_module, "cubes_in_hand", lambda *_: torch.ones(5, 2, dtype=torch.bool))
+    check = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.step]))
+    monkeypatch.setattr(
+        watch_module, "cubes_in_hand", lambda *_: torch.ones(5, 2, dtype=torch.bool)
+    )
     watch.start(env)
-    for frame in range(len(placed)):
-        now.frame = frame
-        controller.phase.fill_(frame // 2)
-        watch.update(env, controller, evidence)
+    for step in range(len(placed)):
+        now.step = step
+        controller.phase.fill_(step // 2)
+        watch.update(env, controller, check)
     signs = [Sign(sign) for sign in watch.sign.tolist()]
     assert signs == [Sign.NONE, Sign.MISSED, Sign.LEFT, Sign.MISSED, Sign.LEFT]
-    assert [names[number] for number in watch.phase[1:].tolist()] == ["open_red", "approach_blue", "open_blue", "done"]
-    assert watch.frame[1:].tolist() == [at["retreat_red"], at["approach_blue"] + 1, at["retreat_blue"], at["done"] + 1]
+    assert [names[number] for number in watch.phase[1:].tolist()] == [
+        "open_red",
+        "approach_blue",
+        "open_blue",
+        "done",
+    ]
+    assert watch.step[1:].tolist() == [
+        at["retreat_red"],
+        at["approach_blue"] + 1,
+        at["retreat_blue"],
+        at["done"] + 1,
+    ]
 
 
 def test_radial_yaw() -> None:
@@ -466,8 +616,10 @@ def test_worst_regions_of_made_up_episodes() -> None:
     places[:5, 0, :2] = 0.41, -0.05
     corner = (places[:, 0, 0] >= 0.34) & (places[:, 0, 0] < 0.36) & (places[:, 0, 1] < -0.12)
     turned = (radial_yaw_deg(places[:, 1]) >= 30.0) & (radial_yaw_deg(places[:, 1]) < 45.0)
-    accepted = ~(corner & (rng.random(n) < 0.9)) & ~(turned & (rng.random(n) < 0.5))
-    found = find_regions(places, accepted, cell=0.02, yaw_cell_deg=15.0, episodes=20, cubes=("red", "blue"))
+    succeeded = ~(corner & (rng.random(n) < 0.9)) & ~(turned & (rng.random(n) < 0.5))
+    found = find_regions(
+        places, succeeded, cell=0.02, yaw_cell_deg=15.0, episodes=20, cubes=("red", "blue")
+    )
     assert [region.rate for region in found] == sorted(region.rate for region in found)
     assert all(region.episodes >= 20 for region in found)
     assert not any(region.cube == "red" and region.x_min_m == 0.4 for region in found)
@@ -478,16 +630,23 @@ def test_worst_regions_of_made_up_episodes() -> None:
     assert alone[0].where == "blue: turned 30 to 45 deg"
     assert len(alone) == 6
     assert sum(region.episodes for region in alone) == n
-    assert sum(region.accepted for region in alone) == accepted.sum()
+    assert sum(region.succeeded for region in alone) == succeeded.sum()
     placed = [region for region in found if region.cube == "red" and region.yaw_min_deg is None]
     assert len(placed) == 6
     whole = next(region for region in placed if (region.x_min_m, region.y_min_m) == (0.34, -0.14))
-    assert (whole.episodes, whole.accepted) == (int(corner.sum()), int((corner & accepted).sum()))
-    assert (whole.rate_low95, whole.rate_high95) == wilson_interval(whole.accepted, whole.episodes)
+    assert (whole.episodes, whole.succeeded) == (int(corner.sum()), int((corner & succeeded).sum()))
+    assert (whole.rate_low95, whole.rate_high95) == wilson_interval(whole.succeeded, whole.episodes)
     assert len(set(found)) == len(found)
     assert isinstance(found[0], Region)
-    well = replace(found[0], cube="blue", accepted=found[0].episodes)  # has no place among the worst
-    (table,) = _tables(load_config(["gate.success.worst_regions=2"]), _Tally(False, StackRule, PHASES), [], [*found[:1], well])
+    well = replace(
+        found[0], cube="blue", succeeded=found[0].episodes
+    )  # has no place among the worst
+    (table,) = _tables(
+        load_config(["gate.success.worst_regions=2"]),
+        _Tally(False, StackRule, PHASES),
+        [],
+        [*found[:1], well],
+    )
     assert table.title == "Worst regions of at least 20 episodes (1 of 1 with a failure)"
     assert [row[0] for row in table.rows] == [found[0].where]
 
@@ -495,17 +654,21 @@ def test_worst_regions_of_made_up_episodes() -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 @pytest.mark.parametrize("robot", ["so101", "rebot"])
-def test_frames_with_the_tracker_are_one_graph(robot: str, new_context: Callable[..., GateContext], tmp_path: Path) -> None:
+def test_steps_with_the_tracker_are_one_graph(
+    robot: str, new_context: Callable[..., GateContext], tmp_path: Path
+) -> None:
     base = new_context("sim=mjwarp", "sim.device=cuda:0", "nworld=64", "graph=require", robot=robot)
     context = base.with_config(success_config(base.cfg))
     sim = context.batch_simulation(64)
-    watch = FailureWatch(context.cfg)
+    watch = FailureMonitor(context.cfg)
     episode = context.run(sim, context.cfg.reset, watch=watch)
     assert episode.captured
-    failed = episode.verdict.failed != 0
+    failed = episode.result.failed != 0
     assert int(failed.sum()) <= 3
     assert not bool(((watch.sign != 0) & ~failed).sum() > 3)
-    assert int(watch._now) == episode.frames
+    assert int(watch._now) == episode.steps
     sim.close()
-    result = play(new_context("sim=mjwarp", "sim.device=cuda:0", "nworld=64", robot=robot), tmp_path)
-    assert result.metrics["accepted"] >= 61
+    result = play(
+        new_context("sim=mjwarp", "sim.device=cuda:0", "nworld=64", robot=robot), tmp_path
+    )
+    assert result.metrics["succeeded"] >= 61

@@ -1,4 +1,6 @@
-"""Terms and managers: values against NumPy and MuJoCo, managers without an environment, and how worlds start."""
+"""Terms and managers: values against NumPy and MuJoCo, managers without an environment, and how
+worlds start.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,14 @@ from stack_checker import BLUE, RED, lowest_corner, rotation_matrix
 from mjstack import make_env
 from mjstack.config.schema import Config
 from mjstack.envs import Env
-from mjstack.gates.gate import GateContext
-from mjstack.managers import ActionManager, ObservationManager, ResetManager, RewardManager, TerminationManager
+from mjstack.episodes.context import GateContext
+from mjstack.managers import (
+    ActionManager,
+    ObservationManager,
+    ResetManager,
+    RewardManager,
+    TerminationManager,
+)
 from mjstack.managers.base import Term
 from mjstack.mdp import observation as observation_terms
 from mjstack.mdp import reset as reset_terms
@@ -42,8 +50,8 @@ OBSERVATIONS = {
     "joint_pos": ({}, "n"),
     "joint_pos_relative": ({}, "n"),
     "joint_vel": ({}, "n"),
-    "aperture_pos": ({}, 3),
-    "aperture_to_object": (OBJECT, 3),
+    "grasp_point_pos": ({}, 3),
+    "grasp_point_to_object": (OBJECT, 3),
     "object_to_object": ({"a": "red_cube", "b": "blue_cube"}, 3),
     "object_pose": (OBJECT, 7),
     "object_velocity": (OBJECT, 6),
@@ -60,14 +68,22 @@ REWARDS = {  # whether it is a fraction, from 0 to 1
     "joint_vel": ({}, False),
 }
 TERMINATIONS = {
-    "time_out": {"frames": 3},
+    "time_out": {"steps": 3},
     "success": {},
     "CubeOffTable": {},
     "JointLimit": {"margin": 0.1},
     "non_finite": {},
     "overflow": {},
 }
-RESETS = ("home", "JointNoise", "JitterCubes", "RandomizeCubes", "CubeMass", "CubeFriction", "ActuatorGains")
+RESETS = (
+    "home",
+    "JointNoise",
+    "JitterCubes",
+    "RandomizeCubes",
+    "CubeMass",
+    "CubeFriction",
+    "ActuatorGains",
+)
 
 
 def test_no_term_is_left_out() -> None:
@@ -118,13 +134,14 @@ class Reference:
 
     def __init__(self, env: Env, world: int) -> None:
         self.data = mujoco.MjData(env.sim.model)
-        self.data.qpos[:], self.data.qvel[:] = env.sim.qpos[world].double().cpu(), env.sim.qvel[world].double().cpu()
+        self.data.qpos[:] = env.sim.qpos[world].double().cpu()
+        self.data.qvel[:] = env.sim.qvel[world].double().cpu()
         mujoco.mj_forward(env.sim.model, self.data)
         self.robot = env.cfg.robot
 
     @property
-    def aperture(self) -> np.ndarray:
-        return np.mean([self.data.site(name).xpos for name in self.robot.aperture_sites], axis=0)
+    def grasp_point(self) -> np.ndarray:
+        return np.mean([self.data.site(name).xpos for name in self.robot.grasp_sites], axis=0)
 
     def joints(self, kind: str) -> np.ndarray:
         names = [*self.robot.arm_joints, *self.robot.gripper_joints]
@@ -134,13 +151,15 @@ class Reference:
         return self.data.body(name).xpos
 
     def observations(self, action: np.ndarray) -> dict[str, np.ndarray]:
-        """The terms of conf/observation/stack.yaml and reach.yaml, without noise, clip and scale."""
+        """The terms of conf/observation/stack.yaml and reach.yaml, without noise, clip
+        and scale.
+        """
         red, blue = (self.object(name) for name in CUBES)
         return {
             "joint_pos": self.joints("qpos") - self.robot.home,
             "joint_vel": self.joints("qvel"),
-            "aperture_to_red": red - self.aperture,
-            "aperture_to_goal": red + np.array([0.0, 0.0, 0.06]) - self.aperture,
+            "grasp_point_to_red": red - self.grasp_point,
+            "grasp_point_to_goal": red + np.array([0.0, 0.0, 0.06]) - self.grasp_point,
             "red_to_blue": blue - red,
             "red_pose": np.concatenate((red, self.data.body("red_cube").xquat)),
             "red_velocity": self.data.joint("red_cube").qvel,
@@ -158,21 +177,31 @@ def test_observation_groups_hold_what_mujoco_says(backend: str, task: str, robot
     moves = actions(env, 6)
     for move in moves:
         obs = env.step(move)[0]
-    assert (env.frame == 6).all()
+    assert (env.episode_step == 6).all()
     for k in range(3):
         expected = Reference(env, k).observations(moves[-1][k].double().cpu().numpy())
         for group, cfg in env.cfg.observation.items():
-            values, start = obs[group][k].double().cpu().numpy(), 0
+            values = obs[group][k].double().cpu().numpy()
+            start = 0
             for name, term in cfg.terms.items():
                 if name == "jaw_force":
                     width = 2
-                    np.testing.assert_array_equal(values[start : start + 2], 0.0)  # nobody touches the cube yet
+                    np.testing.assert_array_equal(
+                        values[start : start + 2], 0.0
+                    )  # nobody touches the cube yet
                 else:
                     width = len(expected[name])
-                    want = term.scale * (np.clip(expected[name], *term.clip) if term.clip else expected[name])
+                    want = term.scale * (
+                        np.clip(expected[name], *term.clip) if term.clip else expected[name]
+                    )
                     noise = (term.noise * abs(term.scale)) if cfg.noise else 0.0
-                    last = start + width * (term.history - 1)  # the newest frame of a history
-                    np.testing.assert_allclose(values[last : last + width], want, atol=noise + 2e-5, err_msg=f"{group} {name}")
+                    last = start + width * (term.history - 1)  # the newest step of a history
+                    np.testing.assert_allclose(
+                        values[last : last + width],
+                        want,
+                        atol=noise + 2e-5,
+                        err_msg=f"{group} {name}",
+                    )
                 start += width * term.history
             assert start == len(values)
 
@@ -180,26 +209,31 @@ def test_observation_groups_hold_what_mujoco_says(backend: str, task: str, robot
 # A scripted episode, through the environment
 
 
-def record(env: Env, stage: Stage, frames: int = 600) -> SimpleNamespace:
-    """Plays the scripted grasp; per frame the state, the returned values and each term's reward."""
+def record(env: Env, stage: Stage, steps: int = 600) -> SimpleNamespace:
+    """Plays the scripted grasp; per step the state, the returned values and each term's reward."""
     planner = stage(env.cfg.robot.name).planner
     env.reset(seed=0)
     cubes = torch.cat([env.sim.qpos[:, a : a + 2] for a in env.index.cube_qpos], dim=1)
     tape = planner.plan(cubes.double().cpu().numpy())
     rows: dict[str, list[torch.Tensor]] = {}
-    for frame in range(frames):
-        row = returned(env.step(tape.command(frame).float())) | {
+    for step in range(steps):
+        row = returned(env.step(tape.command(step).float())) | {
             "qpos": env.sim.qpos.clone(),
             "qvel": env.sim.qvel.clone(),
             "ctrl": env.sim.ctrl.clone(),
-            "aperture": env.sim.site_xpos[:, env.index.aperture_sites].mean(1),
+            "grasp_point": env.sim.site_xpos[:, env.index.grasp_sites].mean(1),
             "values": env.reward_manager.values.clone(),
             "action": env.action.clone(),
             "episode": env.episode.clone(),
         }
         for name, value in row.items():
             rows.setdefault(name, []).append(value)
-    return SimpleNamespace(cfg=env.cfg, index=env.index, phases=planner.phases, **{n: torch.stack(v) for n, v in rows.items()})
+    return SimpleNamespace(
+        cfg=env.cfg,
+        index=env.index,
+        phases=planner.phases,
+        **{n: torch.stack(v) for n, v in rows.items()},
+    )
 
 
 def scripted_cfg(robot: str) -> Config:
@@ -222,28 +256,38 @@ def scripted(stage: Stage) -> Callable[[str], SimpleNamespace]:
     return get
 
 
-def cubes_of(rec: SimpleNamespace, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+def cubes_of(
+    rec: SimpleNamespace, qpos: torch.Tensor, qvel: torch.Tensor
+) -> tuple[np.ndarray, np.ndarray]:
     """Poses and velocities of both cubes, shape ``(..., 2, 7)`` and ``(..., 2, 6)``."""
     pose = [qpos[..., a : a + 7] for a in rec.index.cube_qpos]
     velocity = [qvel[..., a : a + 6] for a in rec.index.cube_qvel]
     return torch.stack(pose, -2).numpy(), torch.stack(velocity, -2).numpy()
 
 
-def test_rewards_of_a_scripted_episode(robot: str, scripted: Callable[[str], SimpleNamespace]) -> None:
+def test_rewards_of_a_scripted_episode(
+    robot: str, scripted: Callable[[str], SimpleNamespace]
+) -> None:
     rec = scripted(robot)
-    cfg, dt = rec.cfg, rec.cfg.timing.frame_dt
+    cfg = rec.cfg
+    dt = rec.cfg.timing.step_dt
     names = list(cfg.reward)
-    got = {name: rec.values[..., i].double().numpy() / (cfg.reward[name].weight * dt) for i, name in enumerate(names)}
+    got = {
+        name: rec.values[..., i].double().numpy() / (cfg.reward[name].weight * dt)
+        for i, name in enumerate(names)
+    }
     pose, _ = cubes_of(rec, rec.qpos, rec.qvel)
-    half, top = cfg.scene.cube_half, table_top(cfg)
-    low = np.array([[lowest_corner(p[RED], half) - top for p in frame] for frame in pose])
-    red, blue = pose[..., RED, :3], pose[..., BLUE, :3]
+    half = cfg.scene.cube_half
+    top = table_top(cfg)
+    low = np.array([[lowest_corner(p[RED], half) - top for p in step] for step in pose])
+    red = pose[..., RED, :3]
+    blue = pose[..., BLUE, :3]
     above_blue = blue + np.array([0.0, 0.0, 2.0 * half])
     action = rec.action.double().numpy()
     change = np.diff(action, axis=0, prepend=np.zeros_like(action[:1]))
     qvel = rec.qvel[..., torch.from_numpy(rec.index.robot_qvel)].numpy()
     expected = {
-        "reach": 1.0 - np.tanh(np.linalg.norm(red - rec.aperture.numpy(), axis=-1) / 0.1),
+        "reach": 1.0 - np.tanh(np.linalg.norm(red - rec.grasp_point.numpy(), axis=-1) / 0.1),
         "lift": np.clip(low / 0.05, 0.0, 1.0),
         "place": (1.0 - np.tanh(np.linalg.norm(above_blue - red, axis=-1) / 0.1)) * (low > 0.005),
         "success": rec.success.numpy(),
@@ -266,18 +310,24 @@ def test_rewards_of_a_scripted_episode(robot: str, scripted: Callable[[str], Sim
     assert got["success"][-1].min() == pytest.approx(1.0, rel=1e-5)
 
 
-def test_jaw_force_is_mujocos_contact_force(robot: str, backend: str, scripted: Callable[[str], SimpleNamespace]) -> None:
+def test_jaw_force_is_mujocos_contact_force(
+    robot: str, backend: str, scripted: Callable[[str], SimpleNamespace]
+) -> None:
     """Nothing before the grasp; in a steady grasp what mj_contactForce adds up to, jaw by jaw."""
     rec = scripted(robot)
     cfg = configure("task=stack", "action=joint_absolute", "reset=jitter", robot=robot)
     env = on_shared_sim(backend, 3, cfg)
     phases = {p.name: p for p in rec.phases}
-    for frame, grasped in ((phases["above_red"].stop, False), (phases["lift_red"].stop - 20, True)):
+    for step, grasped in ((phases["above_red"].stop, False), (phases["lift_red"].stop - 20, True)):
         env.reset(seed=0)
-        for view, values in ((env.sim.qpos, rec.qpos), (env.sim.qvel, rec.qvel), (env.sim.ctrl, rec.ctrl)):
-            view.copy_(values[frame])
+        for view, values in (
+            (env.sim.qpos, rec.qpos),
+            (env.sim.qvel, rec.qvel),
+            (env.sim.ctrl, rec.ctrl),
+        ):
+            view.copy_(values[step])
         for t in range(1, 4):
-            obs = env.step(rec.action[frame + t].to(env.device).float())[0]["privileged"]
+            obs = env.step(rec.action[step + t].to(env.device).float())[0]["privileged"]
         column = sum(width for width in (*[len(cfg.robot.home)] * 2, 3, 3, 7, 6, 7))
         force = 10.0 * obs[:, column : column + 2].double().cpu().numpy()  # its scale is 0.1
         grasp = env.reward_manager.values[:, list(cfg.reward).index("grasp")]
@@ -306,94 +356,128 @@ def test_jaw_force_has_a_column_for_each_jaw(robot: str) -> None:
     env.sim.sensordata[:] = 1.0  # both jaws of both cubes
     assert reward_terms.grasp(env, object="red_cube", force=1.7).tolist() == [1.0] * 3
     assert reward_terms.grasp(env, object="red_cube", force=1.8).tolist() == [0.0] * 3
-    env.sim.sensordata[2, int(env.sim.model.sensor(f"{env.cfg.robot.jaw_bodies[1]}/red_cube").adr[0]) :][:3] = 0.0
-    assert reward_terms.grasp(env, object="red_cube").tolist() == [1.0, 1.0, 0.0]  # one jaw is no grasp
+    env.sim.sensordata[
+        2, int(env.sim.model.sensor(f"{env.cfg.robot.jaw_bodies[1]}/red_cube").adr[0]) :
+    ][:3] = 0.0
+    assert reward_terms.grasp(env, object="red_cube").tolist() == [
+        1.0,
+        1.0,
+        0.0,
+    ]  # one jaw is no grasp
 
 
 def jaw_forces(env: Env, world: int) -> list[float]:
     """Contact force of each jaw on the red cube [N], added up from MuJoCo's contacts."""
     m = env.sim.model
     data = mujoco.MjData(m)
-    data.qpos[:], data.qvel[:], data.ctrl[:] = (v[world].double().cpu() for v in (env.sim.qpos, env.sim.qvel, env.sim.ctrl))
+    data.qpos[:], data.qvel[:], data.ctrl[:] = (
+        v[world].double().cpu() for v in (env.sim.qpos, env.sim.qvel, env.sim.ctrl)
+    )
     mujoco.mj_forward(m, data)
     cube = m.body("red_cube").id
     out = []
     for name in env.cfg.robot.jaw_bodies:
-        jaw, total = m.body(name).id, np.zeros(3)
+        jaw = m.body(name).id
+        total = np.zeros(3)
         for i, contact in enumerate(data.contact):
             bodies = [m.geom_bodyid[g] for g in contact.geom]
             if sorted(bodies) == sorted((jaw, cube)):
                 force = np.zeros(6)
                 mujoco.mj_contactForce(m, data, i, force)
-                turned = contact.frame.reshape(3, 3).T @ force[:3]  # from the first geom to the second
+                turned = (
+                    contact.frame.reshape(3, 3).T @ force[:3]
+                )  # from the first geom to the second
                 total += turned if bodies[1] == cube else -turned
         out.append(float(np.linalg.norm(total)))
     return out
 
 
-def test_success_ends_a_scripted_episode(robot: str, stage: Stage, scripted: Callable[[str], SimpleNamespace]) -> None:
-    """In the frame in which it is first achieved, and not before the cubes have rested for a whole window."""
+def test_success_ends_a_scripted_episode(
+    robot: str, stage: Stage, scripted: Callable[[str], SimpleNamespace]
+) -> None:
+    """In the step in which it is first achieved, and not before the cubes have rested for a whole
+    window.
+    """
     rec = scripted(robot)
     first = rec.success.int().argmax(0).tolist()
     window = rec.cfg.gate.acceptance.window
     placed = next(p for p in rec.phases if p.name == "place_stack").stop
-    assert all(frame >= placed + window // 2 for frame in first)
+    assert all(step >= placed + window // 2 for step in first)
     assert rec.success[-1].all()
     cfg = configure("task=stack", "action=joint_absolute", "reset=jitter", robot=robot)
     env = on_shared_sim("native", 3, cfg)
     run = record(env, stage, max(first) + 1)
-    for k, frame in enumerate(first):
-        assert not run.terminated[:frame, k].any()
-        assert run.terminated[frame, k]
-        assert run.success[frame, k]
-        assert run.episode[frame, k] == 1
-        assert torch.equal(run.qpos[:frame, k], rec.qpos[:frame, k])
+    for k, step in enumerate(first):
+        assert not run.terminated[:step, k].any()
+        assert run.terminated[step, k]
+        assert run.success[step, k]
+        assert run.episode[step, k] == 1
+        assert torch.equal(run.qpos[:step, k], rec.qpos[:step, k])
         for group in cfg.observation:
-            assert torch.equal(getattr(run, f"final.{group}")[frame, k], getattr(rec, f"obs.{group}")[frame, k])
+            assert torch.equal(
+                getattr(run, f"final.{group}")[step, k], getattr(rec, f"obs.{group}")[step, k]
+            )
     assert not run.truncated.any()
 
 
 # Success of the stack task against NumPy
 
 
-def rested(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray, cfg: Config, since: np.ndarray) -> np.ndarray:
-    """Rules 4 and 5 over the window that ends at each frame, and an open gripper in that frame.
+def rested(
+    pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray, cfg: Config, since: np.ndarray
+) -> np.ndarray:
+    """Rules 4 and 5 over the window that ends at each step, and an open gripper in that step.
 
     Args:
-        pose: Shape ``(frames, 2, 7)``.
-        velocity: Shape ``(frames, 2, 6)``.
-        opening: Of every finger, shape ``(frames, n)``.
+        pose: Shape ``(steps, 2, 7)``.
+        velocity: Shape ``(steps, 2, 6)``.
+        opening: Of every finger, shape ``(steps, n)``.
         cfg: Thresholds, table and cubes.
-        since: First frame of the episode that each frame belongs to, shape ``(frames,)``.
+        since: First frame of the episode that each step belongs to, shape ``(steps,)``.
     """
-    t, scene = cfg.gate.acceptance, cfg.scene
-    half, top = scene.cube_half, table_top(cfg)
-    red, blue = pose[:, RED], pose[:, BLUE]
+    t = cfg.gate.acceptance
+    scene = cfg.scene
+    half = scene.cube_half
+    top = table_top(cfg)
+    red = pose[:, RED]
+    blue = pose[:, BLUE]
     good = np.linalg.norm(red[:, :2] - blue[:, :2], axis=1) <= t.xy_err
     good &= (red[:, 2] - blue[:, 2] >= t.dz_min) & (red[:, 2] - blue[:, 2] <= t.dz_max)
     for i, p in enumerate(blue):
         good[i] &= bool(np.isfinite(p).all()) and abs(lowest_corner(p, half) - top) <= t.support_gap
-        good[i] &= all(abs(p[j] - scene.table_center[j]) <= scene.table_half[j] - half for j in (0, 1))
-    speed = np.linalg.norm(velocity[..., :3], axis=-1) + math.sqrt(3.0) * half * np.linalg.norm(velocity[..., 3:], axis=-1)
+        good[i] &= all(
+            abs(p[j] - scene.table_center[j]) <= scene.table_half[j] - half for j in (0, 1)
+        )
+    speed = np.linalg.norm(velocity[..., :3], axis=-1) + math.sqrt(3.0) * half * np.linalg.norm(
+        velocity[..., 3:], axis=-1
+    )
     out = np.zeros(len(pose), dtype=bool)
-    for frame in range(t.window - 1, len(pose)):
-        part = slice(frame - t.window + 1, frame + 1)
-        if part.start < since[frame] or not good[part].all() or not (opening[frame] >= 0.8).all():
+    for step in range(t.window - 1, len(pose)):
+        part = slice(step - t.window + 1, step + 1)
+        if part.start < since[step] or not good[part].all() or not (opening[step] >= 0.8).all():
             continue
         rms = np.sqrt(np.square(speed[part]).mean(0))
-        places, turns = pose[part, :, :3], pose[part, :, 3:]
+        places = pose[part, :, :3]
+        turns = pose[part, :, 3:]
         distance = np.linalg.norm(places[:, None] - places[None], axis=-1).max()
         chord = np.minimum(
-            np.linalg.norm(turns[:, None] - turns[None], axis=-1), np.linalg.norm(turns[:, None] + turns[None], axis=-1)
+            np.linalg.norm(turns[:, None] - turns[None], axis=-1),
+            np.linalg.norm(turns[:, None] + turns[None], axis=-1),
         )
         angle = 4.0 * np.arcsin(np.minimum(1.0, 0.5 * chord)).max()
-        out[frame] = (rms <= t.rest_speed).all() and distance <= t.rest_position and angle <= math.radians(t.rest_rotation_deg)
+        out[step] = (
+            (rms <= t.rest_speed).all()
+            and distance <= t.rest_position
+            and angle <= math.radians(t.rest_rotation_deg)
+        )
     return out
 
 
 FROM = 115  # where trajectories are altered: the world has been successful for a while
 Alter = Callable[[np.ndarray, np.ndarray, np.ndarray], None]
-VARIANTS: dict[str, tuple[Alter | None, bool]] = {}  # what is done, and whether the world is successful again at the end
+VARIANTS: dict[
+    str, tuple[Alter | None, bool]
+] = {}  # what is done, and whether the world is successful again at the end
 
 
 def variant(*, recovers: bool) -> Callable[[Alter], Alter]:
@@ -421,10 +505,10 @@ def both_shifted(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) ->
 def red_rotated(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
     half = math.radians(4.0) / 2.0
     turn = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
-    for frame in range(FROM, len(pose)):
+    for step in range(FROM, len(pose)):
         out = np.zeros(4)
-        mujoco.mju_mulQuat(out, turn, pose[frame, RED, 3:])
-        pose[frame, RED, 3:] = out
+        mujoco.mju_mulQuat(out, turn, pose[step, RED, 3:])
+        pose[step, RED, 3:] = out
 
 
 @variant(recovers=True)
@@ -433,15 +517,17 @@ def other_sign(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> N
 
 
 @variant(recovers=True)
-def red_shifted_for_one_frame(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+def red_shifted_for_one_step(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
     pose[FROM, RED, 2] += 0.0065
 
 
 @variant(recovers=True)
-def at_the_edge_and_beyond_for_one_frame(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+def at_the_edge_and_beyond_for_one_step(
+    pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray
+) -> None:
     pose[:, RED, 0] = pose[:, BLUE, 0] + 0.0135
     pose[:, RED, 1] = pose[:, BLUE, 1]
-    pose[FROM, RED, 0] += 0.003  # not stacked in this frame, though it would pass as at rest
+    pose[FROM, RED, 0] += 0.003  # not stacked in this step, though it would pass as at rest
 
 
 @variant(recovers=True)
@@ -471,7 +557,9 @@ def kicked(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
 
 @variant(recovers=True)
 def kicked_gently(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
-    velocity[FROM, RED, :3] = 0.15  # far above the threshold for one frame, below it as RMS over the window
+    velocity[FROM, RED, :3] = (
+        0.15  # far above the threshold for one step, below it as RMS over the window
+    )
 
 
 @variant(recovers=True)
@@ -500,52 +588,80 @@ def broken_and_started_anew(pose: np.ndarray, velocity: np.ndarray, opening: np.
     velocity[FROM - 1, BLUE, 1] = math.inf
 
 
-def assert_success(rec: SimpleNamespace, worlds: list[tuple[str, torch.Tensor, torch.Tensor]], expected: np.ndarray) -> None:
-    """The term says what is expected, shape ``(worlds, frames)``; some worlds start anew when their trajectory is altered."""
+def assert_success(
+    rec: SimpleNamespace, worlds: list[tuple[str, torch.Tensor, torch.Tensor]], expected: np.ndarray
+) -> None:
+    """The term says what is expected, shape ``(worlds, steps)``; some worlds start anew when their
+    trajectory is altered.
+    """
     names, qpos, qvel = zip(*worlds, strict=True)
     state = torch.stack(qpos, 1), torch.stack(qvel, 1)
-    env = SimpleNamespace(nworld=len(names), device=torch.device("cpu"), cfg=rec.cfg, index=rec.index, sim=SimpleNamespace())
-    env.sim.qpos, env.sim.qvel = state[0][0], state[1][0]
+    env = SimpleNamespace(
+        nworld=len(names),
+        device=torch.device("cpu"),
+        cfg=rec.cfg,
+        index=rec.index,
+        sim=SimpleNamespace(),
+    )
+    env.sim.qpos = state[0][0]
+    env.sim.qvel = state[1][0]
     term = StackSuccess(env, open_fraction=0.8)
     anew = torch.tensor(["anew" in name for name in names])
-    for frame, want in enumerate(expected.T.tolist()):
-        if frame == FROM:
+    for step, want in enumerate(expected.T.tolist()):
+        if step == FROM:
             term.reset(anew)
-        env.sim.qpos, env.sim.qvel = state[0][frame], state[1][frame]
+        env.sim.qpos = state[0][step]
+        env.sim.qvel = state[1][step]
         got = term(env).tolist()
-        assert got == want, f"frame {frame}: {[name for name, a, b in zip(names, got, want, strict=True) if a != b]}"
+        assert got == want, (
+            f"step {step}: {[name for name, a, b in zip(names, got, want, strict=True) if a != b]}"
+        )
 
 
-def test_stack_success_is_rules_four_and_five(robot: str, scripted: Callable[[str], SimpleNamespace]) -> None:
-    """Frame by frame, over the recorded episodes and altered ends of the first, some of whose worlds start anew in between."""
+def test_stack_success_is_rules_four_and_five(
+    robot: str, scripted: Callable[[str], SimpleNamespace]
+) -> None:
+    """Step by step, over the recorded episodes and altered ends of the first, some of whose worlds
+    start anew in between.
+    """
     rec = scripted(robot)
-    closed, opened = (np.array(v) for v in (rec.cfg.robot.gripper_closed, rec.cfg.robot.gripper_open))
+    closed, opened = (
+        np.array(v) for v in (rec.cfg.robot.gripper_closed, rec.cfg.robot.gripper_open)
+    )
     gripper = torch.from_numpy(rec.index.robot_qpos[rec.index.n_arm :])
 
     def opening(qpos: torch.Tensor) -> np.ndarray:
         return (qpos[:, gripper].numpy() - closed) / (opened - closed)
 
-    whole, expected = [], []
+    whole = []
+    expected = []
     for k in range(3):
-        qpos, qvel = rec.qpos[:, k], rec.qvel[:, k]
+        qpos = rec.qpos[:, k]
+        qvel = rec.qvel[:, k]
         whole.append((f"world {k}", qpos, qvel))
-        expected.append(rested(*cubes_of(rec, qpos, qvel), opening(qpos), rec.cfg, np.zeros(len(qpos))))
+        expected.append(
+            rested(*cubes_of(rec, qpos, qvel), opening(qpos), rec.cfg, np.zeros(len(qpos)))
+        )
         assert expected[-1][-1]
         assert not expected[-1][:480].any()
         assert rec.success[:, k].tolist() == expected[-1].tolist()  # what the environment said
     assert_success(rec, whole, np.array(expected))
 
-    # The last 170 frames, and then the cubes just stand there for another 75.
+    # The last 170 steps, and then the cubes just stand there for another 75.
     qpos = torch.cat((rec.qpos[430:, 0], rec.qpos[-1:, 0].expand(75, -1)))
     qvel = torch.cat((rec.qvel[430:, 0], torch.zeros_like(rec.qvel[-1:, 0]).expand(75, -1)))
-    altered, expected = [], []
+    altered = []
+    expected = []
     for name, (alter, recovers) in VARIANTS.items():
-        q, v, fingers = qpos.clone(), qvel.clone(), opening(qpos)
+        q = qpos.clone()
+        v = qvel.clone()
+        fingers = opening(qpos)
         pose, velocity = cubes_of(rec, q, v)
         if alter is not None:
             alter(pose, velocity, fingers)
         for i, (a, b) in enumerate(zip(rec.index.cube_qpos, rec.index.cube_qvel, strict=True)):
-            q[:, a : a + 7], v[:, b : b + 6] = torch.from_numpy(pose[:, i]), torch.from_numpy(velocity[:, i])
+            q[:, a : a + 7] = torch.from_numpy(pose[:, i])
+            v[:, b : b + 6] = torch.from_numpy(velocity[:, i])
         q[:, gripper] = torch.from_numpy(closed + fingers * (opened - closed))
         since = np.where(np.arange(len(q)) >= FROM, FROM, 0) if "anew" in name else np.zeros(len(q))
         want = rested(pose, velocity, fingers, rec.cfg, since)
@@ -556,58 +672,72 @@ def test_stack_success_is_rules_four_and_five(robot: str, scripted: Callable[[st
         altered.append((name, q, v))
         expected.append(want)
     assert_success(rec, altered, np.array(expected))
-    for world, want in zip(altered, expected, strict=True):  # alone, a world that is not stacked now and then says the same
-        if world[0] in ("blue_hops", "at_the_edge_and_beyond_for_one_frame", "broken_and_started_anew"):
+    for world, want in zip(
+        altered, expected, strict=True
+    ):  # alone, a world that is not stacked now and then says the same
+        if world[0] in (
+            "blue_hops",
+            "at_the_edge_and_beyond_for_one_step",
+            "broken_and_started_anew",
+        ):
             assert_success(rec, [world], want[None])
 
 
 # Success of the reach task
 
 
-def test_reach_success_counts_frames_in_a_row() -> None:
-    n, frames = 4, 80
-    near = np.random.default_rng(0).random((frames, n)) < 0.85
-    index = SimpleNamespace(aperture_sites=[0, 2], object_address=lambda name: (3, 0))
+def test_reach_success_counts_steps_in_a_row() -> None:
+    n = 4
+    steps = 80
+    near = np.random.default_rng(0).random((steps, n)) < 0.85
+    index = SimpleNamespace(grasp_sites=[0, 2], object_address=lambda name: (3, 0))
     env = SimpleNamespace(nworld=n, device=torch.device("cpu"), index=index, sim=SimpleNamespace())
-    term = ReachSuccess(env, object="red_cube", height=0.06, distance=0.02, frames=5)
-    run, seen = np.zeros(n, dtype=int), []
-    for frame in range(frames):
-        if frame == 40:
+    term = ReachSuccess(env, object="red_cube", height=0.06, distance=0.02, steps=5)
+    run = np.zeros(n, dtype=int)
+    seen = []
+    for step in range(steps):
+        if step == 40:
             term.reset(torch.tensor([True, False, False, True]))
             run[[0, 3]] = 0
-        rng = np.random.default_rng(frame)
+        rng = np.random.default_rng(step)
         direction = rng.normal(size=(n, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         goal = rng.normal(size=(n, 3))
-        aperture = goal + direction * np.where(near[frame], 0.0199, 0.0201)[:, None]
+        grasp_point = goal + direction * np.where(near[step], 0.0199, 0.0201)[:, None]
         spread = rng.normal(size=(n, 3))
-        env.sim.site_xpos = torch.from_numpy(np.stack((aperture + spread, goal, aperture - spread), axis=1))
+        env.sim.site_xpos = torch.from_numpy(
+            np.stack((grasp_point + spread, goal, grasp_point - spread), axis=1)
+        )
         env.sim.qpos = torch.zeros((n, 10), dtype=torch.float64)
         env.sim.qpos[:, 3:6] = torch.from_numpy(goal - [0.0, 0.0, 0.06])
-        run = np.where(near[frame], run + 1, 0)
+        run = np.where(near[step], run + 1, 0)
         got = term(env)
         seen.append(got.tolist())
-        assert seen[-1] == (run >= 5).tolist(), frame
+        assert seen[-1] == (run >= 5).tolist(), step
     assert 0.2 < np.mean(seen) < 0.8
 
 
-def test_reaching_ends_the_episode_after_ten_frames_in_a_row(backend: str) -> None:
-    """The goal is carried to the aperture: in world 1 all the time, in world 2 with an interruption."""
+def test_reaching_ends_the_episode_after_ten_steps_in_a_row(backend: str) -> None:
+    """The goal is carried to the grasp_point: in world 1 all the time, in world 2 with an
+    interruption.
+    """
     cfg = configure("task=reach", "reset=nominal")
     cfg.termination.pop("cube_off_table")
     env = on_shared_sim(backend, 3, cfg)
     env.reset(seed=0)
     q, v = env.index.objects["red_cube"]
     hold = torch.zeros((3, env.action_manager.action_dim), device=env.device)
-    for frame in range(1, 17):
-        aperture = env.sim.site_xpos[:, env.index.aperture_sites].mean(1)
-        env.sim.qpos[1:, q : q + 3] = aperture[1:] - torch.tensor([0.0, 0.0, cfg.task.goal_height], device=env.device)
+    for step in range(1, 17):
+        grasp_point = env.sim.site_xpos[:, env.index.grasp_sites].mean(1)
+        env.sim.qpos[1:, q : q + 3] = grasp_point[1:] - torch.tensor(
+            [0.0, 0.0, cfg.task.goal_height], device=env.device
+        )
         env.sim.qvel[1:, v : v + 6] = 0.0
-        if frame == 6:
+        if step == 6:
             env.sim.qpos[2, q] += 0.03
         _, _, terminated, truncated, extras = env.step(hold)
-        expected = [False, frame == 10, frame == 16]
-        assert terminated.tolist() == expected, frame
+        expected = [False, step == 10, step == 16]
+        assert terminated.tolist() == expected, step
         assert extras["success"].tolist() == expected
         assert not truncated.any()
         success = env.reward_manager.values[:, list(cfg.reward).index("success")]
@@ -625,7 +755,9 @@ def test_joint_limit_at_its_threshold(robot: str) -> None:
         for sign, end in ((-1, low), (1, high)):
             for part, out in ((0.09, False), (0.11, True)):
                 env.sim.reset()
-                env.sim.qpos[:, torch.from_numpy(env.index.robot_qpos)] = torch.tensor(env.cfg.robot.home).double()
+                env.sim.qpos[:, torch.from_numpy(env.index.robot_qpos)] = torch.tensor(
+                    env.cfg.robot.home
+                ).double()
                 env.sim.qpos[1, env.index.robot_qpos[j]] = end + sign * part * (high - low)
                 assert term(env).tolist() == [False, out, False]
 
@@ -639,7 +771,9 @@ def test_cube_off_table_at_its_threshold(robot: str) -> None:
             for sign in (-1, 1):
                 for by, out in ((-0.001, False), (0.001, True)):
                     env.sim.reset()
-                    env.sim.qpos[2, a + axis] = scene.table_center[axis] + sign * (scene.table_half[axis] + by)
+                    env.sim.qpos[2, a + axis] = scene.table_center[axis] + sign * (
+                        scene.table_half[axis] + by
+                    )
                     assert term(env).tolist() == [False, False, out]
         for by, out in ((0.001, False), (-0.001, True)):
             env.sim.reset()
@@ -654,12 +788,14 @@ class Bench:
     """The smallest thing that managers work on: see mjstack.managers.EnvView."""
 
     def __init__(self, cfg: Config, backend: str, nworld: int) -> None:
-        self.cfg, self.nworld, self.seed = cfg, nworld, cfg.seed
+        self.cfg = cfg
+        self.nworld = nworld
+        self.seed = cfg.seed
         self.sim = new_sim(backend, nworld, cfg.robot.name)
         self.index = SceneIndex(self.sim.model, cfg.robot)
         self.device = self.sim.device
         self.world = torch.arange(nworld, device=self.device)
-        self.episode, self.frame = torch.zeros_like(self.world), torch.zeros_like(self.world)
+        self.episode, self.episode_step = torch.zeros_like(self.world), torch.zeros_like(self.world)
         self.success = torch.zeros(nworld, dtype=torch.bool, device=self.device)
         self.actions: ActionManager | None = None
 
@@ -699,14 +835,16 @@ def test_managers_work_on_any_object_of_that_shape(kind: str) -> None:
     for move, row in zip(moves, expected, strict=True):
         bench.actions.process(move)
         bench.actions.write_commands()
-        bench.sim.step(cfg.timing.substeps, kinematics=True)
-        bench.frame += 1
+        bench.sim.step(cfg.timing.decimation, kinematics=True)
+        bench.episode_step += 1
         ends.compute()
         assert torch.equal(rewards.compute(), row["reward"])
         assert torch.equal(ends.terminated, row["terminated"])
         for group, value in observations.compute().items():
             assert torch.equal(value, row[f"final.{group}"])
-    torch.testing.assert_close(rewards.episode_sums.sum(1), torch.stack([row["reward"] for row in expected]).sum(0))
+    torch.testing.assert_close(
+        rewards.episode_sums.sum(1), torch.stack([row["reward"] for row in expected]).sum(0)
+    )
     before = {name: getattr(bench.sim, name).clone() for name in ("qpos", "qvel", "ctrl")}
     bench.episode += mask_of(env, 1)
     resets.reset(mask_of(env, 1))
@@ -720,7 +858,13 @@ def test_managers_work_on_any_object_of_that_shape(kind: str) -> None:
         (bench.actions, cfg.action),
         (ends, cfg.termination),
         (rewards, cfg.reward),
-        (observations, [*cfg.observation, *(name for group in cfg.observation.values() for name in group.terms)]),
+        (
+            observations,
+            [
+                *cfg.observation,
+                *(name for group in cfg.observation.values() for name in group.terms),
+            ],
+        ),
     ):
         text = str(manager)
         for name in names:
@@ -755,11 +899,15 @@ def test_tables_show_settings_and_the_environment_shows_all_tables() -> None:
 
 def test_overrides_change_exactly_what_they_name() -> None:
     env = make_env(
-        ["sim=native", "action=ee_delta", "reset=nominal", "~reward.grasp", "reward.lift.weight=3"], nworld=2, seed=5
+        ["sim=native", "action=ee_delta", "reset=nominal", "~reward.grasp", "reward.lift.weight=3"],
+        nworld=2,
+        seed=5,
     )
     expected = configure("sim=native")
-    expected.nworld, expected.seed = 2, 5
-    expected.action, expected.reset = configure("action=ee_delta").action, configure("reset=nominal").reset
+    expected.nworld = 2
+    expected.seed = 5
+    expected.action = configure("action=ee_delta").action
+    expected.reset = configure("reset=nominal").reset
     expected.reward.pop("grasp")
     expected.reward["lift"].weight = 3.0
     assert env.cfg == expected
@@ -767,7 +915,14 @@ def test_overrides_change_exactly_what_they_name() -> None:
     assert list(env.action_manager.terms) == ["arm", "gripper"]
     assert type(env.action_manager.terms["arm"]).__name__ == "EndEffectorDelta"
     assert env.action_manager.action_dim == 4
-    assert env.reward_manager.names == ["reach", "lift", "place", "success", "action_rate", "joint_vel"]
+    assert env.reward_manager.names == [
+        "reach",
+        "lift",
+        "place",
+        "success",
+        "action_rate",
+        "joint_vel",
+    ]
     assert "3.0" in next(line for line in str(env.reward_manager).splitlines() if "lift" in line)
     assert (env.nworld, env.seed) == (2, 5)
     env.reset()
@@ -776,7 +931,7 @@ def test_overrides_change_exactly_what_they_name() -> None:
     env.sim.qpos[:, env.index.cube_qpos[0] + 2] += 0.2
     env.step(torch.zeros(2, 4))
     column = env.reward_manager.values[:, 1]
-    torch.testing.assert_close(column, torch.full_like(column, 3.0 * env.cfg.timing.frame_dt))
+    torch.testing.assert_close(column, torch.full_like(column, 3.0 * env.cfg.timing.step_dt))
     env.close()
 
 
@@ -796,7 +951,8 @@ def corners(pose: np.ndarray, half: float) -> np.ndarray:
     return (pose[:3, None] + rotation_matrix(pose[3:]) @ (half * signs)).T
 
 
-# Half-widths of a region in which cubes overlap, leave the table or hit the arm unless each is placed with care.
+# Half-widths of a region in which cubes overlap, leave the table or hit the arm unless each is
+# placed with care.
 WIDE = {"so101": [0.12, 0.15], "rebot": [0.10, 0.20]}
 
 
@@ -807,7 +963,8 @@ def test_cubes_start_on_the_table_and_touch_nothing_else(robot: str, reset: str)
         cfg.reset["cubes"].params.update(xy=WIDE[robot], candidates=32)
         cfg.controller.ik_tolerance = 1.0  # the arm does not get to all of it
     env = start_of(cfg)
-    m, scene = env.sim.model, env.cfg.scene
+    m = env.sim.model
+    scene = env.cfg.scene
     data = mujoco.MjData(m)
     table = m.geom("table").id
     cubes = [m.geom(name).id for name in CUBES]
@@ -821,7 +978,9 @@ def test_cubes_start_on_the_table_and_touch_nothing_else(robot: str, reset: str)
             assert np.ptp(at[:, 2]) == pytest.approx(2.0 * scene.cube_half)
             assert (np.abs(at[:, :2] - scene.table_center[:2]) <= scene.table_half[:2]).all()
         touching = {tuple(sorted(contact.geom)) for contact in data.contact}
-        assert {pair for pair in touching if set(pair) & {*cubes}} <= {tuple(sorted((table, cube))) for cube in cubes}
+        assert {pair for pair in touching if set(pair) & {*cubes}} <= {
+            tuple(sorted((table, cube))) for cube in cubes
+        }
         gap = min(gap, mujoco.mj_geomDistance(m, data, *cubes, 1.0, None))
         np.testing.assert_array_equal(env.sim.qvel[k], 0.0)
     assert gap > (0.01 if reset in ("randomized", "wide") else 0.0)
@@ -830,7 +989,8 @@ def test_cubes_start_on_the_table_and_touch_nothing_else(robot: str, reset: str)
 def test_home_jitter_and_noise_stay_within_their_widths(robot: str) -> None:
     nominal = start_of(configure("reset=nominal", robot=robot))
     qpos0 = torch.from_numpy(nominal.sim.model.qpos0.copy())
-    columns, ctrl = torch.from_numpy(nominal.index.robot_qpos), torch.from_numpy(nominal.index.ctrl)
+    columns = torch.from_numpy(nominal.index.robot_qpos)
+    ctrl = torch.from_numpy(nominal.index.ctrl)
     home = torch.tensor(nominal.cfg.robot.home, dtype=torch.float64)
     expected = qpos0.clone()
     expected[columns] = home
@@ -856,10 +1016,14 @@ def test_home_jitter_and_noise_stay_within_their_widths(robot: str) -> None:
     assert torch.equal(noisy.sim.qpos[:, columns], noisy.sim.ctrl[:, ctrl])
     assert off[:, :n_arm].abs().max() <= 0.02 + 1e-12
     limits = torch.from_numpy(noisy.index.ctrl_range)
-    assert ((noisy.sim.ctrl[:, ctrl] >= limits[:, 0]) & (noisy.sim.ctrl[:, ctrl] <= limits[:, 1])).all()
+    assert (
+        (noisy.sim.ctrl[:, ctrl] >= limits[:, 0]) & (noisy.sim.ctrl[:, ctrl] <= limits[:, 1])
+    ).all()
     assert not off[:, n_arm:].any()
     for j in range(n_arm):
-        assert len(torch.unique(off[:, j])) > MANY // 3, j  # home may lie on a limit, as the SO-101's does not
+        assert len(torch.unique(off[:, j])) > MANY // 3, (
+            j
+        )  # home may lie on a limit, as the SO-101's does not
     for a in noisy.index.cube_qpos:
         off = noisy.sim.qpos[:, a : a + 2] - qpos0[a : a + 2]
         yaw = 2.0 * torch.atan2(noisy.sim.qpos[:, a + 6], noisy.sim.qpos[:, a + 3])
@@ -868,13 +1032,17 @@ def test_home_jitter_and_noise_stay_within_their_widths(robot: str) -> None:
         assert (off.amax(0) > 0.7 * half).all()
         assert (off.amin(0) < -0.7 * half).all()  # some places are taken by the arm
         # Whole turns: every quarter of them is taken.
-        assert torch.histc(torch.remainder(yaw, 2 * math.pi), 4, 0.0, 2 * math.pi).min() > MANY // 10
+        assert (
+            torch.histc(torch.remainder(yaw, 2 * math.pi), 4, 0.0, 2 * math.pi).min() > MANY // 10
+        )
 
 
 def test_masses_friction_and_gains_are_drawn_anew_from_the_models_own(robot: str) -> None:
     env = start_of(configure("reset=randomized", robot=robot))
-    m, index = env.sim.model, env.index
-    bodies, geoms = [m.body(name).id for name in CUBES], [m.geom(name).id for name in CUBES]
+    m = env.sim.model
+    index = env.index
+    bodies = [m.body(name).id for name in CUBES]
+    geoms = [m.geom(name).id for name in CUBES]
     servos = torch.from_numpy(index.ctrl)
     seen: dict[str, list[torch.Tensor]] = {"mass": [], "friction": [], "gain": []}
     for _ in range(6):
@@ -889,13 +1057,23 @@ def test_masses_friction_and_gains_are_drawn_anew_from_the_models_own(robot: str
             1.0 / ratio["dof_invweight0"][:, dofs],
         ):
             torch.testing.assert_close(other, mass[..., None].expand_as(other), rtol=1e-6, atol=0)
-        gain = fields["actuator_gainprm"][:, servos, 0] / torch.from_numpy(m.actuator_gainprm)[servos, 0]
-        bias = fields["actuator_biasprm"][:, servos, 1:3] / torch.from_numpy(m.actuator_biasprm)[servos, 1:3]
+        gain = (
+            fields["actuator_gainprm"][:, servos, 0]
+            / torch.from_numpy(m.actuator_gainprm)[servos, 0]
+        )
+        bias = (
+            fields["actuator_biasprm"][:, servos, 1:3]
+            / torch.from_numpy(m.actuator_biasprm)[servos, 1:3]
+        )
         finite = torch.isfinite(bias)  # no damping stays no damping
-        torch.testing.assert_close(bias[finite], gain[..., None].expand_as(bias)[finite], rtol=1e-6, atol=0)
+        torch.testing.assert_close(
+            bias[finite], gain[..., None].expand_as(bias)[finite], rtol=1e-6, atol=0
+        )
         assert finite[..., 0].all()
         partners = [m.geom("table").id]
-        partners += [g for g in range(m.ngeom) if m.body(m.geom_bodyid[g]).name in env.cfg.robot.jaw_bodies]
+        partners += [
+            g for g in range(m.ngeom) if m.body(m.geom_bodyid[g]).name in env.cfg.robot.jaw_bodies
+        ]
         seen["mass"].append(mass)
         seen["friction"].append(fields["geom_friction"][:, geoms, 0])
         seen["gain"].append(gain)
@@ -917,7 +1095,8 @@ def test_masses_friction_and_gains_are_drawn_anew_from_the_models_own(robot: str
         margin = 0.03 * (high - low)
         assert (values >= low - 1e-9).all()
         assert (values <= high + 1e-9).all()
-        # The whole range in every episode: factors upon factors would leave it or close in on something.
+        # The whole range in every episode: factors upon factors would leave it or close in on
+        # something.
         assert (values.amin((1, 2)) < low + margin).all()
         assert (values.amax((1, 2)) > high - margin).all()
         assert len(torch.unique(values[0, :, 0])) == MANY
@@ -934,11 +1113,20 @@ def test_a_masked_reset_draws_for_its_worlds_alone(robot: str) -> None:
     mask = torch.rand(MANY, generator=torch.Generator().manual_seed(0)) < 0.3
     env.reset(mask=mask)
     after = held(env)
-    changed = ("qpos", "ctrl", "episode", "fields.body_mass", "fields.geom_friction", "fields.actuator_gainprm")
+    changed = (
+        "qpos",
+        "ctrl",
+        "episode",
+        "fields.body_mass",
+        "fields.geom_friction",
+        "fields.actuator_gainprm",
+    )
     for name in before:
         assert torch.equal(after[name][~mask], before[name][~mask]), name
     for name in changed:
-        differs = (after[name][mask] != before[name][mask]).flatten(1 if before[name].dim() > 1 else 0)
+        differs = (after[name][mask] != before[name][mask]).flatten(
+            1 if before[name].dim() > 1 else 0
+        )
         assert (differs.any(1) if differs.dim() > 1 else differs).all(), name
 
 
@@ -946,8 +1134,9 @@ def test_terms_with_parameters_are_built_once() -> None:
     """A class is built with its parameters, a function is called with them."""
     env = on_shared_sim("native", 3, configure())
     cfg = env.cfg.termination
-    limit, clock = Term("a", cfg["joint_limit"], env), Term("b", cfg["time_out"], env)
-    env.frame.copy_(torch.tensor([599, 600, 601]))
+    limit = Term("a", cfg["joint_limit"], env)
+    clock = Term("b", cfg["time_out"], env)
+    env.episode_step.copy_(torch.tensor([599, 600, 601]))
     assert clock(env).tolist() == [False, True, True]
     assert limit(env).tolist() == [False] * 3
     limit.reset(mask_of(env, 1))  # no memory, nothing to forget

@@ -14,16 +14,16 @@ import pytest
 import torch
 from environments import brisk
 
+from mjstack.bench import env_step, power, sections
+from mjstack.bench.env_step import measure_env_step
+from mjstack.bench.power import EnergyMeter
+from mjstack.bench.timing import Timing, capture_problem, steps_that_fit, timed
 from mjstack.config import load_config
 from mjstack.config.schema import GraphMode
 from mjstack.envs import build_env
-from mjstack.gates import env_step, power, sections
-from mjstack.gates.env_step import measure_env_step
-from mjstack.gates.episode import State, run_episode
-from mjstack.gates.gate import GateContext
-from mjstack.gates.power import EnergyMeter
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.rollout import State, run_episode
 from mjstack.gates.throughput import run_throughput
-from mjstack.gates.timing import Timing, capture_problem, frames_that_fit, timed
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation
 from mjstack.sim.native import NativeSimulation
@@ -31,8 +31,8 @@ from mjstack.sim.native import NativeSimulation
 SHORT = (
     "gates=[throughput]",
     "gate.throughput.repetitions=3",
-    "gate.throughput.frames=3",
-    "gate.throughput.env_frames=2",
+    "gate.throughput.steps=3",
+    "gate.throughput.env_steps=2",
     "gate.throughput.cpu_max_seconds=120",
     *brisk(),
 )
@@ -41,24 +41,47 @@ SPEEDS = ("per_s", "ms_per", "seconds", "ratio", "over_physics", "power")
 
 def speeds(result: GateResult, section: str = "") -> list[str]:
     """Metrics that say how fast something was."""
-    named = [name for name in result.metrics if name.startswith(section) and any(word in name for word in SPEEDS)]
+    named = [
+        name
+        for name in result.metrics
+        if name.startswith(section) and any(word in name for word in SPEEDS)
+    ]
     return [name for name in named if name != "gpu_power_and_memory"]
 
 
 def test_timing_is_arithmetic() -> None:
-    timing = Timing(nworld=4, frames=5, substeps=10, seconds=[2.0, 0.5, 1.0])
+    timing = Timing(nworld=4, steps=5, decimation=10, seconds=[2.0, 0.5, 1.0])
     assert timing.median == 1.0
     assert timing.world_steps_per_s == 200.0
-    step, frame = timing.step_metrics(), timing.frame_metrics()
-    assert [step[f"ms_per_batched_step.{k}"] for k in ("median", "min", "max")] == [20.0, 10.0, 40.0]
-    assert [step[f"world_steps_per_s.{k}"] for k in ("median", "min", "max")] == [200.0, 100.0, 400.0]
-    assert [frame[f"ms_per_env_step.{k}"] for k in ("median", "min", "max")] == [200.0, 100.0, 400.0]
-    assert [frame[f"env_steps_per_s.{k}"] for k in ("median", "min", "max")] == [20.0, 10.0, 40.0]
+    step = timing.step_metrics()
+    env_rates = timing.env_step_metrics()
+    assert [step[f"ms_per_batched_step.{k}"] for k in ("median", "min", "max")] == [
+        20.0,
+        10.0,
+        40.0,
+    ]
+    assert [step[f"world_steps_per_s.{k}"] for k in ("median", "min", "max")] == [
+        200.0,
+        100.0,
+        400.0,
+    ]
+    assert [env_rates[f"ms_per_env_step.{k}"] for k in ("median", "min", "max")] == [
+        200.0,
+        100.0,
+        400.0,
+    ]
+    assert [env_rates[f"env_steps_per_s.{k}"] for k in ("median", "min", "max")] == [
+        20.0,
+        10.0,
+        40.0,
+    ]
 
 
-@pytest.mark.parametrize(("budget", "frame", "fit"), [(10.0, 1.0, 10), (10.0, 0.1, 25), (0.5, 1.0, 1), (2.5, 1.0, 2)])
-def test_frames_fit_into_the_time(budget: float, frame: float, fit: int) -> None:
-    assert frames_that_fit(25, budget, frame) == fit
+@pytest.mark.parametrize(
+    ("budget", "step", "fit"), [(10.0, 1.0, 10), (10.0, 0.1, 25), (0.5, 1.0, 1), (2.5, 1.0, 2)]
+)
+def test_steps_fit_into_the_time(budget: float, step: float, fit: int) -> None:
+    assert steps_that_fit(25, budget, step) == fit
 
 
 def test_timed_waits_for_the_device_at_both_ends() -> None:
@@ -73,28 +96,36 @@ def test_native_sections(new_context: Callable[..., GateContext]) -> None:
     assert result.status is Status.passed, result.reason
     assert cuda.status is Status.skipped or torch.cuda.is_available()
     m = result.metrics
-    assert (m["worlds"], m["physics.repetitions"], m["physics.frames_per_repetition"]) == (2, 3, 3)
-    assert (m["episode.accepted"], m["episode.repetitions"], m["episode.frames"]) == (2, 3, 300)
-    assert (m["env_step.turns"], m["env_step.frames_per_turn"]) == (3, 2)
+    assert (m["worlds"], m["physics.repetitions"], m["physics.steps_per_repetition"]) == (2, 3, 3)
+    assert (m["episode.succeeded"], m["episode.repetitions"], m["episode.steps"]) == (2, 3, 300)
+    assert (m["env_step.turns"], m["env_step.steps_per_turn"]) == (3, 2)
     for section in ("physics", "episode", "env_step"):
         # With three repetitions the median of the rates is the rate of the median.
-        ms, rate = m[f"{section}.ms_per_batched_step.median"], m[f"{section}.world_steps_per_s.median"]
+        ms = m[f"{section}.ms_per_batched_step.median"]
+        rate = m[f"{section}.world_steps_per_s.median"]
         assert rate == pytest.approx(2 * 1e3 / ms)
-        assert m[f"{section}.ms_per_batched_step.min"] <= ms <= m[f"{section}.ms_per_batched_step.max"]
-    assert m["episode.seconds.median"] == pytest.approx(3.0 * m["episode.ms_per_batched_step.median"])
+        assert (
+            m[f"{section}.ms_per_batched_step.min"] <= ms <= m[f"{section}.ms_per_batched_step.max"]
+        )
+    assert m["episode.seconds.median"] == pytest.approx(
+        3.0 * m["episode.ms_per_batched_step.median"]
+    )
     assert m["env_step.managers_over_physics.median"] > 0.0
-    assert m["env_step.managers_ms_per_frame.median"] < m["env_step.ms_per_env_step.max"]
+    assert m["env_step.managers_ms_per_step.median"] < m["env_step.ms_per_env_step.max"]
     assert m["gpu_power_and_memory"] == "not measured: no GPU"
     for section in ("physics", "episode", "env_step"):
         assert m[f"{section}.captured"] is False  # native MuJoCo has nothing to capture
         assert m[f"{section}.warm_up_s"] == m[f"{section}.capture_s"] == 0.0
-    alone, over = m["env_step.managers_alone_over_physics.median"], m["env_step.managers_over_physics.median"]
+    alone = m["env_step.managers_alone_over_physics.median"]
+    over = m["env_step.managers_over_physics.median"]
     assert f"managers {100.0 * over:+.1f} % (alone {100.0 * alone:.1f} %)" in result.reason
     assert "(eager)" not in result.reason
     assert not any("bare" in name for name in m)
 
 
-def test_episode_alternates_with_bare_steps_on_mjwarp(new_context: Callable[..., GateContext]) -> None:
+def test_episode_alternates_with_bare_steps_on_mjwarp(
+    new_context: Callable[..., GateContext],
+) -> None:
     context = new_context(
         "sim=mjwarp",
         "sim.device=cpu",
@@ -106,10 +137,12 @@ def test_episode_alternates_with_bare_steps_on_mjwarp(new_context: Callable[...,
     result, _ = run_throughput(context)
     assert result.status is Status.passed, result.reason
     m = result.metrics
-    assert m["episode.accepted"] == 1
-    assert m["episode.bare_ratio.median"] == pytest.approx(m["episode.seconds.median"] / m["episode.bare_seconds.median"])
+    assert m["episode.succeeded"] == 1
+    assert m["episode.bare_ratio.median"] == pytest.approx(
+        m["episode.seconds.median"] / m["episode.bare_seconds.median"]
+    )
     assert "x bare steps" in result.reason
-    # Warp's CPU device: physics is captured, the frame around it is not.
+    # Warp's CPU device: physics is captured, the step around it is not.
     assert (m["episode.captured"], m["episode.physics_captured"]) == (False, True)
     assert m["episode.warm_up_s"] > 0.0
     assert m["episode.capture_s"] > 0.0
@@ -117,7 +150,9 @@ def test_episode_alternates_with_bare_steps_on_mjwarp(new_context: Callable[...,
 
 def test_warm_up_and_capture_are_apart_on_mjwarp(new_context: Callable[..., GateContext]) -> None:
     sections_ = "gate.throughput.sections=[physics,env_step]"
-    result, _ = run_throughput(new_context("sim=mjwarp", "sim.device=cpu", "nworld=1", *SHORT, sections_))
+    result, _ = run_throughput(
+        new_context("sim=mjwarp", "sim.device=cpu", "nworld=1", *SHORT, sections_)
+    )
     assert result.status is Status.passed, result.reason
     m = result.metrics
     for section in ("physics", "env_step"):
@@ -125,7 +160,7 @@ def test_warm_up_and_capture_are_apart_on_mjwarp(new_context: Callable[..., Gate
         assert m[f"{section}.capture_s"] > 0.0
     assert m["physics.captured"] is True
     assert (m["env_step.captured"], m["env_step.physics_captured"]) == (False, True)
-    # The first call of a frame was neither timed nor the estimate: eager it takes some 0.15 s.
+    # The first call of a step was neither timed nor the estimate: eager it takes some 0.15 s.
     assert 1e-3 * m["physics.ms_per_batched_step.max"] * 10 < m["physics.warm_up_s"]
 
 
@@ -139,16 +174,23 @@ def test_warm_up_and_capture_are_apart_on_mjwarp(new_context: Callable[..., Gate
         ("cpu", GraphMode.auto, False, False),
     ],
 )
-def test_eager_work_is_void_where_it_should_be_captured(device: str, mode: GraphMode, captured: bool, void: bool) -> None:
+def test_eager_work_is_void_where_it_should_be_captured(
+    device: str, mode: GraphMode, captured: bool, void: bool
+) -> None:
     sim: Any = SimpleNamespace(device=torch.device(device))
     assert bool(capture_problem(sim, mode, captured)) is void
 
 
 def test_bare_steps_play_the_same_trajectory(
-    new_context: Callable[..., GateContext], make_sim: Callable[..., Simulation], monkeypatch: pytest.MonkeyPatch
+    new_context: Callable[..., GateContext],
+    make_sim: Callable[..., Simulation],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Warp's CPU device is bit-reproducible: whatever else a step does, the physics of both is the same."""
-    context, sim = new_context("nworld=1", *brisk()), make_sim("mjwarp", 1)
+    """Warp's CPU device is bit-reproducible: whatever else a step does, the physics of both is the
+    same.
+    """
+    context = new_context("nworld=1", *brisk())
+    sim = make_sim("mjwarp", 1)
     run_episode(sim, context.index, context.cfg, context.planner, context.cfg.reset)
     final = sim.qpos.clone()
     seconds, problem = sections._play_bare(context, sim)  # type: ignore[arg-type]
@@ -160,15 +202,18 @@ def test_bare_steps_play_the_same_trajectory(
 
 
 def test_bare_steps_that_lose_worlds_do_not_count(
-    new_context: Callable[..., GateContext], make_sim: Callable[..., Simulation], monkeypatch: pytest.MonkeyPatch
+    new_context: Callable[..., GateContext],
+    make_sim: Callable[..., Simulation],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """8 rows do not hold two cubes on a table. What bare steps lose is counted once, after them."""
-    context, sim = new_context("nworld=1"), make_sim("mjwarp", 1, "batch.njmax=8")
+    context = new_context("nworld=1")
+    sim = make_sim("mjwarp", 1, "batch.njmax=8")
     start = sections.start_worlds
 
     def short(*args: Any) -> Any:
         env, controller = start(*args)
-        return env, SimpleNamespace(frames=2, command=controller.command)
+        return env, SimpleNamespace(steps=2, command=controller.command)
 
     monkeypatch.setattr(sections, "start_worlds", short)
     assert sections._play_bare(context, sim)[1] == "1 worlds overflowed or diverged with bare steps"  # type: ignore[arg-type]
@@ -176,13 +221,19 @@ def test_bare_steps_that_lose_worlds_do_not_count(
 
 def test_rejected_episode_voids_every_section(new_context: Callable[..., GateContext]) -> None:
     result, _ = run_throughput(
-        new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.repetitions=1", "gate.acceptance.xy_err=1e-7")
+        new_context(
+            "sim=native",
+            "nworld=2",
+            *SHORT,
+            "gate.throughput.repetitions=1",
+            "gate.acceptance.xy_err=1e-7",
+        )
     )
     assert result.status is Status.failed
     assert result.reason.count("no figure") == 3
-    assert "2 of 2 worlds (0, 1) failed the acceptance" in result.reason
+    assert "2 of 2 worlds (0, 1) failed the check" in result.reason
     assert speeds(result) == []
-    assert result.metrics["episode.accepted"] == 0
+    assert result.metrics["episode.succeeded"] == 0
 
 
 @pytest.mark.parametrize("section", ["physics", "env_step"])
@@ -195,7 +246,7 @@ def test_overflow_voids_the_figure(new_context: Callable[..., GateContext], sect
             "nworld=2",
             *SHORT,
             f"gate.throughput.sections=[{section}]",
-            "gate.throughput.env_frames=20",
+            "gate.throughput.env_steps=20",
             "batch.njmax=40",
         )
     )
@@ -204,27 +255,38 @@ def test_overflow_voids_the_figure(new_context: Callable[..., GateContext], sect
     assert speeds(result) == []
 
 
-def test_steps_not_made_void_the_figure(new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_not_made_void_the_figure(
+    new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
     step = NativeSimulation.step
 
     def lazy(self: NativeSimulation, n: int = 1, *, kinematics: bool = False) -> None:
         step(self, max(1, n - 1), kinematics=kinematics)
 
     monkeypatch.setattr(NativeSimulation, "step", lazy)
-    result, _ = run_throughput(new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.sections=[physics]"))
+    result, _ = run_throughput(
+        new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.sections=[physics]")
+    )
     assert result.status is Status.failed
     assert "physics: no figure: 2 worlds overflowed, diverged or were not stepped" in result.reason
     assert speeds(result) == []
 
 
-def test_broken_section_leaves_the_others(new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_broken_section_leaves_the_others(
+    new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def out_of_memory(*_: object, **__: object) -> None:
         raise MemoryError("Unable to allocate 9 GiB")
 
     monkeypatch.setattr(sections, "measure_env_step", out_of_memory)
-    result, _ = run_throughput(new_context("sim=native", "nworld=1", *SHORT, "gate.throughput.sections=[physics,env_step]"))
+    result, _ = run_throughput(
+        new_context("sim=native", "nworld=1", *SHORT, "gate.throughput.sections=[physics,env_step]")
+    )
     assert result.status is Status.failed
-    assert "env_step: no figure: MemoryError: Unable to allocate 9 GiB (run.log has the traceback)" in result.reason
+    assert (
+        "env_step: no figure: MemoryError: Unable to allocate 9 GiB (run.log has the traceback)"
+        in result.reason
+    )
     assert speeds(result, "env_step") == []
     assert speeds(result, "physics") != []
 
@@ -236,7 +298,9 @@ def test_broken_episode_does_not_verify_the_task(
         raise RuntimeError("bad")
 
     monkeypatch.setattr(sections, "run_episode", broken)
-    context = new_context("sim=native", "nworld=1", *SHORT, "gate.throughput.sections=[physics,episode]")
+    context = new_context(
+        "sim=native", "nworld=1", *SHORT, "gate.throughput.sections=[physics,episode]"
+    )
     result, _ = run_throughput(context)
     assert result.status is Status.failed
     assert "episode: no figure: RuntimeError: bad" in result.reason
@@ -248,16 +312,20 @@ def test_broken_episode_does_not_verify_the_task(
 
 
 def test_no_time_for_an_episode_is_said(new_context: Callable[..., GateContext]) -> None:
-    result, _ = run_throughput(new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.cpu_max_seconds=1e-4"))
+    result, _ = run_throughput(
+        new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.cpu_max_seconds=1e-4")
+    )
     assert result.status is Status.passed
     assert "episode: not measured: an episode would take about" in result.reason
     assert "the task was not verified in this run" in result.reason
-    assert result.metrics["physics.frames_per_repetition"] == 1
-    assert result.metrics["env_step.frames_per_turn"] == 1
+    assert result.metrics["physics.steps_per_repetition"] == 1
+    assert result.metrics["env_step.steps_per_turn"] == 1
     assert speeds(result, "episode") == []
 
 
-def test_start_states_repeat_without_the_batch_gate(new_context: Callable[..., GateContext]) -> None:
+def test_start_states_repeat_without_the_batch_gate(
+    new_context: Callable[..., GateContext],
+) -> None:
     context = new_context("sim=native", "nworld=5", *SHORT, "gate.throughput.start_worlds=2")
     sim = context.batch_simulation(5)
     state = sections._carry_start(context, sim)
@@ -267,7 +335,9 @@ def test_start_states_repeat_without_the_batch_gate(new_context: Callable[..., G
     red = context.index.cube_qpos[0]
     gripper = context.index.robot_qpos[-1]
     assert np.abs(state.qpos[:, red] - context.cfg.scene.red_xy[0]).max() < 0.03
-    assert state.qpos[:, gripper].max() < context.cfg.robot.gripper_open[0] - 0.1  # closed on the cube
+    assert (
+        state.qpos[:, gripper].max() < context.cfg.robot.gripper_open[0] - 0.1
+    )  # closed on the cube
     kept = State(state.qpos.copy(), state.qvel, state.ctrl)
     context.carry_start = kept
     assert sections._carry_start(context, sim) is kept
@@ -277,7 +347,8 @@ def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., GateC
     """Red beside the jaws in two of five worlds, then in three of them."""
     context = new_context("sim=native", "nworld=5", *SHORT, "gate.throughput.sections=[physics]")
     sim = context.batch_simulation(5)
-    state, red = sections._carry_start(context, sim), context.index.cube_qpos[0]
+    state = sections._carry_start(context, sim)
+    red = context.index.cube_qpos[0]
     state.qpos[[1, 4], red + 1] -= 0.1
     context.carry_start = state
     result, _ = run_throughput(context)
@@ -287,34 +358,42 @@ def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., GateC
     state.qpos[0, red + 1] -= 0.1
     result, _ = run_throughput(context)
     assert result.status is Status.failed
-    assert "physics: no figure: only 2 of 5 worlds have the cube in hand as lift_red begins" in result.reason
+    assert (
+        "physics: no figure: only 2 of 5 worlds have the cube in hand as lift_red begins"
+        in result.reason
+    )
     assert speeds(result, "physics") == []
 
 
 class Witness:
-    """A rival that only looks: where the physics under the recorded commands ends."""
+    """A baseline that only looks: where the physics under the recorded commands ends."""
 
     def __init__(self, sim: Simulation) -> None:
-        self.sim, self.ends, self.frames = sim, [], 0
+        self.sim = sim
+        self.ends = []
+        self.steps = 0
 
     def begin(self) -> None:
-        self.frames = 0
+        self.steps = 0
 
     def record(self) -> None:
-        self.frames += 1
+        self.steps += 1
 
     def play(self) -> None:
         pass
 
     def check(self) -> None:
-        self.ends.append((self.frames, self.sim.qpos.clone()))
+        self.ends.append((self.steps, self.sim.qpos.clone()))
 
 
 def test_the_parts_play_one_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Physics alone ends where the whole step ended, except in worlds that were reset meanwhile, of which there are some."""
-    cfg = load_config(["task=stack", "sim=native", "task.episode_frames=9"])
+    """Physics alone ends where the whole step ended, except in worlds that were reset meanwhile, of
+    which there are some.
+    """
+    cfg = load_config(["task=stack", "sim=native", "task.episode_steps=9"])
     env = build_env(cfg, nworld=12)
-    wholes, take = [], env_step.snapshot
+    wholes = []
+    take = env_step.snapshot
 
     def keep(sim: Simulation) -> State:
         wholes.append((take(sim), env.episode.clone()))
@@ -322,26 +401,36 @@ def test_the_parts_play_one_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(env_step, "snapshot", keep)
     witness = Witness(env.sim)
-    times = measure_env_step(env, frames=4, turns=3, rival=witness)
-    assert len(times.physics_ms) == len(times.managers_ms) == len(times.env_ms) == len(times.rival_ms) == 3
+    times = measure_env_step(env, steps=4, turns=3, baseline=witness)
+    assert (
+        len(times.physics_ms)
+        == len(times.managers_ms)
+        == len(times.env_ms)
+        == len(times.baseline_ms)
+        == 3
+    )
     assert times.overhead == pytest.approx(
         statistics.median(e / p - 1.0 for e, p in zip(times.env_ms, times.physics_ms, strict=True))
     )
-    assert times.managers_alone == [m / p for m, p in zip(times.managers_ms, times.physics_ms, strict=True)]
+    assert times.managers_alone == [
+        m / p for m, p in zip(times.managers_ms, times.physics_ms, strict=True)
+    ]
     for residual, whole_ms, physics_ms, managers_ms in zip(
         times.residual_ms, times.env_ms, times.physics_ms, times.managers_ms, strict=True
     ):
         assert residual + physics_ms + managers_ms == pytest.approx(whole_ms)
     assert times.problem == ""
     ended = 0
-    for (_, before), (whole, after), (frames, alone) in zip(wholes[:-1], wholes[1:], witness.ends, strict=True):
+    for (_, before), (whole, after), (steps, alone) in zip(
+        wholes[:-1], wholes[1:], witness.ends, strict=True
+    ):
         same = (before == after).numpy()
         ended += int((after - before).sum())
-        assert frames == 4
+        assert steps == 4
         assert same.any()
         assert np.array_equal(whole.qpos[same], alone.numpy()[same])
         assert not np.array_equal(whole.qpos[~same], alone.numpy()[~same])
-    assert ended > 12  # 16 frames of episodes of 9: every world once at least
+    assert ended > 12  # 16 steps of episodes of 9: every world once at least
     assert 0 < times.episodes < ended  # the first turn warms up
 
 
@@ -352,7 +441,8 @@ class FakeNvml:
         pass
 
     def __init__(self, refuses: str = "") -> None:
-        self.refuses, self.millijoules = refuses, 0.0
+        self.refuses = refuses
+        self.millijoules = 0.0
 
     def nvmlInit(self) -> None:
         pass
@@ -384,7 +474,10 @@ def test_energy_is_that_of_the_stretches_alone(monkeypatch: pytest.MonkeyPatch) 
         energy.start()
         energy.stop()
         nvml.millijoules += 5e5
-    assert energy.metrics() == {"gpu_power_mean_w": pytest.approx(20.0), "gpu_energy_j": pytest.approx(200.0)}
+    assert energy.metrics() == {
+        "gpu_power_mean_w": pytest.approx(20.0),
+        "gpu_energy_j": pytest.approx(200.0),
+    }
     energy.clear()
     assert "too short" in str(energy.metrics()["gpu_power_mean_w"])
 
@@ -392,26 +485,36 @@ def test_energy_is_that_of_the_stretches_alone(monkeypatch: pytest.MonkeyPatch) 
 def test_the_meter_runs_while_the_work_does() -> None:
     seen: list[str] = []
     sim: Any = SimpleNamespace(synchronize=lambda: seen.append("wait"))
-    energy: Any = SimpleNamespace(start=lambda: seen.append("start"), stop=lambda: seen.append("stop"))
+    energy: Any = SimpleNamespace(
+        start=lambda: seen.append("start"), stop=lambda: seen.append("stop")
+    )
     timed(sim, lambda: seen.append("work"), energy)
     assert seen == ["wait", "start", "work", "wait", "stop"]
 
 
-def test_the_meter_sees_an_episodes_replayed_frames(new_context: Callable[..., GateContext]) -> None:
-    context, seen = new_context("sim=native", "nworld=1"), []
+def test_the_meter_sees_an_episodes_replayed_steps(new_context: Callable[..., GateContext]) -> None:
+    context = new_context("sim=native", "nworld=1")
+    seen = []
     sim = context.batch_simulation(1)
     energy: Any = SimpleNamespace(
-        start=lambda: seen.append(int(sim.step_count[0])), stop=lambda: seen.append(int(sim.step_count[0]))
+        start=lambda: seen.append(int(sim.step_count[0])),
+        stop=lambda: seen.append(int(sim.step_count[0])),
     )
     context.run(sim, context.cfg.reset, meter=energy)
-    assert seen == [20, 6000]  # not the two frames that warm up and are captured
+    assert seen == [20, 6000]  # not the two steps that warm up and are captured
 
 
 @pytest.mark.parametrize(
     ("nvml", "why"),
-    [(None, "nvidia-ml-py is not installed"), (FakeNvml("Not Supported"), "Not Supported"), (FakeNvml(), "too short")],
+    [
+        (None, "nvidia-ml-py is not installed"),
+        (FakeNvml("Not Supported"), "Not Supported"),
+        (FakeNvml(), "too short"),
+    ],
 )
-def test_missing_power_says_why(monkeypatch: pytest.MonkeyPatch, nvml: FakeNvml | None, why: str) -> None:
+def test_missing_power_says_why(
+    monkeypatch: pytest.MonkeyPatch, nvml: FakeNvml | None, why: str
+) -> None:
     energy = meter(monkeypatch, nvml)
     energy.start()
     energy.stop()
@@ -434,10 +537,12 @@ def test_episode_costs_hardly_more_than_bare_steps(new_context: Callable[..., Ga
     assert baseline.status is Status.skipped
     assert result.status is Status.passed, result.reason
     m = result.metrics
-    assert m["episode.accepted"] == 2048
+    assert m["episode.succeeded"] == 2048
     assert m["episode.bare_ratio.median"] <= 1.04
     for section in ("physics", "episode", "env_step"):
-        assert 0.0 < m[f"{section}.gpu_memory_arrays_mib"] <= m[f"{section}.gpu_memory_whole_gpu_mib"]
+        assert (
+            0.0 < m[f"{section}.gpu_memory_arrays_mib"] <= m[f"{section}.gpu_memory_whole_gpu_mib"]
+        )
         watts = m[f"{section}.gpu_power_mean_w"]
         assert str(watts).startswith("not measured: ") or 50.0 < float(watts) < 2000.0
         assert m[f"{section}.captured"] is True

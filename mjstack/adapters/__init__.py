@@ -1,7 +1,7 @@
 """An `Env` in the interfaces of reinforcement learning libraries, one module each.
 
-Nothing is imported here, because the libraries are the extra ``train``: import ``mjstack.adapters.gymnasium`` or
-``mjstack.adapters.rsl_rl``.
+Nothing is imported here, because the libraries are the extra ``train``: import
+``mjstack.adapters.gymnasium`` or ``mjstack.adapters.rsl_rl``.
 """
 
 from __future__ import annotations
@@ -23,4 +23,7 @@ class MissingExtra(MjstackError):
             reason: What the import said; it may be another library, which this one needs.
         """
         said = " ".join(str(reason).split())
-        super().__init__(f"{module} needs {library}, which cannot be imported ({said}). Run: pip install 'mjstack[train]'.")
+        super().__init__(
+            f"{module} needs {library}, which cannot be imported ({said}). Run: pip install"
+            " 'mjstack[train]'."
+        )

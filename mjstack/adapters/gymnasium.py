@@ -1,4 +1,6 @@
-"""Gymnasium's interfaces with numpy arrays: many worlds as a `VectorEnv`, or one world as an `Env`."""
+"""Gymnasium's interfaces with numpy arrays: many worlds as a `VectorEnv`, or one world as
+an `Env`.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +27,18 @@ Observation = np.ndarray | dict[str, np.ndarray]
 class GymnasiumVectorEnv(VectorEnv):
     """All worlds of an environment as a Gymnasium vector environment.
 
-    A world that ends is reset in the same step (``AutoresetMode.SAME_STEP``). ``infos`` then has, as in Gymnasium's own
-    vector environments:
+    A world that ends is reset in the same step (``AutoresetMode.SAME_STEP``). ``infos`` then has,
+    as in Gymnasium's own vector environments:
 
-    - ``final_obs``: object array ``(num_envs,)``, the last observation of each world that ended, None elsewhere;
+    - ``final_obs``: object array ``(num_envs,)``, the last observation of each world that ended,
+      None elsewhere;
     - ``final_info``: the ``success`` of the episodes that ended;
     - ``_final_obs`` and ``_final_info``: which worlds they hold for, ``(num_envs,)``, bool.
 
     In every step it has ``success``, ``(num_envs,)``, bool, as it was before any reset.
 
-    Actions beyond ``action_space`` are passed on as they are; ``gymnasium.wrappers.vector.ClipAction`` clips them.
+    Actions beyond ``action_space`` are passed on as they are;
+    ``gymnasium.wrappers.vector.ClipAction`` clips them.
 
     Attributes:
         inner: The environment.
@@ -46,12 +50,14 @@ class GymnasiumVectorEnv(VectorEnv):
 
         Args:
             env: The environment.
-            group: Which observation group to return, as one array. None returns all of them in a dict.
+            group: Which observation group to return, as one array. None returns all of them in a
+                dict.
 
         Raises:
             UnknownName: There is no such observation group.
         """
-        self.inner, self.group = env, group
+        self.inner = env
+        self.group = group
         self.num_envs = env.nworld
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         self.single_observation_space = _observation_space(env, group)
@@ -59,13 +65,16 @@ class GymnasiumVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, env.nworld)
         self.action_space = batch_space(self.single_action_space, env.nworld)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
         """Starts new episodes.
 
         Args:
-            seed: Starts every world anew under this seed. Without one, the worlds go on to their next episodes under the
-                seed that they have, at first the configured one.
-            options: ``reset_mask``: which worlds to reset, shape ``(num_envs,)``, bool; by default all.
+            seed: Starts every world anew under this seed. Without one, the worlds go on to their
+                next episodes under the seed that they have, at first the configured one.
+            options: ``reset_mask``: which worlds to reset, shape ``(num_envs,)``, bool; by default
+                all.
 
         Returns:
             Observations of all worlds, ``(num_envs, dim)``, float32, and an empty dict.
@@ -74,19 +83,25 @@ class GymnasiumVectorEnv(VectorEnv):
             MjstackError: The seed or an option cannot be used.
         """
         mask = _reset_mask(_checked(options, ("reset_mask",)), self.num_envs)
-        obs, _ = self.inner.reset(seed=seed, mask=None if mask is None else torch.from_numpy(mask).to(self.inner.device))
-        super().reset(seed=seed)  # after the environment, whose message about a wrong seed says more
+        obs, _ = self.inner.reset(
+            seed=seed, mask=None if mask is None else torch.from_numpy(mask).to(self.inner.device)
+        )
+        super().reset(
+            seed=seed
+        )  # after the environment, whose message about a wrong seed says more
         return _numpy(obs, self.group), {}
 
-    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advances every world by one control interval.
 
         Args:
             actions: Shape ``(num_envs, action_dim)``, float32.
 
         Returns:
-            Observations ``(num_envs, dim)``, float32; rewards ``(num_envs,)``, float32; terminations and truncations
-            ``(num_envs,)``, bool; and infos, see the class.
+            Observations ``(num_envs, dim)``, float32; rewards ``(num_envs,)``, float32;
+            terminations and truncations ``(num_envs,)``, bool; and infos, see the class.
 
         Raises:
             MjstackError: The actions cannot be used, or something went wrong in the worlds.
@@ -94,7 +109,10 @@ class GymnasiumVectorEnv(VectorEnv):
         action = _tensor(actions, self.action_space, self.inner.device)
         obs, reward, terminated, truncated, extras = self.inner.step(action)
         success = extras["success"].cpu().numpy()
-        infos: dict[str, Any] = {"success": success, "_success": np.ones(self.num_envs, dtype=np.bool_)}
+        infos: dict[str, Any] = {
+            "success": success,
+            "_success": np.ones(self.num_envs, dtype=np.bool_),
+        }
         done = (terminated | truncated).cpu().numpy()
         if done.any():
             final = _numpy(extras["final_obs"], self.group)
@@ -103,7 +121,8 @@ class GymnasiumVectorEnv(VectorEnv):
                 rows[world] = _row(final, world)
             infos["final_obs"] = rows
             infos["final_info"] = {"success": success & done, "_success": done.copy()}
-            infos["_final_obs"], infos["_final_info"] = done.copy(), done.copy()
+            infos["_final_obs"] = done.copy()
+            infos["_final_info"] = done.copy()
         return (
             _numpy(obs, self.group),
             reward.cpu().numpy(),
@@ -132,26 +151,36 @@ class GymnasiumEnv(gymnasium.Env):
 
         Args:
             env: The environment.
-            group: Which observation group to return, as one array. None returns all of them in a dict.
+            group: Which observation group to return, as one array. None returns all of them in a
+                dict.
 
         Raises:
             MjstackError: It has more worlds than one, or no such observation group.
         """
         if env.nworld != 1:
-            raise ArgumentError("env", f"{env.nworld} worlds", "one", "Build it with nworld=1, or use GymnasiumVectorEnv")
-        self.inner, self.group = env, group
-        self.metadata = {"render_modes": [], "render_fps": round(1.0 / env.cfg.timing.frame_dt)}
+            raise ArgumentError(
+                "env",
+                f"{env.nworld} worlds",
+                "one",
+                "Build it with nworld=1, or use GymnasiumVectorEnv",
+            )
+        self.inner = env
+        self.group = group
+        self.metadata = {"render_modes": [], "render_fps": round(1.0 / env.cfg.timing.step_dt)}
         self.observation_space = _observation_space(env, group)
         self.action_space = _action_space(env)
-        # The inner environment starts the next episode in the step that ends one; this is what it saw first.
+        # The inner environment starts the next episode in the step that ends one; this is what it
+        # saw first.
         self._first: dict[str, torch.Tensor] | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
         """Starts a new episode.
 
         Args:
-            seed: Starts with the first episode of this seed. Without one, the next episode under the seed that is in use,
-                at first the configured one.
+            seed: Starts with the first episode of this seed. Without one, the next episode under
+                the seed that is in use, at first the configured one.
             options: None are known.
 
         Returns:
@@ -165,7 +194,9 @@ class GymnasiumEnv(gymnasium.Env):
         if seed is not None or first is None:
             first, _ = self.inner.reset(seed=seed)
         self._first = None
-        super().reset(seed=seed)  # after the environment, whose message about a wrong seed says more
+        super().reset(
+            seed=seed
+        )  # after the environment, whose message about a wrong seed says more
         return _row(_numpy(first, self.group), 0), {}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -175,21 +206,30 @@ class GymnasiumEnv(gymnasium.Env):
             action: Shape ``(action_dim,)``, float32.
 
         Returns:
-            The observation ``(dim,)``, float32, the reward, whether the episode terminated, whether it was truncated, and
-            the info, see the class.
+            The observation ``(dim,)``, float32, the reward, whether the episode terminated, whether
+            it was truncated, and the info, see the class.
 
         Raises:
-            MjstackError: The action cannot be used, the episode has ended, or something went wrong in the world.
+            MjstackError: The action cannot be used, the episode has ended, or something went wrong
+                in the world.
         """
         if self._first is not None:
-            raise ArgumentError("env", "step() after the end of an episode", "reset() first", "Call env.reset()")
+            raise ArgumentError(
+                "env", "step() after the end of an episode", "reset() first", "Call env.reset()"
+            )
         obs, reward, terminated, truncated, extras = self.inner.step(
             _tensor(action, self.action_space, self.inner.device).unsqueeze(0)
         )
         ended = bool(terminated), bool(truncated)
         if any(ended):
-            self._first, obs = obs, extras["final_obs"]
-        return _row(_numpy(obs, self.group), 0), float(reward), *ended, {"success": bool(extras["success"])}
+            self._first = obs
+            obs = extras["final_obs"]
+        return (
+            _row(_numpy(obs, self.group), 0),
+            float(reward),
+            *ended,
+            {"success": bool(extras["success"])},
+        )
 
     def close(self) -> None:
         """Gives the simulation's threads and buffers back."""
@@ -198,7 +238,8 @@ class GymnasiumEnv(gymnasium.Env):
 
 def _observation_space(env: Env, group: str | None) -> spaces.Space:
     boxes: dict[str, spaces.Space] = {
-        name: spaces.Box(-np.inf, np.inf, (dim,), np.float32) for name, dim in env.observation_manager.group_dims.items()
+        name: spaces.Box(-np.inf, np.inf, (dim,), np.float32)
+        for name, dim in env.observation_manager.group_dims.items()
     }
     if group is None:
         return spaces.Dict(boxes)
@@ -208,7 +249,9 @@ def _observation_space(env: Env, group: str | None) -> spaces.Space:
 
 
 def _action_space(env: Env) -> spaces.Box:
-    low, high = (bound.float().cpu().numpy() for bound in (env.action_manager.low, env.action_manager.high))
+    low, high = (
+        bound.float().cpu().numpy() for bound in (env.action_manager.low, env.action_manager.high)
+    )
     return spaces.Box(low, high, dtype=np.float32)
 
 
@@ -219,13 +262,17 @@ def _numpy(obs: dict[str, torch.Tensor], group: str | None) -> Observation:
 
 
 def _row(obs: Observation, world: int) -> Observation:
-    return {name: value[world] for name, value in obs.items()} if isinstance(obs, dict) else obs[world]
+    return (
+        {name: value[world] for name, value in obs.items()} if isinstance(obs, dict) else obs[world]
+    )
 
 
 def _tensor(action: Any, space: spaces.Space, device: torch.device) -> torch.Tensor:
     expected = f"a float32 array of shape {space.shape}"
     try:
-        array = np.array(action, dtype=np.float32)  # a copy: torch wants memory that it may write to
+        array = np.array(
+            action, dtype=np.float32
+        )  # a copy: torch wants memory that it may write to
     except (TypeError, ValueError) as error:
         raise ArgumentError("action", type(action).__name__, expected) from error
     if array.shape != space.shape:
@@ -249,5 +296,7 @@ def _reset_mask(options: dict[str, Any], num_envs: int) -> np.ndarray | None:
     if not isinstance(mask, np.ndarray):
         raise ArgumentError("options['reset_mask']", type(mask).__name__, expected)
     if mask.shape != (num_envs,) or mask.dtype != np.bool_:
-        raise ArgumentError("options['reset_mask']", f"{mask.dtype} of shape {mask.shape}", expected)
+        raise ArgumentError(
+            "options['reset_mask']", f"{mask.dtype} of shape {mask.shape}", expected
+        )
     return mask

@@ -21,8 +21,8 @@ except ImportError as error:
 class RslRlVecEnv(VecEnv):
     """All worlds of an environment for the runners of rsl-rl-lib 5.
 
-    Every observation group is an entry of the `TensorDict`. The runner's configuration says who sees which, such as
-    ``"obs_groups": {"actor": ["policy"], "critic": ["policy", "privileged"]}``.
+    Every observation group is an entry of the `TensorDict`. The runner's configuration says who
+    sees which, such as ``"obs_groups": {"actor": ["policy"], "critic": ["policy", "privileged"]}``.
 
     Actions are clamped to the action manager's bounds, because a Gaussian policy has none.
 
@@ -30,7 +30,7 @@ class RslRlVecEnv(VecEnv):
         env: The environment.
         num_envs: Number of worlds.
         num_actions: Width of the action.
-        max_episode_length: Frames after which an episode times out.
+        max_episode_length: Steps after which an episode times out.
         device: Where tensors live.
         cfg: The environment's configuration, which loggers store.
     """
@@ -40,8 +40,8 @@ class RslRlVecEnv(VecEnv):
 
         Args:
             env: The environment.
-            log_interval: Steps between two readings of the episode statistics, each of which waits for the device. The
-                runner's ``num_steps_per_env`` gives one reading per iteration.
+            log_interval: Steps between two readings of the episode statistics, each of which waits
+                for the device. The runner's ``num_steps_per_env`` gives one reading per iteration.
 
         Raises:
             MjstackError: The interval is out of range, or the worlds cannot start.
@@ -51,28 +51,36 @@ class RslRlVecEnv(VecEnv):
         self.env = env
         self.num_envs: int = env.nworld
         self.num_actions: int = env.action_manager.action_dim
-        self.max_episode_length: int = env.max_episode_frames
+        self.max_episode_length: int = env.max_episode_steps
         self.device: torch.device = env.device
         self.cfg: Config = env.cfg
-        self._low, self._high = env.action_manager.low.float(), env.action_manager.high.float()
-        self._log_interval, self._steps = log_interval, 0
+        self._low = env.action_manager.low.float()
+        self._high = env.action_manager.high.float()
+        self._log_interval = log_interval
+        self._steps = 0
         env.reset()
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Frames since each world's last reset, shape ``(num_envs,)``, int64.
+        """Steps since each world's last reset, shape ``(num_envs,)``, int64.
 
-        Assigning copies into the environment: runners start worlds at random times of an episode so that not all end at
-        once.
+        Assigning copies into the environment: runners start worlds at random times of an episode so
+        that not all end at once.
         """
-        return self.env.frame
+        return self.env.episode_step
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
-        if not isinstance(value, torch.Tensor) or value.shape != self.env.frame.shape:
-            found = f"shape {tuple(value.shape)}" if isinstance(value, torch.Tensor) else type(value).__name__
-            raise ArgumentError("episode_length_buf", found, f"a tensor of shape ({self.num_envs},)")
-        self.env.frame.copy_(value)
+        if not isinstance(value, torch.Tensor) or value.shape != self.env.episode_step.shape:
+            found = (
+                f"shape {tuple(value.shape)}"
+                if isinstance(value, torch.Tensor)
+                else type(value).__name__
+            )
+            raise ArgumentError(
+                "episode_length_buf", found, f"a tensor of shape ({self.num_envs},)"
+            )
+        self.env.episode_step.copy_(value)
 
     def get_observations(self) -> TensorDict:
         """The current observations.
@@ -80,9 +88,13 @@ class RslRlVecEnv(VecEnv):
         Returns:
             Every group, each ``(num_envs, dim)``, float32.
         """
-        return self._tensordict({name: group.clone() for name, group in self.env.observation_manager.groups.items()})
+        return self._tensordict(
+            {name: group.clone() for name, group in self.env.observation_manager.groups.items()}
+        )
 
-    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Advances every world by one control interval; worlds that end are reset in the same step.
 
         Args:
@@ -92,19 +104,24 @@ class RslRlVecEnv(VecEnv):
             ``observations``: every group, each ``(num_envs, dim)``, float32.
             ``rewards``: shape ``(num_envs,)``, float32.
             ``dones``: whether the episode ended, for whatever reason, shape ``(num_envs,)``, int64.
-            ``extras``: ``time_outs``, ended by the clock alone, shape ``(num_envs,)``, bool; and every ``log_interval``
+            ``extras``: ``time_outs``, ended by the clock alone, shape ``(num_envs,)``, bool; and
+                every ``log_interval``
             steps ``log``, means over the episodes that ended since the last one.
 
         Raises:
             MjstackError: The actions cannot be used, or something went wrong in the worlds.
         """
         self.env.action_manager.check(actions)
-        obs, rewards, terminated, truncated, _ = self.env.step(torch.clamp(actions, self._low, self._high))
+        obs, rewards, terminated, truncated, _ = self.env.step(
+            torch.clamp(actions, self._low, self._high)
+        )
         extras: dict[str, Any] = {"time_outs": truncated}
         self._steps += 1
         if self._steps % self._log_interval == 0:
             # The slash keeps the runner's logger from putting names of its own in front.
-            extras["log"] = {f"episode/{name}": value for name, value in self.env.read_statistics().items()}
+            extras["log"] = {
+                f"episode/{name}": value for name, value in self.env.read_statistics().items()
+            }
         return self._tensordict(obs), rewards, (terminated | truncated).long(), extras
 
     def close(self) -> None:

@@ -1,4 +1,6 @@
-"""What ``--help`` says. Groups, choices, keys and the words for them are read from `conf/`, where they are defined."""
+"""What ``--help`` says. Groups, choices, keys and the words for them are read from `conf/`, where
+they are defined.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +20,28 @@ _EXAMPLES = (
     ("-m robot=so101,rebot timing=default,fine", "a sweep with a summary table"),
     ("'gates=[batch]' gate.batch.seeds=10", "ten seeds: how rare are failures?"),
     ("'gates=[success]' nworld=64", "how often does it work from random starts?"),
-    ("reset=layout layout=worlds.csv nworld=64", "worlds that start as the rows of a file say"),
-    ("job=replay run=outputs/DATE/TIME world=17", "one world of an earlier run again: why did it fail?"),
+    (
+        "reset=starts_file starts=worlds.csv nworld=64",
+        "worlds that start as the rows of a file say",
+    ),
+    (
+        "job=replay run=outputs/DATE/TIME world=17",
+        "one world of an earlier run again: why did it fail?",
+    ),
     ("job=collect job.episodes=20", "demonstrations of the scripted expert, as a dataset; resumes"),
     ("job=scaling robot=so101", "throughput from 1 to 32,768 worlds; resumes"),
-    ("job=study nworld=8", "what the solver's limits cost, and who is still accepted"),
-    ("job=reachability robot=rebot", "what the arm reaches, and how far cubes may stand from their places"),
+    ("job=study nworld=8", "what the solver's limits cost, and who is still succeeded"),
+    (
+        "job=reachability robot=rebot",
+        "what the arm reaches, and how far cubes may stand from their places",
+    ),
 )
 _FLAGS = (
     ("--cfg job", "print the whole configuration as the other arguments make it, and run nothing"),
-    ("--cfg job -p gate.batch", "print a part of it; job=collect --cfg job -p job has the keys of a job"),
+    (
+        "--cfg job -p gate.batch",
+        "print a part of it; job=collect --cfg job -p job has the keys of a job",
+    ),
     ("-m", "a sweep over comma-separated values"),
     ("--hydra-help", "Hydra's own flags"),
     ("--version", "mjstack's version"),
@@ -61,7 +75,9 @@ class Key:
 
 def list_groups() -> list[Group]:
     """The configuration groups, in the order in which they are composed."""
-    return [Group(name, _choices(name, default), words) for name, default, words in _entries(_GROUP)]
+    return [
+        Group(name, _choices(name, default), words) for name, default, words in _entries(_GROUP)
+    ]
 
 
 def list_keys() -> list[Key]:
@@ -74,19 +90,33 @@ def help_text(width: int) -> str:
     groups = [(group.name, f"{group.words}: {', '.join(group.choices)}") for group in list_groups()]
     keys = [(key.name, f"{key.words} ({key.default.replace(', ', ',')})") for key in list_keys()]
     parts = [
-        ["mjstack: two cubes and one simulated arm, from native MuJoCo to thousands of MuJoCo Warp worlds, verified in gates."],
-        ["Usage: mjstack [group=choice ...] [key=value ...] [flags]", "In a checkout: python scripts/run.py ..."],
-        ["Examples:", *_table([(f"mjstack {command}", words) for command, words in _EXAMPLES], width)],
-        ["Groups, to be set as group=choice, and their choices, the default first:", *_table(groups, width)],
+        [
+            "mjstack: two cubes and one simulated arm, from native MuJoCo to thousands of MuJoCo"
+            " Warp worlds, verified in gates."
+        ],
+        [
+            "Usage: mjstack [group=choice ...] [key=value ...] [flags]",
+            "In a checkout: python scripts/run.py ...",
+        ],
+        [
+            "Examples:",
+            *_table([(f"mjstack {command}", words) for command, words in _EXAMPLES], width),
+        ],
+        [
+            "Groups, to be set as group=choice, and their choices, the default first:",
+            *_table(groups, width),
+        ],
         ["Keys, to be set as key=value, and their defaults:", *_table(keys, width)],
         [
-            "What groups hold can be set too: gate.batch.seeds=10. ~reward.grasp leaves a term out, +reward.mine=... adds one. "
-            "--cfg job prints them all."
+            "What groups hold can be set too: gate.batch.seeds=10. ~reward.grasp leaves a term out,"
+            " +reward.mine=... adds one. --cfg job prints them all."
         ],
         ["Flags:", *_table(_FLAGS, width)],
         [_STATUSES],
     ]
-    return "\n\n".join("\n".join(line for text in part for line in textwrap.wrap(text, width)) for part in parts)
+    return "\n\n".join(
+        "\n".join(line for text in part for line in textwrap.wrap(text, width)) for part in parts
+    )
 
 
 def _entries(pattern: re.Pattern[str]) -> Iterator[tuple[str, str, str]]:
@@ -96,7 +126,11 @@ def _entries(pattern: re.Pattern[str]) -> Iterator[tuple[str, str, str]]:
 
 
 def _choices(group: str, default: str) -> list[str]:
-    found = sorted(file.name.removesuffix(".yaml") for file in _CONF.joinpath(group).iterdir() if file.name.endswith(".yaml"))
+    found = sorted(
+        file.name.removesuffix(".yaml")
+        for file in _CONF.joinpath(group).iterdir()
+        if file.name.endswith(".yaml")
+    )
     return sorted(found, key=lambda name: name != default)
 
 
@@ -105,5 +139,7 @@ def _table(rows: Sequence[tuple[str, str]], width: int) -> list[str]:
     indent = max(len(name) for name, _ in rows) + 4
     lines = []
     for name, words in rows:
-        lines += textwrap.wrap(words, width, initial_indent=f"  {name}".ljust(indent), subsequent_indent=" " * indent)
+        lines += textwrap.wrap(
+            words, width, initial_indent=f"  {name}".ljust(indent), subsequent_indent=" " * indent
+        )
     return lines

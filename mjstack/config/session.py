@@ -1,4 +1,6 @@
-"""Hydra's side of a composition: where the files are, and a Hydra of its own that leaves somebody else's as it was."""
+"""Hydra's side of a composition: where the files are, and a Hydra of its own that leaves somebody
+else's as it was.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ CONFIG_NAME = "config"
 
 @contextmanager
 def own_hydra() -> Iterator[None]:
-    """Composes from mjstack's files, also inside somebody else's Hydra application, whose state comes back afterwards."""
+    """Composes from mjstack's files, also inside somebody else's Hydra application, whose state
+    comes back afterwards.
+    """
     outer = Singleton.get_state()
     GlobalHydra.instance().clear()
     try:

@@ -25,7 +25,8 @@ from mjstack.errors import ConfigError, TermError, UnknownName
 
 
 def type_terms(cfg: Config) -> None:
-    """Gives every term and every variant of the solver its type, in place. A term that is null is left out.
+    """Gives every term and every variant of the solver its type, in place. A term that is null is
+    left out.
 
     Raises:
         MjstackError: A term has an unknown key, lacks one, or a value has the wrong type.
@@ -42,13 +43,21 @@ def type_terms(cfg: Config) -> None:
         group.terms = _terms(f"observation.{name}.terms", group.terms, ObservationTermCfg)
     if isinstance(cfg.job, StudyJobCfg):
         cfg.job.variants = {
-            name: _typed(f"job.variants.{name}", asdict(cfg.solver) | node if isinstance(node, dict) else node, SolverCfg)
+            name: _typed(
+                f"job.variants.{name}",
+                asdict(cfg.solver) | node if isinstance(node, dict) else node,
+                SolverCfg,
+            )
             for name, node in cfg.job.variants.items()
         }
 
 
 def _terms(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
-    return {name: _typed(f"{key}.{name}", node, kind) for name, node in nodes.items() if node is not None}
+    return {
+        name: _typed(f"{key}.{name}", node, kind)
+        for name, node in nodes.items()
+        if node is not None
+    }
 
 
 def _typed(key: str, node: Any, kind: type) -> Any:
@@ -61,7 +70,9 @@ def _typed(key: str, node: Any, kind: type) -> Any:
     try:
         merged = OmegaConf.merge(_schema(kind), node)
     except OmegaConfBaseException:
-        _find_misfit(key, node, kind)  # names the key; where none is to blame alone, the error stays as it is
+        _find_misfit(
+            key, node, kind
+        )  # names the key; where none is to blame alone, the error stays as it is
         raise
     missing = sorted(OmegaConf.missing_keys(merged))
     if missing:
@@ -83,5 +94,9 @@ def _find_misfit(key: str, node: dict[str, Any], kind: type) -> None:
             OmegaConf.merge(_schema(kind), {name: value})
         except OmegaConfBaseException as error:
             hint = get_type_hints(kind)[name]
-            wanted = " or ".join(hint.__members__) if isinstance(hint, EnumMeta) else fields(kind)[names.index(name)].type
+            wanted = (
+                " or ".join(hint.__members__)
+                if isinstance(hint, EnumMeta)
+                else fields(kind)[names.index(name)].type
+            )
             raise ConfigError(f"{key}.{name}", value, str(wanted)) from error

@@ -1,4 +1,6 @@
-"""Demonstrations on disk in the layout of LeRobotDataset v3, written and checked with pyarrow alone."""
+"""Demonstrations on disk in the layout of LeRobotDataset v3, written and checked with pyarrow
+alone.
+"""
 
 from __future__ import annotations
 
@@ -7,4 +9,12 @@ from mjstack.datasets.reader import StoredDataset, read_dataset
 from mjstack.datasets.spec import DatasetSpec, EpisodeData, Feature
 from mjstack.datasets.writer import DatasetWriter
 
-__all__ = ["DatasetSpec", "DatasetWriter", "EpisodeData", "Feature", "StoredDataset", "read_dataset", "require_pyarrow"]
+__all__ = [
+    "DatasetSpec",
+    "DatasetWriter",
+    "EpisodeData",
+    "Feature",
+    "StoredDataset",
+    "read_dataset",
+    "require_pyarrow",
+]

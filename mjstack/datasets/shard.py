@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.datasets import layout
+from mjstack.datasets import lerobot
 from mjstack.datasets.arrow import require_pyarrow
 from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData, typed_row
 from mjstack.datasets.staging import Staging
@@ -25,7 +25,9 @@ class Shard:
         staging: The files of the commit, the data file first.
     """
 
-    def __init__(self, folder: Path, spec: DatasetSpec, number: int, episodes: int, frames: int) -> None:
+    def __init__(
+        self, folder: Path, spec: DatasetSpec, number: int, episodes: int, frames: int
+    ) -> None:
         """Begins a shard.
 
         Args:
@@ -39,8 +41,11 @@ class Shard:
         self.rows: dict[str, list[Any]] = {}
         self.statistics: list[dict[str, np.ndarray]] = []
         self.staging = Staging()
-        self._folder, self._spec, self._schema = folder, spec, layout.frames_schema(spec)
-        self._episodes, self._frames = episodes, frames
+        self._folder = folder
+        self._spec = spec
+        self._schema = lerobot.frames_schema(spec)
+        self._episodes = episodes
+        self._frames = frames
         self._file: Any = None
         self._parquet: Any = None
 
@@ -61,12 +66,14 @@ class Shard:
             task: Index of its task.
         """
         if self._parquet is None:
-            self._file = self.staging.open(layout.data_path(self._folder, self.number))
-            # Few floats occur twice: a dictionary of them takes three times the time and half again the room.
+            self._file = self.staging.open(lerobot.data_path(self._folder, self.number))
+            # Few floats occur twice: a dictionary of them takes three times the time and half again
+            # the room.
             self._parquet = require_pyarrow()[1].ParquetWriter(
                 self._file, self._schema, compression="snappy", use_dictionary=list(INDICES)
             )
-        number, length = self._episodes + len(self), len(next(iter(arrays.values())))
+        number = self._episodes + len(self)
+        length = len(next(iter(arrays.values())))
         frame = np.arange(length)
         indices: dict[str, np.ndarray] = {
             "timestamp": (frame / self._spec.fps).astype(np.float32),
@@ -75,11 +82,15 @@ class Shard:
             "index": self._frames + frame,
             "task_index": np.full(length, task),
         }
-        columns: dict[str, np.ndarray] = dict(arrays) | {name: values[:, None] for name, values in indices.items()}
-        self._parquet.write_table(layout.frames_table(self._schema, columns), row_group_size=length)
+        columns: dict[str, np.ndarray] = dict(arrays) | {
+            name: values[:, None] for name, values in indices.items()
+        }
+        self._parquet.write_table(
+            lerobot.frames_table(self._schema, columns), row_group_size=length
+        )
         # In float64, which holds every type's values exactly, but int64's beyond 2^53.
         numbers = np.concatenate([columns[name].T for name in self._schema.names], dtype=np.float64)
-        place = layout.shard_indices(self.number)
+        place = lerobot.shard_indices(self.number)
         row: dict[str, Any] = {"episode_index": number, "length": length}
         row |= {f"data/{name}": index for name, index in place.items()}
         row |= {"dataset_from_index": self._frames, "dataset_to_index": self._frames + length}
@@ -93,7 +104,9 @@ class Shard:
     def discard(self) -> None:
         """Removes what has not taken its place."""
         if self._parquet is not None:
-            self._parquet.is_open = False  # it would complete its file when it is collected, and that is closed by then
+            self._parquet.is_open = (
+                False  # it would complete its file when it is collected, and that is closed by then
+            )
         self.staging.discard()
 
     def finish(self, tasks: list[str] | None) -> None:
@@ -105,6 +118,10 @@ class Shard:
         _, parquet = require_pyarrow()
         self._parquet.close()
         if tasks is not None:
-            parquet.write_table(layout.tasks_table(tasks), self.staging.open(self._folder / layout.TASKS))
-        table = layout.episodes_table(self._spec, self.rows, self.statistics)
-        parquet.write_table(table, self.staging.open(layout.episodes_path(self._folder, self.number)))
+            parquet.write_table(
+                lerobot.tasks_table(tasks), self.staging.open(self._folder / lerobot.TASKS)
+            )
+        table = lerobot.episodes_table(self._spec, self.rows, self.statistics)
+        parquet.write_table(
+            table, self.staging.open(lerobot.episodes_path(self._folder, self.number))
+        )

@@ -1,4 +1,6 @@
-"""Files that take their places together: written beside them first, where a full disk does no harm, then renamed."""
+"""Files that take their places together: written beside them first, where a full disk does no harm,
+then renamed.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ class Staging:
         self.open(path).write(content)
 
     def commit(self) -> None:
-        """Puts everything onto the disk, then every file to its place, in the order in which they were opened."""
+        """Puts everything onto the disk, then every file to its place, in the order in which they
+        were opened.
+        """
         for file, name, _ in self._files:
             file.flush()
             os.fsync(file.fileno())
@@ -47,21 +51,29 @@ class Staging:
     def discard(self) -> None:
         """Removes what has not taken its place."""
         for file, name, _ in self._files:
-            with contextlib.suppress(OSError):  # closing writes what is buffered, for which there may be no room
+            with contextlib.suppress(
+                OSError
+            ):  # closing writes what is buffered, for which there may be no room
                 file.close()
             name.unlink(missing_ok=True)
         self._files.clear()
 
 
 def temporary(path: Path) -> str:
-    """How the name of a file begins that is on its way to ``path``. Readers do not look at it: it is hidden, and no parquet."""
+    """How the name of a file begins that is on its way to ``path``. Readers do not look at it: it
+    is hidden, and no parquet.
+    """
     return f".{path.name}."
 
 
 @contextlib.contextmanager
 def interrupts_deferred() -> Iterator[None]:
-    """Ctrl-C waits until the block has ended, so that an episode is written as a whole or not at all."""
-    if threading.current_thread() is not threading.main_thread():  # Python interrupts the main thread alone
+    """Ctrl-C waits until the block has ended, so that an episode is written as a whole or not at
+    all.
+    """
+    if (
+        threading.current_thread() is not threading.main_thread()
+    ):  # Python interrupts the main thread alone
         yield
         return
     caught: list[tuple] = []

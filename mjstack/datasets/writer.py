@@ -1,4 +1,6 @@
-"""Adds episodes to a dataset, shard by shard, so that whatever stops it loses no episode that it has committed."""
+"""Adds episodes to a dataset, shard by shard, so that whatever stops it loses no episode that it
+has committed.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.datasets import layout
+from mjstack.datasets import lerobot
 from mjstack.datasets.arrow import require_pyarrow
-from mjstack.datasets.opening import check_same, lock_folder, read_info, read_shards, read_tasks, uncommitted
+from mjstack.datasets.resume import (
+    check_same,
+    lock_folder,
+    read_info,
+    read_shards,
+    read_tasks,
+    uncommitted,
+)
 from mjstack.datasets.shard import Shard
 from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_arrays, typed_row
 from mjstack.datasets.staging import Staging, interrupts_deferred
@@ -26,9 +35,10 @@ from mjstack.errors import ArgumentError, DatasetError, UnwrittenError
 class DatasetWriter:
     """Writes a new dataset, or goes on with one that the same configuration has begun.
 
-    `add` writes episodes into a hidden file, one after the other, and keeps none of their frames; `flush` commits what was
-    added. info.json is the last file to change in a commit and says how many files count: a kill before it costs the episodes
-    since the last commit, and the next writer clears away what they left. One writer has a dataset at a time.
+    `add` writes episodes into a hidden file, one after the other, and keeps none of their frames;
+    `flush` commits what was added. info.json is the last file to change in a commit and says how
+    many files count: a kill before it costs the episodes since the last commit, and the next writer
+    clears away what they left. One writer has a dataset at a time.
 
         with DatasetWriter(folder, spec) as writer:
             for seed in seeds:
@@ -51,20 +61,26 @@ class DatasetWriter:
             file_mb: Size of a data file at which it is committed and the next one begins [MiB].
 
         Raises:
-            DatasetError: Something else is there, or a dataset of another configuration, or another process is writing it.
+            DatasetError: Something else is there, or a dataset of another configuration, or another
+                process is writing it.
             UnwrittenError: The folder cannot be written.
         """
         require_pyarrow()
         if file_mb < 1:
             raise ArgumentError("file_mb", file_mb, "at least 1 MiB")
-        self.folder, self.spec = Path(folder), spec
+        self.folder = Path(folder)
+        self.spec = spec
         self.committed: list[tuple[int, int]] = []
         self.frames = 0
-        self._file_mb, self._shards, self._open = file_mb, 0, True
+        self._file_mb = file_mb
+        self._shards = 0
+        self._open = True
         self._provenance: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}
         self._tasks_committed = 0
-        self._statistics = RunningStatistics(sum(dim for _, dim in layout.all_features(spec.features).values()))
+        self._statistics = RunningStatistics(
+            sum(dim for _, dim in lerobot.all_features(spec.features).values())
+        )
         try:
             if self.folder.exists() and not self.folder.is_dir():
                 raise DatasetError(f"{folder} is a file, expected a folder. Give another")
@@ -78,8 +94,15 @@ class DatasetWriter:
     def __enter__(self) -> DatasetWriter:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Commits what was added, also where something else went wrong: those episodes are finished."""
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Commits what was added, also where something else went wrong: those episodes are
+        finished.
+        """
         self.close()
 
     @property
@@ -95,7 +118,8 @@ class DatasetWriter:
 
         Raises:
             DatasetError: An episode does not fit the spec, or has a number that is not finite.
-            UnwrittenError: It cannot be written; the writer is closed, and what was committed is kept.
+            UnwrittenError: It cannot be written; the writer is closed, and what was committed is
+                kept.
         """
         self._check_open()
         for episode in episodes:
@@ -104,15 +128,20 @@ class DatasetWriter:
         for episode in episodes:
             arrays = typed_arrays(self.spec, episode)
             with interrupts_deferred(), self._guarded():
-                self._shard.add(arrays, episode, self._tasks.setdefault(episode.task, len(self._tasks)))
-            if self._shard.size * (1.0 + 1.0 / self.pending) > self._file_mb * 2**20:  # one more like these is too much
+                self._shard.add(
+                    arrays, episode, self._tasks.setdefault(episode.task, len(self._tasks))
+                )
+            if (
+                self._shard.size * (1.0 + 1.0 / self.pending) > self._file_mb * 2**20
+            ):  # one more like these is too much
                 self.flush()
 
     def flush(self) -> None:
         """Commits what was added.
 
         Raises:
-            UnwrittenError: It cannot be written; the writer is closed, and what was committed before is kept.
+            UnwrittenError: It cannot be written; the writer is closed, and what was committed
+                before is kept.
         """
         self._check_open()
         if self.pending:
@@ -143,7 +172,10 @@ class DatasetWriter:
         while self._provenance and self._provenance[-1]["from_episode"] == len(self.committed):
             del self._provenance[-1]
         now = json.loads(json.dumps(dict(self.spec.provenance)))
-        if not self._provenance or {**self._provenance[-1], "from_episode": 0} != {**now, "from_episode": 0}:
+        if not self._provenance or {**self._provenance[-1], "from_episode": 0} != {
+            **now,
+            "from_episode": 0,
+        }:
             self._provenance.append({"from_episode": len(self.committed), **now})
         staging = Staging()
         try:
@@ -163,7 +195,9 @@ class DatasetWriter:
         shard.staging.commit()
         self._shard = self._next_shard()
 
-    def _take_in(self, rows: dict[str, list[Any]], statistics: Sequence[dict[str, np.ndarray]]) -> None:
+    def _take_in(
+        self, rows: dict[str, list[Any]], statistics: Sequence[dict[str, np.ndarray]]
+    ) -> None:
         """Counts a shard's episodes."""
         for length, episode in zip(rows["length"], statistics, strict=True):
             self._statistics.add(length, episode)
@@ -176,10 +210,12 @@ class DatasetWriter:
         """Statistics, and last the file that says what counts."""
         if self.committed:
             staging.write(
-                self.folder / layout.STATS,
-                layout.stats_json(self.spec.features, self._statistics.count, self._statistics.read()),
+                self.folder / lerobot.STATS,
+                lerobot.stats_json(
+                    self.spec.features, self._statistics.count, self._statistics.read()
+                ),
             )
-        info = layout.make_info(
+        info = lerobot.make_info(
             self.spec,
             provenance=self._provenance,
             file_mb=self._file_mb,
@@ -188,16 +224,22 @@ class DatasetWriter:
             tasks=self._tasks_committed,
             shards=self._shards,
         )
-        staging.write(self.folder / layout.INFO, layout.to_json(info))
+        staging.write(self.folder / lerobot.INFO, lerobot.to_json(info))
 
     def _check_open(self) -> None:
         if not self._open:
-            raise DatasetError(f"{self.folder}: the writer is closed, expected an open one. Make another, which goes on")
+            raise DatasetError(
+                f"{self.folder}: the writer is closed, expected an open one. Make another, which"
+                " goes on"
+            )
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Closes the writer if something goes wrong in the middle of a file, and removes what was on its way."""
-        kept, frames = len(self.committed), self.frames
+        """Closes the writer if something goes wrong in the middle of a file, and removes what was
+        on its way.
+        """
+        kept = len(self.committed)
+        frames = self.frames
         try:
             yield
         except BaseException as error:

@@ -1,6 +1,6 @@
 """The environment over both backends, and how it is built."""
 
-from mjstack.envs.build import build_env, demonstration_config, make_env, scripted_config
+from mjstack.envs.build import build_env, demonstration_config, driven_config, make_env
 from mjstack.envs.env import Env
 
-__all__ = ["Env", "build_env", "demonstration_config", "make_env", "scripted_config"]
+__all__ = ["Env", "build_env", "demonstration_config", "driven_config", "make_env"]

@@ -10,8 +10,8 @@ import torch
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
+from mjstack.envs.buffers import probe_env_sizes
 from mjstack.envs.env import Env
-from mjstack.envs.probe import probe_env_sizes
 from mjstack.errors import ArgumentError
 from mjstack.managers.reset import required_fields
 from mjstack.scene import SceneIndex, build_model
@@ -20,28 +20,42 @@ from mjstack.sim.sizes import resolve_env_sizes
 
 
 def make_env(
-    overrides: Sequence[str] = (), *, nworld: int | None = None, seed: int | None = None, device: str | None = None
+    overrides: Sequence[str] = (),
+    *,
+    nworld: int | None = None,
+    seed: int | None = None,
+    device: str | None = None,
 ) -> Env:
     """Builds an environment as the command line would configure it.
 
     Args:
         overrides: Such as ``["task=reach", "robot=rebot", "action=ee_delta"]``.
-        nworld: Number of worlds. What is given here and below wins over an override of the same key.
+        nworld: Number of worlds. What is given here and below wins over an override of the same
+            key.
         seed: Seed of every random number.
         device: ``auto``, ``cpu`` or ``cuda:N``.
 
     Returns:
-        The environment, on MJWarp where there is CUDA, else on native MuJoCo (``sim=...`` chooses). Call ``reset`` first.
+        The environment, on MJWarp where there is CUDA, else on native MuJoCo (``sim=...`` chooses).
+        Call ``reset`` first.
 
     Raises:
         MjstackError: An override or a term cannot be used; the message says which and what to do.
     """
     several = isinstance(overrides, Sequence) and not isinstance(overrides, str)
     if not several or not all(isinstance(override, str) for override in overrides):
-        found = repr(overrides) if isinstance(overrides, str | Sequence) else f"a {type(overrides).__name__}"
-        raise ArgumentError("overrides", found, "a list of strings, such as ['task=reach', 'robot=rebot']")
+        found = (
+            repr(overrides)
+            if isinstance(overrides, str | Sequence)
+            else f"a {type(overrides).__name__}"
+        )
+        raise ArgumentError(
+            "overrides", found, "a list of strings, such as ['task=reach', 'robot=rebot']"
+        )
     given = {"nworld": nworld, "seed": seed, "sim.device": device}
-    return build_env(load_config([*overrides, *(f"{k}={v}" for k, v in given.items() if v is not None)]))
+    return build_env(
+        load_config([*overrides, *(f"{k}={v}" for k, v in given.items() if v is not None)])
+    )
 
 
 @torch.inference_mode(False)  # buffers made in inference mode could not be written outside it
@@ -54,7 +68,8 @@ def build_env(
     device: str | None = None,
     sizes: BatchSizes | None = None,
 ) -> Env:
-    """Builds an environment on a simulation of its own. Gates, whose simulation is shared, build `Env` on that.
+    """Builds an environment on a simulation of its own. Gates, whose simulation is shared, build
+    `Env` on that.
 
     Args:
         cfg: The configuration.
@@ -62,8 +77,9 @@ def build_env(
         model: The scene, if it has been compiled before.
         backend: Overrides the configured backend.
         device: Overrides the configured device.
-        sizes: Overrides MJWarp's buffer sizes, which by default have room for random actions. With ``batch=auto`` they are
-            measured first, in worlds that are gone again before these are made.
+        sizes: Overrides MJWarp's buffer sizes, which by default have room for random actions. With
+            ``batch=auto`` they are measured first, in worlds that are gone again before these are
+            made.
     """
     model = build_model(cfg) if model is None else model
     nworld = cfg.nworld if nworld is None else nworld
@@ -72,16 +88,29 @@ def build_env(
     elif device is None:
         device = resolve_device(cfg.sim.device)
     if sizes is None:
-        sizes = probe_env_sizes(cfg, model, nworld, backend, device) if cfg.batch.auto else resolve_env_sizes(cfg)
-    sim = make_simulation(model, cfg, nworld, backend=backend, device=device, fields=required_fields(cfg.reset), sizes=sizes)
+        sizes = (
+            probe_env_sizes(cfg, model, nworld, backend, device)
+            if cfg.batch.auto
+            else resolve_env_sizes(cfg)
+        )
+    sim = make_simulation(
+        model,
+        cfg,
+        nworld,
+        backend=backend,
+        device=device,
+        fields=required_fields(cfg.reset),
+        sizes=sizes,
+    )
     return Env(sim, SceneIndex(model, cfg.robot), cfg)
 
 
-def scripted_config(cfg: Config, **changes: object) -> Config:
-    """The configuration of an environment that the scripted controller drives through one whole episode.
+def driven_config(cfg: Config, **changes: object) -> Config:
+    """The configuration of an environment that the scripted controller drives through one whole
+    episode.
 
-    The controller's action terms take the place of the configured ones. Nothing ends an episode early or rewards it: the
-    acceptance judges it as a whole.
+    The controller's action terms take the place of the configured ones. Nothing ends an episode
+    early or rewards it: the acceptance judges it as a whole.
     """
     return replace(
         cfg,
@@ -95,5 +124,9 @@ def scripted_config(cfg: Config, **changes: object) -> Config:
 
 
 def demonstration_config(cfg: Config) -> Config:
-    """Likewise for episodes that are kept: observations, rewards and success are computed as configured."""
-    return replace(scripted_config(cfg), observation=cfg.observation, reward=cfg.reward, task=cfg.task)
+    """Likewise for episodes that are kept: observations, rewards and success are computed as
+    configured.
+    """
+    return replace(
+        driven_config(cfg), observation=cfg.observation, reward=cfg.reward, task=cfg.task
+    )

@@ -10,12 +10,12 @@ import torch
 
 from mjstack.config.schema import Config
 from mjstack.envs.faults import FaultLatch, count_start
+from mjstack.envs.halves import Eager, Repeated, StepHalves
 from mjstack.envs.outputs import Outputs
-from mjstack.envs.parts import Eager, Repeated, StepParts
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
-from mjstack.managers.base import Term, first_value, one_pass, running
+from mjstack.managers.base import Term, current_term, first_value, step_cache
 from mjstack.managers.observation import ObservationManager
 from mjstack.managers.reset import ResetManager
 from mjstack.managers.reward import RewardManager
@@ -24,7 +24,9 @@ from mjstack.math import not_finite
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
 
-FAULT_WINDOW = 200  # steps between two looks at the faults on CUDA; on the CPU looking costs nothing
+FAULT_WINDOW = (
+    200  # steps between two looks at the faults on CUDA; on the CPU looking costs nothing
+)
 
 
 class Env:
@@ -33,18 +35,20 @@ class Env:
     One step, in this order:
 
     1. the action manager takes the action and writes ``sim.ctrl``;
-    2. the simulation makes ``substeps`` physics steps and brings body, site and geom poses up to date;
+    2. the simulation makes ``decimation`` physics steps and brings body, site and geom poses up to
+       date;
     3. success, terminations and rewards look at the new state;
     4. observations are computed: for the worlds that end here, this is the terminal observation;
     5. finished episodes go into the statistics;
     6. the worlds that ended are reset, and observed again.
 
-    On CUDA the whole step is one graph: the first step after a build runs eagerly, the second is captured, and later ones
-    replay it. It is captured anew after ``sim.resize`` and ``sim.set_options``; after a change of anything else that it has
-    baked in, such as a term's Python number, call `recapture`.
+    On CUDA the whole step is one graph: the first step after a build runs eagerly, the second is
+    captured, and later ones replay it. It is captured anew after ``sim.resize`` and
+    ``sim.set_options``; after a change of anything else that it has baked in, such as a term's
+    Python number, call `recapture`.
 
-    What derives from contacts (``sensordata``, ``contact_count``) is that of the last physics step before, and zero in a
-    world that has just been reset.
+    What derives from contacts (``sensordata``, ``contact_count``) is that of the last physics step
+    before, and zero in a world that has just been reset.
 
     Attributes:
         sim: The worlds.
@@ -56,7 +60,7 @@ class Env:
         key: The same on the device, shape ``(1,)``, int64.
         world: Number of each world, shape ``(nworld,)``, int64.
         episode: Episode of each world, shape ``(nworld,)``, int64.
-        frame: Frames since each world's last reset, shape ``(nworld,)``, int64.
+        step: Steps since each world's last reset, shape ``(nworld,)``, int64.
         success: Whether the task is achieved, shape ``(nworld,)``, bool.
         action_manager: Actions; ``action_dim`` is the policy's output.
         observation_manager: Observation groups; ``group_dims`` are the policy's inputs.
@@ -66,44 +70,56 @@ class Env:
         graph: What `step` repeats, captured or not.
     """
 
-    def __init__(self, sim: Simulation, index: SceneIndex, cfg: Config, *, check_faults: bool = True) -> None:
+    def __init__(
+        self, sim: Simulation, index: SceneIndex, cfg: Config, *, check_faults: bool = True
+    ) -> None:
         """Builds the managers on a simulation, and checks every term once.
 
         Args:
-            sim: The worlds, with the model fields that the reset terms write (`managers.required_fields`).
+            sim: The worlds, with the model fields that the reset terms write
+                (`managers.required_fields`).
             index: Addresses in the simulation's model.
-            cfg: The configuration: action, observation, reset, termination, reward and task.success are used.
-            check_faults: Raise when physics was lost. Gates, which judge such worlds themselves, do without.
+            cfg: The configuration: action, observation, reset, termination, reward and task.success
+                are used.
+            check_faults: Raise when physics was lost. Gates, which judge such worlds themselves, do
+                without.
 
         Raises:
             MjstackError: A term cannot be found, built or used; the message names it.
         """
-        self.sim, self.index, self.cfg = sim, index, cfg
-        self.nworld, self.device = sim.nworld, sim.device
+        self.sim = sim
+        self.index = index
+        self.cfg = cfg
+        self.nworld = sim.nworld
+        self.device = sim.device
         self.key = torch.zeros(1, dtype=torch.int64, device=sim.device)
         self.seed = cfg.seed
         self.world = torch.arange(sim.nworld, device=sim.device)
         self.episode = torch.full_like(self.world, -1)
-        self.frame = torch.zeros_like(self.world)
+        self.episode_step = torch.zeros_like(self.world)
         self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
         self._everyone = torch.ones_like(self.success)
         self._steps = self._version = 0
         self._check_faults = check_faults
         self._started = self._closed = False
-        self._substeps = cfg.timing.substeps
+        self._decimation = cfg.timing.decimation
 
         # Terms are checked on worlds that have started, because a term may read anything.
         self.reset_manager = ResetManager(self, cfg.reset)
         self.episode.zero_()
         self._write_start(self._everyone)
         self.action_manager = ActionManager(self, cfg.action)
-        self._success = None if cfg.task.success is None else Term("task.success", cfg.task.success, self)
+        self._success = (
+            None if cfg.task.success is None else Term("task.success", cfg.task.success, self)
+        )
         if self._success is not None:
             first_value(self._success, self, dims=(1,), boolean=True)
         self.termination_manager = TerminationManager(self, cfg.termination)
         self.reward_manager = RewardManager(self, cfg.reward)
         self.observation_manager = ObservationManager(self, cfg.observation)
-        self.statistics = EpisodeStatistics(self.reward_manager.names, self.termination_manager.names, sim.device)
+        self.statistics = EpisodeStatistics(
+            self.reward_manager.names, self.termination_manager.names, sim.device
+        )
         self._forget(self._everyone)
         self.episode.fill_(-1)
         self._bind_outputs()
@@ -131,10 +147,16 @@ class Env:
         return self.action_manager.previous_action
 
     @property
-    def max_episode_frames(self) -> int:
-        """Frames after which an episode times out: the time-out term's, or the task's where there is none."""
-        limits = [t.params["frames"] for t in self.cfg.termination.values() if t.time_out and "frames" in t.params]
-        return min(limits, default=self.cfg.task.episode_frames)
+    def max_episode_steps(self) -> int:
+        """Steps after which an episode times out: the time-out term's, or the task's where there is
+        none.
+        """
+        limits = [
+            t.params["steps"]
+            for t in self.cfg.termination.values()
+            if t.time_out and "steps" in t.params
+        ]
+        return min(limits, default=self.cfg.task.episode_steps)
 
     def reset(
         self, *, seed: int | None = None, mask: torch.Tensor | None = None
@@ -142,7 +164,8 @@ class Env:
         """Starts new episodes.
 
         Args:
-            seed: Starts every world's episode 0 under this seed. Without it, each reset world goes on to its next episode.
+            seed: Starts every world's episode 0 under this seed. Without it, each reset world goes
+                on to its next episode.
             mask: Which worlds, shape ``(nworld,)``, bool; all if None.
 
         Returns:
@@ -153,19 +176,28 @@ class Env:
             FaultError: The start does not fit the batch sizes.
         """
         if self._closed:
-            raise ArgumentError("env", "reset() after close()", "an open environment", "Make a new one")
+            raise ArgumentError(
+                "env", "reset() after close()", "an open environment", "Make a new one"
+            )
         mask = self._everyone if mask is None else self._check_mask(mask)
         if seed is not None:
             if mask is not self._everyone:
                 raise ArgumentError(
-                    "seed", str(seed), "no mask beside it, because a seed starts every world anew", "Leave one out"
+                    "seed",
+                    str(seed),
+                    "no mask beside it, because a seed starts every world anew",
+                    "Leave one out",
                 )
-            if isinstance(seed, bool) or not hasattr(seed, "__index__") or not 0 <= operator.index(seed) < 1 << 32:
+            if (
+                isinstance(seed, bool)
+                or not hasattr(seed, "__index__")
+                or not 0 <= operator.index(seed) < 1 << 32
+            ):
                 raise ArgumentError("seed", repr(seed), "an integer from 0 to 4294967295")
             self.seed = operator.index(seed)
             self.episode.fill_(-1)
         self.episode += mask
-        self.frame.masked_fill_(mask, 0)
+        self.episode_step.masked_fill_(mask, 0)
         self._write_start(mask)
         if mask is self._everyone:
             if count_start(self.sim):
@@ -184,21 +216,29 @@ class Env:
             action: Shape ``(nworld, action_dim)``, float32.
 
         Returns:
-            ``obs``: by group, ``(nworld, dim)``, float32; of worlds that ended, the first of the new episode.
+            ``obs``: by group, ``(nworld, dim)``, float32; of worlds that ended, the first of the
+                new episode.
             ``reward``: ``(nworld,)``, float32.
             ``terminated``: ended by what happened, ``(nworld,)``, bool.
             ``truncated``: ended by the clock alone, ``(nworld,)``, bool.
-            ``extras``: ``final_obs`` (as ``obs``, before the reset: valid where an episode ended) and ``success`` (at the
-            end of this frame, before the reset).
+            ``extras``: ``final_obs`` (as ``obs``, before the reset: valid where an episode ended)
+                and ``success`` (at the
+            end of this step, before the reset).
 
         All of them are the caller's to keep.
 
         Raises:
             ArgumentError: The action has a wrong shape, dtype or device, or is not finite.
-            FaultError: Physics was lost, or a term gave a number that is not finite; on CUDA within 200 steps.
+            FaultError: Physics was lost, or a term gave a number that is not finite; on CUDA within
+                200 steps.
         """
         if not self._started:
-            raise ArgumentError("env", "step() before reset(), or after close()", "reset() first", "Call env.reset()")
+            raise ArgumentError(
+                "env",
+                "step() before reset(), or after close()",
+                "reset() first",
+                "Call env.reset()",
+            )
         self.action_manager.take(action)
         self.graph()
         self._steps += 1
@@ -207,17 +247,24 @@ class Env:
         out = self._outputs.copy()
         obs = {name: out[f"obs/{name}"] for name in self.observation_manager.groups}
         final = {name: out[f"final/{name}"] for name in self.observation_manager.groups}
-        return obs, out["reward"], out["terminated"], out["truncated"], {"final_obs": final, "success": out["success"]}
+        return (
+            obs,
+            out["reward"],
+            out["terminated"],
+            out["truncated"],
+            {"final_obs": final, "success": out["success"]},
+        )
 
     def advance(self) -> None:
-        """The part of `step` that is the same at every frame: it acts on the action that was taken in, and returns nothing.
+        """The part of `step` that is the same at every step: it acts on the action that was taken
+        in, and returns nothing.
 
         On CUDA it has fixed shapes and no host read, so that a larger graph may hold it.
         """
         self._command()
         self._move()
         self._judge()
-        running.label = ""
+        current_term.label = ""
 
     def captured(self, work: Callable[[], None], name: str) -> Repeated:
         """Work of this environment as a graph on CUDA; elsewhere as it is.
@@ -236,24 +283,30 @@ class Env:
             self.cfg.graph,
             name=name,
             version=lambda: self.sim.version + self._version,
-            culprit=lambda: running.label,
+            culprit=lambda: current_term.label,
         )
 
     def recapture(self) -> None:
-        """Has every graph of this environment captured anew: for a change of something that a graph has baked in."""
+        """Has every graph of this environment captured anew: for a change of something that a graph
+        has baked in.
+        """
         self._version += 1
 
-    def parts(self) -> StepParts:
+    def parts(self) -> StepHalves:
         """A step taken apart, for measurements."""
 
         def managers() -> None:
             self._command()
             self._judge()
 
-        return StepParts(self.captured(self._move, "the physics"), self.captured(managers, "the managers"))
+        return StepHalves(
+            self.captured(self._move, "the physics"), self.captured(managers, "the managers")
+        )
 
     def read_statistics(self) -> dict[str, float]:
-        """Means over the episodes that ended since the last call; see `EpisodeStatistics.read`. Waits for the device."""
+        """Means over the episodes that ended since the last call; see `EpisodeStatistics.read`.
+        Waits for the device.
+        """
         self.raise_faults()
         return self.statistics.read()
 
@@ -274,7 +327,10 @@ class Env:
         self.sim.close()
 
     def __str__(self) -> str:
-        head = f"{self.cfg.task.name} with {self.cfg.robot.title}: {self.nworld} worlds, {self.sim.description}"
+        head = (
+            f"{self.cfg.task.name} with {self.cfg.robot.title}: {self.nworld} worlds,"
+            f" {self.sim.description}"
+        )
         managers = (
             self.action_manager,
             self.observation_manager,
@@ -286,65 +342,85 @@ class Env:
 
     def _bind_outputs(self) -> None:
         """Moves what `step` returns side by side."""
-        rewards, ends, observations = self.reward_manager, self.termination_manager, self.observation_manager
+        rewards = self.reward_manager
+        ends = self.termination_manager
+        observations = self.observation_manager
         returned = {f"obs/{name}": group for name, group in observations.groups.items()}
         returned |= {f"final/{name}": group for name, group in observations.groups.items()}
-        returned |= {"reward": rewards.reward, "terminated": ends.terminated, "truncated": ends.truncated}
+        returned |= {
+            "reward": rewards.reward,
+            "terminated": ends.terminated,
+            "truncated": ends.truncated,
+        }
         self._outputs = Outputs(returned | {"success": self.success}, self.device)
         out = self._outputs.tensors
-        rewards.reward, ends.terminated, ends.truncated = out["reward"], out["terminated"], out["truncated"]
+        rewards.reward = out["reward"]
+        ends.terminated = out["terminated"]
+        ends.truncated = out["truncated"]
         for name in observations.groups:
             observations.groups[name] = out[f"obs/{name}"]
 
     def _command(self) -> None:
-        running.label = ""
+        current_term.label = ""
         self.action_manager.accept()
         self.action_manager.write_commands()
 
     def _move(self) -> None:
-        running.label = ""
-        self.sim.step(self._substeps, kinematics=True)
+        current_term.label = ""
+        self.sim.step(self._decimation, kinematics=True)
 
     def _judge(self) -> None:
         """What looks at the new state, and the resets."""
-        self.frame += 1
+        self.episode_step += 1
         broken = not_finite(self.sim.qpos, self.sim.qvel)
         if self._success is not None:
             torch.logical_and(self._success(self), ~broken, out=self.success)
 
         def reward() -> None:
-            with one_pass():
+            with step_cache():
                 self.termination_manager.compute()
                 self.reward_manager.compute(void=broken)
 
         def observe() -> None:
-            with one_pass():
+            with step_cache():
                 self.observation_manager.compute()
 
         self._side_by_side(reward, observe)
-        running.label = ""
+        current_term.label = ""
         if self._check_faults and not broken.is_cuda:
             self._faults.latch(broken)
             self._faults.raise_any()
         self._reset_ended(broken)
 
     def _reset_ended(self, broken: torch.Tensor) -> None:
-        """The terminal observation, the statistics, the reset of the worlds that ended, and the observation to go on with."""
-        ends, rewards, out = self.termination_manager, self.reward_manager, self._outputs.tensors
+        """The terminal observation, the statistics, the reset of the worlds that ended, and the
+        observation to go on with.
+        """
+        ends = self.termination_manager
+        rewards = self.reward_manager
+        out = self._outputs.tensors
         on_cuda = broken.is_cuda
         done = ends.terminated | ends.truncated
-        # On CUDA, where looking would stop the device, worlds are always reset: those of an empty mask, if need be.
+        # On CUDA, where looking would stop the device, worlds are always reset: those of an empty
+        # mask, if need be.
         ending = len(ends.names) > 0 and (on_cuda or bool(done.any()))
 
         def hand_out() -> None:
             out["success"].copy_(self.success)
             # What a diverged world saw last is 0, not NaN, which a value times 0 would hand on.
             for name, group in self.observation_manager.groups.items():
-                torch.where(broken[:, None], group.nan_to_num(0.0, 0.0, 0.0), group, out=out[f"final/{name}"])
+                torch.where(
+                    broken[:, None],
+                    group.nan_to_num(0.0, 0.0, 0.0),
+                    group,
+                    out=out[f"final/{name}"],
+                )
 
         def count() -> None:
             if ending:
-                self.statistics.update(done, self.frame, self.success, rewards.episode_sums, ends.values)
+                self.statistics.update(
+                    done, self.episode_step, self.success, rewards.episode_sums, ends.values
+                )
 
         def latch() -> None:
             if on_cuda and self._check_faults:
@@ -353,10 +429,10 @@ class Env:
         self._side_by_side(hand_out, count, latch)
         if ending:
             self.episode += done
-            self.frame.masked_fill_(done, 0)
+            self.episode_step.masked_fill_(done, 0)
             self._write_start(done)
             self._forget(done)
-            with one_pass():
+            with step_cache():
                 self.observation_manager.refresh(done)
         elif on_cuda or bool(broken.any()):
             for name, group in self.observation_manager.groups.items():
@@ -378,7 +454,7 @@ class Env:
         self.sim.kinematics(mask)
 
     def _forget(self, mask: torch.Tensor) -> None:
-        """Whatever is kept from frame to frame starts anew."""
+        """Whatever is kept from step to step starts anew."""
         self.action_manager.reset(mask)
         self.termination_manager.reset(mask)
         self.reward_manager.reset(mask)
@@ -390,10 +466,18 @@ class Env:
         expected = f"a bool tensor of shape ({self.nworld},) on {self.device}"
         if not isinstance(mask, torch.Tensor):
             raise ArgumentError("mask", type(mask).__name__, expected)
-        if tuple(mask.shape) != (self.nworld,) or mask.dtype is not torch.bool or mask.device != self.device:
-            raise ArgumentError("mask", f"{mask.dtype} of shape {tuple(mask.shape)} on {mask.device}", expected)
+        if (
+            tuple(mask.shape) != (self.nworld,)
+            or mask.dtype is not torch.bool
+            or mask.device != self.device
+        ):
+            raise ArgumentError(
+                "mask", f"{mask.dtype} of shape {tuple(mask.shape)} on {mask.device}", expected
+            )
         if not self._started:
-            raise ArgumentError("mask", "a part of the worlds", "none at the first reset", "Call env.reset()")
+            raise ArgumentError(
+                "mask", "a part of the worlds", "none at the first reset", "Call env.reset()"
+            )
         return mask
 
 

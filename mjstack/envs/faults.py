@@ -1,4 +1,6 @@
-"""What goes wrong in a world while it is stepped: latched on the device, and told to whoever looks."""
+"""What goes wrong in a world while it is stepped: latched on the device, and told to
+whoever looks.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ _POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
 
 
 class Fault(Enum):
-    """What went wrong in a world, latched until the host looks; in the order in which `FaultLatch.latch` stacks them."""
+    """What went wrong in a world, latched until the host looks; in the order in which
+    `FaultLatch.latch` stacks them.
+    """
 
     ACTION = "actions were not finite"
     STATE = "the state is not finite"
@@ -48,14 +52,15 @@ class FaultLatch:
         self._state_ends = self._ends_on("non_finite")
 
     def latch(self, broken: torch.Tensor) -> None:
-        """Takes in a frame, before a reset can erase what went wrong.
+        """Takes in a step, before a reset can erase what went wrong.
 
         Args:
             broken: Worlds whose state is not finite, shape ``(nworld,)``, bool.
         """
         env = self._env
         self._overflow |= env.sim.overflow & self._lost
-        bad_action, reward = env.action_manager.not_finite, env.reward_manager.reward
+        bad_action = env.action_manager.not_finite
+        reward = env.reward_manager.reward
         groups = env.observation_manager.groups.values()
         seen = not_finite(*groups) if groups else self._nobody
         state = self._nobody if self._state_ends else broken
@@ -75,7 +80,8 @@ class FaultLatch:
         """
         if not bool(self._faults.any() | (self._overflow != 0).any()):
             return
-        nworld, overflow = self._env.nworld, self._overflow.tolist()
+        nworld = self._env.nworld
+        overflow = self._overflow.tolist()
         lost = [w for w, bits in enumerate(overflow) if bits]
         if lost:
             bits = 0
@@ -91,7 +97,10 @@ class FaultLatch:
 
     def _ends_on(self, term: str) -> bool:
         """Whether one of mjstack's own terminations is in use, under whatever name."""
-        return any(cfg.func == f"mjstack.mdp.termination.{term}" for cfg in self._env.cfg.termination.values())
+        return any(
+            cfg.func == f"mjstack.mdp.termination.{term}"
+            for cfg in self._env.cfg.termination.values()
+        )
 
     def _culprits(self, fault: Fault, world: int) -> str:
         """Names the terms behind a number that is not finite, as far as their last values tell."""
@@ -107,7 +116,8 @@ class FaultLatch:
 
 
 def count_start(sim: Simulation) -> bool:
-    """Counts the contacts of a full start, which MJWarp's pool must hold before the first step. Waits for the device.
+    """Counts the contacts of a full start, which MJWarp's pool must hold before the first step.
+    Waits for the device.
 
     Returns:
         Whether the state was computed with for it: native MuJoCo has no such pool.
@@ -115,19 +125,25 @@ def count_start(sim: Simulation) -> bool:
     Raises:
         FaultError: The start does not fit.
     """
-    sizes, pool = getattr(sim, "sizes", None), getattr(sim, "peak_pool", None)
+    sizes = getattr(sim, "sizes", None)
+    pool = getattr(sim, "peak_pool", None)
     if sizes is None or pool is None:
         return False
     pool.zero_()  # it has the peak of everything before
     sim.forward()
-    used, room = max(pool.tolist()), sizes.contact_pool(sim.nworld)
+    used = max(pool.tolist())
+    room = sizes.contact_pool(sim.nworld)
     if used > room:
-        key, value = ("naconmax", sizes.naconmax) if sizes.naconmax is not None else ("nconmax", sizes.nconmax)
+        key, value = (
+            ("naconmax", sizes.naconmax)
+            if sizes.naconmax is not None
+            else ("nconmax", sizes.nconmax)
+        )
         per_world = -(-used // sim.nworld)
         need = used if sizes.naconmax is not None else per_world
         raise FaultError(
-            f"batch.{key}={value}: the start of {sim.nworld} worlds needs at least {used} contacts and "
-            f"collision pairs ({per_world} per world), and there is room for {room}",
+            f"batch.{key}={value}: the start of {sim.nworld} worlds needs at least {used} contacts"
+            f" and collision pairs ({per_world} per world), and there is room for {room}",
             f"Raise it to more than batch.{key}={need}, or choose a reset with fewer contacts",
         )
     return True
@@ -135,7 +151,8 @@ def count_start(sim: Simulation) -> bool:
 
 def _capacity_hint(sim: Simulation, bits: int) -> str:
     """What to raise for some overflow bits."""
-    sizes, pool = getattr(sim, "sizes", None), getattr(sim, "peak_pool", None)
+    sizes = getattr(sim, "sizes", None)
+    pool = getattr(sim, "peak_pool", None)
     # The pools' own sizes take precedence where they are set.
     contacts = "nconmax" if getattr(sizes, "naconmax", None) is None else "naconmax"
     convex = "nccdmax" if getattr(sizes, "naccdmax", None) is None else "naccdmax"

@@ -1,6 +1,7 @@
 """What a step returns, laid side by side in memory: one copy makes all of it the caller's own.
 
-The copies share memory, so that keeping one of them keeps all of a step. To autograd each is a tensor of its own.
+The copies share memory, so that keeping one of them keeps all of a step. To autograd each is a
+tensor of its own.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class Outputs:
         return self._views(self._memory.clone())
 
     def _views(self, memory: torch.Tensor) -> dict[str, torch.Tensor]:
-        storage, views = memory.untyped_storage(), {}
+        storage = memory.untyped_storage()
+        views = {}
         for name, (start, dtype, shape) in self._layout.items():
             # Not a view of `memory`: writing into one would then count as writing into the others.
             tensor = torch.empty(0, dtype=dtype, device=memory.device)

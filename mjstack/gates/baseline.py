@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjstack.gates.gate import GateContext, judge_one
+from mjstack.episodes.context import GateContext, judge_one
 from mjstack.report.record import GateResult
 
 
@@ -12,17 +12,24 @@ def run_baseline(context: GateContext) -> list[GateResult]:
     """Runs the nominal episode on native MuJoCo and judges it."""
     cfg = context.cfg
     sim, episode = context.nominal
-    status, reason, metrics = judge_one(context.evidence.rules, episode.verdict)
-    headline = context.evidence.headline(metrics)
+    status, reason, metrics = judge_one(context.check.rules, episode.result)
+    headline = context.check.headline(metrics)
     context.say(f"{cfg.task.name} check: {headline}")
     metrics["episode_s"] = episode.seconds
-    metrics["world_steps_per_s"] = episode.frames * cfg.timing.substeps / episode.seconds
+    metrics["world_steps_per_s"] = episode.steps * cfg.timing.decimation / episode.seconds
     metrics["waypoint_error_m"] = float(episode.waypoint_error.max())
-    metrics["path_error_m"] = context.planner.path_error(np.array([*cfg.scene.red_xy, *cfg.scene.blue_xy]))
+    metrics["path_error_m"] = context.planner.path_error(
+        np.array([*cfg.scene.red_xy, *cfg.scene.blue_xy])
+    )
     metrics["peak_contacts"] = int(sim.peak_contacts[0])
     metrics["peak_constraint_rows"] = int(sim.peak_constraints[0])
     metrics["backend"] = sim.description
-    context.shown, context.shown_by = episode, "baseline world"
-    thresholds = context.evidence.thresholds(cfg) | {"waypoint_error_m": cfg.controller.ik_tolerance}
+    context.shown = episode
+    context.shown_by = "baseline world"
+    thresholds = context.check.thresholds(cfg) | {"waypoint_error_m": cfg.controller.ik_tolerance}
     summary = reason or headline
-    return [GateResult(name="baseline", status=status, reason=summary, thresholds=thresholds, metrics=metrics)]
+    return [
+        GateResult(
+            name="baseline", status=status, reason=summary, thresholds=thresholds, metrics=metrics
+        )
+    ]

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mjstack.episodes.batch_record import FAILING, BatchRecord, write_failing
+from mjstack.episodes.context import GateContext, TimedEpisode, failing_rules, play_seeds
+from mjstack.episodes.rollout import Episode
 from mjstack.errors import name_worlds
-from mjstack.gates.batch_record import FAILING, BatchRecord, write_failing
-from mjstack.gates.episode import Episode
-from mjstack.gates.gate import GateContext, TimedEpisode, failing_rules, play_seeds
 from mjstack.math import wilson_interval
 from mjstack.report.markdown import format_percent
 from mjstack.report.record import GateResult, Status, Value
 from mjstack.sim import Simulation
-from mjstack.tasks.evidence import Rule
+from mjstack.tasks.check import Rule
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +25,8 @@ _NAMED = 100  # worlds a rule in report.md; failing_worlds.csv has all
 
 @dataclass(eq=False, slots=True)
 class _Tally:
-    """Sums over the seeds: numbers, and the failing worlds by name. Nothing of the other worlds is kept.
+    """Sums over the seeds: numbers, and the failing worlds by name. Nothing of the other worlds is
+    kept.
 
     Attributes:
         several: Whether there are several seeds; then a world's name has its seed too.
@@ -54,9 +55,13 @@ class _Tally:
         self.worlds += sim.nworld
         self.seconds += episode.seconds
         self.steps += int(sim.step_count.sum())
-        self.failed += [self._name(record.seed, world) for world in np.flatnonzero(record.failed).tolist()]
+        self.failed += [
+            self._name(record.seed, world) for world in np.flatnonzero(record.failed).tolist()
+        ]
         for rule, worlds in failing_rules(self.rules, record.failed).items():
-            self.broken.setdefault(rule, []).extend(self._name(record.seed, world) for world in worlds)
+            self.broken.setdefault(rule, []).extend(
+                self._name(record.seed, world) for world in worlds
+            )
         self.rows += record.failing_rows(self.rules)
         measured = record.values | {
             "waypoint_error_m": episode.waypoint_error,
@@ -66,7 +71,8 @@ class _Tally:
         for name, values in measured.items():  # NaN, which a diverged world has, is handed on
             self.low[name] = float(np.minimum(self.low.get(name, math.inf), values.min()))
             self.high[name] = float(np.maximum(self.high.get(name, -math.inf), values.max()))
-        # Rounded: on CUDA even identical worlds differ in the last digits. Adding 0 makes -0 the same as 0.
+        # Rounded: on CUDA even identical worlds differ in the last digits. Adding 0 makes -0 the
+        # same as 0.
         self.ends.update(hash(row.tobytes()) for row in np.round(record.qpos, 4) + 0.0)
 
     def _name(self, seed: int, world: int) -> str:
@@ -78,24 +84,33 @@ def run_batch(context: GateContext) -> list[GateResult]:
     """Plays the task in nworld worlds that start differently, under every seed, and judges each."""
     cfg = context.cfg
     t = cfg.gate.batch
-    tally = _Tally(t.seeds > 1, context.evidence.rules)
+    tally = _Tally(t.seeds > 1, context.check.rules)
     details: list[str] = []
     sim = context.batch_simulation(cfg.nworld)
     sizes = getattr(sim, "sizes", None)
     metrics: dict[str, Value] = {
-        "sizes": f"{sizes.as_overrides()} ({sizes.source})" if sizes else "native MuJoCo has no fixed buffers"
+        "sizes": (
+            f"{sizes.as_overrides()} ({sizes.source})"
+            if sizes
+            else "native MuJoCo has no fixed buffers"
+        )
     }
 
     def keep(record: BatchRecord) -> None:
         details.extend(_keep(context, record, tally))
-        accepted = int((record.failed == 0).sum())
+        succeeded = int((record.failed == 0).sum())
         if t.seeds > 1:
-            metrics[f"seed{record.seed}.accepted"] = accepted
+            metrics[f"seed{record.seed}.succeeded"] = succeeded
             so_far = f"{tally.worlds - len(tally.failed)} of {tally.worlds}"
-            context.say(f"batch, seed {record.seed}: {accepted} of {cfg.nworld} worlds accepted, {so_far} so far")
+            context.say(
+                f"batch, seed {record.seed}: {succeeded} of {cfg.nworld} worlds succeeded, {so_far}"
+                " so far"
+            )
 
     try:
-        problems = play_seeds(cfg.seed, t.seeds, lambda seed: _play(context, sim, seed, tally), keep)
+        problems = play_seeds(
+            cfg.seed, t.seeds, lambda seed: _play(context, sim, seed, tally), keep
+        )
         description = sim.description
     finally:
         sim.close()
@@ -106,7 +121,9 @@ def _play(context: GateContext, sim: Simulation, seed: int, tally: _Tally) -> Ba
     """One seed's episode in every world."""
     cfg = context.cfg
     last = context.phase_start(cfg.gate.throughput.from_phase) - 1
-    snapshots = frozenset([last] if seed == cfg.seed else [])  # throughput goes on from the first seed
+    snapshots = frozenset(
+        [last] if seed == cfg.seed else []
+    )  # throughput goes on from the first seed
     episode = context.run(sim, cfg.reset, seed=seed, snapshots=snapshots)
     context.carry_start = episode.states.get(last, context.carry_start)
     if seed == cfg.seed:
@@ -117,7 +134,9 @@ def _play(context: GateContext, sim: Simulation, seed: int, tally: _Tally) -> Ba
 
 
 def _keep(context: GateContext, record: BatchRecord, tally: _Tally) -> list[str]:
-    """Writes the seed's record, before the next one can break or be stopped. A full disk takes no verdict back."""
+    """Writes the seed's record, before the next one can break or be stopped. A full disk takes no
+    result back.
+    """
     if context.folder is None:
         return []
     try:
@@ -141,21 +160,22 @@ def _judge(
     cfg = context.cfg
     t = cfg.gate.batch
     what = "worlds" if t.seeds == 1 else "world-episodes"
-    accepted, bad = tally.worlds - len(tally.failed), tally.failed
-    rate, (low, high) = accepted / tally.worlds, wilson_interval(accepted, tally.worlds)
+    succeeded = tally.worlds - len(tally.failed)
+    bad = tally.failed
+    rate, (low, high) = succeeded / tally.worlds, wilson_interval(succeeded, tally.worlds)
     metrics = {
         "backend": description,
         "worlds": cfg.nworld,
         "seeds": tally.seeds,
         "world_episodes": tally.worlds,
-        "accepted": accepted,
+        "succeeded": succeeded,
         "success_rate": rate,
         "success_rate_low95": low,
         "success_rate_high95": high,
         "distinct_final_states": len(tally.ends),
         **{
             metric: (tally.low if side == "min" else tally.high)[value]
-            for metric, (value, side) in context.evidence.summaries.items()
+            for metric, (value, side) in context.check.summaries.items()
         },
         "waypoint_error_max_m": tally.high["waypoint_error_m"],
         "peak_contacts_per_world": int(tally.high["peak_contacts"]),
@@ -166,12 +186,19 @@ def _judge(
     if not bad:  # how fast worlds are that do not do the task is no figure
         metrics |= {"episode_s": tally.seconds, "world_steps_per_s": tally.steps / tally.seconds}
     details = [
-        *(f"{rule.text}: {name_worlds(worlds, tally.worlds, _NAMED, what)}" for rule, worlds in tally.broken.items()),
+        *(
+            f"{rule.text}: {name_worlds(worlds, tally.worlds, _NAMED, what)}"
+            for rule, worlds in tally.broken.items()
+        ),
         *details,
     ]
     counts = "; ".join(f"{rule.text} in {len(worlds)}" for rule, worlds in tally.broken.items())
-    interval = f"{format_percent(rate)}, 95 % interval {format_percent(low, '')} to {format_percent(high)}"
-    summary = f"{accepted} of {tally.worlds} {what} accepted ({interval}), {len(tally.ends)} distinct"
+    interval = (
+        f"{format_percent(rate)}, 95 % interval {format_percent(low, '')} to {format_percent(high)}"
+    )
+    summary = (
+        f"{succeeded} of {tally.worlds} {what} succeeded ({interval}), {len(tally.ends)} distinct"
+    )
     failing = f"{name_worlds(bad, tally.worlds, what=what)} failed: {counts}"
     if len(bad) > t.failed_worlds:
         problems.insert(0, failing)
@@ -179,14 +206,14 @@ def _judge(
         summary += f"; {failing}"
     if tally.worlds > 1 and len(tally.ends) < t.distinct_fraction * tally.worlds:
         problems.append(
-            f"only {len(tally.ends)} distinct final states of {tally.worlds} {what}: identical worlds prove nothing, "
-            "use reset=jitter"
+            f"only {len(tally.ends)} distinct final states of {tally.worlds} {what}: identical"
+            " worlds prove nothing, use reset=jitter"
         )
     reason = "; ".join([summary, *problems])
     if bad and context.folder is not None:
         details.append(f"{FAILING} has every failing world with what was measured")
         reason += f". To look at one: job=replay run={context.folder} world={bad[0]}"
-    thresholds = dict(context.evidence.thresholds(cfg))
+    thresholds = dict(context.check.thresholds(cfg))
     thresholds |= {"failed_worlds": t.failed_worlds, "distinct_fraction": t.distinct_fraction}
     return GateResult(
         name="batch",

@@ -9,8 +9,8 @@ import torch
 
 from mjstack.config.schema import Config
 from mjstack.config.validate import PARITY_FIELDS
-from mjstack.gates.episode import NOMINAL, State, restore
-from mjstack.gates.gate import GateContext, judge_one
+from mjstack.episodes.context import GateContext, judge_one
+from mjstack.episodes.rollout import NOMINAL, State, restore
 from mjstack.math import quat_angle
 from mjstack.report.record import GateResult, Status, Value
 from mjstack.sim import Simulation, describe_overflow
@@ -24,7 +24,7 @@ def run_parity(context: GateContext) -> list[GateResult]:
     problems: list[str] = []
     details: list[str] = []
     metrics: dict[str, Value] = {"backend": mjwarp.description}
-    thresholds: dict[str, Value] = dict(context.evidence.thresholds(cfg))
+    thresholds: dict[str, Value] = dict(context.check.thresholds(cfg))
 
     for name, phase in cfg.gate.parity.states.items():
         state = reference.states[context.phase_end(phase)]
@@ -34,7 +34,10 @@ def run_parity(context: GateContext) -> list[GateResult]:
                 metrics[f"{name}.step{steps}.{field}"] = found[field]
                 thresholds[f"step{steps}.{field}"] = limit
                 if not found[field] <= limit:
-                    problems.append(f"{name}, {steps} steps: {field} differs by {found[field]:.2g}, limit {limit:.2g}")
+                    problems.append(
+                        f"{name}, {steps} steps: {field} differs by {found[field]:.2g}, limit"
+                        f" {limit:.2g}"
+                    )
 
     for option, (asked, held, uploaded, equal) in compare_options(cfg, native, mjwarp).items():
         metrics[f"option.{option}"] = f"{asked} / {held} / {uploaded}"
@@ -43,12 +46,15 @@ def run_parity(context: GateContext) -> list[GateResult]:
         if not equal:
             problems.append(line)
 
-    episode = context.run(mjwarp, NOMINAL, record=True, on_frame=context.on_frame)
-    status, reason, judged = judge_one(context.evidence.rules, episode.verdict)
+    episode = context.run(mjwarp, NOMINAL, record=True, on_step=context.on_step)
+    status, reason, judged = judge_one(context.check.rules, episode.result)
     if status is Status.failed:
         problems.append(reason)
     if int(mjwarp.overflow[0]):
-        problems.append(f"{describe_overflow(int(mjwarp.overflow[0]))} overflow: raise batch.njmax or batch.nconmax")
+        problems.append(
+            f"{describe_overflow(int(mjwarp.overflow[0]))} overflow: raise batch.njmax or"
+            " batch.nconmax"
+        )
     metrics.update(judged)
     metrics["peak_contacts"] = int(mjwarp.peak_contacts[0])
     metrics["peak_constraint_rows"] = int(mjwarp.peak_constraints[0])
@@ -58,17 +64,26 @@ def run_parity(context: GateContext) -> list[GateResult]:
     assert episode.qpos is not None
     assert reference.qpos is not None
     for cube, address in zip(("red", "blue"), context.index.cube_qpos, strict=True):
-        ours, theirs = episode.qpos[-1, address : address + 7], reference.qpos[-1, address : address + 7]
+        ours = episode.qpos[-1, address : address + 7]
+        theirs = reference.qpos[-1, address : address + 7]
         distance = float(np.linalg.norm(ours[:3] - theirs[:3]))
-        angle = math.degrees(float(quat_angle(torch.from_numpy(ours[3:]), torch.from_numpy(theirs[3:]))))
-        metrics[f"final.{cube}.position_m"], metrics[f"final.{cube}.rotation_deg"] = distance, angle
-        if not (distance <= cfg.gate.parity.cube_position and angle <= cfg.gate.parity.cube_rotation_deg):
-            problems.append(f"{cube} cube ends {1e3 * distance:.2f} mm and {angle:.2f} deg from native's")
+        angle = math.degrees(
+            float(quat_angle(torch.from_numpy(ours[3:]), torch.from_numpy(theirs[3:])))
+        )
+        metrics[f"final.{cube}.position_m"] = distance
+        metrics[f"final.{cube}.rotation_deg"] = angle
+        if not (
+            distance <= cfg.gate.parity.cube_position and angle <= cfg.gate.parity.cube_rotation_deg
+        ):
+            problems.append(
+                f"{cube} cube ends {1e3 * distance:.2f} mm and {angle:.2f} deg from native's"
+            )
     thresholds["final.position_m"] = cfg.gate.parity.cube_position
     thresholds["final.rotation_deg"] = cfg.gate.parity.cube_rotation_deg
-    headline = context.evidence.headline(judged)
+    headline = context.check.headline(judged)
     context.say(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
-    context.shown, context.shown_by = episode, "parity world"
+    context.shown = episode
+    context.shown_by = "parity world"
     mjwarp.close()
     summary = "; ".join(problems) or (
         f"{headline}; red {1e3 * float(metrics['final.red.position_m'] or 0):.2f} mm from native's"
@@ -85,8 +100,12 @@ def run_parity(context: GateContext) -> list[GateResult]:
     ]
 
 
-def compare_steps(native: Simulation, mjwarp: Simulation, state: State, steps: int) -> dict[str, float]:
-    """Largest absolute difference of every field after some steps from one state, derived fields brought up to date."""
+def compare_steps(
+    native: Simulation, mjwarp: Simulation, state: State, steps: int
+) -> dict[str, float]:
+    """Largest absolute difference of every field after some steps from one state, derived fields
+    brought up to date.
+    """
     for sim in (native, mjwarp):
         restore(sim, state)
         sim.step(steps)
@@ -94,15 +113,19 @@ def compare_steps(native: Simulation, mjwarp: Simulation, state: State, steps: i
         sim.synchronize()
     out = {}
     for field in PARITY_FIELDS:
-        a, b = getattr(native, field).double(), getattr(mjwarp, field).double().cpu()
+        a = getattr(native, field).double()
+        b = getattr(mjwarp, field).double().cpu()
         if field == "xquat":  # q and -q are one rotation
             b = torch.where((a * b).sum(-1, keepdim=True) < 0.0, -b, b)
         out[field] = float((a - b).abs().amax())
     return out
 
 
-def compare_options(cfg: Config, native: Simulation, mjwarp: Simulation) -> dict[str, tuple[str, str, str, bool]]:
-    """Requested, native's and the uploaded options side by side, and whether they agree; numbers to float32.
+def compare_options(
+    cfg: Config, native: Simulation, mjwarp: Simulation
+) -> dict[str, tuple[str, str, str, bool]]:
+    """Requested, native's and the uploaded options side by side, and whether they agree; numbers to
+    float32.
 
     What the configuration leaves to the robot's file is requested as ``the file's``.
     """
@@ -122,7 +145,12 @@ def compare_options(cfg: Config, native: Simulation, mjwarp: Simulation) -> dict
     for name, held in native.option_values().items():
         asked = requested.get(name)
         equal = _agree(name, held, uploaded[name]) and (asked is None or _agree(name, asked, held))
-        out[name] = ("the file's" if asked is None else _short(asked), _short(held), _short(uploaded[name]), equal)
+        out[name] = (
+            "the file's" if asked is None else _short(asked),
+            _short(held),
+            _short(uploaded[name]),
+            equal,
+        )
     return out
 
 
@@ -130,7 +158,8 @@ def _agree(name: str, asked: float | int | str, got: float | int | str) -> bool:
     if isinstance(asked, str) or isinstance(got, str):
         return asked == got
     if name == "tolerance":  # MJWarp clamps it to what float32 can resolve
-        asked, got = max(asked, 1e-6), max(got, 1e-6)
+        asked = max(asked, 1e-6)
+        got = max(got, 1e-6)
     return math.isclose(asked, got, rel_tol=1e-5)
 
 

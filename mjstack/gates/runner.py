@@ -7,11 +7,11 @@ import time
 import traceback
 from collections.abc import Callable
 
+from mjstack.episodes.context import GateContext
 from mjstack.errors import MjstackError, is_out_of_memory
 from mjstack.gates.baseline import run_baseline
 from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import run_capacity
-from mjstack.gates.gate import GateContext
 from mjstack.gates.parity import run_parity
 from mjstack.gates.success import run_success
 from mjstack.gates.throughput import run_throughput
@@ -44,7 +44,8 @@ def run_gates(
         on_result: Told after each result, before the next gate starts.
 
     Returns:
-        All results. A gate that raises has failed, with the error as its reason; the others still run.
+        All results. A gate that raises has failed, with the error as its reason; the others still
+        run.
     """
     out: list[GateResult] = []
     for name, run in GATES.items():
@@ -55,9 +56,14 @@ def run_gates(
 
 
 def run_guarded(
-    context: GateContext, name: str, run: Gate, on_result: Callable[[GateResult], None] = lambda _: None
+    context: GateContext,
+    name: str,
+    run: Gate,
+    on_result: Callable[[GateResult], None] = lambda _: None,
 ) -> list[GateResult]:
-    """Runs one gate, or whatever judges like one. If it raises it has failed, with the error as its reason."""
+    """Runs one gate, or whatever judges like one. If it raises it has failed, with the error as its
+    reason.
+    """
     began = time.perf_counter()
     try:
         results = run(context)

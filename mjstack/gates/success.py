@@ -1,4 +1,6 @@
-"""Gate *success*: how often the scripted controller that watches does the task from random starts, and where it fails."""
+"""Gate *success*: how often the scripted controller that watches does the task from random starts,
+and where it fails.
+"""
 
 from __future__ import annotations
 
@@ -10,23 +12,30 @@ from pathlib import Path
 import numpy as np
 
 from mjstack.config.schema import Config
-from mjstack.config.validate import places_cubes, reads_layout
+from mjstack.config.validate import places_cubes, reads_starts_file
 from mjstack.envs import Env
+from mjstack.episodes.batch_record import FAILING, write_failing
+from mjstack.episodes.context import GateContext, failing_rules, play_seeds
+from mjstack.episodes.failures import FailureMonitor, describe_sign
+from mjstack.episodes.regions import Region, find_regions
+from mjstack.episodes.rollout import CLOSED_LOOP
+from mjstack.episodes.success_record import (
+    BOTH,
+    PICTURE,
+    REGIONS,
+    SuccessRecord,
+    start_places,
+    starts_name,
+)
 from mjstack.errors import MjstackError, name_worlds
-from mjstack.gates.batch_record import FAILING, write_failing
-from mjstack.gates.episode import SCRIPTED
-from mjstack.gates.gate import GateContext, failing_rules, play_seeds
-from mjstack.gates.regions import Region, find_regions
-from mjstack.gates.success_record import BOTH, PICTURE, REGIONS, SuccessRecord, layout_name, start_places
-from mjstack.gates.watch import FailureWatch, describe_sign
 from mjstack.math import wilson_interval
-from mjstack.mdp.layout import write_layout
+from mjstack.mdp.starts.starts_file import write_starts
+from mjstack.report.csv_table import to_csv
 from mjstack.report.markdown import format_percent
 from mjstack.report.record import GateResult, Status, Table, Value, write_atomic
 from mjstack.report.success import save_places
-from mjstack.report.table import to_csv
 from mjstack.sim import Simulation
-from mjstack.tasks.evidence import Rule
+from mjstack.tasks.check import Rule
 
 log = logging.getLogger(__name__)
 
@@ -37,15 +46,15 @@ _NAMED = 100  # episodes a line in report.md; the table of failing ones has all
 def success_config(cfg: Config) -> Config:
     """The configuration under which the gate plays: its controller, and how its worlds start."""
     t = cfg.gate.success
-    reset = dict(cfg.reset if reads_layout(cfg.reset) else t.reset)
+    reset = dict(cfg.reset if reads_starts_file(cfg.reset) else t.reset)
     if t.region is not None:
         for name, term in reset.items():
             if places_cubes(term):
                 reset[name] = replace(term, params=term.params | {"xy": list(t.region)})
-    return replace(cfg, reset=reset, controller=replace(cfg.controller, name=SCRIPTED))
+    return replace(cfg, reset=reset, controller=replace(cfg.controller, name=CLOSED_LOOP))
 
 
-class _Watch(FailureWatch):
+class _Watch(FailureMonitor):
     """Keeps how worlds start, too, and writes it down."""
 
     def __init__(self, cfg: Config, path: Path | None) -> None:
@@ -60,8 +69,10 @@ class _Watch(FailureWatch):
         self.places = start_places(env)
         if self._path is not None:
             try:
-                write_layout(env, self._path)
-            except MjstackError as error:  # such as a full disk: the episodes are played all the same
+                write_starts(env, self._path)
+            except (
+                MjstackError
+            ) as error:  # such as a full disk: the episodes are played all the same
                 log.error("no %s: %s", self._path, error)
                 self.problem = f"{self._path.name} could not be written: {error}"
 
@@ -80,7 +91,7 @@ class _Tally:
     rules: type[Rule]
     phases: list[str]
     seeds: list[int] = field(default_factory=list)
-    accepted: list[np.ndarray] = field(default_factory=list)
+    succeeded: list[np.ndarray] = field(default_factory=list)
     retries: list[np.ndarray] = field(default_factory=list)
     places: list[np.ndarray] = field(default_factory=list)
     waypoint_error: float = 0.0
@@ -94,25 +105,28 @@ class _Tally:
     @property
     def episodes(self) -> int:
         """How many were played."""
-        return sum(len(accepted) for accepted in self.accepted)
+        return sum(len(succeeded) for succeeded in self.succeeded)
 
     @property
     def good(self) -> int:
-        """How many were accepted."""
+        """How many succeeded."""
         return self.episodes - len(self.failed)
 
     def add(self, record: SuccessRecord, seconds: float, waypoint_error: float) -> None:
         """Takes in one seed."""
-        seed, failed = record.batch.seed, ~record.accepted
+        seed = record.batch.seed
+        failed = ~record.succeeded
 
         def names(worlds: Sequence[int]) -> list[str]:
             return [f"{seed}:{world}" if self.several else str(world) for world in worlds]
 
         self.seeds.append(seed)
-        self.accepted.append(record.accepted)
+        self.succeeded.append(record.succeeded)
         self.retries.append(record.retries)
         self.places.append(record.places)
-        self.waypoint_error = float(np.maximum(self.waypoint_error, waypoint_error))  # NaN is handed on
+        self.waypoint_error = float(
+            np.maximum(self.waypoint_error, waypoint_error)
+        )  # NaN is handed on
         self.seconds += seconds
         self.failed += names(np.flatnonzero(failed).tolist())
         self.unreachable += names(np.flatnonzero(record.unreachable).tolist())
@@ -125,26 +139,39 @@ class _Tally:
 
 
 def run_success(context: GateContext) -> list[GateResult]:
-    """Plays the task from random starts under every seed, and holds the share of accepted episodes against ``rate``."""
+    """Plays the task from random starts under every seed, and holds the share of succeeded episodes
+    against ``rate``.
+    """
     own = context.with_config(success_config(context.cfg))
-    cfg, t = own.cfg, own.cfg.gate.success
-    tally = _Tally(t.seeds > 1, own.evidence.rules, [phase.name for phase in own.planner.phases])
+    cfg = own.cfg
+    t = own.cfg.gate.success
+    tally = _Tally(t.seeds > 1, own.check.rules, [phase.name for phase in own.planner.phases])
     details: list[str] = []
     sim = own.batch_simulation(cfg.nworld)
     sizes = getattr(sim, "sizes", None)
     metrics: dict[str, Value] = {
         "backend": sim.description,
-        "sizes": f"{sizes.as_overrides()} ({sizes.source})" if sizes else "native MuJoCo has no fixed buffers",
+        "sizes": (
+            f"{sizes.as_overrides()} ({sizes.source})"
+            if sizes
+            else "native MuJoCo has no fixed buffers"
+        ),
     }
 
     def keep(record: SuccessRecord) -> None:
         _keep(own, record, tally, details)
         if t.seeds > 1:
-            accepted, so_far = int(record.accepted.sum()), f"{tally.good} of {tally.episodes}"
-            context.say(f"success, seed {record.batch.seed}: {accepted} of {cfg.nworld} episodes accepted, {so_far} so far")
+            succeeded = int(record.succeeded.sum())
+            so_far = f"{tally.good} of {tally.episodes}"
+            context.say(
+                f"success, seed {record.batch.seed}: {succeeded} of {cfg.nworld} episodes"
+                f" succeeded, {so_far} so far"
+            )
 
     try:
-        problems = play_seeds(cfg.seed, t.seeds, lambda seed: _play(own, sim, seed, tally, details), keep)
+        problems = play_seeds(
+            cfg.seed, t.seeds, lambda seed: _play(own, sim, seed, tally, details), keep
+        )
     finally:
         sim.close()
     result = _judge(own, tally, metrics, problems, details)
@@ -152,12 +179,15 @@ def run_success(context: GateContext) -> list[GateResult]:
     return [result]
 
 
-def _play(context: GateContext, sim: Simulation, seed: int, tally: _Tally, details: list[str]) -> SuccessRecord:
+def _play(
+    context: GateContext, sim: Simulation, seed: int, tally: _Tally, details: list[str]
+) -> SuccessRecord:
     """One seed's episode in every world."""
-    cfg, path = context.cfg, None
+    cfg = context.cfg
+    path = None
     if context.folder is not None:
-        path = context.folder / layout_name(seed)
-        if cfg.layout is not None and path.resolve() == Path(cfg.layout).resolve():
+        path = context.folder / starts_name(seed)
+        if cfg.starts is not None and path.resolve() == Path(cfg.starts).resolve():
             path = None  # the worlds start from this very file
     watch = _Watch(cfg, path)
     episode = context.run(sim, cfg.reset, seed=seed, watch=watch)
@@ -173,7 +203,9 @@ def _failing_name(cfg: Config) -> str:
 
 
 def _keep(context: GateContext, record: SuccessRecord, tally: _Tally, details: list[str]) -> None:
-    """Writes the seed's record, before the next one can break or be stopped. A full disk takes no verdict back."""
+    """Writes the seed's record, before the next one can break or be stopped. A full disk takes no
+    result back.
+    """
     folder = context.folder
     if folder is None:
         return
@@ -183,51 +215,66 @@ def _keep(context: GateContext, record: SuccessRecord, tally: _Tally, details: l
             write_failing(folder, record.header(), tally.rows, _failing_name(context.cfg))
     except OSError as error:
         log.exception("the record of seed %d was not written", record.batch.seed)
-        details.append(f"seed {record.batch.seed}: no record of its episodes could be written ({error.strerror})")
+        details.append(
+            f"seed {record.batch.seed}: no record of its episodes could be written"
+            f" ({error.strerror})"
+        )
 
 
 def _judge(
-    context: GateContext, tally: _Tally, metrics: dict[str, Value], problems: list[str], details: list[str]
+    context: GateContext,
+    tally: _Tally,
+    metrics: dict[str, Value],
+    problems: list[str],
+    details: list[str],
 ) -> GateResult:
-    cfg, t = context.cfg, context.cfg.gate.success
-    n, good = tally.episodes, tally.good
+    cfg = context.cfg
+    t = context.cfg.gate.success
+    n = tally.episodes
+    good = tally.good
     rate, (low, high) = good / n, wilson_interval(good, n)
-    accepted, retries, places = (np.concatenate(parts) for parts in (tally.accepted, tally.retries, tally.places))
+    succeeded, retries, places = (
+        np.concatenate(parts) for parts in (tally.succeeded, tally.retries, tally.places)
+    )
     retried = retries > 0
     regions = find_regions(
         places,
-        accepted,
+        succeeded,
         cell=t.cell,
         yaw_cell_deg=t.yaw_cell_deg,
         episodes=t.cell_episodes,
         cubes=CUBES,
     )
     metrics |= {
-        "starts": f"layout={cfg.layout}" if reads_layout(cfg.reset) else _describe_start(cfg),
+        "starts": f"starts={cfg.starts}" if reads_starts_file(cfg.reset) else _describe_start(cfg),
         "worlds": cfg.nworld,
         "seeds": len(tally.seeds),
         "episodes": n,
-        "accepted": good,
+        "succeeded": good,
         "success_rate": rate,
         "success_rate_low95": low,
         "success_rate_high95": high,
         "distinct_starts": len(np.unique(np.round(places, 6).reshape(n, -1), axis=0)),
         "retried": int(retried.sum()),
         "retries": int(retries.sum()),
-        "retried_accepted": int((retried & accepted).sum()),
+        "retried_succeeded": int((retried & succeeded).sum()),
         "unreachable": len(tally.unreachable),
         "waypoint_error_max_m": tally.waypoint_error,
         "episode_s": tally.seconds,
         **{f"failed.{rule.name}": len(worlds) for rule, worlds in tally.broken.items()},
     }
-    per_seed = [int(part.sum()) for part in tally.accepted]
+    per_seed = [int(part.sum()) for part in tally.succeeded]
     if t.seeds > 1:
-        metrics |= {f"seed{seed}.accepted": k for seed, k in zip(tally.seeds, per_seed, strict=True)}
+        metrics |= {
+            f"seed{seed}.succeeded": k for seed, k in zip(tally.seeds, per_seed, strict=True)
+        }
 
-    interval = f"{format_percent(rate)}, 95 % interval {format_percent(low, '')} to {format_percent(high)}"
-    reason = f"{good} of {n} episodes accepted ({interval}), {format_percent(t.rate)} wanted"
+    interval = (
+        f"{format_percent(rate)}, 95 % interval {format_percent(low, '')} to {format_percent(high)}"
+    )
+    reason = f"{good} of {n} episodes succeeded ({interval}), {format_percent(t.rate)} wanted"
     if retried.any():
-        reason += f"; {retried.sum()} retried, {(retried & accepted).sum()} of them accepted"
+        reason += f"; {retried.sum()} retried, {(retried & succeeded).sum()} of them succeeded"
     if tally.failed:
         counts = "; ".join(f"{rule.text} in {len(worlds)}" for rule, worlds in tally.broken.items())
         reason += f"; {name_worlds(tally.failed, n, what='episodes')} failed: {counts}"
@@ -235,23 +282,38 @@ def _judge(
     if rate < t.rate:
         problems.append("rate")
     if not regions:
-        details.append(f"no region has {t.cell_episodes} episodes (gate.success.cell_episodes): more seeds have more")
-    elif all(region.accepted == region.episodes for region in regions):
+        details.append(
+            f"no region has {t.cell_episodes} episodes (gate.success.cell_episodes): more seeds"
+            " have more"
+        )
+    elif all(region.succeeded == region.episodes for region in regions):
         details.append(f"no region of at least {t.cell_episodes} episodes had a failure")
     if tally.unreachable:
-        details.append(f"target out of reach: {name_worlds(tally.unreachable, n, _NAMED, 'episodes')}")
-    details += [f"{rule.text}: {name_worlds(worlds, n, _NAMED, 'episodes')}" for rule, worlds in tally.broken.items()]
+        details.append(
+            f"target out of reach: {name_worlds(tally.unreachable, n, _NAMED, 'episodes')}"
+        )
+    details += [
+        f"{rule.text}: {name_worlds(worlds, n, _NAMED, 'episodes')}"
+        for rule, worlds in tally.broken.items()
+    ]
     if context.folder is not None:
-        details += _save(context, regions, places, accepted, f"{good} of {n} episodes accepted ({interval})")
+        details += _save(
+            context, regions, places, succeeded, f"{good} of {n} episodes succeeded ({interval})"
+        )
         if tally.failed:
             which = "success:" if "batch" in cfg.gates else ""
-            details.append(f"{_failing_name(cfg)} has every failing episode with its start and what was measured")
-            reason += f". To look at one: job=replay run={context.folder} world={which}{tally.failed[0]}"
+            details.append(
+                f"{_failing_name(cfg)} has every failing episode with its start and what was"
+                " measured"
+            )
+            reason += (
+                f". To look at one: job=replay run={context.folder} world={which}{tally.failed[0]}"
+            )
     return GateResult(
         name="success",
         status=Status.failed if problems else Status.passed,
         reason=reason,
-        thresholds=dict(context.evidence.thresholds(cfg)) | {"success_rate_min": t.rate},
+        thresholds=dict(context.check.thresholds(cfg)) | {"success_rate_min": t.rate},
         metrics=metrics,
         details=details,
         tables=_tables(cfg, tally, per_seed, regions),
@@ -260,19 +322,34 @@ def _judge(
 
 def _describe_start(cfg: Config) -> str:
     """How worlds start, in a few words."""
-    regions = [term.params["xy"] for term in cfg.reset.values() if places_cubes(term) and "xy" in term.params]
+    regions = [
+        term.params["xy"]
+        for term in cfg.reset.values()
+        if places_cubes(term) and "xy" in term.params
+    ]
     where = "".join(f", cubes within {x:g} x {y:g} m of their places" for x, y in regions)
     return f"gate.success.reset ({', '.join(cfg.reset)}{where})"
 
 
-def _save(context: GateContext, regions: list[Region], places: np.ndarray, accepted: np.ndarray, title: str) -> list[str]:
-    """Writes the table of regions and the picture; returns what did not work, which takes no verdict back."""
-    folder, scene = context.folder, context.cfg.scene
+def _save(
+    context: GateContext,
+    regions: list[Region],
+    places: np.ndarray,
+    succeeded: np.ndarray,
+    title: str,
+) -> list[str]:
+    """Writes the table of regions and the picture; returns what did not work, which takes no result
+    back.
+    """
+    folder = context.folder
+    scene = context.cfg.scene
     assert folder is not None
     table = (scene.table_center[:2], scene.table_half[:2])
     work: dict[str, Callable[[], None]] = {
         REGIONS: lambda: write_atomic(folder / REGIONS, to_csv(Region, regions)),
-        PICTURE: lambda: save_places(folder / PICTURE, places, accepted, table, f"{context.cfg.robot.title}: {title}", CUBES),
+        PICTURE: lambda: save_places(
+            folder / PICTURE, places, succeeded, table, f"{context.cfg.robot.title}: {title}", CUBES
+        ),
     }
     lost = []
     for name, save in work.items():
@@ -281,7 +358,10 @@ def _save(context: GateContext, regions: list[Region], places: np.ndarray, accep
         except Exception as error:
             log.exception("%s was not written", name)
             (folder / name).unlink(missing_ok=True)  # a picture may be there in part
-            lost.append(f"{name} could not be written ({getattr(error, 'strerror', None) or type(error).__name__})")
+            lost.append(
+                f"{name} could not be written"
+                f" ({getattr(error, 'strerror', None) or type(error).__name__})"
+            )
         else:
             context.pictures += [name] if name == PICTURE else []
     return lost
@@ -289,11 +369,21 @@ def _save(context: GateContext, regions: list[Region], places: np.ndarray, accep
 
 def _tables(cfg: Config, tally: _Tally, per_seed: list[int], regions: list[Region]) -> list[Table]:
     """What report.md shows: seeds, first signs of failure, and the worst regions."""
-    t, n = cfg.gate.success, cfg.nworld
+    t = cfg.gate.success
+    n = cfg.nworld
     tables = []
     if len(tally.seeds) > 1:
-        rows = [[str(seed), str(n), str(k), *_rate_cells(k, n)] for seed, k in zip(tally.seeds, per_seed, strict=True)]
-        tables.append(Table(title="Seeds", header=["seed", "episodes", "accepted", "rate", "95 % interval"], rows=rows))
+        rows = [
+            [str(seed), str(n), str(k), *_rate_cells(k, n)]
+            for seed, k in zip(tally.seeds, per_seed, strict=True)
+        ]
+        tables.append(
+            Table(
+                title="Seeds",
+                header=["seed", "episodes", "succeeded", "rate", "95 % interval"],
+                rows=rows,
+            )
+        )
     if tally.signs:
         rows = [
             [
@@ -305,15 +395,18 @@ def _tables(cfg: Config, tally: _Tally, per_seed: list[int], regions: list[Regio
         ]
         header = ["first sign of failure", "failed episodes", "which"]
         tables.append(Table(title="Where it went wrong", header=header, rows=rows))
-    failing = [r for r in regions if r.accepted < r.episodes]
+    failing = [r for r in regions if r.succeeded < r.episodes]
     if not failing:
         return tables
-    worst = [[r.where, str(r.episodes), str(r.accepted), *_rate_cells(r.accepted, r.episodes)] for r in failing]
+    worst = [
+        [r.where, str(r.episodes), str(r.succeeded), *_rate_cells(r.succeeded, r.episodes)]
+        for r in failing
+    ]
     shown = f"{min(len(worst), t.worst_regions)} of {len(worst)} with a failure"
     tables.append(
         Table(
             title=f"Worst regions of at least {t.cell_episodes} episodes ({shown})",
-            header=["where the cube started", "episodes", "accepted", "rate", "95 % interval"],
+            header=["where the cube started", "episodes", "succeeded", "rate", "95 % interval"],
             rows=worst[: t.worst_regions],
         )
     )

@@ -1,4 +1,6 @@
-"""Gate *throughput*: how fast physics, the validated episode and ``env.step`` are. Void where the task or physics failed."""
+"""Gate *throughput*: how fast physics, the validated episode and ``env.step`` are. Void where the
+task or physics failed.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +13,18 @@ from collections.abc import Callable
 
 import torch
 
+from mjstack.bench.power import EnergyMeter
+from mjstack.bench.sections import (
+    Section,
+    TimeBudget,
+    measure_env_steps,
+    measure_episode,
+    measure_physics,
+)
 from mjstack.config.schema import Backend
 from mjstack.envs import build_env
+from mjstack.episodes.context import GateContext
 from mjstack.errors import MjstackError
-from mjstack.gates.gate import GateContext
-from mjstack.gates.power import EnergyMeter
-from mjstack.gates.sections import Section, Stopwatch, measure_env_steps, measure_episode, measure_physics
 from mjstack.report.record import GateResult, Status, Value
 from mjstack.sim import BatchSizes
 
@@ -28,17 +36,24 @@ CUDA = "throughput_cuda"
 def run_throughput(context: GateContext) -> list[GateResult]:
     """Measures the CPU-side backend as ``throughput`` and MJWarp on CUDA as ``throughput_cuda``.
 
-    On a machine without CUDA the second is a skip; with CUDA the first is native MuJoCo on all cores, as the baseline.
+    On a machine without CUDA the second is a skip; with CUDA the first is native MuJoCo on all
+    cores, as the baseline.
     """
     backend, device = context.backend
     if device.startswith("cuda"):
         if context.cfg.gate.throughput.native_baseline:
             native = _measure(context, "throughput", Backend.native, "cpu")
         else:
-            native = GateResult(name="throughput", status=Status.skipped, reason="gate.throughput.native_baseline=false")
+            native = GateResult(
+                name="throughput",
+                status=Status.skipped,
+                reason="gate.throughput.native_baseline=false",
+            )
         return [native, _measure(context, CUDA, Backend.mjwarp, device)]
     reason = "no CUDA device was used: " + (
-        "this machine has none" if not torch.cuda.is_available() else f"sim={backend.value} sim.device={device}"
+        "this machine has none"
+        if not torch.cuda.is_available()
+        else f"sim={backend.value} sim.device={device}"
     )
     return [
         _measure(context, "throughput", backend, device),
@@ -47,29 +62,41 @@ def run_throughput(context: GateContext) -> list[GateResult]:
 
 
 def _measure(context: GateContext, name: str, backend: Backend, device: str) -> GateResult:
-    """All sections on one backend. One that breaks, out of memory say, leaves the others their figures."""
-    cfg, t = context.cfg, context.cfg.gate.throughput
+    """All sections on one backend. One that breaks, out of memory say, leaves the others their
+    figures.
+    """
+    cfg = context.cfg
+    t = context.cfg.gate.throughput
     batch = context.results.get("batch")
     if batch is not None and batch.status is Status.failed:
-        reason = "no figure: the batch gate failed, and a figure counts only where the task was verified"
+        reason = (
+            "no figure: the batch gate failed, and a figure counts only where the task was verified"
+        )
         return GateResult(name=name, status=Status.failed, reason=reason)
     began = time.perf_counter()
     on_cuda = device.startswith("cuda")
-    watch = Stopwatch(t.max_seconds if on_cuda else t.cpu_max_seconds, t.repetitions)
+    watch = TimeBudget(t.max_seconds if on_cuda else t.cpu_max_seconds, t.repetitions)
     meter = EnergyMeter(device)
     facts: dict[str, Value] = {"worlds": cfg.nworld, "cpu_count": os.cpu_count()}
     sections: list[Section] = []
     if {"physics", "episode"} & set(t.sections):
         sections += _on_scripted_worlds(context, backend, device, watch, meter, facts)
     if "env_step" in t.sections:
-        sections.append(_guarded("env_step", lambda: _on_environment(context, backend, device, watch, meter, facts)))
+        sections.append(
+            _guarded(
+                "env_step", lambda: _on_environment(context, backend, device, watch, meter, facts)
+            )
+        )
     if not on_cuda:
         facts |= {"gpu_power_and_memory": "not measured: no GPU"} | _peak_memory()
 
     episode = next((section for section in sections if section.name == "episode"), None)
     if episode is not None and episode.rejected:
         for section in sections:
-            section.problem = section.problem or "the episode failed, and a figure counts only where the task was verified"
+            section.problem = (
+                section.problem
+                or "the episode failed, and a figure counts only where the task was verified"
+            )
     verified = batch is not None and batch.status is Status.passed
     verified |= episode is not None and bool(episode.figures) and not episode.problem
     parts = []
@@ -101,40 +128,63 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
 
 
 def _on_scripted_worlds(
-    context: GateContext, backend: Backend, device: str, watch: Stopwatch, meter: EnergyMeter, facts: dict[str, Value]
+    context: GateContext,
+    backend: Backend,
+    device: str,
+    watch: TimeBudget,
+    meter: EnergyMeter,
+    facts: dict[str, Value],
 ) -> list[Section]:
     """Sections *physics* and *episode*, on the same worlds."""
-    cfg, wanted = context.cfg, context.cfg.gate.throughput.sections
+    cfg = context.cfg
+    wanted = context.cfg.gate.throughput.sections
     gc.collect()  # environments hold on to their worlds in cycles, and a GPU has not room for all
     began = time.perf_counter()
     try:
         sim = context.simulation(cfg.nworld, backend, device)
     except Exception as error:
-        return [Section(name=name, problem=_explain(name, error)) for name in ("physics", "episode") if name in wanted]
+        return [
+            Section(name=name, problem=_explain(name, error))
+            for name in ("physics", "episode")
+            if name in wanted
+        ]
     facts |= {"backend": sim.description, "build_and_compile_s": time.perf_counter() - began}
     sizes: BatchSizes | None = getattr(sim, "sizes", None)
     if sizes is not None:
-        facts |= {"nconmax": sizes.nconmax, "naconmax": sizes.contact_pool(cfg.nworld), "njmax": sizes.njmax}
+        facts |= {
+            "nconmax": sizes.nconmax,
+            "naconmax": sizes.contact_pool(cfg.nworld),
+            "njmax": sizes.njmax,
+        }
         facts["sizes_from"] = sizes.source
     sections: list[Section] = []
-    frame_seconds: float | None = None
+    step_seconds: float | None = None
     if "physics" in wanted:
         sections.append(_guarded("physics", lambda: measure_physics(context, sim, watch, meter)))
-        frame_seconds = sections[0].frame_seconds
+        step_seconds = sections[0].step_seconds
     if "episode" in wanted:
-        sections.append(_guarded("episode", lambda: measure_episode(context, sim, watch, meter, frame_seconds)))
+        sections.append(
+            _guarded("episode", lambda: measure_episode(context, sim, watch, meter, step_seconds))
+        )
     sim.close()
     return sections
 
 
 def _on_environment(
-    context: GateContext, backend: Backend, device: str, watch: Stopwatch, meter: EnergyMeter, facts: dict[str, Value]
+    context: GateContext,
+    backend: Backend,
+    device: str,
+    watch: TimeBudget,
+    meter: EnergyMeter,
+    facts: dict[str, Value],
 ) -> Section:
     """Section *env_step*, on an environment with room for random actions."""
     cfg = context.cfg
     gc.collect()
     began = time.perf_counter()
-    env = build_env(cfg, model=context.model, backend=backend, device=device, sizes=context.env_sizes)
+    env = build_env(
+        cfg, model=context.model, backend=backend, device=device, sizes=context.env_sizes
+    )
     facts.setdefault("backend", env.sim.description)
     build_seconds = time.perf_counter() - began
     try:
@@ -158,7 +208,10 @@ def _explain(name: str, error: Exception) -> str:
     if isinstance(error, MjstackError):
         return str(error).rstrip(".")
     log.error("%s broke", name, exc_info=error)
-    return f"{type(error).__name__}: {(str(error) or 'no message').splitlines()[0]} (run.log has the traceback)"
+    return (
+        f"{type(error).__name__}: {(str(error) or 'no message').splitlines()[0]} (run.log has the"
+        " traceback)"
+    )
 
 
 def _peak_memory() -> dict[str, Value]:

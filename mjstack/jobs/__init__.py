@@ -10,9 +10,9 @@ from pathlib import Path
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
 from mjstack.jobs import collect, gates, reachability, replay, scaling, study
-from mjstack.jobs.outcome import JobOutcome
+from mjstack.jobs.result import JobResult
 
-__all__ = ["JOBS", "JobOutcome", "check_job", "job_folder", "run_job"]
+__all__ = ["JOBS", "JobResult", "check_job", "job_folder", "run_job"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,11 +23,12 @@ class Job:
         check: Raises a `MjstackError` for what cannot be done here, before anything is written.
         run: Does it. Gets the configuration, the run's folder and the command line's overrides.
         keys: Top-level keys and groups that its command line may set; None for all.
-        folder: Where it goes if nobody says otherwise, for a job that resumes; None for a folder of the hour.
+        folder: Where it goes if nobody says otherwise, for a job that resumes; None for a folder of
+            the hour.
     """
 
     check: Callable[[Config], None]
-    run: Callable[[Config, Path, list[str]], JobOutcome]
+    run: Callable[[Config, Path, list[str]], JobResult]
     keys: tuple[str, ...] | None = None
     folder: Callable[[Config], Path] | None = None
 
@@ -64,6 +65,6 @@ def job_folder(cfg: Config) -> Path | None:
     return None if find is None else find(cfg)
 
 
-def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
+def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
     """Runs the job that the configuration names. Ctrl-C is an outcome, not an exception."""
     return JOBS[cfg.job.name].run(cfg, folder, overrides)

@@ -1,4 +1,6 @@
-"""One case of the scaling job: the gates, for one backend and number of worlds, in a process of its own."""
+"""One case of the scaling job: the gates, for one backend and number of worlds, in a process of its
+own.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,13 @@ def read_case(folder: Path, nworld: int, backend: str) -> ScalingRow:
 
 
 def run_case(
-    folder: Path, nworld: int, backend: str, overrides: Sequence[str], *, case_seconds: float, call_seconds: float
+    folder: Path,
+    nworld: int,
+    backend: str,
+    overrides: Sequence[str],
+    *,
+    case_seconds: float,
+    call_seconds: float,
 ) -> ScalingRow:
     """Runs a case and keeps its row in its folder.
 
@@ -62,7 +70,9 @@ def run_case(
     began = time.monotonic()
     limit = min(case_seconds, call_seconds)
     with (folder / "output.log").open("w") as log:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+        )
         code: int | None = None
         try:
             code = process.wait(limit)
@@ -78,7 +88,8 @@ def run_case(
     row = _row(folder, nworld, backend, code)
     row.seconds = seconds
     if code is None:
-        row.status, row.reason = "timeout", f"not done after {seconds:.0f} s (job.case_minutes)"
+        row.status = "timeout"
+        row.reason = f"not done after {seconds:.0f} s (job.case_minutes)"
     write_atomic(folder / RESULT, json.dumps(asdict(row), indent=2) + "\n")
     return row
 
@@ -108,8 +119,10 @@ def _row(folder: Path, nworld: int, backend: str, code: int | None) -> ScalingRo
         report = {"gates": [], "provenance": {}}
     output = (folder / "output.log").read_text(errors="replace").strip()
     gates = {gate["name"]: gate for gate in report["gates"]}
-    row = ScalingRow(nworld=nworld, backend=backend, git_commit=str(report["provenance"].get("git_commit", "")))
-    row.accepted = gates.get("batch", {}).get("metrics", {}).get("accepted")
+    row = ScalingRow(
+        nworld=nworld, backend=backend, git_commit=str(report["provenance"].get("git_commit", ""))
+    )
+    row.succeeded = gates.get("batch", {}).get("metrics", {}).get("succeeded")
     for name in ("throughput", "throughput_cuda"):
         if name in gates and gates[name]["status"] != "skip":
             _fill(row, gates[name]["metrics"])
@@ -120,11 +133,17 @@ def _row(folder: Path, nworld: int, backend: str, code: int | None) -> ScalingRo
         return row
     row.status = "fail"
     row.reason = "; ".join(failed) or last
-    if is_out_of_memory(row.reason) or _NO_ROOM.search(row.reason) or (code != 2 and is_out_of_memory(output)):
+    if (
+        is_out_of_memory(row.reason)
+        or _NO_ROOM.search(row.reason)
+        or (code != 2 and is_out_of_memory(output))
+    ):
         row.status = "out of memory"
     elif code is not None and code < 0:
         row.status = "out of memory" if code == -9 else "crashed"
-        row.reason = f"killed by signal {-code}" + (", as the system does when memory runs out" if code == -9 else f"; {last}")
+        row.reason = f"killed by signal {-code}" + (
+            ", as the system does when memory runs out" if code == -9 else f"; {last}"
+        )
     return row
 
 
@@ -136,7 +155,11 @@ def _fill(row: ScalingRow, metrics: dict[str, Any]) -> None:
         return value if isinstance(value, float | int) else None
 
     def most(name: str) -> Value:
-        found = [value for section in ("physics", "episode", "env_step") if (value := get(f"{section}.{name}")) is not None]
+        found = [
+            value
+            for section in ("physics", "episode", "env_step")
+            if (value := get(f"{section}.{name}")) is not None
+        ]
         return max(map(float, found), default=None)
 
     row.hardware = str(metrics.get("backend", ""))
@@ -151,11 +174,15 @@ def _fill(row: ScalingRow, metrics: dict[str, Any]) -> None:
     row.ms_per_env_step = get("env_step.ms_per_env_step.median")
     row.managers_over_physics = get("env_step.managers_over_physics.median")
     row.managers_alone_over_physics = get("env_step.managers_alone_over_physics.median")
-    row.episode_s, row.bare_ratio = get("episode.seconds.median"), get("episode.bare_ratio.median")
-    row.gpu_memory_arrays_mib, row.gpu_memory_whole_gpu_mib = most("gpu_memory_arrays_mib"), most("gpu_memory_whole_gpu_mib")
-    row.gpu_power_mean_w, row.process_peak_mib = get("episode.gpu_power_mean_w"), get("process_peak_mib")
+    row.episode_s = get("episode.seconds.median")
+    row.bare_ratio = get("episode.bare_ratio.median")
+    row.gpu_memory_arrays_mib = most("gpu_memory_arrays_mib")
+    row.gpu_memory_whole_gpu_mib = most("gpu_memory_whole_gpu_mib")
+    row.gpu_power_mean_w = get("episode.gpu_power_mean_w")
+    row.process_peak_mib = get("process_peak_mib")
     row.build_s = get("build_and_compile_s")
-    row.warm_up_s, row.capture_s = get("episode.warm_up_s"), get("episode.capture_s")
+    row.warm_up_s = get("episode.warm_up_s")
+    row.capture_s = get("episode.capture_s")
 
 
 def is_done(row: ScalingRow, retry: bool) -> bool:

@@ -1,4 +1,6 @@
-"""Job *collect*: demonstrations of the scripted expert as a dataset, batch by batch, until as many as asked for are there."""
+"""Job *collect*: demonstrations of the scripted expert as a dataset, batch by batch, until as many
+as asked for are there.
+"""
 
 from __future__ import annotations
 
@@ -13,34 +15,46 @@ from typing import Any, cast
 import torch
 from omegaconf import OmegaConf
 
-from mjstack.config.content import CONTENT, config_hash
+from mjstack.config.fingerprint import CONTENT, config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
 from mjstack.datasets import DatasetSpec, require_pyarrow
-from mjstack.datasets.opening import check_same, lock_folder, read_committed, read_info
+from mjstack.datasets.resume import check_same, lock_folder, read_committed, read_info
 from mjstack.envs import Env, build_env, demonstration_config
+from mjstack.episodes.context import GateContext
 from mjstack.errors import ConfigError, DatasetError, UnwrittenError
-from mjstack.gates.gate import GateContext
 from mjstack.jobs.collect_record import read_batches
 from mjstack.jobs.collection import DATASET, Collection, most_worlds
-from mjstack.jobs.demonstration_spec import Difference, as_override, episode_config, first_difference, make_spec
+from mjstack.jobs.demonstration_spec import (
+    Difference,
+    as_override,
+    episode_config,
+    first_difference,
+    make_spec,
+)
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.reported import Record, run_reported
+from mjstack.jobs.result import JobResult
+from mjstack.jobs.runner import Record, run_reported
 from mjstack.report.record import Status
 
 
 def collect_folder(cfg: Config) -> Path:
     """Where a configuration's dataset is, so that another call finds it."""
     folder = _job(cfg).folder
-    return Path("outputs") / "collect" / config_hash(episode_config(cfg))[:12] if folder is None else Path(folder)
+    return (
+        Path("outputs") / "collect" / config_hash(episode_config(cfg))[:12]
+        if folder is None
+        else Path(folder)
+    )
 
 
 def check_collect(cfg: Config) -> None:
     """Raises for what cannot be done, before anything is written."""
     for key in ("view", "video"):
         if getattr(cfg, key):
-            raise ConfigError(key, "true", "false with job=collect, which shows no world", "Leave it out")
+            raise ConfigError(
+                key, "true", "false with job=collect, which shows no world", "Leave it out"
+            )
     require_pyarrow()
     check_task(cfg)
     env = build_env(demonstration_config(cfg), nworld=2, backend=Backend.native, device="cpu")
@@ -53,7 +67,7 @@ def check_collect(cfg: Config) -> None:
         env.close()
 
 
-def run_collect_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
+def run_collect_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
     """Adds what is missing to the dataset, and leaves dataset.md and the report.
 
     Args:
@@ -73,7 +87,9 @@ def run_collect_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutco
         def conclude(status: Status, problem: str = "") -> None:
             result = collection.result(status, problem, time.perf_counter() - began)
             if collection.write_table(folder, result):
-                context.say(f"dataset: {collection.path}, described in {collection.home / 'dataset.md'}")
+                context.say(
+                    f"dataset: {collection.path}, described in {collection.home / 'dataset.md'}"
+                )
             record(result)
 
         try:
@@ -96,17 +112,24 @@ def _job(cfg: Config) -> CollectJobCfg:
 
 
 def _check_starts(env: Env) -> None:
-    """Refuses starts that are the same in every world or under every seed: an episode would be in the dataset twice."""
-    starts, seed = [], env.cfg.seed
+    """Refuses starts that are the same in every world or under every seed: an episode would be in
+    the dataset twice.
+    """
+    starts = []
+    seed = env.cfg.seed
     for other in (seed, seed - 1 if seed else 1):
         env.reset(seed=other)
         parts = (env.sim.qpos, env.sim.qvel, *env.sim.fields.values())
-        starts += [row.numpy().tobytes() for row in torch.cat([part.double().flatten(1) for part in parts], dim=1)]
+        starts += [
+            row.numpy().tobytes()
+            for row in torch.cat([part.double().flatten(1) for part in parts], dim=1)
+        ]
     if len(set(starts)) < len(starts):
         raise ConfigError(
             "reset",
             f"[{', '.join(env.cfg.reset)}]",
-            "starts that differ from world to world and from seed to seed, so that no episode is there twice",
+            "starts that differ from world to world and from seed to seed, so that no episode is"
+            " there twice",
             "Use reset=randomized or reset=jitter",
         )
 
@@ -121,11 +144,14 @@ def _check_folder(home: Path, spec: DatasetSpec) -> None:
         if folder.exists() and not folder.is_dir():
             raise DatasetError(f"{folder} is a file, expected a folder. Set job.folder to another")
     saved = home / ".hydra" / "config.yaml"
-    if saved.exists() and saved.stat().st_size:  # empty: a call that was killed as it wrote the file
+    if (
+        saved.exists() and saved.stat().st_size
+    ):  # empty: a call that was killed as it wrote the file
         name = OmegaConf.select(OmegaConf.load(saved), "job.name")
         if name != "collect":
             raise DatasetError(
-                f"{home} has a run of job={name}, expected none or one of job=collect. Set job.folder to another"
+                f"{home} has a run of job={name}, expected none or one of job=collect. Set"
+                " job.folder to another"
             )
     if not (home / DATASET).is_dir():
         return
@@ -138,19 +164,26 @@ def _check_folder(home: Path, spec: DatasetSpec) -> None:
     difference = first_difference(theirs, spec.provenance["config"]) if theirs else None
     if difference is not None and info["mjstack"]["config_sha256"] != spec.config_sha256:
         raise DatasetError(
-            f"{home / DATASET} has episodes of another configuration: {difference}. Set job.folder to another folder"
-            f"{_way_back(home, difference)}"
+            f"{home / DATASET} has episodes of another configuration: {difference}. Set job.folder"
+            f" to another folder{_way_back(home, difference)}"
         )
     check_same(home / DATASET, info, spec)
     read_batches(home, read_committed(home / DATASET, info))
 
 
 def _way_back(home: Path, difference: Difference) -> str:
-    """How to go on with a dataset of another configuration: the value to set, or the overrides that it was made with."""
+    """How to go on with a dataset of another configuration: the value to set, or the overrides that
+    it was made with.
+    """
     if difference.alone:
         value = as_override(difference.found)
-        return f", or {difference.key} to {'a file with that content' if value.startswith(CONTENT) else value}"
+        return (
+            f", or {difference.key} to"
+            f" {'a file with that content' if value.startswith(CONTENT) else value}"
+        )
     saved = home / ".hydra" / "overrides.yaml"
-    if not (saved.exists() and saved.stat().st_size):  # it was made by other means than the command line
+    if not (
+        saved.exists() and saved.stat().st_size
+    ):  # it was made by other means than the command line
         return ""
     return f", or give what it was made with: {shlex.join(map(str, OmegaConf.load(saved)))}"

@@ -1,4 +1,6 @@
-"""Plays one batch of demonstrations: the scripted episode with what was seen, done and earned in every frame."""
+"""Plays one batch of demonstrations: the scripted episode with what was seen, done and earned in
+every step.
+"""
 
 from __future__ import annotations
 
@@ -10,52 +12,62 @@ import numpy as np
 import torch
 
 from mjstack.envs import Env, demonstration_config
-from mjstack.gates.episode import make_controller
-from mjstack.gates.gate import GateContext
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.rollout import make_driver
 from mjstack.sim import Simulation
 
-STATE, ACTION, REWARD = "observation.state", "action", "next.reward"
+STATE = "observation.state"
+ACTION = "action"
+REWARD = "next.reward"
 _CHUNK_BYTES = 128 * 2**20  # copied to the host at once
 
 
-def frame_layout(env: Env) -> dict[str, int]:
-    """How many numbers a frame has of each kind, in the order in which `FrameRecorder` keeps them."""
+def column_widths(env: Env) -> dict[str, int]:
+    """How many numbers a step has of each kind, in the order in which `StepRecorder` keeps them."""
     n = len(env.index.ctrl)
-    groups = {f"observation.{name}": dim for name, dim in env.observation_manager.group_dims.items()}
+    groups = {
+        f"observation.{name}": dim for name, dim in env.observation_manager.group_dims.items()
+    }
     return {STATE: n, **groups, ACTION: n, REWARD: 1}
 
 
-class FrameRecorder:
-    """All frames of all worlds in one block on the device. Fixed shapes, no host read: a captured graph may hold it.
+class StepRecorder:
+    """All steps of all worlds in one block on the device. Fixed shapes, no host read: a captured
+    graph may hold it.
 
-    A frame is what the policy would have seen before its action, the joint commands that went to the actuators, and the reward
-    for where they led.
+    A step is what the policy would have seen before its action, the joint commands that went to the
+    actuators, and the reward for where they led.
 
     Attributes:
-        values: The frames, shape ``(frames, nworld, dim)``, float32.
+        values: The steps, shape ``(steps, nworld, dim)``, float32.
         layout: How many numbers of each kind there are, in order.
     """
 
     def __init__(self, env: Env, values: torch.Tensor) -> None:
-        """Takes the block, which is written from its first frame on."""
-        self.values, self.layout = values, frame_layout(env)
+        """Takes the block, which is written from its first step on."""
+        self.values = values
+        self.layout = column_widths(env)
         self._env = env
         self._robot = env.index.on(env.device, env.sim.qpos.dtype)
-        self._seen = torch.zeros((env.nworld, self.layout[STATE] + sum(env.observation_manager.group_dims.values())))
+        self._seen = torch.zeros(
+            (env.nworld, self.layout[STATE] + sum(env.observation_manager.group_dims.values()))
+        )
         self._seen = self._seen.to(env.device)
         self._next = torch.zeros(1, dtype=torch.int64, device=env.device)
 
     def before(self) -> None:
         """Takes in the state that the next action is for."""
         groups = self._env.observation_manager.groups.values()
-        torch.cat([self._robot.qpos.read(self._env.sim.qpos).float(), *groups], dim=1, out=self._seen)
+        torch.cat(
+            [self._robot.qpos.read(self._env.sim.qpos).float(), *groups], dim=1, out=self._seen
+        )
 
     def after(self) -> None:
-        """Takes in the action that was made and its reward, and goes on to the next frame."""
+        """Takes in the action that was made and its reward, and goes on to the next step."""
         env = self._env
         command = self._robot.ctrl.read(env.sim.ctrl).float()
-        frame = torch.cat((self._seen, command, env.reward_manager.reward[:, None]), dim=1)
-        self.values.index_copy_(0, self._next, frame[None])
+        step = torch.cat((self._seen, command, env.reward_manager.reward[:, None]), dim=1)
+        self.values.index_copy_(0, self._next, step[None])
         self._next.add_(1)
 
 
@@ -66,93 +78,97 @@ class Played:
     Attributes:
         seed: What it was played with.
         worlds: Numbers of its worlds.
-        frames: All frames, on the device; the first of them, along the worlds, are of these worlds.
+        steps: All steps, on the device; the first of them, along the worlds, are of these worlds.
         failed: Bits of the task's rules, shape ``(len(worlds),)``, int32.
         retries: Grasps that were tried again, shape ``(len(worlds),)``.
-        seconds: Wall time, from the reset to the verdict [s].
+        seconds: Wall time, from the reset to the result [s].
     """
 
     seed: int
     worlds: Sequence[int]
-    frames: FrameRecorder
+    steps: StepRecorder
     failed: np.ndarray
     retries: np.ndarray
     seconds: float
 
     def finite(self, place: int) -> bool:
-        """Whether every number of a world's frames is finite.
+        """Whether every number of a world's steps is finite.
 
         Args:
             place: Which world, by its place in the batch.
         """
-        return bool(self.frames.values[:, place].isfinite().all())
+        return bool(self.steps.values[:, place].isfinite().all())
 
     def episodes(self, places: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-        """Some worlds' frames on the host, by kind, each ``(frames, dim)``; copied in chunks.
+        """Some worlds' steps on the host, by kind, each ``(steps, dim)``; copied in chunks.
 
         Args:
             places: Which, by their place in the batch.
         """
-        values = self.frames.values
+        values = self.steps.values
         size = max(1, _CHUNK_BYTES // (values[:, 0].numel() * values.element_size()))
-        ends = np.cumsum(list(self.frames.layout.values()))[:-1]
+        ends = np.cumsum(list(self.steps.layout.values()))[:-1]
         for first in range(0, len(places), size):
             chunk = torch.tensor(places[first : first + size], device=values.device)
             rows = values.index_select(1, chunk).transpose(0, 1).contiguous().cpu().numpy()
             for place, row in zip(places[first:], rows, strict=False):
-                yield place, dict(zip(self.frames.layout, np.split(row, ends, axis=1), strict=True))
+                yield place, dict(zip(self.steps.layout, np.split(row, ends, axis=1), strict=True))
 
 
-def frames_block(sim: Simulation, frames: int, dim: int) -> torch.Tensor:
-    """Room for the frames of a batch, on its device."""
-    return torch.zeros((frames, sim.nworld, dim), dtype=torch.float32, device=sim.device)
+def steps_block(sim: Simulation, steps: int, dim: int) -> torch.Tensor:
+    """Room for the steps of a batch, on its device."""
+    return torch.zeros((steps, sim.nworld, dim), dtype=torch.float32, device=sim.device)
 
 
 def play_demonstrations(
     context: GateContext, sim: Simulation, seed: int, values: torch.Tensor, worlds: Sequence[int]
 ) -> Played:
-    """Plays the configured controller once in some worlds of a seed, and judges it by the task's acceptance.
+    """Plays the configured controller once in some worlds of a seed, and judges it by the task's
+    check.
 
-    Nothing ends an episode: worlds go on to its end, so all have as many frames. On CUDA a frame is one graph.
+    Nothing ends an episode: worlds go on to its end, so all have as many steps. On CUDA a step is
+    one graph.
 
     Args:
         context: Configuration, scene and planner.
         sim: Room for the worlds; what it has more of them is played as well and not looked at.
         seed: What they start by.
-        values: Room for the frames, shape ``(frames, nworld, dim)``; see `frames_block`.
+        values: Room for the steps, shape ``(steps, nworld, dim)``; see `steps_block`.
         worlds: Their numbers, which random numbers depend on.
     """
     began = time.perf_counter()
     cfg = replace(context.cfg, seed=seed)
-    env = Env(sim, context.index, demonstration_config(cfg), check_faults=False)  # the acceptance names lost worlds
+    env = Env(
+        sim, context.index, demonstration_config(cfg), check_faults=False
+    )  # the check names lost worlds
     env.world[: len(worlds)].copy_(torch.tensor(worlds))
     env.reset(seed=seed)
     sim.forward()
-    controller = make_controller(env, context.planner, context.advance)
-    evidence = context.evidence(cfg, context.index, context.planner.phases, sim.nworld, sim.device)
-    recorder = FrameRecorder(env, values)
+    controller = make_driver(env, context.planner, context.advance)
+    check = context.check(cfg, context.index, context.planner.phases, sim.nworld, sim.device)
+    recorder = StepRecorder(env, values)
 
     def work() -> None:
         command = controller.command()
         recorder.before()
         env.action_manager.take(command)
         env.advance()
-        evidence.update(sim, controller.phase)
+        check.update(sim, controller.phase)
         recorder.after()
 
-    play = env.captured(work, "a frame of a demonstration")
-    for frame in range(controller.frames):
+    play = env.captured(work, "a step of a demonstration")
+    for step in range(controller.steps):
         play()
-        if frame % 10 == 9:
+        if step % 10 == 9:
             sim.synchronize()  # so that the bar shows work done, not work queued
-        context.tell(f"frames of seed {seed}", frame + 1, controller.frames)
+        context.tell(f"steps of seed {seed}", step + 1, controller.steps)
     sim.synchronize()
     play.drop()
     return Played(
         seed=seed,
         worlds=worlds,
-        frames=recorder,
-        failed=evidence.verdict(sim).failed.cpu().numpy()[: len(worlds)],
+        steps=recorder,
+        failed=check.result(sim).failed.cpu().numpy()[: len(worlds)],
         retries=controller.retries.cpu().numpy()[: len(worlds)],
         seconds=time.perf_counter() - began,
     )

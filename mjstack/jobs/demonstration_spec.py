@@ -1,4 +1,6 @@
-"""What a dataset of demonstrations holds: columns with names and units, and the configuration that episodes depend on."""
+"""What a dataset of demonstrations holds: columns with names and units, and the configuration that
+episodes depend on.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ from typing import Any, cast
 
 import mujoco
 
-from mjstack.config.content import config_content, config_hash
+from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
 from mjstack.datasets import DatasetSpec, Feature
 from mjstack.envs import Env
@@ -17,17 +19,32 @@ from mjstack.errors import ConfigError
 from mjstack.jobs.demonstration import ACTION, REWARD, STATE
 from mjstack.sim import resolve_backend
 
-# Changing one of these changes no episode. The action terms are the controller's, and nothing ends an episode early.
-_NO_MATTER = ("action", "termination", "batch", "sim", "job", "nworld", "gates", "graph", "view", "video", "run", "world")
+# Changing one of these changes no episode. The action terms are the controller's, and nothing ends
+# an episode early.
+_NO_MATTER = (
+    "action",
+    "termination",
+    "batch",
+    "sim",
+    "job",
+    "nworld",
+    "gates",
+    "graph",
+    "view",
+    "video",
+    "run",
+    "world",
+)
 _OTHER_GATES = ("parity", "capacity", "batch", "throughput", "success")
-_JOINTS, _JOINT_SPEEDS = "of the joints", "of the joints, per second"
+_JOINTS = "of the joints"
+_JOINT_SPEEDS = "of the joints, per second"
 # Of the observation terms; one that is not here, such as a user's own, has the unit "unknown".
 _UNITS: dict[str, str | tuple[str, ...]] = {
     "mjstack.mdp.observation.joint_pos": _JOINTS,
     "mjstack.mdp.observation.joint_pos_relative": _JOINTS,
     "mjstack.mdp.observation.joint_vel": _JOINT_SPEEDS,
-    "mjstack.mdp.observation.aperture_pos": "m",
-    "mjstack.mdp.observation.aperture_to_object": "m",
+    "mjstack.mdp.observation.grasp_point_pos": "m",
+    "mjstack.mdp.observation.grasp_point_to_object": "m",
     "mjstack.mdp.observation.object_to_object": "m",
     "mjstack.mdp.observation.object_pose": ("m",) * 3 + ("1",) * 4,
     "mjstack.mdp.observation.object_velocity": ("m/s",) * 3 + ("rad/s",) * 3,
@@ -38,7 +55,8 @@ _UNITS: dict[str, str | tuple[str, ...]] = {
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:
-    """Everything that episodes depend on, in JSON's types. A layout file counts by its content, wherever it is.
+    """Everything that episodes depend on, in JSON's types. A layout file counts by its content,
+    wherever it is.
 
     Raises:
         ConfigError: The layout file cannot be read.
@@ -56,7 +74,8 @@ def episode_config(cfg: Config) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Difference:
-    """Where two configurations differ first. Its text is ``key=found, expected value``, or the names that a group has.
+    """Where two configurations differ first. Its text is ``key=found, expected value``, or the
+    names that a group has.
 
     Attributes:
         key: What differs.
@@ -72,7 +91,9 @@ class Difference:
 
     def __str__(self) -> str:
         if isinstance(self.found, Mapping) and isinstance(self.expected, Mapping):
-            found, expected = (", ".join(map(str, group)) or "nothing" for group in (self.found, self.expected))
+            found, expected = (
+                ", ".join(map(str, group)) or "nothing" for group in (self.found, self.expected)
+            )
             return f"{self.key or 'the configuration'} has {found}, expected {expected}"
         return f"{self.key}={as_override(self.found)}, expected {as_override(self.expected)}"
 
@@ -93,7 +114,9 @@ def as_override(value: Any) -> str:
 
 
 def _differences(theirs: Any, ours: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """The keys whose values differ, and the groups that have other names in them, with what each side has."""
+    """The keys whose values differ, and the groups that have other names in them, with what each
+    side has.
+    """
     if not (isinstance(theirs, Mapping) and isinstance(ours, Mapping)):
         if theirs != ours:
             yield key, theirs, ours
@@ -123,7 +146,11 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
     for group in cfg.observation:
         name = f"observation.{group}"
         if name in features:
-            raise ConfigError(f"observation.{group}", "a group", f"another name, because {name} are the measured joints")
+            raise ConfigError(
+                f"observation.{group}",
+                "a group",
+                f"another name, because {name} are the measured joints",
+            )
         features[name] = _group_feature(env, group, units)
     features |= {
         ACTION: positions,
@@ -144,13 +171,18 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
 def joint_units(env: Env) -> tuple[str, ...]:
     """Units of the robot's joints, arm then gripper: rad for hinges, m for slides."""
     model = env.sim.model
-    kinds = {int(address): int(kind) for address, kind in zip(model.jnt_qposadr, model.jnt_type, strict=True)}
+    kinds = {
+        int(address): int(kind)
+        for address, kind in zip(model.jnt_qposadr, model.jnt_type, strict=True)
+    }
     hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
     return tuple("rad" if kinds[int(address)] == hinge else "m" for address in env.index.robot_qpos)
 
 
 def _group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
-    """A column for each number of an observation group: ``red_pose.2``, and ``red_pose.2.t-1`` one frame before."""
+    """A column for each number of an observation group: ``red_pose.2``, and ``red_pose.2.t-1`` one
+    step before.
+    """
     names: list[str] = []
     units: list[str] = []
     for term, dim in env.observation_manager.term_dims[group].items():
@@ -158,7 +190,10 @@ def _group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
         width = dim // cfg.history
         own = _scaled(_term_units(cfg.func, width, joints), cfg.scale)
         for age in range(cfg.history - 1, -1, -1):
-            names += [f"{term}{f'.{i}' if width > 1 else ''}{f'.t-{age}' if age else ''}" for i in range(width)]
+            names += [
+                f"{term}{f'.{i}' if width > 1 else ''}{f'.t-{age}' if age else ''}"
+                for i in range(width)
+            ]
             units += own
     return Feature(dtype="float32", names=tuple(names), units=tuple(units))
 
@@ -178,4 +213,7 @@ def _scaled(units: Sequence[str], scale: float) -> list[str]:
         return list(units)
     if scale == 0.0:
         return ["unknown"] * len(units)
-    return [unit if unit == "unknown" else f"{1.0 / scale:g} {unit}".removesuffix(" 1") for unit in units]
+    return [
+        unit if unit == "unknown" else f"{1.0 / scale:g} {unit}".removesuffix(" 1")
+        for unit in units
+    ]

@@ -9,10 +9,10 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from mjstack.config.load import load_saved
 from mjstack.config.schema import Config
-from mjstack.config.store import load_saved
+from mjstack.episodes.batch_record import WORLDS, BatchRecord
 from mjstack.errors import MjstackError, RunError
-from mjstack.gates.batch_record import WORLDS, BatchRecord
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -37,24 +37,35 @@ class EarlierRun:
             RunError: There is no such run; the message says what is missing.
         """
         folder = Path(name)
-        expected = "expected the folder of a run, such as outputs/2026-11-21/04-02-05 (of a sweep: one of its jobs')"
+        expected = (
+            "expected the folder of a run, such as outputs/2026-11-21/04-02-05 (of a sweep: one of"
+            " its jobs')"
+        )
         if not folder.is_dir():
             raise RunError(f"run={name}: no such folder, {expected}. Name an existing one.")
-        saved, report = folder / ".hydra" / "config.yaml", folder / "report.json"
+        saved = folder / ".hydra" / "config.yaml"
+        report = folder / "report.json"
         for path in (saved, report):
             if not path.is_file():
-                raise RunError(f"run={name}: has no {path.relative_to(folder)}, {expected}. Name another folder.")
+                raise RunError(
+                    f"run={name}: has no {path.relative_to(folder)}, {expected}. Name another"
+                    " folder."
+                )
         try:
             job = OmegaConf.select(OmegaConf.load(saved), "job.name")
         except Exception:  # what is wrong with the file, `load_saved` says
             job = None
         if job not in (None, "gates"):
-            raise RunError(f"run={name}: is a run of job={job}, expected one of job=gates. Name that run's folder.")
+            raise RunError(
+                f"run={name}: is a run of job={job}, expected one of job=gates. Name that run's"
+                " folder."
+            )
         try:
             cfg = load_saved(saved)
         except MjstackError as error:
             raise RunError(
-                f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error} Use the one that ran it."
+                f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error} Use"
+                " the one that ran it."
             ) from error
         try:
             provenance = json.loads(report.read_text())["provenance"]
@@ -62,12 +73,14 @@ class EarlierRun:
                 raise TypeError(provenance)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise RunError(
-                f"run={name}: report.json cannot be read ({type(error).__name__}), expected mjstack's. Name another folder."
+                f"run={name}: report.json cannot be read ({type(error).__name__}), expected"
+                " mjstack's. Name another folder."
             ) from error
         return cls(folder=folder, cfg=cfg, provenance=provenance)
 
     def batch_record(self, seed: int, stem: str = WORLDS) -> BatchRecord | None:
-        """What its batch gate found under a seed, or the gate whose files begin with ``stem``; None if it did not get there.
+        """What its batch gate found under a seed, or the gate whose files begin with ``stem``; None
+        if it did not get there.
 
         Raises:
             RunError: The record cannot be read, or is not this run's.
@@ -75,7 +88,8 @@ class EarlierRun:
         record = BatchRecord.read(self.folder, seed, stem)
         if record is not None and (record.seed != seed or len(record.failed) != self.cfg.nworld):
             raise RunError(
-                f"run={self.folder}: the record of seed {seed} has {len(record.failed)} worlds of seed {record.seed}, expected "
-                f"{self.cfg.nworld}, the run's nworld. Run that gate again."
+                f"run={self.folder}: the record of seed {seed} has {len(record.failed)} worlds of"
+                f" seed {record.seed}, expected {self.cfg.nworld}, the run's nworld. Run that gate"
+                " again."
             )
         return record

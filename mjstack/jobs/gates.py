@@ -5,21 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 from mjstack.config.schema import Backend, Config
-from mjstack.config.validate import reads_layout
-from mjstack.control.planner import ScriptedPlanner
-from mjstack.control.tilt import turn_sign
+from mjstack.config.validate import reads_starts_file
+from mjstack.drivers.open_loop import OpenLoopPlanner
+from mjstack.drivers.tilt import turn_sign
 from mjstack.envs import build_env
+from mjstack.episodes.batch_record import clear_records
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.success_record import clear_success
 from mjstack.errors import ConfigError
-from mjstack.gates.batch_record import clear_records
-from mjstack.gates.gate import GateContext
 from mjstack.gates.runner import run_gates
 from mjstack.gates.success import success_config
-from mjstack.gates.success_record import clear_success
-from mjstack.jobs.kept_layout import keep_layouts
-from mjstack.jobs.outcome import JobOutcome
+from mjstack.jobs.archived_starts import archive_starts
+from mjstack.jobs.memory_check import check_room
 from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.reported import Record, check_showing, run_reported
-from mjstack.jobs.room import check_room
+from mjstack.jobs.result import JobResult
+from mjstack.jobs.runner import Record, check_showing, run_reported
 from mjstack.sim import resolve_backend
 
 _SCRIPTED = ("stack", "box")  # tasks
@@ -30,7 +30,12 @@ def check_machine(cfg: Config) -> None:
     check_task(cfg)
     if (cfg.view or cfg.video) and not {"baseline", "parity"} & set(cfg.gates):
         key = "view" if cfg.view else "video"
-        raise ConfigError(key, "true", "gates with baseline or parity, whose world is shown", "Add one of them to gates")
+        raise ConfigError(
+            key,
+            "true",
+            "gates with baseline or parity, whose world is shown",
+            "Add one of them to gates",
+        )
     check_showing(cfg)
     if "success" in cfg.gates:
         _check_success(cfg)
@@ -41,9 +46,11 @@ def _check_success(cfg: Config) -> None:
     try:
         build_env(success_config(cfg), nworld=1, backend=Backend.native, device="cpu").close()
     except ConfigError as error:
-        if error.key.startswith("reset.") and not reads_layout(cfg.reset):
+        if error.key.startswith("reset.") and not reads_starts_file(cfg.reset):
             region = cfg.gate.success.region is not None and error.key.endswith(".params.xy")
-            raise error.at("gate.success.region" if region else f"gate.success.{error.key}") from error
+            raise error.at(
+                "gate.success.region" if region else f"gate.success.{error.key}"
+            ) from error
         raise
 
 
@@ -53,8 +60,10 @@ def check_task(cfg: Config) -> None:
     if cfg.task.name not in _SCRIPTED:
         expected = f"one of {', '.join(_SCRIPTED)}, whose scripted episode the gates verify"
         raise ConfigError("task", cfg.task.name, expected, "Train it: mjstack.make_env")
-    ScriptedPlanner(cfg)  # reads the robot, and reaches every nominal target
-    env = build_env(cfg, nworld=1, backend=Backend.native, device="cpu")  # builds and checks every term
+    OpenLoopPlanner(cfg)  # reads the robot, and reaches every nominal target
+    env = build_env(
+        cfg, nworld=1, backend=Backend.native, device="cpu"
+    )  # builds and checks every term
     if cfg.job.name in ("gates", "study"):
         check_room(cfg, env.sim.model)
     if cfg.controller.approach_gain > 0.0:
@@ -62,7 +71,7 @@ def check_task(cfg: Config) -> None:
     env.close()
 
 
-def run_gates_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
+def run_gates_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
     """Runs the gates of one configuration and writes its report after each; see `run_reported`."""
     title = f"task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)}"
     return run_reported(cfg, folder, overrides, title, _run)
@@ -70,7 +79,9 @@ def run_gates_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome
 
 def _run(context: GateContext, bar: ProgressBar, record: Record) -> None:
     if context.folder is not None:
-        context.cfg = keep_layouts(context.cfg, context.folder)
+        context.cfg = archive_starts(context.cfg, context.folder)
         clear_records(context.folder)
-        clear_success(context.folder, keep=None if context.cfg.layout is None else Path(context.cfg.layout))
+        clear_success(
+            context.folder, keep=None if context.cfg.starts is None else Path(context.cfg.starts)
+        )
     run_gates(context, bar.start, record)

@@ -6,9 +6,16 @@ import time
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
-from mjstack.jobs.outcome import STATUS_COLOR
+from mjstack.jobs.result import STATUS_COLOR
 from mjstack.report.markdown import headline
 from mjstack.report.record import GateResult
 
@@ -29,7 +36,8 @@ class ProgressBar:
             transient=True,
             disable=not console.is_terminal,
         )
-        self._gate, self._unit = "", ""
+        self._gate = ""
+        self._unit = ""
         self._task: TaskID | None = None
         self._began = self._spoke = time.monotonic()
 
@@ -48,7 +56,9 @@ class ProgressBar:
         """Begins something with a name."""
         self._gate = gate
         self._drop()
-        self._task = self._progress.add_task(gate, total=1, unit="", rate="starting (MJWarp compiles at its first use)")
+        self._task = self._progress.add_task(
+            gate, total=1, unit="", rate="starting (MJWarp compiles at its first use)"
+        )
         self._spoke = time.monotonic()
 
     def advance(self, unit: str, done: int, total: int) -> None:
@@ -56,8 +66,11 @@ class ProgressBar:
         now = time.monotonic()
         if unit != self._unit or done <= 1 or self._task is None:
             self._drop()
-            self._unit, self._began = unit, now
-            self._task = self._progress.add_task(f"{self._gate}: {unit}", total=total, unit="", rate="")
+            self._unit = unit
+            self._began = now
+            self._task = self._progress.add_task(
+                f"{self._gate}: {unit}", total=total, unit="", rate=""
+            )
         rate = f"{done / (now - self._began):.1f}/s" if now > self._began and done > 1 else ""
         self._progress.update(self._task, completed=done, rate=rate)
         if self._progress.disable and done > 1 and now - self._spoke > 15.0:
@@ -69,7 +82,10 @@ class ProgressBar:
         """Prints a gate's result."""
         self._drop()
         color = STATUS_COLOR[result.status]
-        self.say(f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s): {escape(headline(result))}")
+        self.say(
+            f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s):"
+            f" {escape(headline(result))}"
+        )
 
     def _drop(self) -> None:
         if self._task is not None:

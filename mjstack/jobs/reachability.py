@@ -1,4 +1,6 @@
-"""Job *reachability*: what the arm reaches on the table, at which tilt, and how far from their places the cubes may stand."""
+"""Job *reachability*: what the arm reaches on the table, at which tilt, and how far from their
+places the cubes may stand.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +14,21 @@ from typing import cast
 import numpy as np
 
 from mjstack.config.schema import Config, ReachabilityJobCfg
+from mjstack.episodes.context import GateContext
 from mjstack.errors import ConfigError
-from mjstack.gates.gate import GateContext
-from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.reported import Record, run_reported
+from mjstack.jobs.result import JobResult
+from mjstack.jobs.runner import Record, run_reported
 from mjstack.kinematics.reach import PointReach
-from mjstack.report.reachability import CubeRegion, ReachLevel, ReachMap, save_map, to_csv, to_markdown, to_npz
+from mjstack.report.reachability import (
+    CubeRegion,
+    ReachLevel,
+    ReachMap,
+    save_map,
+    to_csv,
+    to_markdown,
+    to_npz,
+)
 from mjstack.report.record import GateResult, Status, write_atomic
 from mjstack.scene import BLUE, RED, table_top
 from mjstack.scene.phases import cube_targets
@@ -35,17 +45,24 @@ def check_reachability(cfg: Config) -> None:
     """Raises for what cannot be done, before anything is written."""
     for key in ("view", "video"):
         if getattr(cfg, key):
-            raise ConfigError(key, "true", "false with job=reachability, which moves nothing", "Leave it out")
+            raise ConfigError(
+                key, "true", "false with job=reachability, which moves nothing", "Leave it out"
+            )
     resolve_backend(cfg)
     find_levels(cfg)
-    job, half = cast(ReachabilityJobCfg, cfg.job), cfg.scene.table_half
+    job = cast(ReachabilityJobCfg, cfg.job)
+    half = cfg.scene.table_half
     points = math.prod(2 * int(half[k] / job.step) + 1 for k in (0, 1))
     if points > _MOST_POINTS or job.step > min(half[:2]):
         least = math.sqrt(4.0 * half[0] * half[1] / _MOST_POINTS)
-        raise ConfigError("job.step", job.step, f"{least:.4f} to {min(half[:2]):g} m; this table would have {points} points")
+        raise ConfigError(
+            "job.step",
+            job.step,
+            f"{least:.4f} to {min(half[:2]):g} m; this table would have {points} points",
+        )
 
 
-def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
+def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
     """Draws the map and leaves reachability.csv, .npz, .md, .png and the report.
 
     Args:
@@ -54,7 +71,8 @@ def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> Job
         overrides: What was asked for on the command line.
 
     Returns:
-        How it ended: a pass if the region of ``reset=randomized`` is reached with the margin, around both cubes' places.
+        How it ended: a pass if the region of ``reset=randomized`` is reached with the margin,
+        around both cubes' places.
     """
 
     def work(context: GateContext, bar: ProgressBar, record: Record) -> None:
@@ -62,11 +80,22 @@ def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> Job
         for name, (height, gripper) in find_levels(cfg).items():
             bar.start(name)
             began = time.perf_counter()
-            levels.append(map_level(context, name, height, gripper, lambda done, total: bar.advance("points", done, total)))
+            levels.append(
+                map_level(
+                    context,
+                    name,
+                    height,
+                    gripper,
+                    lambda done, total: bar.advance("points", done, total),
+                )
+            )
             _write(context, folder, levels, [])
             record(_level_result(levels[-1], time.perf_counter() - began))
         began = time.perf_counter()
-        regions = [find_region(cfg, levels, RED, cfg.scene.red_xy), find_region(cfg, levels, BLUE, cfg.scene.blue_xy)]
+        regions = [
+            find_region(cfg, levels, RED, cfg.scene.red_xy),
+            find_region(cfg, levels, BLUE, cfg.scene.blue_xy),
+        ]
         _write(context, folder, levels, regions)
         for region in regions:
             record(_region_result(cfg, region, time.perf_counter() - began))
@@ -76,57 +105,88 @@ def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> Job
 
 
 def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
-    """Heights above a cube's centre [m] at which the task needs the aperture centre, and the gripper's command there.
+    """Heights above a cube's centre [m] at which the task needs the grasp point, and the gripper's
+    command there.
 
-    ``approach`` is the controller's first target over a cube, ``grasp`` its lowest, and ``carry`` its highest.
+    ``approach`` is the controller's first target over a cube, ``grasp`` its lowest, and ``carry``
+    its highest.
     """
     red, blue = cube_targets(cfg)
     if not red + blue:
-        raise ConfigError("controller.phases", list(cfg.controller.phases), "a phase with a cube as its anchor")
+        raise ConfigError(
+            "controller.phases", list(cfg.controller.phases), "a phase with a cube as its anchor"
+        )
     low, high = (end(red + blue, key=lambda target: target.height) for end in (min, max))
     first = (red + blue)[0]
-    # The jaws close where they grasp, but come there open, which reaches less far where one jaw stays.
-    return {"grasp": (low.height, "open"), "approach": (first.height, first.gripper), "carry": (high.height, high.gripper)}
+    # The jaws close where they grasp, but come there open, which reaches less far where one jaw
+    # stays.
+    return {
+        "grasp": (low.height, "open"),
+        "approach": (first.height, first.gripper),
+        "carry": (high.height, high.gripper),
+    }
 
 
 def axes(cfg: Config) -> tuple[np.ndarray, np.ndarray]:
     """The map's columns and rows: x and y [m] of points on the table, one in its middle."""
-    step, scene = cast(ReachabilityJobCfg, cfg.job).step, cfg.scene
+    step = cast(ReachabilityJobCfg, cfg.job).step
+    scene = cfg.scene
     counts = [int(scene.table_half[k] / step + 1e-9) for k in (0, 1)]
     x, y = (scene.table_center[k] + step * np.arange(-counts[k], counts[k] + 1) for k in (0, 1))
     return x, y
 
 
 def map_level(
-    context: GateContext, name: str, height: float, gripper: str, progress: Callable[[int, int], object]
+    context: GateContext,
+    name: str,
+    height: float,
+    gripper: str,
+    progress: Callable[[int, int], object],
 ) -> ReachLevel:
     """Solves every point of one height."""
     cfg = context.cfg
     command = cfg.robot.gripper_open if gripper == "open" else cfg.robot.gripper_closed
-    reach, tolerance = PointReach(context.model, cfg.robot, command), cfg.controller.ik_tolerance
+    reach = PointReach(context.model, cfg.robot, command)
+    tolerance = cfg.controller.ik_tolerance
     x, y = axes(cfg)
     level = table_top(cfg.scene) + cfg.scene.cube_half + height
-    points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), level)], axis=-1).reshape(-1, 3)
-    residual, tilt = np.empty(len(points)), np.empty(len(points))
+    points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), level)], axis=-1).reshape(
+        -1, 3
+    )
+    residual = np.empty(len(points))
+    tilt = np.empty(len(points))
     for first in range(0, len(points), _SHARE):
         part = slice(first, first + _SHARE)
         found = reach.solve_upright(points[part], tolerance)
-        residual[part], tilt[part] = found.distance, np.where(found.distance <= tolerance, found.tilt, np.nan)
+        residual[part] = found.distance
+        tilt[part] = np.where(found.distance <= tolerance, found.tilt, np.nan)
         progress(min(first + _SHARE, len(points)), len(points))
     shape = len(y), len(x)
-    return ReachLevel(name=name, height=height, gripper=gripper, residual=residual.reshape(shape), tilt=tilt.reshape(shape))
+    return ReachLevel(
+        name=name,
+        height=height,
+        gripper=gripper,
+        residual=residual.reshape(shape),
+        tilt=tilt.reshape(shape),
+    )
 
 
 def find_region(cfg: Config, levels: list[ReachLevel], cube: str, place: list[float]) -> CubeRegion:
-    """The largest regions around a place that are reached at every level, with the margin, and stay on the table.
+    """The largest regions around a place that are reached at every level, with the margin, and stay
+    on the table.
 
     Between two points of the map the worse one counts.
     """
-    job, scene = cast(ReachabilityJobCfg, cfg.job), cfg.scene
+    job = cast(ReachabilityJobCfg, cfg.job)
+    scene = cfg.scene
     x, y = axes(cfg)
     blocked = ~np.logical_and.reduce([level.reached for level in levels])
     rows, columns = np.nonzero(blocked)
-    away = np.stack((np.abs(x[columns] - place[0]), np.abs(y[rows] - place[1])), axis=1) - job.step - job.margin
+    away = (
+        np.stack((np.abs(x[columns] - place[0]), np.abs(y[rows] - place[1])), axis=1)
+        - job.step
+        - job.margin
+    )
     edge = [_map_edge(axis, place[k]) - job.margin for k, axis in enumerate((x, y))]
 
     def most_y(half_x: float) -> float:
@@ -134,8 +194,14 @@ def find_region(cfg: Config, levels: list[ReachLevel], cube: str, place: list[fl
         beside = away[away[:, 0] <= half_x, 1]
         return min(edge[1], beside.min(initial=math.inf)) if half_x <= edge[0] else -1.0
 
-    room = [scene.table_half[k] - math.sqrt(2.0) * scene.cube_half - abs(place[k] - scene.table_center[k]) for k in (0, 1)]
-    square, largest = 0.0, (0.0, 0.0)
+    room = [
+        scene.table_half[k]
+        - math.sqrt(2.0) * scene.cube_half
+        - abs(place[k] - scene.table_center[k])
+        for k in (0, 1)
+    ]
+    square = 0.0
+    largest = (0.0, 0.0)
     for half_x in np.arange(0.0, max(room[0], 0.0) + 1e-9, _FINE):
         half_y = min(room[1], most_y(half_x))
         if half_y < 0.0:
@@ -169,20 +235,26 @@ def _level_result(level: ReachLevel, seconds: float) -> GateResult:
         "points": level.reached.size,
         "reached_fraction": share,
     }
-    reason = f"{level.height:.3f} m above a cube's centre, {level.gripper}: {100.0 * share:.1f} % of the table reached"
+    reason = (
+        f"{level.height:.3f} m above a cube's centre, {level.gripper}: {100.0 * share:.1f} % of the"
+        " table reached"
+    )
     if share:
         low, high = (float(np.degrees(end(level.tilt))) for end in (np.nanmin, np.nanmax))
         metrics |= {"smallest_tilt_deg": low, "largest_tilt_deg": high}
         reason += f", tilted by {low:.0f} to {high:.0f} degrees at least"
-    return GateResult(name=level.name, status=Status.passed, reason=reason, seconds=seconds, metrics=metrics)
+    return GateResult(
+        name=level.name, status=Status.passed, reason=reason, seconds=seconds, metrics=metrics
+    )
 
 
 def _region_result(cfg: Config, region: CubeRegion, seconds: float) -> GateResult:
     margin = cast(ReachabilityJobCfg, cfg.job).margin
     reason = (
-        f"scene.random_xy {region.configured[0]:g} x {region.configured[1]:g} m is {'' if region.reached else 'not '}reached "
-        f"with {1e3 * margin:g} mm to spare; the largest square is {region.square:.3f} m, the largest rectangle "
-        f"{region.largest[0]:.3f} x {region.largest[1]:.3f} m"
+        f"scene.random_xy {region.configured[0]:g} x {region.configured[1]:g} m is"
+        f" {'' if region.reached else 'not '}reached with {1e3 * margin:g} mm to spare; the largest"
+        f" square is {region.square:.3f} m, the largest rectangle {region.largest[0]:.3f} x"
+        f" {region.largest[1]:.3f} m"
     )
     metrics: Mapping[str, float] = {
         "random_x_m": region.configured[0],
@@ -195,7 +267,12 @@ def _region_result(cfg: Config, region: CubeRegion, seconds: float) -> GateResul
     status = Status.passed if region.reached else Status.failed
     thresholds = {"margin_m": margin}
     return GateResult(
-        name=region.name, status=status, reason=reason, seconds=seconds, thresholds=dict(thresholds), metrics=dict(metrics)
+        name=region.name,
+        status=status,
+        reason=reason,
+        seconds=seconds,
+        thresholds=dict(thresholds),
+        metrics=dict(metrics),
     )
 
 
@@ -212,17 +289,33 @@ def _map(context: GateContext, levels: list[ReachLevel], regions: list[CubeRegio
     )
 
 
-def _write(context: GateContext, folder: Path, levels: list[ReachLevel], regions: list[CubeRegion], picture: str = "") -> None:
+def _write(
+    context: GateContext,
+    folder: Path,
+    levels: list[ReachLevel],
+    regions: list[CubeRegion],
+    picture: str = "",
+) -> None:
     """The tables, as far as they are known."""
     found = _map(context, levels, regions)
-    job, robot = cast(ReachabilityJobCfg, context.cfg.job), context.cfg.robot
+    job = cast(ReachabilityJobCfg, context.cfg.job)
+    robot = context.cfg.robot
     notes = [
-        f"Half-widths in m, around the place. A region counts as reached if it still is with {1e3 * job.margin:g} mm more all "
-        f"round, at every level; points are {1e3 * job.step:g} mm apart. Regions keep cubes of any yaw on the table.",
-        f"Reached: inverse kinematics of {', '.join(robot.ik_joints)} brings the aperture centre within "
-        f"{1e3 * context.cfg.controller.ik_tolerance:g} mm. Collisions are not looked at.",
-        "Tilt: the smallest angle between the gripper's approach axis and straight down that a solution has. A controller that "
-        "goes on from where it is need not find that solution, and may stop at a joint limit short of a point that is reached.",
+        (
+            "Half-widths in m, around the place. A region counts as reached if it still is with"
+            f" {1e3 * job.margin:g} mm more all round, at every level; points are"
+            f" {1e3 * job.step:g} mm apart. Regions keep cubes of any yaw on the table."
+        ),
+        (
+            f"Reached: inverse kinematics of {', '.join(robot.ik_joints)} brings the grasp point"
+            f" within {1e3 * context.cfg.controller.ik_tolerance:g} mm. Collisions are not"
+            " looked at."
+        ),
+        (
+            "Tilt: the smallest angle between the gripper's approach axis and straight down that a"
+            " solution has. A controller that goes on from where it is need not find that solution,"
+            " and may stop at a joint limit short of a point that is reached."
+        ),
         "Reached does not mean grasped: how many worlds succeed, the gate success tells.",
     ]
     write_atomic(folder / "reachability.csv", to_csv(found))
@@ -230,7 +323,9 @@ def _write(context: GateContext, folder: Path, levels: list[ReachLevel], regions
     write_atomic(folder / "reachability.md", to_markdown(found, notes, picture))
 
 
-def _draw(context: GateContext, folder: Path, levels: list[ReachLevel], regions: list[CubeRegion]) -> None:
+def _draw(
+    context: GateContext, folder: Path, levels: list[ReachLevel], regions: list[CubeRegion]
+) -> None:
     """The picture. Its failure takes nothing back."""
     try:
         save_map(folder / "reachability.png", _map(context, levels, regions))

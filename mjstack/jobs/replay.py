@@ -1,4 +1,6 @@
-"""Job *replay*: one world of an earlier run's batch again, alone, with its trajectory kept and every rule explained."""
+"""Job *replay*: one world of an earlier run's batch again, alone, with its trajectory kept and
+every rule explained.
+"""
 
 from __future__ import annotations
 
@@ -12,29 +14,34 @@ from omegaconf import OmegaConf
 from rich.markup import escape
 
 from mjstack.config.schema import Backend, Config, SimCfg
+from mjstack.episodes.batch_record import BatchRecord
+from mjstack.episodes.context import GateContext, judge_one
+from mjstack.episodes.failures import FailureMonitor, describe_sign
+from mjstack.episodes.replay import ReplayedWorld, replay_world, start_of_world
+from mjstack.episodes.success_record import STEM
 from mjstack.errors import ConfigError, DeviceError, RunError
-from mjstack.gates.batch_record import BatchRecord
-from mjstack.gates.gate import GateContext, judge_one
-from mjstack.gates.replay import ReplayedWorld, replay_world, start_of_world
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
-from mjstack.gates.success_record import STEM
-from mjstack.gates.watch import FailureWatch, describe_sign
+from mjstack.jobs.archived_starts import archived_starts, copy_names
 from mjstack.jobs.earlier_run import EarlierRun
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.kept_layout import copy_names, kept_layouts
-from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.reported import Record, check_showing, run_provenance, run_reported
+from mjstack.jobs.result import JobResult
+from mjstack.jobs.runner import Record, check_showing, run_provenance, run_reported
 from mjstack.report.record import GateResult, Status, Value, write_atomic
 from mjstack.sim import resolve_backend, resolve_device
-from mjstack.tasks.evidence import describe_rules
+from mjstack.tasks.check import describe_rules
 
 KEYS = ("job", "run", "world", "sim", "view", "video")
 """What its command line may set. All else is the earlier run's."""
 
-_PLACES = {"git_commit": "mjstack's commit", "cpu": "the processor"}  # besides versions, what arithmetic depends on
-_SAME_START = 1e-6  # [m, rad], and of quaternions: backends differ by rounding, another start by more
+_PLACES = {
+    "git_commit": "mjstack's commit",
+    "cpu": "the processor",
+}  # besides versions, what arithmetic depends on
+_SAME_START = (
+    1e-6  # [m, rad], and of quaternions: backends differ by rounding, another start by more
+)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -47,7 +54,8 @@ class ReplayPlan:
         cfg: The configuration that the gate played under, on the first backend here.
         seed: The seed.
         world: The world's number.
-        where: Backend and device, each played once; the first is the earlier run's unless ``sim`` says otherwise.
+        where: Backend and device, each played once; the first is the earlier run's unless ``sim``
+            says otherwise.
         record: What the gate found there, or None.
         notes: What could not be as it was.
     """
@@ -70,10 +78,14 @@ def check_replay(cfg: Config) -> None:
     _check_start(plan)
 
 
-def run_replay_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
-    """Plays the world on its run's backend and, where that was MJWarp, on native MuJoCo too; see `run_reported`."""
+def run_replay_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
+    """Plays the world on its run's backend and, where that was MJWarp, on native MuJoCo too; see
+    `run_reported`.
+    """
     plan = _plan(cfg)
-    title = f"replay of world {plan.world} of {plan.cfg.nworld}, seed {plan.seed}, of {plan.run.folder}"
+    title = (
+        f"replay of world {plan.world} of {plan.cfg.nworld}, seed {plan.seed}, of {plan.run.folder}"
+    )
     return run_reported(plan.cfg, folder, overrides, title, partial(_run, plan))
 
 
@@ -85,23 +97,32 @@ def _plan(cfg: Config) -> ReplayPlan:
     resolve_backend(cfg)  # what this command line asks for must be there
     run = EarlierRun.read(str(cfg.run))
     *heads, tail = str(cfg.world).split(":")
-    gate = _whose(run.cfg, heads.pop(0) if heads and not heads[0].isdigit() else None, str(cfg.world))
-    seed, world = int(heads[0]) if heads else run.cfg.seed, int(tail)
-    last = run.cfg.seed + (run.cfg.gate.success if gate == "success" else run.cfg.gate.batch).seeds - 1
+    gate = _whose(
+        run.cfg, heads.pop(0) if heads and not heads[0].isdigit() else None, str(cfg.world)
+    )
+    seed = int(heads[0]) if heads else run.cfg.seed
+    world = int(tail)
+    last = (
+        run.cfg.seed + (run.cfg.gate.success if gate == "success" else run.cfg.gate.batch).seeds - 1
+    )
     if not run.cfg.seed <= seed <= last:
         seeds = f"seed {last}" if last == run.cfg.seed else f"a seed from {run.cfg.seed} to {last}"
         raise ConfigError("world", cfg.world, f"{seeds}, as that run has (seed:world)")
     if not world < run.cfg.nworld:
-        raise ConfigError("world", cfg.world, f"a world from 0 to {run.cfg.nworld - 1}, as that run has")
+        raise ConfigError(
+            "world", cfg.world, f"a world from 0 to {run.cfg.nworld - 1}, as that run has"
+        )
     record = run.batch_record(seed, *([STEM] if gate == "success" else []))
-    kept = kept_layouts(run.cfg, run.folder)
+    kept = archived_starts(run.cfg, run.folder)
     played = success_config(kept) if gate == "success" else kept
     where, notes = _choose(cfg.sim, run, record)
     backend, device = where[0]
     return ReplayPlan(
         run=run,
         gate=gate,
-        cfg=replace(played, sim=SimCfg(backend=backend, device=device), view=cfg.view, video=cfg.video),
+        cfg=replace(
+            played, sim=SimCfg(backend=backend, device=device), view=cfg.view, video=cfg.video
+        ),
         seed=seed,
         world=world,
         where=where,
@@ -111,20 +132,29 @@ def _plan(cfg: Config) -> ReplayPlan:
 
 
 def _whose(cfg: Config, named: str | None, world: str) -> str:
-    """The gate whose world is meant: the one that is named, else the one that the run had, *batch* if both."""
+    """The gate whose world is meant: the one that is named, else the one that the run had, *batch*
+    if both.
+    """
     had = [gate for gate in ("batch", "success") if gate in cfg.gates]
     if named is not None and named not in had:
-        raise ConfigError("world", world, f"a world of a gate that run had, {' or '.join(had) or 'neither batch nor success'}")
+        raise ConfigError(
+            "world",
+            world,
+            f"a world of a gate that run had, {' or '.join(had) or 'neither batch nor success'}",
+        )
     return named or (had[0] if had else "batch")
 
 
-def _choose(asked: SimCfg, run: EarlierRun, record: BatchRecord | None) -> tuple[list[tuple[Backend, str]], list[str]]:
+def _choose(
+    asked: SimCfg, run: EarlierRun, record: BatchRecord | None
+) -> tuple[list[tuple[Backend, str]], list[str]]:
     """Backends and devices to play on, and what could not be as it was."""
     ran = _ran_on(run, record)
     backend = ran[0] if asked.backend is Backend.auto else asked.backend
     if backend is Backend.native:
         return [(Backend.native, "cpu")], []
-    device, notes = resolve_device(asked.device), []
+    device = resolve_device(asked.device)
+    notes = []
     if asked.device == "auto" and ran[0] is Backend.mjwarp:
         try:
             device = resolve_device(ran[1])
@@ -138,10 +168,14 @@ def _check_start(plan: ReplayPlan) -> None:
     """Raises if the world would start elsewhere than it did in that run."""
     if plan.record is None or plan.record.start is None:
         return
-    context, then = GateContext(cfg=plan.cfg), plan.record.start[plan.world]
-    # MJWarp takes longer to load than the native start does to compute, and rounding may have it draw otherwise.
+    context = GateContext(cfg=plan.cfg)
+    then = plan.record.start[plan.world]
+    # MJWarp takes longer to load than the native start does to compute, and rounding may have it
+    # draw otherwise.
     for backend, device in dict.fromkeys([(Backend.native, "cpu"), plan.where[0]]):
-        now = start_of_world(context, seed=plan.seed, world=plan.world, backend=backend, device=device)
+        now = start_of_world(
+            context, seed=plan.seed, world=plan.world, backend=backend, device=device
+        )
         off = float(np.abs(now - then).max()) if now.shape == then.shape else math.inf
         if off <= _SAME_START:
             return
@@ -150,13 +184,15 @@ def _check_start(plan: ReplayPlan) -> None:
     if copies:
         fix = f"Put back what it started from, as {copies}"
     raise RunError(
-        f"run={plan.run.folder}: world {plan.world} of seed {plan.seed} would start up to {off:.3g} (m, rad) from where it "
-        f"did, expected its own start. {fix}."
+        f"run={plan.run.folder}: world {plan.world} of seed {plan.seed} would start up to {off:.3g}"
+        f" (m, rad) from where it did, expected its own start. {fix}."
     )
 
 
 def _ran_on(run: EarlierRun, record: BatchRecord | None) -> tuple[Backend, str]:
-    """Backend and device of the earlier batch: as recorded, else what its configuration means on its machine."""
+    """Backend and device of the earlier batch: as recorded, else what its configuration means on
+    its machine.
+    """
     if record is not None:
         return Backend(record.backend), record.device
     device = str(run.provenance.get("device", "")).rpartition(": ")[0]
@@ -169,7 +205,9 @@ def _ran_on(run: EarlierRun, record: BatchRecord | None) -> tuple[Backend, str]:
 def _run(plan: ReplayPlan, context: GateContext, bar: ProgressBar, record: Record) -> None:
     assert context.folder is not None
     played = replace(plan.cfg, seed=plan.seed)
-    write_atomic(context.folder / "replayed_config.yaml", OmegaConf.to_yaml(OmegaConf.structured(played)))
+    write_atomic(
+        context.folder / "replayed_config.yaml", OmegaConf.to_yaml(OmegaConf.structured(played))
+    )
     changes = _changes(plan.run.provenance, run_provenance(plan.cfg, context))
     for line in plan.notes + changes:
         bar.say(escape(line))
@@ -182,89 +220,140 @@ def _run(plan: ReplayPlan, context: GateContext, bar: ProgressBar, record: Recor
 def _changes(then: dict, now: dict) -> list[str]:
     """What is not as it was in the earlier run and could change a result, or its last bits."""
     was = then.get("versions")
-    pairs = [(name, was[name], version) for name, version in now["versions"].items() if isinstance(was, dict) and name in was]
+    pairs = [
+        (name, was[name], version)
+        for name, version in now["versions"].items()
+        if isinstance(was, dict) and name in was
+    ]
     pairs += [(what, then[key], now[key]) for key, what in _PLACES.items() if key in then]
-    lines = [f"{what} was {before} in that run and is {here} now" for what, before, here in pairs if before != here]
+    lines = [
+        f"{what} was {before} in that run and is {here} now"
+        for what, before, here in pairs
+        if before != here
+    ]
     if then.get("model_sha256") != now["model_sha256"]:
         lines.append("the compiled model is not the same as in that run: this is another physics")
     return lines
 
 
 def _replay(
-    plan: ReplayPlan, number: int, backend: Backend, device: str, changes: list[str], context: GateContext
+    plan: ReplayPlan,
+    number: int,
+    backend: Backend,
+    device: str,
+    changes: list[str],
+    context: GateContext,
 ) -> list[GateResult]:
-    """Plays the world on one backend and says how it went, and whether that is what was recorded."""
+    """Plays the world on one backend and says how it went, and whether that is what was
+    recorded.
+    """
     first = number == 0
-    watch = FailureWatch(plan.cfg) if plan.gate == "success" else None
+    watch = FailureMonitor(plan.cfg) if plan.gate == "success" else None
     done = replay_world(
         context,
         seed=plan.seed,
         world=plan.world,
         backend=backend,
         device=device,
-        on_frame=context.on_frame if first else None,
+        on_step=context.on_step if first else None,
         watch=watch,
     )
-    status, reason, metrics = judge_one(context.evidence.rules, done.episode.verdict)
-    reason = reason or f"accepted, {context.evidence.headline(metrics)}"
+    status, reason, metrics = judge_one(context.check.rules, done.episode.result)
+    reason = reason or f"succeeded, {context.check.headline(metrics)}"
     kept, compared = _compare(plan, done, backend, device, changes, context)
     reason += f"; {compared}"
     if not kept:
         status = Status.failed
     if first:
-        context.shown, context.shown_by = done.episode, f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
-    told = [str(finding) for finding in done.findings] + ([] if watch is None else [_first_sign(watch, done, context)])
+        context.shown = done.episode
+        context.shown_by = f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
+    told = [str(finding) for finding in done.findings] + (
+        [] if watch is None else [_first_sign(watch, done, context)]
+    )
     for line in told:
         context.say(escape(f"  {line}"))
-    values: dict[str, Value] = {"backend": done.description, "seed": plan.seed, "world": plan.world, **metrics}
+    values: dict[str, Value] = {
+        "backend": done.description,
+        "seed": plan.seed,
+        "world": plan.world,
+        **metrics,
+    }
     if plan.record is not None:
-        values["recorded"] = describe_rules(context.evidence.rules, int(plan.record.failed[plan.world])) or "accepted"
+        values["recorded"] = (
+            describe_rules(context.check.rules, int(plan.record.failed[plan.world])) or "succeeded"
+        )
     name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
     assert context.folder is not None
     try:
         done.write(context.folder / name, seed=plan.seed, world=plan.world)
         values["trajectory"] = name
     except OSError as error:
-        status, reason = Status.failed, f"{reason}; {name} cannot be written ({error.strerror})"
+        status = Status.failed
+        reason = f"{reason}; {name} cannot be written ({error.strerror})"
     return [
         GateResult(
             name=f"replay_{backend.value}",
             status=status,
             reason=reason,
-            thresholds=context.evidence.thresholds(plan.cfg),
+            thresholds=context.check.thresholds(plan.cfg),
             metrics=values,
             details=told + plan.notes + changes,
         )
     ]
 
 
-def _first_sign(watch: FailureWatch, done: ReplayedWorld, context: GateContext) -> str:
+def _first_sign(watch: FailureMonitor, done: ReplayedWorld, context: GateContext) -> str:
     """What the success gate would say of where the world went wrong."""
-    sign, frame, retries = int(watch.sign[0]), int(watch.frame[0]), int(done.episode.retries[0])
+    sign = int(watch.sign[0])
+    step = int(watch.step[0])
+    retries = int(done.episode.retries[0])
     name = context.planner.phases[int(watch.phase[0])].name if sign else ""
-    when = f", seen in frame {frame}" if sign else ""
-    return f"first sign of failure: {describe_sign(sign, name) if sign else 'none'}{when}; grasps tried again: {retries}"
+    when = f", seen in step {step}" if sign else ""
+    return (
+        f"first sign of failure: {describe_sign(sign, name) if sign else 'none'}{when}; grasps"
+        f" tried again: {retries}"
+    )
 
 
 def _compare(
-    plan: ReplayPlan, done: ReplayedWorld, backend: Backend, device: str, changes: list[str], context: GateContext
+    plan: ReplayPlan,
+    done: ReplayedWorld,
+    backend: Backend,
+    device: str,
+    changes: list[str],
+    context: GateContext,
 ) -> tuple[bool, str]:
-    """What the gate recorded of this world against what happened now, and whether that keeps what is promised."""
+    """What the gate recorded of this world against what happened now, and whether that keeps what
+    is promised.
+    """
     record = plan.record
     if record is None:
-        return True, f"that run recorded no verdict, because its {plan.gate} gate did not get there"
+        return True, f"that run recorded no result, because its {plan.gate} gate did not get there"
     bits = int(record.failed[plan.world])
-    rules = context.evidence.rules
-    told = describe_rules(rules, bits) or "accepted"
+    rules = context.check.rules
+    told = describe_rules(rules, bits) or "succeeded"
     same = bits == done.failed
     if record.backend != backend.value:
-        return True, f"that run's {record.backend} world had {'the same verdict' if same else f'another verdict: {told}'}"
-    ours, theirs = done.qpos_end, record.qpos[plan.world]
+        return (
+            True,
+            (
+                f"that run's {record.backend} world had"
+                f" {'the same result' if same else f'another result: {told}'}"
+            ),
+        )
+    ours = done.qpos_end
+    theirs = record.qpos[plan.world]
     exact = np.array_equal(ours, theirs, equal_nan=True)
     if same and exact:
         return True, "as recorded, and it ends bit for bit where it did"
-    apart = max(float(np.linalg.norm(ours[a : a + 3] - theirs[a : a + 3])) for a in context.index.cube_qpos)
-    ends = "it ends bit for bit where it did" if exact else f"its cubes end {1e3 * apart:.3g} mm from where they did"
+    apart = max(
+        float(np.linalg.norm(ours[a : a + 3] - theirs[a : a + 3])) for a in context.index.cube_qpos
+    )
+    ends = (
+        "it ends bit for bit where it did"
+        if exact
+        else f"its cubes end {1e3 * apart:.3g} mm from where they did"
+    )
     reasons = []  # why it need not end bit for bit where it did
     if device.startswith("cuda") or record.device.startswith("cuda"):
         reasons.append("runs on CUDA agree to rounding only")
@@ -274,6 +363,8 @@ def _compare(
         reasons.append("not all is as it was in that run")
     if not reasons:
         wanted = "" if exact else ", expected bit for bit there"
-        return False, f"NOT as recorded ({'the same verdict' if same else told}): {ends}{wanted}"
+        return False, f"NOT as recorded ({'the same result' if same else told}): {ends}{wanted}"
     why = ", and ".join(["", *reasons])
-    return True, f"as recorded, but {ends}{why}" if same else f"NOT as recorded ({told}): {ends}{why}"
+    return True, (
+        f"as recorded, but {ends}{why}" if same else f"NOT as recorded ({told}): {ends}{why}"
+    )

@@ -1,4 +1,6 @@
-"""Job *scaling*: throughput from one world to many. A case that fails is a gap; what is done is not done again."""
+"""Job *scaling*: throughput from one world to many. A case that fails is a gap; what is done is not
+done again.
+"""
 
 from __future__ import annotations
 
@@ -14,26 +16,40 @@ from omegaconf import OmegaConf
 from rich.console import Console
 from rich.markup import escape
 
-from mjstack.config.content import config_content, config_hash
+from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.schema import Backend, Config, ScalingJobCfg
 from mjstack.errors import ConfigError
 from mjstack.jobs.case import OutOfTime, is_done, read_case, run_case
 from mjstack.jobs.gates import check_machine
-from mjstack.jobs.outcome import JobOutcome
-from mjstack.jobs.reported import model_text
+from mjstack.jobs.result import JobResult
+from mjstack.jobs.runner import model_text
+from mjstack.report.csv_table import to_csv
 from mjstack.report.curves import save_scaling_curves
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Report, Status, write_atomic
 from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow, describe_crossover, to_markdown
-from mjstack.report.table import to_csv
 from mjstack.scene import build_model
 from mjstack.sim import cuda_driver, resolve_device
 
 log = logging.getLogger(__name__)
 
 # What a case sets itself: these of the command line do not reach it.
-_OWN = ("job", "nworld", "gates", "sim", "view", "video", "gate.throughput.native_baseline", "gate.throughput.repetitions")
-_OWN_NATIVE = ("sim.device", "gate.throughput.sections", "gate.throughput.frames", "gate.throughput.env_frames")
+_OWN = (
+    "job",
+    "nworld",
+    "gates",
+    "sim",
+    "view",
+    "video",
+    "gate.throughput.native_baseline",
+    "gate.throughput.repetitions",
+)
+_OWN_NATIVE = (
+    "sim.device",
+    "gate.throughput.sections",
+    "gate.throughput.steps",
+    "gate.throughput.env_steps",
+)
 _GROWTH = 1.5  # of a case over the one before, where the last two do not tell
 
 
@@ -41,7 +57,9 @@ def check_scaling(cfg: Config) -> None:
     """Raises for what this machine cannot do, before anything is written."""
     for key in ("view", "video"):
         if getattr(cfg, key):
-            raise ConfigError(key, "true", "false with job=scaling, which shows no world", "Leave it out")
+            raise ConfigError(
+                key, "true", "false with job=scaling, which shows no world", "Leave it out"
+            )
     backends = _backends(cfg)
     if "mjwarp" in backends:
         resolve_device(cfg.sim.device)
@@ -51,7 +69,13 @@ def check_scaling(cfg: Config) -> None:
 def scaling_folder(cfg: Config) -> Path:
     """Where a configuration's cases are, so that another call finds them."""
     job = asdict(_job(cfg))
-    for key in ("nworlds", "backends", "case_minutes", "max_minutes", "retry"):  # they change no case
+    for key in (
+        "nworlds",
+        "backends",
+        "case_minutes",
+        "max_minutes",
+        "retry",
+    ):  # they change no case
         del job[key]
     config = config_content(cfg)
     for key in ("nworld", "gates", "view", "video"):
@@ -60,8 +84,9 @@ def scaling_folder(cfg: Config) -> Path:
     return Path("outputs") / "scaling" / config_hash(config | {"job": job})[:12]
 
 
-def run_scaling_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
-    """Runs the cases that are not done, and leaves table, plot and report; see `ScalingJobCfg` for what ends a call.
+def run_scaling_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
+    """Runs the cases that are not done, and leaves table, plot and report; see `ScalingJobCfg` for
+    what ends a call.
 
     Args:
         cfg: The configuration.
@@ -71,21 +96,27 @@ def run_scaling_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutco
     Returns:
         How it ended: a pass if every case is there and passed.
     """
-    job, console = _job(cfg), Console(highlight=False)
-    outcome = JobOutcome(status=Status.interrupted, folder=folder, overrides=overrides)
+    job = _job(cfg)
+    console = Console(highlight=False)
+    outcome = JobResult(status=Status.interrupted, folder=folder, overrides=overrides)
     cases = [(nworld, backend) for nworld in job.nworlds for backend in _backends(cfg)]
     folders = {case: folder / "cases" / f"{case[1]}-{case[0]}" for case in cases}
     rows = {case: read_case(folders[case], *case) for case in cases}
     until = math.inf if job.max_minutes is None else time.monotonic() + 60.0 * job.max_minutes
     console.print(
-        f"[bold]{cfg.robot.title}[/], task {cfg.task.name}, scaling: {len(cases)} cases -> {escape(str(folder))}",
+        f"[bold]{cfg.robot.title}[/], task {cfg.task.name}, scaling: {len(cases)} cases ->"
+        f" {escape(str(folder))}",
         soft_wrap=True,
     )
     for override in overrides:
         if _key(override) in {"nworld", "gates", "gate.throughput.repetitions"}:
-            console.print(f"{escape(override)} is not used: each case of job=scaling has its own", soft_wrap=True)
+            console.print(
+                f"{escape(override)} is not used: each case of job=scaling has its own",
+                soft_wrap=True,
+            )
     try:
-        incomplete, started = "", False
+        incomplete = ""
+        started = False
         for number, case in enumerate(cases, 1):
             nworld, backend = case
             label = f"{number}/{len(cases)} {backend}, {nworld} worlds"
@@ -112,7 +143,9 @@ def run_scaling_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutco
             log.info("%s: %s", label, rows[case].status)
             console.print(f"{label}: {_describe(rows[case])}", soft_wrap=True)
             _write_tables(cfg, folder, list(rows.values()))
-        outcome.status = Status.passed if all(row.status == PASS for row in rows.values()) else Status.failed
+        outcome.status = (
+            Status.passed if all(row.status == PASS for row in rows.values()) else Status.failed
+        )
         outcome.gates = _conclude(cfg, folder, rows, incomplete, console)
     except KeyboardInterrupt:
         outcome.status = Status.interrupted
@@ -128,9 +161,14 @@ def run_scaling_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutco
 
 def case_overrides(cfg: Config, overrides: Sequence[str], nworld: int, backend: str) -> list[str]:
     """The command line of a case: the job's own, and what the case sets."""
-    job, native = _job(cfg), backend == "native"
+    job = _job(cfg)
+    native = backend == "native"
     own = _OWN + (_OWN_NATIVE if native else ())
-    kept = [o for o in overrides if _key(o) not in own and not _key(o).startswith(("job.", "sim.backend"))]
+    kept = [
+        o
+        for o in overrides
+        if _key(o) not in own and not _key(o).startswith(("job.", "sim.backend"))
+    ]
     many = nworld > job.large
     out = [*kept, "job=gates", f"sim={backend}", f"nworld={nworld}"]
     out.append(f"gate.throughput.repetitions={job.repetitions_large if many else job.repetitions}")
@@ -141,15 +179,16 @@ def case_overrides(cfg: Config, overrides: Sequence[str], nworld: int, backend: 
         "gates=[throughput]",
         "sim.device=cpu",
         "gate.throughput.sections=[physics,env_step]",
-        f"gate.throughput.frames={job.native_frames}",
-        f"gate.throughput.env_frames={job.native_env_frames}",
+        f"gate.throughput.steps={job.native_steps}",
+        f"gate.throughput.env_steps={job.native_env_steps}",
         f"gate.throughput.cpu_max_seconds={60.0 * job.case_minutes}",
     ]
 
 
 def _say_unwritten(folder: Path, error: OSError) -> None:
     Console(stderr=True, soft_wrap=True).print(
-        f"mjstack: {escape(str(folder))} cannot be written: {error.strerror}. Free space, and run the same command again."
+        f"mjstack: {escape(str(folder))} cannot be written: {error.strerror}. Free space, and run"
+        " the same command again."
     )
 
 
@@ -172,7 +211,9 @@ def _backends(cfg: Config) -> list[str]:
 
 
 def _estimate(rows: dict[tuple[int, str], ScalingRow], case: tuple[int, str]) -> float:
-    """About how long a case will take [s], from those with fewer worlds on the same backend; 0 where there are none."""
+    """About how long a case will take [s], from those with fewer worlds on the same backend; 0
+    where there are none.
+    """
     done = sorted(
         (row.nworld, float(row.seconds))
         for row in rows.values()
@@ -187,8 +228,14 @@ def _estimate(rows: dict[tuple[int, str], ScalingRow], case: tuple[int, str]) ->
 def _describe(row: ScalingRow) -> str:
     if row.status != PASS:
         return f"{row.status}: {row.reason}" if row.reason else row.status
-    rate = f"{row.world_steps_per_s:,.0f} world-steps/s" if isinstance(row.world_steps_per_s, float) else "no figure"
-    return f"pass ({row.seconds:.0f} s): {rate}" if isinstance(row.seconds, float) else f"pass: {rate}"
+    rate = (
+        f"{row.world_steps_per_s:,.0f} world-steps/s"
+        if isinstance(row.world_steps_per_s, float)
+        else "no figure"
+    )
+    return (
+        f"pass ({row.seconds:.0f} s): {rate}" if isinstance(row.seconds, float) else f"pass: {rate}"
+    )
 
 
 def _write_tables(cfg: Config, folder: Path, rows: list[ScalingRow], picture: str = "") -> None:
@@ -201,29 +248,46 @@ def _title(cfg: Config) -> str:
 
 
 def _notes(cfg: Config) -> list[str]:
-    job, t = _job(cfg), cfg.gate.throughput
+    job = _job(cfg)
+    t = cfg.gate.throughput
     return [
-        f"ms per step and world-steps/s: physics under a held command from {t.from_phase} on, cube in hand; medians of "
-        f"{job.repetitions} repetitions up to {job.large:,} worlds, of {job.repetitions_large} above.",
-        f"env-steps/s: env.step with all managers, random actions and resets, {cfg.timing.substeps} physics steps each; "
-        "managers: what they add to its physics, in which worlds that would have ended go on; managers alone: their own time "
-        "over that of physics.",
-        "MJWarp: accepted worlds of the whole episode; its seconds include the acceptance's evidence; over bare steps: "
-        "against replayed mujoco_warp.step alone on the same commands; capture: that of the episode's graph, without its "
-        "warm-up; power, in scaling.csv: during the episodes' replayed frames alone.",
-        f"native: {job.native_frames} frames of physics per repetition on all cores; no episode, so these worlds are not "
-        f"judged; beyond {t.start_worlds} worlds the start states repeat.",
+        (
+            f"ms per step and world-steps/s: physics under a held command from {t.from_phase} on,"
+            f" cube in hand; medians of {job.repetitions} repetitions up to {job.large:,} worlds,"
+            f" of {job.repetitions_large} above."
+        ),
+        (
+            "env-steps/s: env.step with all managers, random actions and resets,"
+            f" {cfg.timing.decimation} physics steps each; managers: what they add to its physics,"
+            " in which worlds that would have ended go on; managers alone: their own time over"
+            " that of physics."
+        ),
+        (
+            "MJWarp: successful worlds of the whole episode; its seconds include the check's check;"
+            " over bare steps: against replayed mujoco_warp.step alone on the same commands;"
+            " capture: that of the episode's graph, without its warm-up; power, in scaling.csv:"
+            " during the episodes' replayed steps alone."
+        ),
+        (
+            f"native: {job.native_steps} steps of physics per repetition on all cores; no episode,"
+            f" so these worlds are not judged; beyond {t.start_worlds} worlds the start states"
+            " repeat."
+        ),
     ]
 
 
 def _conclude(
-    cfg: Config, folder: Path, rows: dict[tuple[int, str], ScalingRow], incomplete: str, console: Console
+    cfg: Config,
+    folder: Path,
+    rows: dict[tuple[int, str], ScalingRow],
+    incomplete: str,
+    console: Console,
 ) -> list[GateResult]:
     """Table, plot and report of what there is."""
     table = list(rows.values())
     picture = ""
     try:
-        save_scaling_curves(folder / "scaling.png", table, cfg.timing.substeps, _title(cfg))
+        save_scaling_curves(folder / "scaling.png", table, cfg.timing.decimation, _title(cfg))
         picture = "scaling.png"
     except Exception as error:  # drawing must not take back what the cases found
         log.exception("drawing failed")
@@ -250,8 +314,8 @@ def _conclude(
         console.print(f"{len(failed)} of {len(table)} cases failed; job.retry=true runs them again")
     if missing:
         console.print(
-            f"incomplete: {len(missing)} of {len(table)} cases have not run ({escape(incomplete)}). "
-            "The same command goes on with them.",
+            f"incomplete: {len(missing)} of {len(table)} cases have not run ({escape(incomplete)})."
+            " The same command goes on with them.",
             soft_wrap=True,
         )
     return report.gates
@@ -261,6 +325,16 @@ def _as_gate(row: ScalingRow) -> GateResult:
     """A row as a result of the report."""
     status = {PASS: Status.passed, NOT_RUN: Status.skipped}.get(row.status, Status.failed)
     reason = "has not run" if row.status == NOT_RUN else _describe(row)
-    metrics = {key: value for key, value in asdict(row).items() if value not in (None, "") and key not in ("status", "reason")}
+    metrics = {
+        key: value
+        for key, value in asdict(row).items()
+        if value not in (None, "") and key not in ("status", "reason")
+    }
     seconds = float(row.seconds) if isinstance(row.seconds, float) else 0.0
-    return GateResult(name=f"{row.backend}-{row.nworld}", status=status, reason=reason, seconds=seconds, metrics=metrics)
+    return GateResult(
+        name=f"{row.backend}-{row.nworld}",
+        status=status,
+        reason=reason,
+        seconds=seconds,
+        metrics=metrics,
+    )

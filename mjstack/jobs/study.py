@@ -1,4 +1,6 @@
-"""Job *study*: what settings of the solver cost, and whether every world is still accepted. It informs, and gates nothing."""
+"""Job *study*: what settings of the solver cost, and whether every world is still succeeded. It
+informs, and gates nothing.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +16,18 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
+from mjstack.episodes.context import GateContext, failing_rules
+from mjstack.episodes.rollout import State, restore, snapshot, start_worlds
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.gates.episode import State, restore, snapshot, start_worlds
-from mjstack.gates.gate import GateContext, failing_rules
 from mjstack.jobs.gates import check_machine
-from mjstack.jobs.outcome import JobOutcome
 from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.reported import Record, run_reported
+from mjstack.jobs.result import JobResult
+from mjstack.jobs.runner import Record, run_reported
 from mjstack.managers.reset import required_fields
+from mjstack.report.csv_table import to_csv
 from mjstack.report.picture import save_study
 from mjstack.report.record import GateResult, Status, write_atomic
 from mjstack.report.study import StudyRow, to_markdown
-from mjstack.report.table import to_csv
 from mjstack.sim import LOST_PHYSICS, Simulation, SolverLimit, make_simulation
 from mjstack.sim.sizes import resolve_measuring_sizes
 
@@ -41,23 +43,25 @@ class _Base:
     Attributes:
         sim: Its worlds.
         state: Cube in hand: where every timed repetition of every variant starts.
-        frames: Frames of a repetition.
+        steps: Steps of a repetition.
     """
 
     sim: Simulation
     state: State
-    frames: int
+    steps: int
 
 
 def check_study(cfg: Config) -> None:
     """Raises for what this machine cannot do, before anything is written."""
     for key in ("view", "video"):
         if getattr(cfg, key):
-            raise ConfigError(key, "true", "false with job=study, which shows no world", "Leave it out")
+            raise ConfigError(
+                key, "true", "false with job=study, which shows no world", "Leave it out"
+            )
     check_machine(cfg)
 
 
-def run_study_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome:
+def run_study_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
     """Measures every variant and leaves study.csv, study.md, study.png and the report.
 
     Args:
@@ -78,7 +82,13 @@ def run_study_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome
         except Exception as error:  # nothing can be compared with it
             log.exception("the configured solver broke")
             reason = (str(error) or type(error).__name__).splitlines()[0]
-            record(GateResult(name="base", status=Status.failed, reason=f"the configured solver cannot be timed: {reason}"))
+            record(
+                GateResult(
+                    name="base",
+                    status=Status.failed,
+                    reason=f"the configured solver cannot be timed: {reason}",
+                )
+            )
             return
         try:
             for name, solver in job.variants.items():
@@ -92,34 +102,41 @@ def run_study_job(cfg: Config, folder: Path, overrides: list[str]) -> JobOutcome
         finally:
             base.sim.close()
 
-    title = f"task {cfg.task.name}, {cfg.nworld} worlds, study of {len(job.variants)} variants of the solver"
+    title = (
+        f"task {cfg.task.name}, {cfg.nworld} worlds, study of {len(job.variants)} variants of the"
+        " solver"
+    )
     return run_reported(cfg, folder, overrides, title, work)
 
 
 def _prepare(context: GateContext, job: StudyJobCfg) -> _Base:
     """The configured solver's worlds, played up to where they hold the cube."""
-    cfg, advance = context.cfg, context.advance
+    cfg = context.cfg
+    advance = context.advance
     sim = _simulation(context)
     env, controller = start_worlds(sim, context.index, cfg, cfg.reset, context.planner, advance)
     first = context.phase_start(cfg.gate.throughput.from_phase)
-    for frame in range(first):
+    for step in range(first):
         env.step(controller.command())
         if advance is not None:
-            advance("frames to the cube in hand", frame + 1, first)
+            advance("steps to the cube in hand", step + 1, first)
     state = snapshot(sim)
     restore(sim, state)
     _play(sim, cfg, _WARM_CALLS)
     seconds = _play(sim, cfg, 1)
-    return _Base(sim, state, max(1, min(job.frames, int(job.max_seconds / seconds))))
+    return _Base(sim, state, max(1, min(job.steps, int(job.max_seconds / seconds))))
 
 
-def _guarded(context: GateContext, job: StudyJobCfg, base: _Base, name: str, solver: SolverCfg) -> StudyRow:
+def _guarded(
+    context: GateContext, job: StudyJobCfg, base: _Base, name: str, solver: SolverCfg
+) -> StudyRow:
     """One variant; if it breaks, the others still run."""
     cfg = context.cfg
     changes = _changes(cfg.solver, solver)
     row = StudyRow(variant=name, changes=changes or "nothing")
     if not changes and name != "base":
-        row.status, row.reason = Status.skipped.value, "the same as base"
+        row.status = Status.skipped.value
+        row.reason = "the same as base"
         return row
     try:
         _measure(_variant(context, solver), job, base, row)
@@ -127,29 +144,43 @@ def _guarded(context: GateContext, job: StudyJobCfg, base: _Base, name: str, sol
         row.reason = str(error)
     except Exception as error:
         log.exception("variant %s broke", name)
-        row.reason = f"{type(error).__name__}: {(str(error) or 'no message').splitlines()[0]} (run.log has the traceback)"
+        row.reason = (
+            f"{type(error).__name__}: {(str(error) or 'no message').splitlines()[0]} (run.log has"
+            " the traceback)"
+        )
     return row
 
 
 def _variant(context: GateContext, solver: SolverCfg) -> GateContext:
-    """The same run with another solver. Its plan is the same too, because inverse kinematics has no contacts."""
+    """The same run with another solver. Its plan is the same too, because inverse kinematics has no
+    contacts.
+    """
     out = GateContext(cfg=replace(context.cfg, solver=solver), advance=context.advance)
     out.planner = context.planner
     return out
 
 
 def _measure(context: GateContext, job: StudyJobCfg, base: _Base, row: StudyRow) -> None:
-    """The whole episode, judged; then turns of some frames with the base, from the base's state with the cube in hand."""
-    cfg, advance = context.cfg, context.advance
+    """The whole episode, judged; then turns of some steps with the base, from the base's state with
+    the cube in hand.
+    """
+    cfg = context.cfg
+    advance = context.advance
     sim = _simulation(context)
     try:
-        verdict = context.run(sim, cfg.reset).verdict
-        failed = verdict.failed.cpu().numpy()
-        row.worlds, row.accepted = sim.nworld, int((failed == 0).sum())
-        broken = failing_rules(context.evidence.rules, failed)
-        row.broken_rules = ", ".join(f"{rule.text} in {len(worlds)}" for rule, worlds in broken.items())
-        row.peak_rows, row.xy_err_max_m = int(sim.peak_constraints.max()), float(verdict.values["xy_err_m"].max())
-        limits: torch.Tensor | None = getattr(sim, "solver_limits", None)  # native MuJoCo does not tell
+        result = context.run(sim, cfg.reset).result
+        failed = result.failed.cpu().numpy()
+        row.worlds = sim.nworld
+        row.succeeded = int((failed == 0).sum())
+        broken = failing_rules(context.check.rules, failed)
+        row.broken_rules = ", ".join(
+            f"{rule.text} in {len(worlds)}" for rule, worlds in broken.items()
+        )
+        row.peak_rows = int(sim.peak_constraints.max())
+        row.xy_err_max_m = float(result.values["xy_err_m"].max())
+        limits: torch.Tensor | None = getattr(
+            sim, "solver_limits", None
+        )  # native MuJoCo does not tell
         if limits is not None:
             row.iteration_limit_worlds = int((limits & SolverLimit.ITERATIONS != 0).sum())
             row.line_search_limit_worlds = int((limits & SolverLimit.LS_ITERATIONS != 0).sum())
@@ -160,34 +191,40 @@ def _measure(context: GateContext, job: StudyJobCfg, base: _Base, row: StudyRow)
             # Each goes first in turn: what drifts, drifts for both.
             for one in list(times)[:: 1 if repetition % 2 else -1]:
                 restore(one, base.state)
-                times[one].append(_play(one, cfg, base.frames))
-                _require_sound(one, base.frames * cfg.timing.substeps)
+                times[one].append(_play(one, cfg, base.steps))
+                _require_sound(one, base.steps * cfg.timing.decimation)
             if advance is not None:
                 advance("repetitions", repetition + 1, job.repetitions)
     finally:
         sim.close()
-    per_step = 1e3 / (base.frames * cfg.timing.substeps)
+    per_step = 1e3 / (base.steps * cfg.timing.decimation)
     ratios = [ours / theirs for ours, theirs in zip(times[sim], times[base.sim], strict=True)]
     row.ms_per_batched_step = per_step * statistics.median(times[sim])
-    row.ms_min, row.ms_max = per_step * min(times[sim]), per_step * max(times[sim])
+    row.ms_min = per_step * min(times[sim])
+    row.ms_max = per_step * max(times[sim])
     row.base_ms = per_step * statistics.median(times[base.sim])
-    row.ratio, row.ratio_min, row.ratio_max = statistics.median(ratios), min(ratios), max(ratios)
+    row.ratio = statistics.median(ratios)
+    row.ratio_min = min(ratios)
+    row.ratio_max = max(ratios)
     row.status = Status.passed.value
 
 
 def _simulation(context: GateContext) -> Simulation:
     """Worlds with room to spare: buffer sizes are not what is studied."""
     cfg, (backend, device) = context.cfg, context.backend
-    fields, sizes = required_fields(cfg.reset), resolve_measuring_sizes(cfg)
-    return make_simulation(context.model, cfg, cfg.nworld, backend=backend, device=device, fields=fields, sizes=sizes)
+    fields = required_fields(cfg.reset)
+    sizes = resolve_measuring_sizes(cfg)
+    return make_simulation(
+        context.model, cfg, cfg.nworld, backend=backend, device=device, fields=fields, sizes=sizes
+    )
 
 
-def _play(sim: Simulation, cfg: Config, frames: int) -> float:
-    """Seconds that some frames take under the held command, the device idle at both ends."""
+def _play(sim: Simulation, cfg: Config, steps: int) -> float:
+    """Seconds that some steps take under the held command, the device idle at both ends."""
     sim.synchronize()
     began = time.perf_counter()
-    for _ in range(frames):
-        sim.step(cfg.timing.substeps)
+    for _ in range(steps):
+        sim.step(cfg.timing.decimation)
     sim.synchronize()
     return time.perf_counter() - began
 
@@ -202,29 +239,45 @@ def _require_sound(sim: Simulation, steps: int) -> None:
     bad |= ~(torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1))
     bad |= sim.step_count != steps
     if count := int(bad.sum()):
-        raise MjstackError(f"no time: {count} of {sim.nworld} worlds overflowed, diverged or were not stepped.")
+        raise MjstackError(
+            f"no time: {count} of {sim.nworld} worlds overflowed, diverged or were not stepped."
+        )
 
 
 def _changes(base: SolverCfg, solver: SolverCfg) -> str:
     """What differs: ``iterations=5``."""
-    pairs = ((field.name, getattr(base, field.name), getattr(solver, field.name)) for field in fields(SolverCfg))
+    pairs = (
+        (field.name, getattr(base, field.name), getattr(solver, field.name))
+        for field in fields(SolverCfg)
+    )
     return ", ".join(f"{name}={_text(new)}" for name, old, new in pairs if new != old)
 
 
 def _text(value: object) -> str:
     if isinstance(value, Enum):
         return str(value.value)
-    return "the model's" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+    return (
+        "the model's" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+    )
 
 
 def _as_result(row: StudyRow, seconds: float) -> GateResult:
     """A row as a result of the report."""
-    metrics = {key: value for key, value in asdict(row).items() if value not in (None, "") and key not in ("status", "reason")}
+    metrics = {
+        key: value
+        for key, value in asdict(row).items()
+        if value not in (None, "") and key not in ("status", "reason")
+    }
     reason = row.reason
     if row.status == Status.passed.value:
-        reason = f"{row.ms_per_batched_step:.3g} ms per step, {row.ratio:.2f} of base, {row.accepted} of {row.worlds} accepted"
+        reason = (
+            f"{row.ms_per_batched_step:.3g} ms per step, {row.ratio:.2f} of base, {row.succeeded}"
+            f" of {row.worlds} succeeded"
+        )
         reason += f" ({row.broken_rules})" if row.broken_rules else ""
-    return GateResult(name=row.variant, status=Status(row.status), reason=reason, seconds=seconds, metrics=metrics)
+    return GateResult(
+        name=row.variant, status=Status(row.status), reason=reason, seconds=seconds, metrics=metrics
+    )
 
 
 def _title(context: GateContext) -> str:
@@ -233,12 +286,16 @@ def _title(context: GateContext) -> str:
 
 
 def _notes(context: GateContext) -> list[str]:
-    job, base = cast(StudyJobCfg, context.cfg.job), asdict(context.cfg.solver)
+    job = cast(StudyJobCfg, context.cfg.job)
+    base = asdict(context.cfg.solver)
     backend, device = context.backend
     notes = [
         f"base: {', '.join(f'{name}={_text(value)}' for name, value in base.items())}",
-        f"{backend.value} on {device}. Times: cube in hand, command held; medians of {job.repetitions} repetitions, in turns "
-        "with base. A ratio is that of two neighbouring turns; in brackets the smallest and the largest.",
+        (
+            f"{backend.value} on {device}. Times: cube in hand, command held; medians of"
+            f" {job.repetitions} repetitions, in turns with base. A ratio is that of two"
+            " neighbouring turns; in brackets the smallest and the largest."
+        ),
         "base as a variant is a second copy of it: its ratio shows how far equal runs differ.",
     ]
     if backend.value == "native":
@@ -246,7 +303,9 @@ def _notes(context: GateContext) -> list[str]:
     return notes
 
 
-def _write_tables(context: GateContext, folder: Path, rows: list[StudyRow], picture: str = "") -> None:
+def _write_tables(
+    context: GateContext, folder: Path, rows: list[StudyRow], picture: str = ""
+) -> None:
     write_atomic(folder / "study.csv", to_csv(StudyRow, rows))
     write_atomic(folder / "study.md", to_markdown(rows, _title(context), _notes(context), picture))
 
@@ -259,8 +318,10 @@ def _draw(context: GateContext, folder: Path, rows: list[StudyRow]) -> None:
     ratios = np.array([[row.ratio, row.ratio_min, row.ratio_max] for row in done], dtype=float)
     labels = [row.variant for row in done]
     try:
-        accepted = [row.accepted or 0 for row in done]
-        save_study(folder / "study.png", labels, ratios, accepted, context.cfg.nworld, _title(context))
+        succeeded = [row.succeeded or 0 for row in done]
+        save_study(
+            folder / "study.png", labels, ratios, succeeded, context.cfg.nworld, _title(context)
+        )
     except Exception as error:
         log.exception("drawing failed")
         context.say(f"no picture: {str(error) or type(error).__name__}")

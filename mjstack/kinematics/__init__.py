@@ -1,1 +1,1 @@
-"""Inverse kinematics for the aperture centre."""
+"""Inverse kinematics for the grasp point."""

@@ -11,7 +11,15 @@ import warp as wp
 
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError, ConfigError, MjstackError, UnknownName
-from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape, aperture_kernel, directions_kernel, solve_kernel
+from mjstack.kinematics.ik_kernels import (
+    HINGE,
+    SLIDE,
+    Chain,
+    Shape,
+    directions_kernel,
+    grasp_point_kernel,
+    solve_kernel,
+)
 from mjstack.scene.index import find
 from mjstack.sim.streams import torch_stream_scope
 
@@ -21,27 +29,32 @@ _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 _Pose = tuple[np.ndarray, np.ndarray]  # position and quaternion (wxyz)
 _Link = tuple[_Pose, np.ndarray, int, int]  # frame, axis, kind, column of the command
 
-_NEAR = 0.00002  # m: with a gain, an iterate this close to the target replaces a closer one that came before
+# m: with a gain, an iterate this close to the target replaces a closer one that came before
+_NEAR = 0.00002
 _LEAST_WITH_GAIN = 4  # iterations
 
 
 class BatchedIk:
-    """Brings the aperture centre, the midpoint of two sites, to a target in every world: damped least squares, float32.
+    """Brings the grasp point, the midpoint of two sites, to a target in every world: damped least
+    squares, float32.
 
-    A solve is one kernel launch, a fixed number of iterations, and neither reads back to the host nor allocates, so that a
-    CUDA graph can hold it. What it returns are its own buffers, overwritten by the next call.
+    A solve is one kernel launch, a fixed number of iterations, and neither reads back to the host
+    nor allocates, so that a CUDA graph can hold it. What it returns are its own buffers,
+    overwritten by the next call.
 
-    The arms have more joints than a point needs. What the spare ones do is open by default: each solve takes the shortest way.
-    With ``posture_gain`` they go towards a posture, with ``approach_gain`` they turn the gripper's approach axis down or to a
-    given direction, in both cases as far as the centre stays on its target, and a step at a time: what is left after one
+    The arms have more joints than a point needs. What the spare ones do is open by default: each
+    solve takes the shortest way. With ``posture_gain`` they go towards a posture, with
+    ``approach_gain`` they turn the gripper's approach axis down or to a given direction, in both
+    cases as far as the centre stays on its target, and a step at a time: what is left after one
     solve goes on in the next.
 
-    Commands are joint positions in the order of the robot's arm joints and then its gripper joints; everything is in the
-    world frame. Joints on the way to the sites that have no command stay where the model has them at qpos0.
+    Commands are joint positions in the order of the robot's arm joints and then its gripper joints;
+    everything is in the world frame. Joints on the way to the sites that have no command stay where
+    the model has them at qpos0.
 
     Attributes:
-        unreachable: Whether the last solve ended farther than ``tolerance`` from its target, or had input that is not finite,
-            shape ``(nworld,)``, bool.
+        unreachable: Whether the last solve ended farther than ``tolerance`` from its target, or had
+            input that is not finite, shape ``(nworld,)``, bool.
     """
 
     def __init__(
@@ -61,26 +74,31 @@ class BatchedIk:
     ) -> None:
         """Reads the chain from the model, allocates, and loads the kernels.
 
-        Eight iterations follow a target that moves by millimetres; one anywhere in the workspace takes up to 40.
+        Eight iterations follow a target that moves by millimetres; one anywhere in the workspace
+        takes up to 40.
 
         Args:
             model: A compiled model that contains the robot, alone or in a scene. It is not kept.
             robot: The robot's profile.
             nworld: Number of worlds.
             device: Where the worlds are: ``"cpu"`` or ``"cuda:N"``.
-            iterations: Steps per solve. With a gain at least 4, because the last two or three, or a quarter of many, go for the
-                target alone.
-            damping: Of the least squares at the target [m/rad]; it grows with the distance. More is calmer near a stretched
-                arm, and slower there.
+            iterations: Steps per solve. With a gain at least 4, because the last two or three, or a
+                quarter of many, go for the target alone.
+            damping: Of the least squares at the target [m/rad]; it grows with the distance. More is
+                calmer near a stretched arm, and slower there.
             max_step: Largest change of any joint per iteration [rad].
-            posture_gain: Share of the way to the posture that is wished for per iteration, from 0 to 1.
-            approach_gain: Turn that is wished for per iteration where the approach axis is horizontal [rad], from 0 to 1.
+            posture_gain: Share of the way to the posture that is wished for per iteration, from 0
+                to 1.
+            approach_gain: Turn that is wished for per iteration where the approach axis is
+                horizontal [rad], from 0 to 1.
             tolerance: Distance beyond which a target counts as unreachable [m].
-            block_dim: CUDA threads per block. Few, because a world is one thread, and many processors then share the worlds.
+            block_dim: CUDA threads per block. Few, because a world is one thread, and many
+                processors then share the worlds.
 
         Raises:
             UnknownName: The model lacks a joint, actuator, site or body of the robot.
-            MjstackError: An argument is out of range, or a commanded joint is neither hinge nor slide.
+            MjstackError: An argument is out of range, or a commanded joint is neither hinge nor
+                slide.
         """
         gained = posture_gain > 0.0 or approach_gain > 0.0
         for name, value, least in (
@@ -90,7 +108,11 @@ class BatchedIk:
         ):
             if value < least:
                 raise ArgumentError(name, value, f"an integer of at least {least}")
-        for name, number in (("damping", damping), ("max_step", max_step), ("tolerance", tolerance)):
+        for name, number in (
+            ("damping", damping),
+            ("max_step", max_step),
+            ("tolerance", tolerance),
+        ):
             if not 0.0 < number < np.inf:
                 raise ArgumentError(name, number, "a positive number")
         for name, number in (("posture_gain", posture_gain), ("approach_gain", approach_gain)):
@@ -102,7 +124,8 @@ class BatchedIk:
             if name not in robot.arm_joints:
                 raise UnknownName("arm joint", name, robot.arm_joints)
         moved = [robot.arm_joints.index(name) for name in robot.ik_joints]
-        low, high = np.full(len(names), -np.inf, dtype=np.float32), np.full(len(names), np.inf, dtype=np.float32)
+        low = np.full(len(names), -np.inf, dtype=np.float32)
+        high = np.full(len(names), np.inf, dtype=np.float32)
         low[moved], high[moved] = _limits(model, robot.ik_joints)
         home = np.array(robot.home, dtype=np.float32)
         for name, angle in robot.locked.items():
@@ -112,65 +135,99 @@ class BatchedIk:
         self._device = wp.get_device(str(device))
         self.device = wp.device_to_torch(self._device)
         self._block_dim = block_dim
-        self._posture_gain, self._approach_gain = posture_gain, approach_gain
-        # In the last iterations no gain counts, so they undo what it cost in distance: measured, 2 of 4, 3 of 8, 10 of 40.
+        self._posture_gain = posture_gain
+        self._approach_gain = approach_gain
+        # In the last iterations no gain counts, so they undo what it cost in distance: measured, 2
+        # of 4, 3 of 8, 10 of 40.
         wishing = iterations - max(min(3, iterations // 2), iterations // 4) if gained else 0
         near = _NEAR if gained else -1.0
-        self._settings = [iterations, wishing, damping, max_step, posture_gain, approach_gain, near, tolerance]
+        self._settings = [
+            iterations,
+            wishing,
+            damping,
+            max_step,
+            posture_gain,
+            approach_gain,
+            near,
+            tolerance,
+        ]
         with wp.ScopedDevice(self._device):
             self._chain, shape = _build_chain(model, robot, joints, moved, low, high)
-            self._wp_given, self._wp_command, self._wp_posture = (wp.zeros((nworld, self._n), dtype=float) for _ in range(3))
-            self._wp_home = wp.array(np.tile(home, (nworld, 1)), dtype=float)
-            self._wp_target, self._wp_wished, self._wp_centre, self._wp_closing, self._wp_approach = (
-                wp.zeros(nworld, dtype=wp.vec3) for _ in range(5)
+            self._wp_given, self._wp_command, self._wp_posture = (
+                wp.zeros((nworld, self._n), dtype=float) for _ in range(3)
             )
+            self._wp_home = wp.array(np.tile(home, (nworld, 1)), dtype=float)
+            (
+                self._wp_target,
+                self._wp_wished,
+                self._wp_centre,
+                self._wp_closing,
+                self._wp_approach,
+            ) = (wp.zeros(nworld, dtype=wp.vec3) for _ in range(5))
             self._wp_down = wp.full(nworld, wp.vec3(0.0, 0.0, -1.0), dtype=wp.vec3)
-            self._wp_distance, self._wp_unreachable = wp.zeros(nworld, dtype=float), wp.zeros(nworld, dtype=wp.bool)
+            self._wp_distance = wp.zeros(nworld, dtype=float)
+            self._wp_unreachable = wp.zeros(nworld, dtype=wp.bool)
         self._kernel = solve_kernel(shape)
         self._given, self._target, self._posture, self._command, self._distance = (
-            wp.to_torch(a) for a in (self._wp_given, self._wp_target, self._wp_posture, self._wp_command, self._wp_distance)
+            wp.to_torch(a)
+            for a in (
+                self._wp_given,
+                self._wp_target,
+                self._wp_posture,
+                self._wp_command,
+                self._wp_distance,
+            )
         )
         self._wished, self._centre, self._closing, self._approach = (
-            wp.to_torch(a) for a in (self._wp_wished, self._wp_centre, self._wp_closing, self._wp_approach)
+            wp.to_torch(a)
+            for a in (self._wp_wished, self._wp_centre, self._wp_closing, self._wp_approach)
         )
         self.unreachable = wp.to_torch(self._wp_unreachable)
-        wp.synchronize_device(self._device)  # the buffers are filled before torch's stream writes into them
-        self.aperture(self._given)  # compiles and loads the kernels: a capture may do neither
+        wp.synchronize_device(
+            self._device
+        )  # the buffers are filled before torch's stream writes into them
+        self.grasp_point(self._given)  # compiles and loads the kernels: a capture may do neither
         self.directions(self._given)
         self.solve(self._given, self._target)
         wp.synchronize_device(self._device)
 
-    def aperture(self, command: torch.Tensor) -> torch.Tensor:
+    def grasp_point(self, command: torch.Tensor) -> torch.Tensor:
         """Forward kinematics.
 
         Args:
-            command: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``, float32 or float64.
+            command: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``, float32 or
+                float64.
 
         Returns:
-            Aperture centre [m], shape ``(nworld, 3)``, float32.
+            Grasp point [m], shape ``(nworld, 3)``, float32.
         """
         self._take("command", self._given, command)
-        self._launch(aperture_kernel, [self._chain, self._wp_given, self._wp_centre])
+        self._launch(grasp_point_kernel, [self._chain, self._wp_given, self._wp_centre])
         return self._centre
 
     def directions(self, command: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Where the gripper points, both in one launch.
 
         Args:
-            command: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``, float32 or float64.
+            command: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``, float32 or
+                float64.
 
         Returns:
-            The closing and the approach axis, as below, unit vectors, shape ``(nworld, 3)`` each, float32.
+            The closing and the approach axis, as below, unit vectors, shape ``(nworld, 3)`` each,
+            float32.
         """
         self._take("command", self._given, command)
-        self._launch(directions_kernel, [self._chain, self._wp_given, self._wp_closing, self._wp_approach])
+        self._launch(
+            directions_kernel, [self._chain, self._wp_given, self._wp_closing, self._wp_approach]
+        )
         return self._closing, self._approach
 
     def closing_axis(self, command: torch.Tensor) -> torch.Tensor:
-        """Unit vector from the first aperture site to the second; zero where they meet.
+        """Unit vector from the first grasp_point site to the second; zero where they meet.
 
         Args:
-            command: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``, float32 or float64.
+            command: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``, float32 or
+                float64.
 
         Returns:
             The closing axis, shape ``(nworld, 3)``, float32.
@@ -181,7 +238,8 @@ class BatchedIk:
         """The robot's approach axis, from the wrist towards what is grasped.
 
         Args:
-            command: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``, float32 or float64.
+            command: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``, float32 or
+                float64.
 
         Returns:
             A unit vector, shape ``(nworld, 3)``, float32.
@@ -195,37 +253,54 @@ class BatchedIk:
         posture: torch.Tensor | None = None,
         approach: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Moves the robot's ik joints from a command towards a target; the other joints stay as given.
+        """Moves the robot's ik joints from a command towards a target; the other joints stay as
+        given.
 
-        The ik joints end within the range of the joint and of its actuator, whatever they start from, and the result is never
-        farther from the target than the start, put within that range; with a gain, not if that makes it more than 20 um. A
-        world whose command, target, posture or approach is not finite keeps its command, and its distance is NaN; the others do
-        not notice.
+        The ik joints end within the range of the joint and of its actuator, whatever they start
+        from, and the result is never farther from the target than the start, put within that range;
+        with a gain, not if that makes it more than 20 um. A world whose command, target, posture or
+        approach is not finite keeps its command, and its distance is NaN; the others do not notice.
 
         Args:
-            command: Where to start [rad, m], shape ``(nworld, n_arm + n_gripper)``, float32 or float64.
-            target: Where the aperture centre goes [m], shape ``(nworld, 3)``, float32 or float64.
-            posture: Where ``posture_gain`` draws the ik joints [rad, m], shape ``(n_arm + n_gripper,)`` for all worlds or
-                ``(nworld, n_arm + n_gripper)``; the robot's home if None.
-            approach: Where ``approach_gain`` turns the approach axis, unit vectors, shape ``(nworld, 3)``; down if None.
+            command: Where to start [rad, m], shape ``(nworld, n_arm + n_gripper)``, float32 or
+                float64.
+            target: Where the grasp point goes [m], shape ``(nworld, 3)``, float32 or float64.
+            posture: Where ``posture_gain`` draws the ik joints [rad, m], shape ``(n_arm +
+                n_gripper,)`` for all worlds or ``(nworld, n_arm + n_gripper)``; the robot's home if
+                None.
+            approach: Where ``approach_gain`` turns the approach axis, unit vectors, shape
+                ``(nworld, 3)``; down if None.
 
         Returns:
-            The new command, shape ``(nworld, n_arm + n_gripper)``, and the distance that is left [m], shape ``(nworld,)``,
-            both float32.
+            The new command, shape ``(nworld, n_arm + n_gripper)``, and the distance that is left
+            [m], shape ``(nworld,)``, both float32.
 
         Raises:
-            ArgumentError: A shape is wrong, or there is a posture or an approach and no gain for it.
+            ArgumentError: A shape is wrong, or there is a posture or an approach and no gain for
+                it.
         """
         self._take("command", self._given, command)
         self._take("target", self._target, target)
         if posture is not None:
             if self._posture_gain == 0.0:
-                raise ArgumentError("posture", "one", "None, because posture_gain is 0", "Build the solver with a posture_gain")
-            self._take("posture", self._posture, posture.expand(self.nworld, -1) if posture.dim() == 1 else posture)
+                raise ArgumentError(
+                    "posture",
+                    "one",
+                    "None, because posture_gain is 0",
+                    "Build the solver with a posture_gain",
+                )
+            self._take(
+                "posture",
+                self._posture,
+                posture.expand(self.nworld, -1) if posture.dim() == 1 else posture,
+            )
         if approach is not None:
             if self._approach_gain == 0.0:
                 raise ArgumentError(
-                    "approach", "one", "None, because approach_gain is 0", "Build the solver with an approach_gain"
+                    "approach",
+                    "one",
+                    "None, because approach_gain is 0",
+                    "Build the solver with an approach_gain",
                 )
             self._take("approach", self._wished, approach)
         self._launch(
@@ -252,21 +327,26 @@ class BatchedIk:
     def _take(self, name: str, buffer: torch.Tensor, values: torch.Tensor) -> None:
         """Copies an argument into float32 memory that keeps its address."""
         if values.shape != buffer.shape:  # else copy_ would broadcast it
-            raise ArgumentError(name, f"shape {tuple(values.shape)}", f"shape {tuple(buffer.shape)}")
+            raise ArgumentError(
+                name, f"shape {tuple(values.shape)}", f"shape {tuple(buffer.shape)}"
+            )
         buffer.copy_(values)
 
 
 def _limits(model: mujoco.MjModel, names: list[str]) -> np.ndarray:
     """Narrower of joint and actuator range [rad, m], shape ``(2, n)``, float32, rounded inwards."""
-    low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    low = np.full(len(names), -np.inf)
+    high = np.full(len(names), np.inf)
     for k, name in enumerate(names):
-        joint, actuator = find(model, "joint", name), find(model, "actuator", name)
+        joint = find(model, "joint", name)
+        actuator = find(model, "actuator", name)
         for limited, span in (
             (model.jnt_limited[joint], model.jnt_range[joint]),
             (model.actuator_ctrllimited[actuator], model.actuator_ctrlrange[actuator]),
         ):
             if limited:
-                low[k], high[k] = max(low[k], span[0]), min(high[k], span[1])
+                low[k] = max(low[k], span[0])
+                high[k] = min(high[k], span[1])
     out = np.stack([low, high]).astype(np.float32)
     out[0] = np.where(out[0] < low, np.nextafter(out[0], np.float32(np.inf)), out[0])
     out[1] = np.where(out[1] > high, np.nextafter(out[1], np.float32(-np.inf)), out[1])
@@ -274,7 +354,12 @@ def _limits(model: mujoco.MjModel, names: list[str]) -> np.ndarray:
 
 
 def _build_chain(
-    model: mujoco.MjModel, robot: RobotCfg, joints: list[int], moved: list[int], low: np.ndarray, high: np.ndarray
+    model: mujoco.MjModel,
+    robot: RobotCfg,
+    joints: list[int],
+    moved: list[int],
+    low: np.ndarray,
+    high: np.ndarray,
 ) -> tuple[Chain, Shape]:
     """Reads the bodies from the world to each site.
 
@@ -289,14 +374,18 @@ def _build_chain(
     Returns:
         The chain, in Warp arrays on the current device, and its shape.
     """
-    first, second = (find(model, "site", name) for name in robot.aperture_sites)
-    first_path, second_path = _path(model, model.site_bodyid[first]), _path(model, model.site_bodyid[second])
+    first, second = (find(model, "site", name) for name in robot.grasp_sites)
+    first_path = _path(model, model.site_bodyid[first])
+    second_path = _path(model, model.site_bodyid[second])
     shared = len([body for body in first_path if body in second_path])
     columns = {joint: column for column, joint in enumerate(joints)}
-    chain, links = Chain(), []
+    chain = Chain()
+    links = []
 
     def extend(bodies: list[int], start: _Pose) -> _Pose:
-        """Appends the bodies' links; returns the frame after them, seen from the last one's joint."""
+        """Appends the bodies' links; returns the frame after them, seen from the last
+        one's joint.
+        """
         pose = start
         for body in bodies:
             pose = _compose(pose, (model.body_pos[body], model.body_quat[body]))
@@ -309,23 +398,32 @@ def _build_chain(
 
     trunk = extend(first_path[:shared], (np.zeros(3), _NO_TURN))
     chain.trunk = len(links)
-    chain.approach = wp.vec3(*_read_approach(model, robot, first_path[:shared], trunk, set(columns)))
+    chain.approach = wp.vec3(
+        *_read_approach(model, robot, first_path[:shared], trunk, set(columns))
+    )
     end = extend(first_path[shared:], trunk)
     chain.first_site = wp.vec3(*_compose(end, (model.site_pos[first], _NO_TURN))[0])
     chain.fork = len(links)
     end = extend(second_path[shared:], trunk)
     chain.second_site = wp.vec3(*_compose(end, (model.site_pos[second], _NO_TURN))[0])
     chain.end = len(links)
-    kinds, column = [kind for _, _, kind, _ in links], [column for *_, column in links]
-    chain.frame = wp.array([[*pos, *quat[1:], quat[0]] for (pos, quat), *_ in links], dtype=wp.transform)  # Warp: xyzw
+    kinds = [kind for _, _, kind, _ in links]
+    column = [column for *_, column in links]
+    chain.frame = wp.array(
+        [[*pos, *quat[1:], quat[0]] for (pos, quat), *_ in links], dtype=wp.transform
+    )  # Warp: xyzw
     chain.axis = wp.array([axis for _, axis, *_ in links], dtype=wp.vec3)
-    chain.kind, chain.column = wp.array(kinds, dtype=int), wp.array(column, dtype=int)
-    chain.low, chain.high = wp.array(low[column], dtype=float), wp.array(high[column], dtype=float)
+    chain.kind = wp.array(kinds, dtype=int)
+    chain.column = wp.array(column, dtype=int)
+    chain.low = wp.array(low[column], dtype=float)
+    chain.high = wp.array(high[column], dtype=float)
     shape = Shape(tuple(kinds), tuple(c in moved for c in column), chain.trunk, chain.fork)
     return chain, shape
 
 
-def _read_approach(model: mujoco.MjModel, robot: RobotCfg, trunk: list[int], end: _Pose, commanded: set[int]) -> np.ndarray:
+def _read_approach(
+    model: mujoco.MjModel, robot: RobotCfg, trunk: list[int], end: _Pose, commanded: set[int]
+) -> np.ndarray:
     """The approach axis seen from the trunk's last link.
 
     Args:
@@ -340,9 +438,13 @@ def _read_approach(model: mujoco.MjModel, robot: RobotCfg, trunk: list[int], end
     body = find(model, "body", robot.approach_body)
     if body not in rigid:
         names = ", ".join(model.body(b).name for b in rigid) or "none"
-        expected = f"a body that carries both aperture sites and that every joint before them moves: {names}"
+        expected = (
+            "a body that carries both grasp_point sites and that every joint before them moves:"
+            f" {names}"
+        )
         raise ConfigError("robot.approach_body", robot.approach_body, expected)
-    turn, back = np.empty(4), end[1].copy()  # from the last body of the trunk to this one, against the way
+    turn = np.empty(4)
+    back = end[1].copy()  # from the last body of the trunk to this one, against the way
     for b in reversed(rigid[rigid.index(body) + 1 :]):
         mujoco.mju_negQuat(turn, model.body_quat[b])
         mujoco.mju_mulQuat(back, back.copy(), turn)
@@ -352,11 +454,17 @@ def _read_approach(model: mujoco.MjModel, robot: RobotCfg, trunk: list[int], end
 
 
 def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose, column: int) -> _Link:
-    """A joint whose frame at qpos0 is ``pose``. The frame at command 0 is turned, or shifted, back by qpos0."""
-    kind, axis = int(model.jnt_type[joint]), model.jnt_axis[joint].copy()
+    """A joint whose frame at qpos0 is ``pose``. The frame at command 0 is turned, or shifted, back
+    by qpos0.
+    """
+    kind = int(model.jnt_type[joint])
+    axis = model.jnt_axis[joint].copy()
     if kind not in _KINDS:
-        name, type_ = model.joint(joint).name, mujoco.mjtJoint(kind).name.removeprefix("mjJNT_").lower()
-        raise MjstackError(f"joint '{name}' is of type {type_}, expected hinge or slide. Command no other joints.")
+        name = model.joint(joint).name
+        type_ = mujoco.mjtJoint(kind).name.removeprefix("mjJNT_").lower()
+        raise MjstackError(
+            f"joint '{name}' is of type {type_}, expected hinge or slide. Command no other joints."
+        )
     zero = float(model.qpos0[model.jnt_qposadr[joint]])
     turn = _NO_TURN.copy()
     if _KINDS[kind] == HINGE:
@@ -381,6 +489,7 @@ def _joints(model: mujoco.MjModel, body: int) -> range:
 
 
 def _compose(a: _Pose, b: _Pose) -> _Pose:
-    pos, quat = np.empty(3), np.empty(4)
+    pos = np.empty(3)
+    quat = np.empty(4)
     mujoco.mju_mulPose(pos, quat, a[0], a[1], b[0], b[1])
     return pos, quat

@@ -1,4 +1,6 @@
-"""Warp kernels for the aperture: forward kinematics and damped least squares, one thread per world."""
+"""Warp kernels for the grasp_point: forward kinematics and damped least squares, one thread per
+world.
+"""
 
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
 from dataclasses import dataclass
@@ -10,36 +12,45 @@ from mjstack.sim.start import wp
 HINGE = 0
 SLIDE = 1
 
-# Share of the squared error [1/rad^2] that is added to the squared damping. A far target is approached without running into a
-# dead end at the limits (from home, over the reBot's whole reach, 97 % instead of 91 % are found); a near one converges fast.
+# Share of the squared error [1/rad^2] that is added to the squared damping. A far target is
+# approached without running into a dead end at the limits (from home, over the reBot's whole reach,
+# 97 % instead of 91 % are found); a near one converges fast.
 FAR_DAMPING = wp.constant(0.1)
 NAN = wp.constant(float("nan"))
 
 
 @wp.struct
 class Chain:
-    """The moving links from the world to the two sites. What does not move is folded into the links' frames.
+    """The moving links from the world to the two sites. What does not move is folded into the
+    links' frames.
 
-    Links up to ``trunk`` carry both sites, from there to ``fork`` only the first one, from there to ``end`` only the second.
+    Links up to ``trunk`` carry both sites, from there to ``fork`` only the first one, from there to
+    ``end`` only the second.
     """
 
     frame: wp.array[wp.transform]  # the joint's frame at command 0, seen from the link before
     axis: wp.array[wp.vec3]  # of unit length, in that frame
     kind: wp.array[int]  # HINGE or SLIDE
     column: wp.array[int]  # of the command
-    low: wp.array[float]  # where inverse kinematics keeps the joint; infinite where it does not move it
+    low: wp.array[
+        float
+    ]  # where inverse kinematics keeps the joint; infinite where it does not move it
     high: wp.array[float]
     trunk: int
     fork: int
     end: int
     first_site: wp.vec3  # seen from the last link before it
     second_site: wp.vec3
-    approach: wp.vec3  # the gripper's approach axis, of unit length, seen from the trunk's last link
+    approach: (
+        wp.vec3
+    )  # the gripper's approach axis, of unit length, seen from the trunk's last link
 
 
 @dataclass(frozen=True)
 class Shape:
-    """What a solve kernel is compiled for, so that its loops unroll and its working memory is registers."""
+    """What a solve kernel is compiled for, so that its loops unroll and its working memory is
+    registers.
+    """
 
     kinds: tuple[int, ...]  # HINGE or SLIDE, of each link
     moved: tuple[bool, ...]  # whether inverse kinematics moves it
@@ -51,38 +62,60 @@ class Shape:
 def turn(pose: wp.transform, axis: wp.vec3, kind: int, value: float) -> wp.transform:
     """A joint's frame after it has moved."""
     if kind == HINGE:
-        return wp.transform_multiply(pose, wp.transform(wp.vec3(), wp.quat_from_axis_angle(axis, value)))
+        return wp.transform_multiply(
+            pose, wp.transform(wp.vec3(), wp.quat_from_axis_angle(axis, value))
+        )
     return wp.transform_multiply(pose, wp.transform(value * axis, wp.quat_identity()))
 
 
 @wp.func
-def follow(chain: Chain, command: wp.array2d[float], w: int, first: int, last: int, start: wp.transform) -> wp.transform:
+def follow(
+    chain: Chain, command: wp.array2d[float], w: int, first: int, last: int, start: wp.transform
+) -> wp.transform:
     """Pose after links ``first`` to ``last`` (exclusive), from a pose."""
     pose = start
     for i in range(first, last):
-        pose = turn(wp.transform_multiply(pose, chain.frame[i]), chain.axis[i], chain.kind[i], command[w, chain.column[i]])
+        pose = turn(
+            wp.transform_multiply(pose, chain.frame[i]),
+            chain.axis[i],
+            chain.kind[i],
+            command[w, chain.column[i]],
+        )
     return pose
 
 
 @wp.kernel(enable_backward=False)
-def aperture_kernel(chain: Chain, command: wp.array2d[float], centre: wp.array[wp.vec3]) -> None:
-    """Aperture centre of every world."""
+def grasp_point_kernel(chain: Chain, command: wp.array2d[float], centre: wp.array[wp.vec3]) -> None:
+    """Grasp point of every world."""
     w = wp.tid()
     trunk = follow(chain, command, w, 0, chain.trunk, wp.transform_identity())
-    first = wp.transform_point(follow(chain, command, w, chain.trunk, chain.fork, trunk), chain.first_site)
-    second = wp.transform_point(follow(chain, command, w, chain.fork, chain.end, trunk), chain.second_site)
+    first = wp.transform_point(
+        follow(chain, command, w, chain.trunk, chain.fork, trunk), chain.first_site
+    )
+    second = wp.transform_point(
+        follow(chain, command, w, chain.fork, chain.end, trunk), chain.second_site
+    )
     centre[w] = wp.lerp(first, second, 0.5)
 
 
 @wp.kernel(enable_backward=False)
 def directions_kernel(
-    chain: Chain, command: wp.array2d[float], closing: wp.array[wp.vec3], approach: wp.array[wp.vec3]
+    chain: Chain,
+    command: wp.array2d[float],
+    closing: wp.array[wp.vec3],
+    approach: wp.array[wp.vec3],
 ) -> None:
-    """Unit vectors of every world's gripper: from the first site to the second, and the approach axis."""
+    """Unit vectors of every world's gripper: from the first site to the second, and the approach
+    axis.
+    """
     w = wp.tid()
     trunk = follow(chain, command, w, 0, chain.trunk, wp.transform_identity())
-    first = wp.transform_point(follow(chain, command, w, chain.trunk, chain.fork, trunk), chain.first_site)
-    second = wp.transform_point(follow(chain, command, w, chain.fork, chain.end, trunk), chain.second_site)
+    first = wp.transform_point(
+        follow(chain, command, w, chain.trunk, chain.fork, trunk), chain.first_site
+    )
+    second = wp.transform_point(
+        follow(chain, command, w, chain.fork, chain.end, trunk), chain.second_site
+    )
     closing[w] = wp.normalize(wp.sub(second, first))
     approach[w] = wp.transform_vector(trunk, chain.approach)
 
@@ -100,27 +133,34 @@ def within(value: float, low: float, high: float) -> float:
 
 @cache
 def solve_kernel(shape: Shape) -> wp.Kernel:
-    """The kernel that moves every world's aperture centre towards its target.
+    """The kernel that moves every world's grasp point towards its target.
 
-    Joints that inverse kinematics does not move are followed once per solve where they come after the ones that it does,
-    as the wrist's roll and the fingers do: an iteration then takes the moved links alone.
+    Joints that inverse kinematics does not move are followed once per solve where they come after
+    the ones that it does, as the wrist's roll and the fingers do: an iteration then takes the moved
+    links alone.
     """
-    n, forked = len(shape.kinds), any(shape.moved[shape.trunk :])
+    n = len(shape.kinds)
+    forked = any(shape.moved[shape.trunk :])
     # Links that an iteration follows: these up to TRUNK carry both sites, and so on as in Chain.
     TRUNK = shape.trunk if forked else max((i + 1 for i in range(n) if shape.moved[i]), default=0)
     FORK, END = (shape.fork, n) if forked else (TRUNK, TRUNK)
     # Links after them, from the trunk's, to the first site and to the second.
     TRUNK_REST = (TRUNK, shape.trunk)
-    FIRST_REST, SECOND_REST = ((0, 0), (0, 0)) if forked else ((shape.trunk, shape.fork), (shape.fork, n))
+    FIRST_REST, SECOND_REST = (
+        ((0, 0), (0, 0)) if forked else ((shape.trunk, shape.fork), (shape.fork, n))
+    )
     Values = wp.types.vector(length=max(END, 1), dtype=float)
     Rows = wp.types.matrix(shape=(max(END, 1), 3), dtype=float)  # a vector per link
 
     @wp.func
-    def find_step(jacobian: Any, q: Any, wish: Any, low: Any, high: Any, error: wp.vec3, damping: float) -> Any:
-        """Damped least-squares step within the limits; what ``wish`` asks for is done as far as it moves no centre.
+    def find_step(
+        jacobian: Any, q: Any, wish: Any, low: Any, high: Any, error: wp.vec3, damping: float
+    ) -> Any:
+        """Damped least-squares step within the limits; what ``wish`` asks for is done as far as it
+        moves no centre.
 
-        A joint that would pass its limit is stopped there, and the others are solved again for what it leaves to do: merely
-        cutting the step would stall beside a limit.
+        A joint that would pass its limit is stopped there, and the others are solved again for what
+        it leaves to do: merely cutting the step would stall beside a limit.
         """
         given = wish  # of a stopped joint: its step
         step = wish
@@ -179,7 +219,10 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             command[w, j] = given[w, j]
             if wishing > 0:
                 finite = finite and wp.isfinite(posture[w, j])
-        q, low, high, home = Values(), Values(), Values(), Values()
+        q = Values()
+        low = Values()
+        high = Values()
+        home = Values()
         for i in range(END):
             j = chain.column[i]
             low[i] = chain.low[i]
@@ -192,16 +235,28 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             distance[w] = NAN
             unreachable[w] = True
             return
-        rest = follow(chain, given, w, wp.static(TRUNK_REST[0]), wp.static(TRUNK_REST[1]), wp.transform_identity())
-        first_end = follow(chain, given, w, wp.static(FIRST_REST[0]), wp.static(FIRST_REST[1]), rest)
-        second_end = follow(chain, given, w, wp.static(SECOND_REST[0]), wp.static(SECOND_REST[1]), rest)
+        rest = follow(
+            chain,
+            given,
+            w,
+            wp.static(TRUNK_REST[0]),
+            wp.static(TRUNK_REST[1]),
+            wp.transform_identity(),
+        )
+        first_end = follow(
+            chain, given, w, wp.static(FIRST_REST[0]), wp.static(FIRST_REST[1]), rest
+        )
+        second_end = follow(
+            chain, given, w, wp.static(SECOND_REST[0]), wp.static(SECOND_REST[1]), rest
+        )
         first_site = wp.transform_point(first_end, chain.first_site)
         second_site = wp.transform_point(second_end, chain.second_site)
         approach = wp.transform_vector(rest, chain.approach)
         best = q
         nearest = wp.float32(0.0)
         for iteration in range(iterations + 1):
-            anchors, axes = Rows(), Rows()
+            anchors = Rows()
+            axes = Rows()
             trunk = wp.transform(wp.vec3(), wp.quat_identity())
             for i in range(TRUNK):
                 pose = wp.transform_multiply(trunk, chain.frame[i])
@@ -232,12 +287,16 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                 jacobian = Rows()
                 for i in range(END):
                     if wp.static(shape.moved[i]):
-                        # Behind the trunk a joint moves one site only, and so the midpoint by half as much.
-                        point, share = centre, wp.float32(1.0)
+                        # Behind the trunk a joint moves one site only, and so the midpoint by half
+                        # as much.
+                        point = centre
+                        share = wp.float32(1.0)
                         if wp.static(i >= FORK):
-                            point, share = second, wp.float32(0.5)
+                            point = second
+                            share = wp.float32(0.5)
                         elif wp.static(i >= TRUNK):
-                            point, share = first, wp.float32(0.5)
+                            point = first
+                            share = wp.float32(0.5)
                         direction = axes[i]
                         if wp.static(shape.kinds[i] == HINGE):
                             direction = wp.cross(direction, point - anchors[i])

@@ -1,4 +1,6 @@
-"""Inverse kinematics with mink on a robot-only model: the reference that plans the scripted grasp."""
+"""Inverse kinematics with mink on a robot-only model: the reference that plans the
+scripted grasp.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,17 @@ from mjstack.errors import ConfigError
 from mjstack.robots import robot_spec
 from mjstack.scene.index import find
 
-_POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the aperture centre by micrometres
-_CONVERGED = 0.1  # of the tolerance: Newton's method squares the error, one more step would be for nothing
-_MAX_STEP = 0.3  # [rad] per iteration, so that a far target is approached on one branch of solutions
+_POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the grasp point by micrometres
+_CONVERGED = (
+    0.1  # of the tolerance: Newton's method squares the error, one more step would be for nothing
+)
+_MAX_STEP = (
+    0.3  # [rad] per iteration, so that a far target is approached on one branch of solutions
+)
 
 
-class ApertureTask(mink.Task):
-    """Drives the aperture centre, the midpoint of two sites, to a point.
+class GraspPointTask(mink.Task):
+    """Drives the grasp point, the midpoint of two sites, to a point.
 
     The midpoint belongs to no single frame: on a jaw that swings it moves with the jaw's angle.
     """
@@ -32,7 +38,7 @@ class ApertureTask(mink.Task):
         self._jac = np.empty((2, 3, nv))
 
     def compute_error(self, configuration: mink.Configuration) -> np.ndarray:
-        """Aperture centre minus target [m], shape ``(3,)``."""
+        """Grasp point minus target [m], shape ``(3,)``."""
         return configuration.data.site_xpos[self._sites].mean(axis=0) - self.target
 
     def compute_jacobian(self, configuration: mink.Configuration) -> np.ndarray:
@@ -42,10 +48,14 @@ class ApertureTask(mink.Task):
         return self._jac.mean(axis=0)
 
 
-class ApertureIk:
-    """Solves for the arm command that brings the aperture centre to a target at a given gripper command."""
+class GraspIk:
+    """Solves for the arm command that brings the grasp point to a target at a given gripper
+    command.
+    """
 
-    def __init__(self, robot: RobotCfg, model: ModelCfg, *, tolerance: float, iterations: int) -> None:
+    def __init__(
+        self, robot: RobotCfg, model: ModelCfg, *, tolerance: float, iterations: int
+    ) -> None:
         """Compiles the robot without a scene.
 
         Args:
@@ -69,7 +79,9 @@ class ApertureIk:
             for name, value in zip(names[-len(values) :], values, strict=True):
                 low, high = self.model.joint(name).range
                 if not low <= value <= high:
-                    raise ConfigError(f"robot.{key} of {name}", value, f"a command within [{low:.4g}, {high:.4g}]")
+                    raise ConfigError(
+                        f"robot.{key} of {name}", value, f"a command within [{low:.4g}, {high:.4g}]"
+                    )
         self._qpos = self.model.jnt_qposadr[joints]
         self._n_arm = len(robot.arm_joints)
         self.home = np.array(robot.home)
@@ -78,17 +90,21 @@ class ApertureIk:
         self._configuration = mink.Configuration(self.model)
         moving = {int(self.model.joint(name).dofadr[0]) for name in robot.ik_joints}
         frozen = [dof for dof in range(self.model.nv) if dof not in moving]
-        self._task = ApertureTask([find(self.model, "site", s) for s in robot.aperture_sites], self.model.nv)
+        self._task = GraspPointTask(
+            [find(self.model, "site", s) for s in robot.grasp_sites], self.model.nv
+        )
         self._posture = mink.PostureTask(self.model, cost=_POSTURE_COST)
         self._limits = [mink.ConfigurationLimit(self.model, gain=1.0)]
         self._constraints = [mink.DofFreezingTask(self.model, frozen)]
         self._posture.set_target(self._to_qpos(self.home))
 
-    def solve(self, target: np.ndarray, gripper: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+    def solve(
+        self, target: np.ndarray, gripper: np.ndarray, start: np.ndarray
+    ) -> tuple[np.ndarray, float]:
         """Finds a command.
 
         Args:
-            target: Where the aperture centre goes [m], shape ``(3,)``.
+            target: Where the grasp point goes [m], shape ``(3,)``.
             gripper: Gripper command, held fixed.
             start: Command to start from, shape ``(nu,)``, arm joints first.
 
@@ -100,7 +116,8 @@ class ApertureIk:
         self._task.target[:] = target
         configuration = self._configuration
         configuration.update(self._to_qpos(command))
-        nearest, distance = configuration.q[self._qpos].copy(), math.inf
+        nearest = configuration.q[self._qpos].copy()
+        distance = math.inf
         for _ in range(self._iterations):
             try:
                 step = mink.solve_ik(
@@ -117,14 +134,19 @@ class ApertureIk:
             largest = float(np.abs(step).max())
             configuration.integrate_inplace(step * min(1.0, _MAX_STEP / max(largest, 1e-12)), 1.0)
             left = float(np.linalg.norm(self._task.compute_error(configuration)))
-            if left < distance:  # undamped, the pull towards home can end in swinging to and fro, farther from the target
-                nearest, distance = configuration.q[self._qpos].copy(), left
+            if (
+                left < distance
+                # undamped, the pull towards home can end in swinging to and fro, farther from the
+                # target
+            ):
+                nearest = configuration.q[self._qpos].copy()
+                distance = left
             if distance < _CONVERGED * self.tolerance:
                 break
         return nearest, distance
 
-    def aperture(self, command: np.ndarray) -> np.ndarray:
-        """Aperture centre [m] at a command, shape ``(3,)``."""
+    def grasp_point(self, command: np.ndarray) -> np.ndarray:
+        """Grasp point [m] at a command, shape ``(3,)``."""
         self._configuration.update(self._to_qpos(command))
         return self._task.compute_error(self._configuration) + self._task.target
 

@@ -1,7 +1,7 @@
 """What the arm reaches: inverse kinematics of many points at once in numpy, for checks and maps.
 
-`mink_ik` plans and `batched_ik` runs with the worlds. Here points have nothing to do with worlds, no Warp is loaded, and the
-gripper's tilt matters too.
+`mink_ik` plans and `batched_ik` runs with the worlds. Here points have nothing to do with worlds,
+no Warp is loaded, and the gripper's tilt matters too.
 """
 
 from __future__ import annotations
@@ -20,8 +20,13 @@ _DAMPING = 1e-3  # [m/rad] of the steps towards a point
 _MAX_STEP = 0.3  # [rad] per joint and iteration
 _CONVERGED = 1e-6  # [m]
 _STILL = 1e-5  # [rad] a step that is smaller ends the way
-_POINTING = 0.02  # [m/rad] what the pointing direction weighs against the position while the tilt is reduced
-_STARTS = (-0.6, 0.0, 0.6)  # [rad] off home, of each joint after the first: on which branch of solutions it begins
+# [m/rad] what the pointing direction weighs against the position while the tilt is reduced
+_POINTING = 0.02
+_STARTS = (
+    -0.6,
+    0.0,
+    0.6,
+)  # [rad] off home, of each joint after the first: on which branch of solutions it begins
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +35,7 @@ class Reached:
 
     Attributes:
         q: The ik joints [rad], shape ``(n, joints)``.
-        distance: From the aperture centre to the point [m], shape ``(n,)``.
+        distance: From the grasp point to the point [m], shape ``(n,)``.
         tilt: Of the gripper from pointing straight down [rad], shape ``(n,)``.
     """
 
@@ -40,9 +45,11 @@ class Reached:
 
 
 class PointReach:
-    """Brings the aperture centre to points, for one opening of the gripper; collisions are not looked at.
+    """Brings the grasp point to points, for one opening of the gripper; collisions are not looked
+    at.
 
-    The other joints stay at the robot's home, or where they are locked. The gripper points along the robot's ``approach_axis``.
+    The other joints stay at the robot's home, or where they are locked. The gripper points along
+    the robot's ``approach_axis``.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg, gripper: Sequence[float]) -> None:
@@ -59,18 +66,31 @@ class PointReach:
         """
         data = mujoco.MjData(model)
         n_arm = len(robot.arm_joints)
-        command = dict(zip([*robot.arm_joints, *robot.gripper_joints], [*robot.home[:n_arm], *gripper], strict=True))
+        command = dict(
+            zip(
+                [*robot.arm_joints, *robot.gripper_joints],
+                [*robot.home[:n_arm], *gripper],
+                strict=True,
+            )
+        )
         command |= robot.locked
         for name, value in command.items():
             data.qpos[model.jnt_qposadr[find(model, "joint", name)]] = value
         mujoco.mj_kinematics(model, data)
-        joints = sorted((find(model, "joint", name) for name in robot.ik_joints), key=lambda j: int(model.jnt_bodyid[j]))
+        joints = sorted(
+            (find(model, "joint", name) for name in robot.ik_joints),
+            key=lambda j: int(model.jnt_bodyid[j]),
+        )
         for j in joints:
             if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
-                raise MjstackError(f"joint '{model.joint(j).name}' is no hinge, expected one of each of robot.ik_joints.")
+                raise MjstackError(
+                    f"joint '{model.joint(j).name}' is no hinge, expected one of each of"
+                    " robot.ik_joints."
+                )
         self._home = np.array([command[model.joint(j).name] for j in joints])
-        self._anchors, self._axes = data.xanchor[joints].copy(), data.xaxis[joints].copy()
-        sites = [find(model, "site", name) for name in robot.aperture_sites]
+        self._anchors = data.xanchor[joints].copy()
+        self._axes = data.xaxis[joints].copy()
+        sites = [find(model, "site", name) for name in robot.grasp_sites]
         self._tip = data.site_xpos[sites].mean(axis=0)
         self._pointing = data.body(robot.approach_body).xmat.reshape(3, 3) @ robot.approach_axis
         span = model.jnt_range[joints].copy()
@@ -96,11 +116,13 @@ class PointReach:
                 break
             found, error = self._descend(self._start(points[left], off), points[left], iterations)
             better = error < distance[left]
-            q[left[better]], distance[left[better]] = found[better], error[better]
+            q[left[better]] = found[better]
+            distance[left[better]] = error[better]
         return Reached(q, distance, self._tilt(q))
 
     def solve_upright(self, points: np.ndarray, tolerance: float, iterations: int = 60) -> Reached:
-        """Likewise, and of the solutions within tolerance takes the one whose gripper is tilted least.
+        """Likewise, and of the solutions within tolerance takes the one whose gripper is tilted
+        least.
 
         Args:
             points: Targets [m], shape ``(n, 3)``.
@@ -108,23 +130,33 @@ class PointReach:
             iterations: Most steps per start.
         """
         best = self.solve(points, iterations)
-        q, distance, tilt = best.q.copy(), best.distance.copy(), best.tilt.copy()
+        q = best.q.copy()
+        distance = best.distance.copy()
+        tilt = best.tilt.copy()
         reached = np.flatnonzero(distance <= tolerance)
         for start in [q[reached], *(self._start(points[reached], off) for off in _STARTS)]:
             found, _ = self._descend(start, points[reached], iterations, _POINTING)
             found, error = self._descend(found, points[reached], iterations)
             lower = (error <= tolerance) & (self._tilt(found) < tilt[reached])
             rows = reached[lower]
-            q[rows], distance[rows], tilt[rows] = found[lower], error[lower], self._tilt(found)[lower]
+            q[rows], distance[rows], tilt[rows] = (
+                found[lower],
+                error[lower],
+                self._tilt(found)[lower],
+            )
         return Reached(q, distance, tilt)
 
     def _start(self, points: np.ndarray, off: float) -> np.ndarray:
-        """Home, turned towards the points where the first joint stands upright, the other joints bent by ``off``."""
+        """Home, turned towards the points where the first joint stands upright, the other joints
+        bent by ``off``.
+        """
         q = np.tile(self._home + off, (len(points), 1))
-        axis, anchor = self._axes[0], self._anchors[0]
+        axis = self._axes[0]
+        anchor = self._anchors[0]
         q[:, 0] = self._home[0]
         if abs(axis[2]) > 0.99:
-            ahead, arm = points - anchor, self._tip - anchor
+            ahead = points - anchor
+            arm = self._tip - anchor
             turn = np.arctan2(ahead[:, 1], ahead[:, 0]) - np.arctan2(arm[1], arm[0])
             q[:, 0] += np.sign(axis[2]) * ((turn + np.pi) % (2.0 * np.pi) - np.pi)
         return np.clip(q, self._low, self._high)
@@ -132,8 +164,11 @@ class PointReach:
     def _descend(
         self, start: np.ndarray, points: np.ndarray, iterations: int, pointing: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Damped least squares within the limits. Points that are reached drop out, unless the tilt is being reduced."""
-        q, left = start.copy(), np.arange(len(points))
+        """Damped least squares within the limits. Points that are reached drop out, unless the tilt
+        is being reduced.
+        """
+        q = start.copy()
+        left = np.arange(len(points))
         for _ in range(iterations):
             jacobian, tip, direction = self._forward(q[left])
             error = points[left] - tip
@@ -144,10 +179,15 @@ class PointReach:
                 error = np.concatenate((error, pointing * ([0.0, 0.0, -1.0] - direction)), axis=1)
             else:
                 keep = far > _CONVERGED
-                left, jacobian, error, far = left[keep], jacobian[keep], error[keep], far[keep]
+                left = left[keep]
+                jacobian = jacobian[keep]
+                error = error[keep]
+                far = far[keep]
                 if not left.size:
                     break
-            step = self._step(q[left], jacobian, error, _DAMPING if pointing else _DAMPING + 0.05 * far)
+            step = self._step(
+                q[left], jacobian, error, _DAMPING if pointing else _DAMPING + 0.05 * far
+            )
             moved = np.clip(q[left] + step, self._low, self._high)
             still = np.abs(moved - q[left]).max(axis=1) < _STILL
             q[left] = moved
@@ -156,30 +196,40 @@ class PointReach:
                 break
         return q, np.linalg.norm(points - self._forward(q)[1], axis=1)
 
-    def _step(self, q: np.ndarray, jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray | float) -> np.ndarray:
+    def _step(
+        self, q: np.ndarray, jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray | float
+    ) -> np.ndarray:
         """One step. A joint that would leave its range is held, and the others take over."""
         weight = np.broadcast_to(np.square(damping), len(q))[:, None, None] * np.eye(q.shape[1])
         free = np.ones_like(q, dtype=bool)
         for _ in range(3):
             open_ = jacobian * free[:, None]
             rhs = np.einsum("nij,ni->nj", open_, error)[..., None]
-            step = np.linalg.solve(np.einsum("nij,nik->njk", open_, open_) + weight, rhs)[..., 0] * free
+            step = (
+                np.linalg.solve(np.einsum("nij,nik->njk", open_, open_) + weight, rhs)[..., 0]
+                * free
+            )
             out = ((q <= self._low) & (step < 0.0)) | ((q >= self._high) & (step > 0.0))
             if not out.any():
                 break
             free &= ~out
-        return step * np.minimum(1.0, _MAX_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+        return step * np.minimum(
+            1.0, _MAX_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12)
+        )
 
     def _forward(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Jacobian ``(n, 3, joints)``, aperture centre and pointing direction, both ``(n, 3)``.
+        """Jacobian ``(n, 3, joints)``, grasp point and pointing direction, both ``(n, 3)``.
 
         A product of exponentials: each joint turns what follows it about its axis at home.
         """
         n, joints = q.shape
-        rotation, shift = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
-        axes, anchors = np.empty((n, joints, 3)), np.empty((n, joints, 3))
+        rotation = np.tile(np.eye(3), (n, 1, 1))
+        shift = np.zeros((n, 3))
+        axes = np.empty((n, joints, 3))
+        anchors = np.empty((n, joints, 3))
         for k, (axis, anchor) in enumerate(zip(self._axes, self._anchors, strict=True)):
-            axes[:, k], anchors[:, k] = rotation @ axis, rotation @ anchor + shift
+            axes[:, k] = rotation @ axis
+            anchors[:, k] = rotation @ anchor + shift
             turn = _rotations(axis, q[:, k] - self._home[k])
             shift = shift + np.einsum("nij,nj->ni", rotation, anchor - turn @ anchor)
             rotation = rotation @ turn
@@ -195,5 +245,6 @@ def _rotations(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Rotations about one axis, shape ``(n, 3, 3)``."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    s, c = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
+    s = np.sin(angles)[:, None, None]
+    c = np.cos(angles)[:, None, None]
     return np.eye(3) + s * cross + (1.0 - c) * (cross @ cross)

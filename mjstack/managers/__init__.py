@@ -1,4 +1,6 @@
-"""Managers: actions, observations, resets, terminations and rewards as named terms over all worlds at once."""
+"""Managers: actions, observations, resets, terminations and rewards as named terms over all worlds
+at once.
+"""
 
 from mjstack.managers.action import ActionManager, ActionTerm
 from mjstack.managers.base import EnvView, random_uniform, uses_fields

@@ -1,4 +1,6 @@
-"""The action manager: slices of the policy's action, each turned into actuator commands by a term."""
+"""The action manager: slices of the policy's action, each turned into actuator commands
+by a term.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +11,20 @@ import torch
 
 from mjstack.config.schema import ActionTermCfg
 from mjstack.errors import ArgumentError, TermError
-from mjstack.managers.base import EnvView, build_instance, check_params, render_table, resolve_func, running, show_params
+from mjstack.managers.base import (
+    EnvView,
+    build_instance,
+    check_params,
+    current_term,
+    render_table,
+    resolve_func,
+    show_params,
+)
 
 
 class ActionTerm(ABC):
-    """Turns a slice of the action into commands. A subclass takes the environment and keyword parameters.
+    """Turns a slice of the action into commands. A subclass takes the environment and keyword
+    parameters.
 
     Attributes:
         dim: Width of the slice.
@@ -39,11 +50,13 @@ class ActionManager:
 
     Attributes:
         action_dim: Width of the whole action.
-        action: The last action, shape ``(nworld, action_dim)``, in the type of the simulation's floats.
+        action: The last action, shape ``(nworld, action_dim)``, in the type of the simulation's
+            floats.
         previous_action: The one before. Both are zero after a reset.
         low: Smallest meaningful action, shape ``(action_dim,)``.
         high: Largest, shape ``(action_dim,)``.
-        not_finite: Worlds whose action was not finite since this was last cleared, shape ``(nworld,)``, bool.
+        not_finite: Worlds whose action was not finite since this was last cleared, shape
+            ``(nworld,)``, bool.
     """
 
     def __init__(self, env: EnvView, cfg: Mapping[str, ActionTermCfg]) -> None:
@@ -62,13 +75,18 @@ class ActionManager:
             label = f"action.{name}"
             cls = resolve_func(label, term_cfg.func)
             if not (isinstance(cls, type) and issubclass(cls, ActionTerm)):
-                raise TermError(label, f"func={term_cfg.func}: expected a subclass of mjstack.managers.ActionTerm")
+                raise TermError(
+                    label,
+                    f"func={term_cfg.func}: expected a subclass of mjstack.managers.ActionTerm",
+                )
             check_params(label, cls, dict(term_cfg.params), 1)
             term = build_instance(label, cls, env, dict(term_cfg.params))
             for actuator in term.actuators:
                 if actuator in driven:
                     raise TermError(
-                        label, f"drives actuator {actuator}, which {driven[actuator]} drives too: leave one of them out"
+                        label,
+                        f"drives actuator {actuator}, which {driven[actuator]} drives too: leave"
+                        " one of them out",
                     )
                 driven[actuator] = label
             self.terms[name] = term
@@ -77,7 +95,9 @@ class ActionManager:
             start += term.dim
         self.action_dim = start
         zeros = torch.zeros((env.nworld, start), dtype=env.sim.qpos.dtype, device=env.device)
-        self.action, self.previous_action, self._taken = zeros, zeros.clone(), zeros.clone()
+        self.action = zeros
+        self.previous_action = zeros.clone()
+        self._taken = zeros.clone()
         bounds = [(term.low, term.high) for term, _ in self._slices]
         self.low = torch.cat([low for low, _ in bounds]) if bounds else zeros[0]
         self.high = torch.cat([high for _, high in bounds]) if bounds else zeros[0]
@@ -86,8 +106,8 @@ class ActionManager:
     def process(self, action: torch.Tensor) -> None:
         """Takes in an action: `take`, which checks it, and `accept`.
 
-        A value that is not finite is an error at once on the CPU. On CUDA, where looking would stop the device, it counts
-        as 0 and its world is marked in ``not_finite``.
+        A value that is not finite is an error at once on the CPU. On CUDA, where looking would stop
+        the device, it counts as 0 and its world is marked in ``not_finite``.
 
         Args:
             action: Shape ``(nworld, action_dim)``, float32 or float64.
@@ -105,7 +125,10 @@ class ActionManager:
         if not action.is_cuda and not bool(torch.isfinite(action).all()):
             world = int((~torch.isfinite(action)).any(1).nonzero()[0, 0])
             raise ArgumentError(
-                "action", f"{action[world].tolist()} in world {world}", "finite numbers", "Check what the policy returns"
+                "action",
+                f"{action[world].tolist()} in world {world}",
+                "finite numbers",
+                "Check what the policy returns",
             )
         self._taken.copy_(action)
 
@@ -117,7 +140,10 @@ class ActionManager:
 
     def check(self, action: torch.Tensor) -> None:
         """Raises an `ArgumentError` for an action of wrong type, shape, dtype or device."""
-        expected = f"a float32 tensor of shape ({self._env.nworld}, {self.action_dim}) on {self._env.device}"
+        expected = (
+            f"a float32 tensor of shape ({self._env.nworld}, {self.action_dim}) on"
+            f" {self._env.device}"
+        )
         if not isinstance(action, torch.Tensor):
             raise ArgumentError("action", type(action).__name__, expected)
         if tuple(action.shape) != (self._env.nworld, self.action_dim):
@@ -130,7 +156,7 @@ class ActionManager:
     def write_commands(self) -> None:
         """Writes ``sim.ctrl`` in all worlds, term by term."""
         for (name, term), (_, part) in zip(self.terms.items(), self._slices, strict=True):
-            running.label = f"action.{name}"
+            current_term.label = f"action.{name}"
             term.write_commands(self.action[:, part])
 
     def reset(self, mask: torch.Tensor) -> None:
@@ -139,4 +165,6 @@ class ActionManager:
         self.previous_action.masked_fill_(mask[:, None], 0.0)
 
     def __str__(self) -> str:
-        return render_table(f"action: {self.action_dim} numbers", ("term", "dim", "range", "parameters"), self._rows)
+        return render_table(
+            f"action: {self.action_dim} numbers", ("term", "dim", "range", "parameters"), self._rows
+        )

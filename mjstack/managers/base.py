@@ -1,4 +1,6 @@
-"""What managers share: the view of an environment that terms receive, and how terms are found, checked and shown."""
+"""What managers share: the view of an environment that terms receive, and how terms are found,
+checked and shown.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,7 @@ class EnvView(Protocol):
         key: The same on the device, shape ``(1,)``, int64: what a captured step reads.
         world: Number of each world, shape ``(nworld,)``, int64.
         episode: Episode of each world, shape ``(nworld,)``, int64.
-        frame: Frames since each world's last reset, shape ``(nworld,)``, int64.
+        episode_step: Control steps since each world's last reset, shape ``(nworld,)``, int64.
         action: The policy's last action, shape ``(nworld, action_dim)``.
         previous_action: The one before.
         success: Whether the task is achieved, shape ``(nworld,)``, bool.
@@ -51,7 +53,7 @@ class EnvView(Protocol):
     key: torch.Tensor
     world: torch.Tensor
     episode: torch.Tensor
-    frame: torch.Tensor
+    episode_step: torch.Tensor
 
     @property
     def action(self) -> torch.Tensor:
@@ -67,7 +69,9 @@ class EnvView(Protocol):
 
 
 def uses_fields(*names: str) -> Callable[[Any], Any]:
-    """Marks a reset term that writes per-world model fields, so that the simulation is built with them."""
+    """Marks a reset term that writes per-world model fields, so that the simulation is built with
+    them.
+    """
 
     def mark(term: Any) -> Any:
         term.model_fields = names
@@ -77,9 +81,15 @@ def uses_fields(*names: str) -> Callable[[Any], Any]:
 
 
 def random_uniform(
-    env: EnvView, name: str, size: int, low: float = -1.0, high: float = 1.0, step: torch.Tensor | None = None
+    env: EnvView,
+    name: str,
+    size: int,
+    low: float = -1.0,
+    high: float = 1.0,
+    step: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Random numbers of every world's current episode, the same whatever nworld is and whichever worlds reset.
+    """Random numbers of every world's current episode, the same whatever nworld is and whichever
+    worlds reset.
 
     Args:
         env: The environment.
@@ -94,13 +104,24 @@ def random_uniform(
     """
     stream = zlib.crc32(name.encode())
     if env.device.type == "cuda":
-        from mjstack.sim.draws import draw_uniform  # one kernel; loads Warp, which native runs do not need
+        from mjstack.sim.draws import (
+            draw_uniform,
+        )  # one kernel; loads Warp, which native runs do not need
 
         return draw_uniform(
-            key=env.key, stream=stream, world=env.world, episode=env.episode, step=step, size=size, low=low, high=high
+            key=env.key,
+            stream=stream,
+            world=env.world,
+            episode=env.episode,
+            step=step,
+            size=size,
+            low=low,
+            high=high,
         )
     step = torch.zeros_like(env.world) if step is None else step
-    draw = uniform(seed=env.seed, world=env.world, episode=env.episode, step=step, stream=stream, size=size)
+    draw = uniform(
+        seed=env.seed, world=env.world, episode=env.episode, step=step, stream=stream, size=size
+    )
     return low + 0.5 * (high - low) * (draw.to(env.sim.qpos.dtype) + 1.0)
 
 
@@ -112,43 +133,61 @@ def resolve_func(label: str, path: str) -> Callable[..., Any]:
     """
     module_name, _, attribute = path.rpartition(".")
     if not module_name:
-        raise TermError(label, f"func={path}: expected a dotted name, such as mjstack.mdp.reward.reach")
+        raise TermError(
+            label, f"func={path}: expected a dotted name, such as mjstack.mdp.reward.reach"
+        )
     try:
         module = importlib.import_module(module_name)
     except Exception as error:  # the module is the user's, and may raise anything
         reason = str(error).splitlines()[0] if str(error) else "no message"
         kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
-        raise TermError(label, f"func={path}: module '{module_name}' cannot be imported ({kind}{reason})") from error
+        raise TermError(
+            label, f"func={path}: module '{module_name}' cannot be imported ({kind}{reason})"
+        ) from error
     func = getattr(module, attribute, None)
     if not callable(func):
         names = [
-            name for name, value in vars(module).items() if callable(value) and getattr(value, "__module__", "") == module_name
+            name
+            for name, value in vars(module).items()
+            if callable(value) and getattr(value, "__module__", "") == module_name
         ]
-        raise TermError(label, f"func={path}: '{attribute}' does not exist. {suggest(attribute, names)}")
+        raise TermError(
+            label, f"func={path}: '{attribute}' does not exist. {suggest(attribute, names)}"
+        )
     return func
 
 
-def check_params(label: str, func: Callable[..., Any], params: dict[str, Any], leading: int) -> None:
+def check_params(
+    label: str, func: Callable[..., Any], params: dict[str, Any], leading: int
+) -> None:
     """Holds the parameters against a signature whose first ``leading`` arguments the manager gives.
 
     Raises:
         TermError: A parameter is unknown or missing.
     """
     every = list(inspect.signature(func).parameters.values())
-    given = [p for p in every if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD, p.VAR_POSITIONAL)]
+    given = [
+        p for p in every if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD, p.VAR_POSITIONAL)
+    ]
     if len(given) < leading and not any(p.kind is p.VAR_POSITIONAL for p in given):
         form = "(env, mask, *, ...)" if leading == 2 else "(env, *, ...)"
-        raise TermError(label, f"{getattr(func, '__name__', func)} does not take what its manager gives, expected {form}")
-    accepted = every[leading:]
-    if any(p.kind is p.VAR_KEYWORD for p in accepted):
+        raise TermError(
+            label,
+            f"{getattr(func, '__name__', func)} does not take what its manager gives, expected"
+            f" {form}",
+        )
+    succeeded = every[leading:]
+    if any(p.kind is p.VAR_KEYWORD for p in succeeded):
         return
-    names = [p.name for p in accepted]
+    names = [p.name for p in succeeded]
     for name in params:
         if name not in names:
             raise TermError(label, f"parameter '{name}' does not exist. {suggest(name, names)}")
-    missing = [p.name for p in accepted if p.default is p.empty and p.name not in params]
+    missing = [p.name for p in succeeded if p.default is p.empty and p.name not in params]
     if missing:
-        raise TermError(label, f"parameter '{missing[0]}' is missing: set {label}.params.{missing[0]}")
+        raise TermError(
+            label, f"parameter '{missing[0]}' is missing: set {label}.params.{missing[0]}"
+        )
     try:
         hints = get_type_hints(func.__init__ if inspect.isclass(func) else func)
     except (NameError, TypeError):  # a user's annotations may name what cannot be resolved here
@@ -160,23 +199,36 @@ def check_params(label: str, func: Callable[..., Any], params: dict[str, Any], l
 
 
 def _mismatch(value: Any, hint: Any) -> str:
-    """What an annotation expects where a value from YAML does not fit it; empty where it fits or nobody can tell."""
-    origin, inner = get_origin(hint), get_args(hint)
+    """What an annotation expects where a value from YAML does not fit it; empty where it fits or
+    nobody can tell.
+    """
+    origin = get_origin(hint)
+    inner = get_args(hint)
     if origin in (Union, UnionType):
         problems = [_mismatch(value, option) for option in inner]
         return "" if "" in problems else " or ".join(problems)
     if origin in (list, Sequence) and not isinstance(value, str):
         if not isinstance(value, list | tuple):
             return f"a list, such as [{value}, {value}]"
-        return next((f"a list, each of it {p}" for p in (_mismatch(v, inner[0]) for v in value) if p), "")
-    names = {float: "a number", int: "an integer", bool: "true or false", str: "a name", type(None): "null"}
+        return next(
+            (f"a list, each of it {p}" for p in (_mismatch(v, inner[0]) for v in value) if p), ""
+        )
+    names = {
+        float: "a number",
+        int: "an integer",
+        bool: "true or false",
+        str: "a name",
+        type(None): "null",
+    }
     if hint not in names:
         return f"a list of {names.get(inner[0], 'values')}" if origin in (list, Sequence) else ""
     fits = isinstance(value, int | float) if hint is float else isinstance(value, hint)
     return "" if fits and (hint is bool or not isinstance(value, bool)) else names[hint]
 
 
-def build_instance(label: str, cls: Callable[..., Any], env: EnvView, params: dict[str, Any]) -> Any:
+def build_instance(
+    label: str, cls: Callable[..., Any], env: EnvView, params: dict[str, Any]
+) -> Any:
     """Builds a term that is a class.
 
     Raises:
@@ -204,29 +256,32 @@ def _located(label: str, error: ParameterError) -> ConfigError:
     return ConfigError(f"{label}.params.{name}", value, expected, fix)
 
 
-class Running:
+class CurrentTerm:
     """What terms are doing right now.
 
     Attributes:
-        label: Dotted configuration key of the term that was called last: the one to name if a capture fails.
-        values: What has been computed from the state that a pass looks at, by what and for whom; None outside a pass.
+        label: Dotted configuration key of the term that was called last: the one to name if a
+            capture fails.
+        values: What has been computed from the state that a pass looks at, by what and for whom;
+            None outside a pass.
     """
 
     label = ""
     values: dict[Any, torch.Tensor] | None = None
 
 
-running = Running()
+current_term = CurrentTerm()
 
 
 @contextmanager
-def one_pass() -> Iterator[None]:
+def step_cache() -> Iterator[None]:
     """While nothing changes the state: what two terms have in common is computed once."""
-    outer, running.values = running.values, {}
+    outer = current_term.values
+    current_term.values = {}
     try:
         yield
     finally:
-        running.values = outer
+        current_term.values = outer
 
 
 def require_positive(name: str, value: float) -> None:
@@ -246,15 +301,17 @@ def shared(key: Any, compute: Callable[[], torch.Tensor]) -> torch.Tensor:
         key: What it is, the environment included.
         compute: Computes it.
     """
-    if running.values is None:
+    if current_term.values is None:
         return compute()
-    if key not in running.values:
-        running.values[key] = compute()
-    return running.values[key]
+    if key not in current_term.values:
+        current_term.values[key] = compute()
+    return current_term.values[key]
 
 
 class Term:
-    """A term ready to be called: a function with its parameters, or an instance of a class built with them."""
+    """A term ready to be called: a function with its parameters, or an instance of a class built
+    with them.
+    """
 
     def __init__(self, label: str, cfg: TermCfg, env: EnvView, *, masked: bool = False) -> None:
         """Finds the function or class and checks its parameters.
@@ -280,21 +337,25 @@ class Term:
             self.params_of_call: dict[str, Any] = {}
             self._reset = getattr(self._call, "reset", None)
         else:
-            self._call, self.params_of_call = func, self.params
-        # Two groups may ask for the same: a function of the state gives both the same answer. Others may keep something.
+            self._call = func
+            self.params_of_call = self.params
+        # Two groups may ask for the same: a function of the state gives both the same answer.
+        # Others may keep something.
         self._shared_by = None if is_class or masked else (func, repr(sorted(self.params.items())))
 
     @property
     def has_memory(self) -> bool:
-        """Whether the term keeps something from frame to frame."""
+        """Whether the term keeps something from step to step."""
         return self._reset is not None
 
     def __call__(self, *args: Any) -> Any:
         """Calls the term with the environment, and a mask if it takes one."""
-        running.label = self.label
+        current_term.label = self.label
         if self._shared_by is None:
             return self._call(*args, **self.params_of_call)
-        return shared((id(args[0]), *self._shared_by), lambda: self._call(*args, **self.params_of_call))
+        return shared(
+            (id(args[0]), *self._shared_by), lambda: self._call(*args, **self.params_of_call)
+        )
 
     def reset(self, mask: torch.Tensor) -> None:
         """Lets a term with a memory forget the masked worlds."""
@@ -302,7 +363,9 @@ class Term:
             self._reset(mask)
 
 
-def check_value(label: str, value: Any, env: EnvView, *, dims: tuple[int, ...], boolean: bool = False) -> torch.Tensor:
+def check_value(
+    label: str, value: Any, env: EnvView, *, dims: tuple[int, ...], boolean: bool = False
+) -> torch.Tensor:
     """Holds a term's first value against what its manager needs.
 
     Args:
@@ -329,7 +392,9 @@ def check_value(label: str, value: Any, env: EnvView, *, dims: tuple[int, ...], 
     return value
 
 
-def first_value(term: Term, env: EnvView, *, dims: tuple[int, ...], boolean: bool = False) -> torch.Tensor:
+def first_value(
+    term: Term, env: EnvView, *, dims: tuple[int, ...], boolean: bool = False
+) -> torch.Tensor:
     """Calls a value term for the first time and checks what it returns.
 
     Raises:

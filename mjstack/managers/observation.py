@@ -1,4 +1,6 @@
-"""The observation manager: groups of terms, each group one tensor, with noise, clipping, scaling and history."""
+"""The observation manager: groups of terms, each group one tensor, with noise, clipping, scaling
+and history.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,14 @@ import torch
 
 from mjstack.config.schema import ObservationGroupCfg, ObservationTermCfg
 from mjstack.errors import TermError
-from mjstack.managers.base import EnvView, Term, first_value, random_uniform, render_table, show_params
+from mjstack.managers.base import (
+    EnvView,
+    Term,
+    first_value,
+    random_uniform,
+    render_table,
+    show_params,
+)
 
 
 class _Part:
@@ -23,21 +32,24 @@ class _Part:
         if not math.isfinite(cfg.scale):
             raise TermError(label, f"scale={cfg.scale}: expected a finite number")
         if cfg.clip is not None and not (len(cfg.clip) == 2 and cfg.clip[0] < cfg.clip[1]):
-            raise TermError(label, f"clip={list(cfg.clip)}: expected two numbers, the smaller one first")
+            raise TermError(
+                label, f"clip={list(cfg.clip)}: expected two numbers, the smaller one first"
+            )
         self.cfg = cfg
         self.term = Term(label, cfg, env)
         if self.term.has_memory:
             raise TermError(
                 label,
-                "has a reset(mask), so it keeps something from frame to frame, and observations are computed twice where a "
-                "world resets: use history, or keep it in a reward or termination term",
+                "has a reset(mask), so it keeps something from step to step, and observations are"
+                " computed twice where a world resets: use history, or keep it in a reward or"
+                " termination term",
             )
         value = first_value(self.term, env, dims=(1, 2))
         self.width = 1 if value.dim() == 1 else value.shape[1]
         self.dim = self.width * cfg.history
 
     def spread(self, value: float) -> list[float]:
-        """A number for each column of one frame."""
+        """A number for each column of one step."""
         return [value] * self.width
 
 
@@ -45,76 +57,113 @@ class _Group:
     """The terms of one group: noise, clipping and scaling are done for all columns at once."""
 
     def __init__(self, name: str, cfg: ObservationGroupCfg, env: EnvView) -> None:
-        self.name, self.noisy, self._env = name, cfg.noise, env
-        self.parts = {term: _Part(f"observation.{name}.terms.{term}", c, env) for term, c in cfg.terms.items()}
+        self.name = name
+        self.noisy = cfg.noise
+        self._env = env
+        self.parts = {
+            term: _Part(f"observation.{name}.terms.{term}", c, env) for term, c in cfg.terms.items()
+        }
         if not self.parts:
-            raise TermError(f"observation.{name}", "has no terms: expected at least one, or no such group")
+            raise TermError(
+                f"observation.{name}", "has no terms: expected at least one, or no such group"
+            )
         parts = self.parts.values()
 
         def row(values: Callable[[_Part], float]) -> torch.Tensor:
-            return torch.tensor([x for p in parts for x in p.spread(values(p))], dtype=torch.float32, device=env.device)
+            return torch.tensor(
+                [x for p in parts for x in p.spread(values(p))],
+                dtype=torch.float32,
+                device=env.device,
+            )
 
         self.dim = sum(part.dim for part in parts)
         noise = [x for part in parts for x in part.spread(part.cfg.noise if cfg.noise else 0.0)]
         # Only columns with noise get numbers: where one stands in the draw follows from them alone.
         columns = [i for i, x in enumerate(noise) if x > 0.0]
-        self._noise = torch.tensor([noise[i] for i in columns], dtype=torch.float32, device=env.device)
+        self._noise = torch.tensor(
+            [noise[i] for i in columns], dtype=torch.float32, device=env.device
+        )
         self._noise_columns = torch.tensor(columns, dtype=torch.int64, device=env.device)
         clips = any(part.cfg.clip is not None for part in parts)
-        self._low = row(lambda p: -math.inf if p.cfg.clip is None else p.cfg.clip[0]) if clips else None
-        self._high = row(lambda p: math.inf if p.cfg.clip is None else p.cfg.clip[1]) if clips else None
-        self._scale = row(lambda p: p.cfg.scale) if any(part.cfg.scale != 1.0 for part in parts) else None
-        # Where each frame of the history stands in the group: all columns of the last one, and for older ones those that
-        # have a history that long. A frame moves to where the next older one was.
-        starts, at = [], 0
+        self._low = (
+            row(lambda p: -math.inf if p.cfg.clip is None else p.cfg.clip[0]) if clips else None
+        )
+        self._high = (
+            row(lambda p: math.inf if p.cfg.clip is None else p.cfg.clip[1]) if clips else None
+        )
+        self._scale = (
+            row(lambda p: p.cfg.scale) if any(part.cfg.scale != 1.0 for part in parts) else None
+        )
+        # Where each frame of the history stands in the group: all columns of the last one, and for
+        # older ones those that have a history that long. A step moves to where the next older one
+        # was.
+        starts = []
+        at = 0
         for part in parts:
             starts.append(at)
             at += part.dim
-        newest = [s + p.dim - p.width + i for p, s in zip(parts, starts, strict=True) for i in range(p.width)]
+        newest = [
+            s + p.dim - p.width + i
+            for p, s in zip(parts, starts, strict=True)
+            for i in range(p.width)
+        ]
         older = [s + i for p, s in zip(parts, starts, strict=True) for i in range(p.dim - p.width)]
         widths = [p.width for p in parts for _ in range(p.dim - p.width)]
         self._newest = torch.tensor(newest, device=env.device) if older else None
         self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
         self._older = torch.tensor(older, dtype=torch.int64, device=env.device)
-        self._next = torch.tensor([i + w for i, w in zip(older, widths, strict=True)], dtype=torch.int64, device=env.device)
-        source = [i for p, first in _first_columns(parts) for _ in range(p.cfg.history) for i in range(first, first + p.width)]
+        self._next = torch.tensor(
+            [i + w for i, w in zip(older, widths, strict=True)],
+            dtype=torch.int64,
+            device=env.device,
+        )
+        source = [
+            i
+            for p, first in _first_columns(parts)
+            for _ in range(p.cfg.history)
+            for i in range(first, first + p.width)
+        ]
         self._repeat = torch.tensor(source, dtype=torch.int64, device=env.device)
 
     def compute(self) -> torch.Tensor:
-        """One frame of every world, shape ``(nworld, sum of widths)``."""
+        """One step of every world, shape ``(nworld, sum of widths)``."""
         n = self._env.nworld
-        values = [part.term(self._env).float().reshape(n, part.width) for part in self.parts.values()]
-        frame = torch.cat(values, dim=1)
+        values = [
+            part.term(self._env).float().reshape(n, part.width) for part in self.parts.values()
+        ]
+        step = torch.cat(values, dim=1)
         if len(self._noise_columns):
             size = len(self._noise_columns)
-            draw = random_uniform(self._env, f"observation.{self.name}", size, step=self._env.frame).float()
-            frame.index_add_(1, self._noise_columns, self._noise * draw)
+            draw = random_uniform(
+                self._env, f"observation.{self.name}", size, step=self._env.episode_step
+            ).float()
+            step.index_add_(1, self._noise_columns, self._noise * draw)
         if self._low is not None:
-            frame.clamp_(self._low, self._high)
-        return frame if self._scale is None else frame.mul_(self._scale)
+            step.clamp_(self._low, self._high)
+        return step if self._scale is None else step.mul_(self._scale)
 
     def append(self, out: torch.Tensor) -> None:
-        """Takes in a new frame of every world, and forgets the oldest."""
-        frame = self.compute()
+        """Takes in a new step of every world, and forgets the oldest."""
+        step = self.compute()
         if self._newest is None:
-            out.copy_(frame)
+            out.copy_(step)
             return
         self._past[:, self._older] = self._past.index_select(1, self._next)
-        self._past[:, self._newest] = frame
+        self._past[:, self._newest] = step
         out.copy_(self._past)
 
     def restart(self, out: torch.Tensor, mask: torch.Tensor) -> None:
-        """The whole history of the masked worlds becomes the current frame."""
-        frame = self.compute()
+        """The whole history of the masked worlds becomes the current step."""
+        step = self.compute()
         if self._newest is None:
-            torch.where(mask[:, None], frame, out, out=out)
+            torch.where(mask[:, None], step, out, out=out)
             return
-        torch.where(mask[:, None], frame.index_select(1, self._repeat), self._past, out=self._past)
+        torch.where(mask[:, None], step.index_select(1, self._repeat), self._past, out=self._past)
         out.copy_(self._past)
 
 
 def _first_columns(parts: Iterable[_Part]) -> Iterator[tuple[_Part, int]]:
-    """Each part with its first column within one frame."""
+    """Each part with its first column within one step."""
     first = 0
     for part in parts:
         yield part, first
@@ -126,7 +175,8 @@ class ObservationManager:
 
     Attributes:
         group_dims: Width of each group.
-        term_dims: Width of each term, history included, by group and name, in the order of the columns.
+        term_dims: Width of each term, history included, by group and name, in the order of the
+            columns.
         groups: The tensors, by group. They are written anew at every step.
     """
 
@@ -138,20 +188,25 @@ class ObservationManager:
         """
         self._groups = {name: _Group(name, group, env) for name, group in cfg.items()}
         self.group_dims = {name: group.dim for name, group in self._groups.items()}
-        self.term_dims = {name: {term: p.dim for term, p in group.parts.items()} for name, group in self._groups.items()}
+        self.term_dims = {
+            name: {term: p.dim for term, p in group.parts.items()}
+            for name, group in self._groups.items()
+        }
         self.groups = {
             name: torch.full((env.nworld, dim), math.nan, dtype=torch.float32, device=env.device)
             for name, dim in self.group_dims.items()
         }
 
     def compute(self) -> dict[str, torch.Tensor]:
-        """Takes in a new frame of every world, and returns `groups`."""
+        """Takes in a new step of every world, and returns `groups`."""
         for name, group in self._groups.items():
             group.append(self.groups[name])
         return self.groups
 
     def refresh(self, mask: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Computes the masked worlds anew after their reset; their whole history becomes the first frame."""
+        """Computes the masked worlds anew after their reset; their whole history becomes the first
+        step.
+        """
         for name, group in self._groups.items():
             group.restart(self.groups[name], mask)
         return self.groups
@@ -173,6 +228,12 @@ class ObservationManager:
                 cfg = part.cfg
                 noise = cfg.noise if terms.noisy else 0.0
                 params = show_params(part.term.params)
-                rows.append((group, name, part.dim, cfg.history, noise, cfg.clip or "", cfg.scale, params))
-        title = "observation: " + ", ".join(f"{group} {dim}" for group, dim in self.group_dims.items())
-        return render_table(title, ("group", "term", "dim", "history", "noise", "clip", "scale", "parameters"), rows)
+                rows.append(
+                    (group, name, part.dim, cfg.history, noise, cfg.clip or "", cfg.scale, params)
+                )
+        title = "observation: " + ", ".join(
+            f"{group} {dim}" for group, dim in self.group_dims.items()
+        )
+        return render_table(
+            title, ("group", "term", "dim", "history", "noise", "clip", "scale", "parameters"), rows
+        )

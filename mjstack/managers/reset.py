@@ -26,9 +26,12 @@ class ResetManager:
             lacking = [field for field in wanted if field not in env.sim.fields]
             if lacking:
                 raise TermError(
-                    f"reset.{name}", f"writes {', '.join(lacking)}: build the simulation with fields={list(wanted)}"
+                    f"reset.{name}",
+                    f"writes {', '.join(lacking)}: build the simulation with fields={list(wanted)}",
                 )
-        self._terms = {name: Term(f"reset.{name}", term, env, masked=True) for name, term in cfg.items()}
+        self._terms = {
+            name: Term(f"reset.{name}", term, env, masked=True) for name, term in cfg.items()
+        }
 
     def reset(self, mask: torch.Tensor) -> None:
         """Resets the worlds of a ``(nworld,)`` bool mask: qpos0 first, then every term."""
@@ -43,13 +46,20 @@ class ResetManager:
                 raise TermError(term.label, f"raised {type(error).__name__}: {reason}") from error
 
     def __str__(self) -> str:
-        rows = [(name, show_params(term.params), ", ".join(term.model_fields)) for name, term in self._terms.items()]
-        return render_table(f"reset: {len(rows)} terms", ("term", "parameters", "model fields"), rows)
+        rows = [
+            (name, show_params(term.params), ", ".join(term.model_fields))
+            for name, term in self._terms.items()
+        ]
+        return render_table(
+            f"reset: {len(rows)} terms", ("term", "parameters", "model fields"), rows
+        )
 
 
 def required_fields(cfg: Mapping[str, TermCfg]) -> tuple[str, ...]:
     """Per-world model fields that some reset terms write, for the simulation's constructor."""
     names: dict[str, None] = {}
     for name, term in cfg.items():
-        names |= dict.fromkeys(getattr(resolve_func(f"reset.{name}", term.func), "model_fields", ()))
+        names |= dict.fromkeys(
+            getattr(resolve_func(f"reset.{name}", term.func), "model_fields", ())
+        )
     return tuple(names)

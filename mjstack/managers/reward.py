@@ -13,43 +13,54 @@ from mjstack.managers.base import EnvView, Term, first_value, render_table, show
 
 
 class RewardManager:
-    """Adds up ``weight x value x frame_dt`` over the terms.
+    """Adds up ``weight x value x step_dt`` over the terms.
 
     Attributes:
         names: The terms.
-        weights: ``weight x frame_dt`` of every term, shape ``(nterm,)``, float32. Write into it to change a weight later.
-        reward: The sum at the last frame, shape ``(nworld,)``, float32.
+        weights: ``weight x step_dt`` of every term, shape ``(nterm,)``, float32. Write into it to
+            change a weight later.
+        reward: The sum at the last step, shape ``(nworld,)``, float32.
         values: Its summands, shape ``(nworld, nterm)``, float32.
-        episode_sums: The summands since each world's last reset, shape ``(nworld, nterm)``, float32.
+        episode_sums: The summands since each world's last reset, shape ``(nworld, nterm)``,
+            float32.
     """
 
     def __init__(self, env: EnvView, cfg: Mapping[str, RewardTermCfg]) -> None:
         """Builds the terms and calls each once.
 
         Raises:
-            TermError: A term cannot be found, does not return ``(nworld,)`` numbers, or has a weight that is not finite.
+            TermError: A term cannot be found, does not return ``(nworld,)`` numbers, or has a
+                weight that is not finite.
         """
-        self._env, self._cfg = env, dict(cfg)
+        self._env = env
+        self._cfg = dict(cfg)
         self._terms = {name: Term(f"reward.{name}", term, env) for name, term in cfg.items()}
         for name, term in self._terms.items():
             if not math.isfinite(cfg[name].weight):
                 raise TermError(term.label, f"weight={cfg[name].weight}: expected a finite number")
             first_value(term, env, dims=(1,))
         self.names = list(self._terms)
-        weights = [cfg[name].weight * env.cfg.timing.frame_dt for name in self.names]
+        weights = [cfg[name].weight * env.cfg.timing.step_dt for name in self.names]
         self.weights = torch.tensor(weights, dtype=torch.float32, device=env.device)
         self.reward = torch.zeros(env.nworld, dtype=torch.float32, device=env.device)
-        self.values = torch.zeros((env.nworld, len(self.names)), dtype=torch.float32, device=env.device)
+        self.values = torch.zeros(
+            (env.nworld, len(self.names)), dtype=torch.float32, device=env.device
+        )
         self.episode_sums = torch.zeros_like(self.values)
 
     def compute(self, void: torch.Tensor | None = None) -> torch.Tensor:
         """Writes `values` and `reward`, and returns `reward`.
 
         Args:
-            void: Worlds whose state is not finite, shape ``(nworld,)``, bool: they get no reward for this frame.
+            void: Worlds whose state is not finite, shape ``(nworld,)``, bool: they get no reward
+                for this step.
         """
         if self._terms:
-            torch.mul(torch.stack([term(self._env).float() for term in self._terms.values()], 1), self.weights, out=self.values)
+            torch.mul(
+                torch.stack([term(self._env).float() for term in self._terms.values()], 1),
+                self.weights,
+                out=self.values,
+            )
         if void is not None:
             self.values.masked_fill_(void[:, None], 0.0)
         self.episode_sums += self.values
@@ -62,5 +73,10 @@ class RewardManager:
             term.reset(mask)
 
     def __str__(self) -> str:
-        rows = [(name, self._cfg[name].weight, show_params(term.params)) for name, term in self._terms.items()]
-        return render_table(f"reward: {len(rows)} terms", ("term", "weight per s", "parameters"), rows)
+        rows = [
+            (name, self._cfg[name].weight, show_params(term.params))
+            for name, term in self._terms.items()
+        ]
+        return render_table(
+            f"reward: {len(rows)} terms", ("term", "weight per s", "parameters"), rows
+        )

@@ -1,4 +1,6 @@
-"""The termination manager: which worlds' episodes end, and whether by the clock or by what happened."""
+"""The termination manager: which worlds' episodes end, and whether by the clock or by what
+happened.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ class TerminationManager:
         Raises:
             TermError: A term cannot be found, or does not return ``(nworld,)`` bool.
         """
-        self._env, self._cfg = env, dict(cfg)
+        self._env = env
+        self._cfg = dict(cfg)
         self._terms = {name: Term(f"termination.{name}", term, env) for name, term in cfg.items()}
         for term in self._terms.values():
             first_value(term, env, dims=(1,), boolean=True)
@@ -36,7 +39,9 @@ class TerminationManager:
             return torch.zeros((env.nworld, *shape), dtype=torch.bool, device=env.device)
 
         self.terminated, self.truncated, self.values = flags(), flags(), flags(len(self.names))
-        self._ends = torch.tensor([not cfg[name].time_out for name in self.names], dtype=torch.bool, device=env.device)
+        self._ends = torch.tensor(
+            [not cfg[name].time_out for name in self.names], dtype=torch.bool, device=env.device
+        )
 
     def compute(self) -> None:
         """Writes `terminated`, `truncated` and `values`."""
@@ -44,7 +49,8 @@ class TerminationManager:
             return
         torch.stack([term(self._env) for term in self._terms.values()], dim=1, out=self.values)
         torch.any(self.values & self._ends, dim=1, out=self.terminated)
-        # Where both hold, the state itself ended the episode: there is nothing left to bootstrap from.
+        # Where both hold, the state itself ended the episode: there is nothing left to bootstrap
+        # from.
         torch.any(self.values, dim=1, out=self.truncated)
         self.truncated ^= self.terminated
 
@@ -55,7 +61,13 @@ class TerminationManager:
 
     def __str__(self) -> str:
         rows = [
-            (name, "truncated" if self._cfg[name].time_out else "terminated", show_params(term.params))
+            (
+                name,
+                "truncated" if self._cfg[name].time_out else "terminated",
+                show_params(term.params),
+            )
             for name, term in self._terms.items()
         ]
-        return render_table(f"termination: {len(rows)} terms", ("term", "episode counts as", "parameters"), rows)
+        return render_table(
+            f"termination: {len(rows)} terms", ("term", "episode counts as", "parameters"), rows
+        )

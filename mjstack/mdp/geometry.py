@@ -1,4 +1,6 @@
-"""Where things are, read from the simulation's views: what observations, rewards and terminations share."""
+"""Where things are, read from the simulation's views: what observations, rewards and terminations
+share.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def named_pose(env: EnvView, pose: str) -> torch.Tensor:
 
 
 def joint_positions(env: EnvView) -> torch.Tensor:
-    """Arm joints [rad], then gripper joints [rad or m], shape ``(nworld, n)``. Not to be written into."""
+    """Arm joints [rad], then gripper joints [rad or m], shape ``(nworld, n)``. Not to be written
+    into.
+    """
     return robot(env).qpos.read(env.sim.qpos)
 
 
@@ -42,43 +46,55 @@ def joint_velocities(env: EnvView) -> torch.Tensor:
     return robot(env).qvel.read(env.sim.qvel)
 
 
-def aperture_center(env: EnvView) -> torch.Tensor:
+def grasp_point(env: EnvView) -> torch.Tensor:
     """Midpoint between the jaws [m], world frame, shape ``(nworld, 3)``."""
-    first, second = env.index.aperture_sites
+    first, second = env.index.grasp_sites
     return 0.5 * (env.sim.site_xpos[:, first] + env.sim.site_xpos[:, second])
 
 
 def gripper_opening(env: EnvView) -> torch.Tensor:
-    """How far each gripper joint is open as measured, 0 closed to 1 open, shape ``(nworld, n_gripper)``."""
+    """How far each gripper joint is open as measured, 0 closed to 1 open, shape ``(nworld,
+    n_gripper)``.
+    """
     tensors = robot(env)
     q = tensors.gripper_qpos.read(env.sim.qpos)
     return (q - tensors.gripper_closed) / (tensors.gripper_open - tensors.gripper_closed)
 
 
 def pose_w(env: EnvView, name: str) -> torch.Tensor:
-    """Position [m] and quaternion (wxyz) of an object, from qpos, which is never stale, shape ``(nworld, 7)``."""
+    """Position [m] and quaternion (wxyz) of an object, from qpos, which is never stale, shape
+    ``(nworld, 7)``.
+    """
     address, _ = env.index.object_address(name)
     return env.sim.qpos[:, address : address + 7]
 
 
 def above_table(env: EnvView, name: str) -> torch.Tensor:
-    """Height of a cube's lowest corner above the table [m], shape ``(nworld,)``. Not to be written into."""
+    """Height of a cube's lowest corner above the table [m], shape ``(nworld,)``. Not to be written
+    into.
+    """
 
     def compute() -> torch.Tensor:
         pose = pose_w(env, name)
-        return lowest_corner(pose[:, :3], pose[:, 3:], env.cfg.scene.cube_half) - table_top(env.cfg.scene)
+        return lowest_corner(pose[:, :3], pose[:, 3:], env.cfg.scene.cube_half) - table_top(
+            env.cfg.scene
+        )
 
     return shared((id(env), above_table, name), compute)
 
 
 def jaw_forces(env: EnvView, name: str) -> torch.Tensor:
-    """Size of the contact force [N] of each jaw on an object, at the last physics step, shape ``(nworld, 2)``."""
+    """Size of the contact force [N] of each jaw on an object, at the last physics step, shape
+    ``(nworld, 2)``.
+    """
     env.index.object_address(name)
     return _jaw_forces(env.index, env.sim, name)
 
 
 def cubes_in_hand(index: SceneIndex, sim: Simulation) -> torch.Tensor:
-    """Whether both jaws press on each cube, at the last physics step, shape ``(nworld, 2)``, bool."""
+    """Whether both jaws press on each cube, at the last physics step, shape ``(nworld,
+    2)``, bool.
+    """
     return torch.stack([(_jaw_forces(index, sim, name) > LOADED).all(1) for name in CUBES], dim=1)
 
 

@@ -5,7 +5,14 @@ from __future__ import annotations
 import torch
 
 from mjstack.managers.base import EnvView
-from mjstack.mdp.geometry import aperture_center, jaw_forces, joint_positions, joint_velocities, pose_w, robot
+from mjstack.mdp.geometry import (
+    grasp_point,
+    jaw_forces,
+    joint_positions,
+    joint_velocities,
+    pose_w,
+    robot,
+)
 
 
 def joint_pos(env: EnvView) -> torch.Tensor:
@@ -23,20 +30,20 @@ def joint_vel(env: EnvView) -> torch.Tensor:
     return joint_velocities(env)
 
 
-def aperture_pos(env: EnvView) -> torch.Tensor:
-    """Aperture centre [m], world frame, shape ``(nworld, 3)``."""
-    return aperture_center(env)
+def grasp_point_pos(env: EnvView) -> torch.Tensor:
+    """Grasp point [m], world frame, shape ``(nworld, 3)``."""
+    return grasp_point(env)
 
 
-def aperture_to_object(env: EnvView, *, object: str, height: float = 0.0) -> torch.Tensor:
-    """From the aperture centre to a point above an object's centre [m], shape ``(nworld, 3)``.
+def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> torch.Tensor:
+    """From the grasp point to a point above an object's centre [m], shape ``(nworld, 3)``.
 
     Args:
         env: The environment.
         object: Scene object.
         height: How far above [m].
     """
-    offset = pose_w(env, object)[:, :3] - aperture_center(env)
+    offset = pose_w(env, object)[:, :3] - grasp_point(env)
     offset[:, 2] += height
     return offset
 
@@ -58,7 +65,9 @@ def object_velocity(env: EnvView, *, object: str) -> torch.Tensor:
 
 
 def jaw_force(env: EnvView, *, object: str) -> torch.Tensor:
-    """Size of each jaw's contact force on an object [N], at the last physics step, shape ``(nworld, 2)``."""
+    """Size of each jaw's contact force on an object [N], at the last physics step, shape ``(nworld,
+    2)``.
+    """
     return jaw_forces(env, object)
 
 

@@ -1,4 +1,6 @@
-"""Reset terms: they write the start of an episode into the masked worlds, from the model's nominal values each time."""
+"""Reset terms: they write the start of an episode into the masked worlds, from the model's nominal
+values each time.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,17 @@ from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import named_pose, pose_w, robot
-from mjstack.mdp.placement import Placement
-from mjstack.mdp.reachable import require_reach
-from mjstack.mdp.variation import FRICTION_FIELDS, GAIN_FIELDS, MASS_FIELDS, CubeMasses, ServoGains, SlidingFriction, bounds
+from mjstack.mdp.starts.placement import Placement
+from mjstack.mdp.starts.randomization import (
+    FRICTION_FIELDS,
+    GAIN_FIELDS,
+    MASS_FIELDS,
+    CubeMasses,
+    ServoGains,
+    SlidingFriction,
+    bounds,
+)
+from mjstack.mdp.starts.reach import require_reach
 
 
 def home(env: EnvView, mask: torch.Tensor, *, pose: str = "home") -> None:
@@ -25,7 +35,9 @@ def home(env: EnvView, mask: torch.Tensor, *, pose: str = "home") -> None:
 class JointNoise:
     """Adds uniform noise to the robot's joint positions and commands, within the joints' ranges."""
 
-    label = "reset.joints"  # the manager sets the term's own, so that two of them draw different numbers
+    label = (  # the manager sets the term's own, so that two of them draw different numbers
+        "reset.joints"
+    )
 
     def __init__(self, env: EnvView, *, arm: float, gripper: float = 0.0) -> None:
         """Takes the half-widths.
@@ -37,11 +49,13 @@ class JointNoise:
         """
         _not_negative("arm", arm)
         _not_negative("gripper", gripper)
-        tensors, n_arm = robot(env), env.index.n_arm
+        tensors = robot(env)
+        n_arm = env.index.n_arm
         self._width = torch.full_like(tensors.home, gripper)
         self._width[:n_arm] = arm
         both = torch.stack((tensors.range, tensors.ctrl_range))
-        self._low, self._high = both[..., 0].amax(0), both[..., 1].amin(0)
+        self._low = both[..., 0].amax(0)
+        self._high = both[..., 1].amin(0)
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes qpos and ctrl."""
@@ -65,9 +79,12 @@ class JitterCubes:
         """
         _not_negative("xy", xy)
         _not_negative("yaw", yaw)
-        placement = Placement(env.cfg, env.sim.model, env.index, region=(xy, xy), gap=0.0, pose=env.cfg.robot.home)
+        placement = Placement(
+            env.cfg, env.sim.model, env.index, region=(xy, xy), gap=0.0, pose=env.cfg.robot.home
+        )
         placement.require_all_free("xy", xy)
-        self._xy, self._yaw = xy, yaw
+        self._xy = xy
+        self._yaw = yaw
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes qpos."""
@@ -80,9 +97,10 @@ class JitterCubes:
 class RandomizeCubes:
     """Puts each cube anywhere in a region around its place where nothing is in its way.
 
-    Both cubes stay on the table, apart from each other, and clear of what is fixed to the world and of the arm at its start,
-    joint noise included. Each world draws some candidates and takes the first pair that fits, so that the number of operations
-    is fixed. Regions that the arm does not reach are refused.
+    Both cubes stay on the table, apart from each other, and clear of what is fixed to the world and
+    of the arm at its start, joint noise included. Each world draws some candidates and takes the
+    first pair that fits, so that the number of operations is fixed. Regions that the arm does not
+    reach are refused.
     """
 
     label = "reset.cubes"
@@ -108,7 +126,8 @@ class RandomizeCubes:
             pose: Where the arm is then, ``home`` or ``start``.
 
         Raises:
-            ParameterError: A value is out of range, the region leaves no free place, or the arm does not reach all of it.
+            ParameterError: A value is out of range, the region leaves no free place, or the arm
+                does not reach all of it.
         """
         if len(xy) != 2:
             raise ParameterError("xy", list(xy), "two numbers [m]")
@@ -116,8 +135,13 @@ class RandomizeCubes:
             _not_negative(name, value)
         if candidates < 1:
             raise ParameterError("candidates", candidates, "an integer of at least 1")
-        self._yaw, self._candidates = yaw, candidates
-        noise = [term.params.get("arm", 0.0) for term in env.cfg.reset.values() if term.func.endswith(".JointNoise")]
+        self._yaw = yaw
+        self._candidates = candidates
+        noise = [
+            term.params.get("arm", 0.0)
+            for term in env.cfg.reset.values()
+            if term.func.endswith(".JointNoise")
+        ]
         self._placement = Placement(
             env.cfg,
             env.sim.model,
@@ -133,7 +157,9 @@ class RandomizeCubes:
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes qpos."""
-        draws = random_uniform(env, self.label, 2 * (2 * self._candidates + 1)).view(env.nworld, 2, -1)
+        draws = random_uniform(env, self.label, 2 * (2 * self._candidates + 1)).view(
+            env.nworld, 2, -1
+        )
         offsets = self._placement.choose(draws[..., 1:].reshape(env.nworld, 2, self._candidates, 2))
         for number, name in enumerate(env.index.objects):
             dx, dy = offsets[:, number].unbind(1)
@@ -171,12 +197,16 @@ class CubeFriction:
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes geom_friction."""
-        self._friction.write(mask, random_uniform(env, self.label, len(self._friction.names), self._low, self._high))
+        self._friction.write(
+            mask, random_uniform(env, self.label, len(self._friction.names), self._low, self._high)
+        )
 
 
 @uses_fields(*GAIN_FIELDS)
 class ActuatorGains:
-    """Scales the stiffness and damping of each of the robot's position servos by one factor per servo."""
+    """Scales the stiffness and damping of each of the robot's position servos by one factor per
+    servo.
+    """
 
     label = "reset.gains"
 
@@ -187,7 +217,9 @@ class ActuatorGains:
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes gains and biases."""
-        self._gains.write(mask, random_uniform(env, self.label, len(env.index.ctrl), self._low, self._high))
+        self._gains.write(
+            mask, random_uniform(env, self.label, len(env.index.ctrl), self._low, self._high)
+        )
 
 
 def _write(view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor) -> None:
@@ -201,11 +233,19 @@ def _write_robot(env: EnvView, mask: torch.Tensor, command: torch.Tensor) -> Non
     tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
 
 
-def _write_cube(env: EnvView, mask: torch.Tensor, name: str, dx: torch.Tensor, dy: torch.Tensor, yaw: torch.Tensor) -> None:
+def _write_cube(
+    env: EnvView,
+    mask: torch.Tensor,
+    name: str,
+    dx: torch.Tensor,
+    dy: torch.Tensor,
+    yaw: torch.Tensor,
+) -> None:
     """Moves the masked worlds' cube off the place where the simulation's reset has put it."""
     view = pose_w(env, name)
     place = view[:, :3] + torch.stack((dx, dy, torch.zeros_like(dx)), dim=1)
-    # Float64, because a float32 cosine need not be that of any angle, and a file of layouts has the angle.
+    # Float64, because a float32 cosine need not be that of any angle, and a file of layouts has the
+    # angle.
     _write(view, mask, torch.cat((place, quat_from_yaw(yaw.double()).to(place.dtype)), dim=1))
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 
 from mjstack.managers.base import EnvView, require_positive
-from mjstack.mdp.geometry import above_table, aperture_center, jaw_forces, joint_velocities, pose_w
+from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, joint_velocities, pose_w
 
 
 def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> torch.Tensor:
-    """Nearness of the aperture centre to a point above an object: ``1 - tanh(distance / scale)``.
+    """Nearness of the grasp point to a point above an object: ``1 - tanh(distance / scale)``.
 
     Args:
         env: The environment.
@@ -18,7 +18,7 @@ def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> to
         height: How far above the object's centre the point is [m].
     """
     require_positive("scale", scale)
-    offset = pose_w(env, object)[:, :3] - aperture_center(env)
+    offset = pose_w(env, object)[:, :3] - grasp_point(env)
     offset[:, 2] += height
     return 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
 
@@ -29,13 +29,17 @@ def grasp(env: EnvView, *, object: str, force: float = 0.05) -> torch.Tensor:
 
 
 def lift(env: EnvView, *, object: str, height: float) -> torch.Tensor:
-    """Height of a cube's lowest corner above the table as a fraction of ``height`` [m], from 0 to 1."""
+    """Height of a cube's lowest corner above the table as a fraction of ``height`` [m], from 0 to
+    1.
+    """
     require_positive("height", height)
     return (above_table(env, object) / height).clamp(0.0, 1.0)
 
 
 def place(env: EnvView, *, a: str, b: str, scale: float) -> torch.Tensor:
-    """Nearness of cube ``a`` to its place on cube ``b``, while it is off the table: ``1 - tanh(distance / scale)``."""
+    """Nearness of cube ``a`` to its place on cube ``b``, while it is off the table: ``1 -
+    tanh(distance / scale)``.
+    """
     require_positive("scale", scale)
     offset = pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
     offset[:, 2] += 2.0 * env.cfg.scene.cube_half
@@ -44,12 +48,12 @@ def place(env: EnvView, *, a: str, b: str, scale: float) -> torch.Tensor:
 
 
 def success(env: EnvView) -> torch.Tensor:
-    """1 in a frame in which the task is achieved."""
+    """1 in a step in which the task is achieved."""
     return env.success.to(torch.float32)
 
 
 def action_rate(env: EnvView) -> torch.Tensor:
-    """Squared change of the action since the last frame, summed."""
+    """Squared change of the action since the last step, summed."""
     return (env.action - env.previous_action).square().sum(1)
 
 

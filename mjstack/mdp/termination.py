@@ -14,11 +14,11 @@ from mjstack.scene import table_top
 from mjstack.sim import LOST_PHYSICS
 
 
-def time_out(env: EnvView, *, frames: int) -> torch.Tensor:
-    """After this many frames."""
-    if frames < 1:
-        raise ParameterError("frames", frames, "an integer of at least 1")
-    return env.frame >= frames
+def time_out(env: EnvView, *, steps: int) -> torch.Tensor:
+    """After this many steps."""
+    if steps < 1:
+        raise ParameterError("steps", steps, "an integer of at least 1")
+    return env.episode_step >= steps
 
 
 def success(env: EnvView) -> torch.Tensor:
@@ -47,7 +47,9 @@ class CubeOffTable:
 
 
 class JointLimit:
-    """When a joint of the robot is outside its range by more than a part of it: MuJoCo's limits are soft."""
+    """When a joint of the robot is outside its range by more than a part of it: MuJoCo's limits are
+    soft.
+    """
 
     def __init__(self, env: EnvView, *, margin: float) -> None:
         """Reads the ranges.
@@ -63,7 +65,8 @@ class JointLimit:
             raise ParameterError("margin", margin, "a number that is not negative")
         limits = robot(env).range
         room = margin * (limits[:, 1] - limits[:, 0])
-        self._low, self._high = limits[:, 0] - room, limits[:, 1] + room
+        self._low = limits[:, 0] - room
+        self._high = limits[:, 1] + room
 
     def __call__(self, env: EnvView) -> torch.Tensor:
         """True for worlds with a joint outside, shape ``(nworld,)``."""

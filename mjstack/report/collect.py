@@ -1,4 +1,6 @@
-"""A dataset of demonstrations as tables: what is in it, how good the expert was, and how to load it."""
+"""A dataset of demonstrations as tables: what is in it, how good the expert was, and how to load
+it.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ for name in ("observation.state", "action"):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ColumnRange:
-    """What one number of the frames ranges over.
+    """What one number of the steps ranges over.
 
     Attributes:
         name: Feature and number, such as ``action shoulder_pan.pos``.
@@ -42,7 +44,9 @@ class ColumnRange:
     high: float
 
 
-def to_markdown(title: str, facts: Mapping[str, Value], ranges: Sequence[ColumnRange], folder: str) -> str:
+def to_markdown(
+    title: str, facts: Mapping[str, Value], ranges: Sequence[ColumnRange], folder: str
+) -> str:
     """Facts, ranges, and the lines that load the first episode.
 
     Args:
@@ -53,7 +57,21 @@ def to_markdown(title: str, facts: Mapping[str, Value], ranges: Sequence[ColumnR
     """
     lines = [f"# {title}", "", "| what | value |", "| --- | ---: |"]
     lines += [f"| {name} | {escape_cell(format_value(value))} |" for name, value in facts.items()]
-    lines += ["", "| number | unit | smallest | mean | largest |", "| --- | --- | ---: | ---: | ---: |"]
-    lines += [f"| {row.name} | {row.unit} | {row.low:.4f} | {row.mean:.4f} | {row.high:.4f} |" for row in ranges]
-    lines += ["", "With pyarrow alone:", "", "```python", LOADING.format(folder=folder).rstrip("\n"), "```"]
+    lines += [
+        "",
+        "| number | unit | smallest | mean | largest |",
+        "| --- | --- | ---: | ---: | ---: |",
+    ]
+    lines += [
+        f"| {row.name} | {row.unit} | {row.low:.4f} | {row.mean:.4f} | {row.high:.4f} |"
+        for row in ranges
+    ]
+    lines += [
+        "",
+        "With pyarrow alone:",
+        "",
+        "```python",
+        LOADING.format(folder=folder).rstrip("\n"),
+        "```",
+    ]
     return "\n".join(lines) + "\n"

@@ -22,13 +22,16 @@ _SERIES = (
 )
 
 
-def save_scaling_curves(path: Path, rows: Sequence[ScalingRow], substeps: int, title: str) -> None:
+def save_scaling_curves(
+    path: Path, rows: Sequence[ScalingRow], decimation: int, title: str
+) -> None:
     """Draws both panels.
 
     Args:
         path: The picture.
-        rows: The table. A case that did not pass interrupts its curves, whatever it has measured, and a cross marks it.
-        substeps: Physics steps in an environment step: both are drawn as world-steps/s.
+        rows: The table. A case that did not pass interrupts its curves, whatever it has measured,
+            and a cross marks it.
+        decimation: Physics steps in an environment step: both are drawn as world-steps/s.
         title: What is shown.
     """
     figure, (rate, cost) = plt.subplots(1, 2, figsize=(12, 4.8), layout="constrained")
@@ -38,8 +41,11 @@ def save_scaling_curves(path: Path, rows: Sequence[ScalingRow], substeps: int, t
             continue
         worlds = [row.nworld for row in mine]
         for name, line, marker, what in _SERIES:
-            factor = substeps if name == "env_steps_per_s" else 1
-            values = [factor * _number(getattr(row, name)) if row.status == PASS else math.nan for row in mine]
+            factor = decimation if name == "env_steps_per_s" else 1
+            values = [
+                factor * _number(getattr(row, name)) if row.status == PASS else math.nan
+                for row in mine
+            ]
             if all(math.isnan(value) for value in values):
                 continue
             label = f"{LABELS[backend]}, {what}"
@@ -51,10 +57,16 @@ def save_scaling_curves(path: Path, rows: Sequence[ScalingRow], substeps: int, t
             bottom = [0.02 if backend == "mjwarp" else 0.06] * len(failed)
             axes.plot(failed, bottom, "x", color=color, transform=axes.get_xaxis_transform())
     at = crossover(rows)
-    for axes, name, goes in ((rate, "world-steps/s", "up"), (cost, "ms per physics step of all worlds", "down")):
+    for axes, name, goes in (
+        (rate, "world-steps/s", "up"),
+        (cost, "ms per physics step of all worlds", "down"),
+    ):
         axes.set(xscale="log", yscale="log", xlabel="worlds", ylabel=name, title=f"{name}")
         axes.set_xscale("log", base=2)
-        axes.set_xticks(sorted({row.nworld for row in rows}), [f"{n:,}" for n in sorted({row.nworld for row in rows})])
+        axes.set_xticks(
+            sorted({row.nworld for row in rows}),
+            [f"{n:,}" for n in sorted({row.nworld for row in rows})],
+        )
         axes.tick_params(axis="x", rotation=45)
         axes.grid(alpha=0.3, which="both" if goes == "up" else "major")
         if at is not None:

@@ -11,7 +11,10 @@ def to_markdown(report: Report) -> str:
     """Summary table, pictures, then every gate with thresholds and metrics."""
     lines = [f"# mjstack run: {report.status.value}", ""]
     lines += ["| gate | status | seconds | what it says |", "| --- | --- | ---: | --- |"]
-    lines += [f"| {g.name} | {g.status.value} | {g.seconds:.1f} | {escape_cell(g.reason)} |" for g in report.gates]
+    lines += [
+        f"| {g.name} | {g.status.value} | {g.seconds:.1f} | {escape_cell(g.reason)} |"
+        for g in report.gates
+    ]
     for picture in report.pictures:
         lines += ["", f"![{picture}]({picture})"]
     for gate in report.gates:
@@ -24,7 +27,11 @@ def to_markdown(report: Report) -> str:
             lines += ["", f"### {table.title}", "", *_rows(table)]
     lines += ["", "## Provenance", "", "| what | value |", "| --- | --- |"]
     for key, value in report.provenance.items():
-        text = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else format_value(value)
+        text = (
+            ", ".join(f"{k} {v}" for k, v in value.items())
+            if isinstance(value, dict)
+            else format_value(value)
+        )
         lines.append(f"| {key} | {text} |")
     skipped = [gate for gate in report.gates if gate.status is Status.skipped]
     if skipped:
@@ -60,7 +67,10 @@ def headline(gate: GateResult) -> str:
 def _rows(table: Table) -> list[str]:
     """A table as Markdown: its first column is text, the others are numbers."""
     rule = ["---", *["---:"] * (len(table.header) - 1)]
-    return [f"| {' | '.join(escape_cell(cell) for cell in row)} |" for row in (table.header, rule, *table.rows)]
+    return [
+        f"| {' | '.join(escape_cell(cell) for cell in row)} |"
+        for row in (table.header, rule, *table.rows)
+    ]
 
 
 def _table(title: str, values: dict[str, Value]) -> list[str]:

@@ -31,19 +31,26 @@ class SceneCamera:
         Raises:
             MjstackError: This machine cannot draw offscreen.
         """
-        self._model, self._data = model, mujoco.MjData(model)
+        self._model = model
+        self._data = mujoco.MjData(model)
         try:
             self._renderer = mujoco.Renderer(model, height, width)
         except Exception as error:  # OpenGL loaders fail in their own ways
             gl = os.environ.get("MUJOCO_GL", "not set")
             raise MjstackError(
-                f"offscreen rendering fails (MUJOCO_GL={gl}: {type(error).__name__}). Set MUJOCO_GL=egl or osmesa."
+                f"offscreen rendering fails (MUJOCO_GL={gl}: {type(error).__name__}). Set"
+                " MUJOCO_GL=egl or osmesa."
             ) from error
         table = model.geom("table").id
         self._camera = mujoco.MjvCamera()
-        self._camera.lookat = [0.62 * model.geom_pos[table][0], 0.0, model.geom_pos[table][2] + 0.08]
+        self._camera.lookat = [
+            0.62 * model.geom_pos[table][0],
+            0.0,
+            model.geom_pos[table][2] + 0.08,
+        ]
         self._camera.distance = 0.55 + 1.0 * float(model.geom_pos[table][0])
-        self._camera.azimuth, self._camera.elevation = 140.0, -24.0
+        self._camera.azimuth = 140.0
+        self._camera.elevation = -24.0
 
     def draw(self, qpos: np.ndarray) -> np.ndarray:
         """An image of one state, shape ``(height, width, 3)``, uint8."""
@@ -58,7 +65,12 @@ class SceneCamera:
 
 
 def save_pictures(
-    folder: Path, model: mujoco.MjModel, qpos: np.ndarray, cubes: np.ndarray, half: float, title: str
+    folder: Path,
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    cubes: np.ndarray,
+    half: float,
+    title: str,
 ) -> list[str]:
     """Writes scene.png and trajectories.png.
 
@@ -85,22 +97,22 @@ def save_pictures(
     return ["scene.png", "trajectories.png"]
 
 
-def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, frame_dt: float) -> None:
+def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, step_dt: float) -> None:
     """Writes an mp4 of an episode in real time.
 
     Args:
         path: The file.
         model: The scene with visuals.
         qpos: States at frame ends, shape ``(frames, nq)``.
-        frame_dt: Time between them [s].
+        step_dt: Time between them [s].
 
     Raises:
         MjstackError: This machine cannot draw offscreen, or lacks the extra ``video``.
     """
     writer_of = require_video()
-    skip = max(1, round(1.0 / (25.0 * frame_dt)))
+    skip = max(1, round(1.0 / (25.0 * step_dt)))
     camera = SceneCamera(model, 640, 480)
-    writer = writer_of(str(path), (640, 480), fps=1.0 / (frame_dt * skip), macro_block_size=16)
+    writer = writer_of(str(path), (640, 480), fps=1.0 / (step_dt * skip), macro_block_size=16)
     writer.send(None)
     for state in qpos[::skip]:
         writer.send(np.ascontiguousarray(camera.draw(state)))
@@ -113,7 +125,9 @@ def require_video() -> Callable[..., Any]:
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise MjstackError("video=true needs the extra 'video'. Run: pip install 'mjstack[video]'.") from error
+        raise MjstackError(
+            "video=true needs the extra 'video'. Run: pip install 'mjstack[video]'."
+        ) from error
     return imageio_ffmpeg.write_frames
 
 
@@ -125,10 +139,22 @@ def _plot_trajectories(path: Path, cubes: np.ndarray, half: float, title: str) -
             axes.plot(mm[:, 1], mm[:, row], color=color, label=name)
             for at, fill in ((mm[0], False), (mm[-1], True)):
                 corner = (at[1] - 1e3 * half, at[row] - 1e3 * half)
-                square = plt.Rectangle(corner, 2e3 * half, 2e3 * half, color=color, fill=fill, alpha=0.5 if fill else 1.0)
+                square = plt.Rectangle(
+                    corner,
+                    2e3 * half,
+                    2e3 * half,
+                    color=color,
+                    fill=fill,
+                    alpha=0.5 if fill else 1.0,
+                )
                 axes.add_patch(square)
         height.plot(mm[:, 2], color=color, label=name)
-    side.set(xlabel="y [mm]", ylabel="z [mm]", title="from the front (outline: start, filled: end)", aspect="equal")
+    side.set(
+        xlabel="y [mm]",
+        ylabel="z [mm]",
+        title="from the front (outline: start, filled: end)",
+        aspect="equal",
+    )
     above.set(xlabel="y [mm]", ylabel="x [mm]", title="from above", aspect="equal")
     height.set(xlabel="frame", ylabel="z [mm]", title="height of the centre")
     for axes in (side, above, height):
@@ -140,18 +166,24 @@ def _plot_trajectories(path: Path, cubes: np.ndarray, half: float, title: str) -
     plt.close(figure)
 
 
-def _plot_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray, cubes: np.ndarray, half: float, title: str) -> None:
+def _plot_scene(
+    path: Path, model: mujoco.MjModel, qpos: np.ndarray, cubes: np.ndarray, half: float, title: str
+) -> None:
     """A drawing in lines for machines without OpenGL: arm joints, table and cubes."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
     figure = plt.figure(figsize=(7, 5.5), layout="constrained")
     axes = figure.add_subplot(projection="3d")
-    anchors = data.xanchor[[j for j in range(model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]]
+    anchors = data.xanchor[
+        [j for j in range(model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
+    ]
     axes.plot(*np.vstack([[0, 0, 0], anchors]).T, "-o", color="0.3")
     table = model.geom("table").id
-    center, size = model.geom_pos[table], model.geom_size[table]
-    low, extent = center - size, 2.0 * size
+    center = model.geom_pos[table]
+    size = model.geom_size[table]
+    low = center - size
+    extent = 2.0 * size
     axes.bar3d(*low, *extent, color="#b8a894", alpha=0.4)
     for pos, color in zip(cubes, CUBE_COLORS.values(), strict=True):
         axes.bar3d(*(pos - half), *([2.0 * half] * 3), color=color)
@@ -161,28 +193,34 @@ def _plot_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray, cubes: np.n
     plt.close(figure)
 
 
-def save_study(path: Path, names: list[str], ratios: np.ndarray, accepted: list[int], nworld: int, title: str) -> None:
-    """Writes a bar per variant: its time over that of the base, and the worlds that were accepted.
+def save_study(
+    path: Path, names: list[str], ratios: np.ndarray, succeeded: list[int], nworld: int, title: str
+) -> None:
+    """Writes a bar per variant: its time over that of the base, and the worlds that succeeded.
 
     Args:
         path: The file.
         names: The variants.
         ratios: Median, smallest and largest ratio of each, shape ``(n, 3)``.
-        accepted: Accepted worlds of each.
+        succeeded: Succeeded worlds of each.
         nworld: Of how many.
         title: What is shown.
     """
-    figure, (time, worlds) = plt.subplots(1, 2, figsize=(11, 1.5 + 0.3 * len(names)), layout="constrained", sharey=True)
+    figure, (time, worlds) = plt.subplots(
+        1, 2, figsize=(11, 1.5 + 0.3 * len(names)), layout="constrained", sharey=True
+    )
     rows = np.arange(len(names))
-    colors = ["#2457c7" if count == nworld else "#cc2a24" for count in accepted]
+    colors = ["#2457c7" if count == nworld else "#cc2a24" for count in succeeded]
     middle, low, high = ratios.T
-    time.barh(rows, middle, xerr=(middle - low, high - middle), color=colors, ecolor="0.4", capsize=2)
+    time.barh(
+        rows, middle, xerr=(middle - low, high - middle), color=colors, ecolor="0.4", capsize=2
+    )
     time.axvline(1.0, color="0.3", linewidth=1.0)
     time.set(xlabel="time per step over that of base (whiskers: all repetitions)")
     time.set_yticks(rows, names)
     time.invert_yaxis()
-    worlds.barh(rows, accepted, color=colors)
-    worlds.set(xlabel=f"accepted of {nworld} worlds (red: not all)", xlim=(0, nworld))
+    worlds.barh(rows, succeeded, color=colors)
+    worlds.set(xlabel=f"succeeded of {nworld} worlds (red: not all)", xlim=(0, nworld))
     for axes in (time, worlds):
         axes.grid(alpha=0.3, axis="x")
     figure.suptitle(title)

@@ -15,7 +15,9 @@ from mjstack.report.record import Value
 PACKAGES = ("mjstack", "mujoco", "mujoco-warp", "warp-lang", "torch", "mink", "hydra-core", "numpy")
 
 
-def collect_provenance(*, config_yaml: str, model_text: str, device: str, driver: str) -> dict[str, Value | dict[str, Value]]:
+def collect_provenance(
+    *, config_yaml: str, model_text: str, device: str, driver: str
+) -> dict[str, Value | dict[str, Value]]:
     """Collects what is needed to judge and to repeat a run.
 
     Args:
@@ -54,13 +56,21 @@ def _cpu_name() -> str:
 
 
 def _git_commit() -> str:
-    """The checkout's commit, marked where files differ from it; an installed wheel has none, whatever repository it lies in."""
+    """The checkout's commit, marked where files differ from it; an installed wheel has none,
+    whatever repository it lies in.
+    """
     root = Path(__file__).resolve().parents[2]
     git = ["git", "-C", str(root)]
     try:
         top, commit, dirty = (
-            subprocess.run([*git, *args], capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-            for args in (("rev-parse", "--show-toplevel"), ("rev-parse", "HEAD"), ("status", "--porcelain"))
+            subprocess.run(
+                [*git, *args], capture_output=True, text=True, timeout=10, check=True
+            ).stdout.strip()
+            for args in (
+                ("rev-parse", "--show-toplevel"),
+                ("rev-parse", "HEAD"),
+                ("status", "--porcelain"),
+            )
         )
     except (OSError, subprocess.SubprocessError):
         return "no checkout"

@@ -28,7 +28,8 @@ class ReachLevel:
         height: Of the points above a cube's centre [m].
         gripper: ``open`` or ``closed``.
         residual: Distance that is left at each point [m], shape ``(ny, nx)``.
-        tilt: Smallest tilt of the gripper from vertical [rad], NaN where the point is not reached, shape ``(ny, nx)``.
+        tilt: Smallest tilt of the gripper from vertical [rad], NaN where the point is not reached,
+            shape ``(ny, nx)``.
     """
 
     name: str
@@ -51,9 +52,11 @@ class CubeRegion:
         name: The cube.
         place: Its nominal x and y [m].
         configured: Half-widths of ``reset=randomized`` [m].
-        square: Largest half-width of a square around the place that is reached with the margin [m]; 0 where none is.
+        square: Largest half-width of a square around the place that is reached with the margin [m];
+            0 where none is.
         largest: Half-widths of the largest rectangle likewise [m].
-        tilt: Largest of the smallest tilts in the configured region at the grasp [rad]; NaN where some is not reached.
+        tilt: Largest of the smallest tilts in the configured region at the grasp [rad]; NaN where
+            some is not reached.
         reached: Whether the configured region is, with the margin.
     """
 
@@ -91,7 +94,11 @@ def to_csv(found: ReachMap) -> str:
     """A row per point; the tilt is empty where the arm does not get to."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    parts = [f"{level.name}_{part}" for level in found.levels for part in ("reached", "residual_m", "tilt_deg")]
+    parts = [
+        f"{level.name}_{part}"
+        for level in found.levels
+        for part in ("reached", "residual_m", "tilt_deg")
+    ]
     writer.writerow(["x_m", "y_m", *parts])
     for row, y in enumerate(found.y):
         for column, x in enumerate(found.x):
@@ -99,7 +106,11 @@ def to_csv(found: ReachMap) -> str:
             for level in found.levels:
                 tilt = level.tilt[row, column]
                 reached = np.isfinite(tilt)
-                cells += [str(int(reached)), f"{level.residual[row, column]:.3g}", f"{np.degrees(tilt):.2f}" if reached else ""]
+                cells += [
+                    str(int(reached)),
+                    f"{level.residual[row, column]:.3g}",
+                    f"{np.degrees(tilt):.2f}" if reached else "",
+                ]
             writer.writerow(cells)
     return out.getvalue()
 
@@ -122,16 +133,26 @@ def to_npz(found: ReachMap) -> bytes:
 
 def to_markdown(found: ReachMap, notes: Sequence[str], picture: str = "") -> str:
     """Both tables and the picture."""
-    lines = [f"# {found.title}", "", "| cube | place | configured | largest square | largest rectangle | tilt at most |"]
+    lines = [
+        f"# {found.title}",
+        "",
+        "| cube | place | configured | largest square | largest rectangle | tilt at most |",
+    ]
     lines += ["| --- | --- | --- | ---: | ---: | ---: |"]
     for region in found.regions:
         place = f"({region.place[0]:.3f}, {region.place[1]:.3f})"
-        verdict = "reached" if region.reached else "NOT reached"
-        configured = f"{region.configured[0]:.3f} x {region.configured[1]:.3f}, {verdict}"
+        result = "reached" if region.reached else "NOT reached"
+        configured = f"{region.configured[0]:.3f} x {region.configured[1]:.3f}, {result}"
         largest = f"{region.largest[0]:.3f} x {region.largest[1]:.3f}"
         tilt = f"{np.degrees(region.tilt):.0f}°" if np.isfinite(region.tilt) else ""
-        lines.append(f"| {region.name} | {place} | {configured} | {region.square:.3f} | {largest} | {tilt} |")
-    lines += ["", "| level | above the cube's centre | gripper | reached | tilt |", "| --- | ---: | --- | ---: | ---: |"]
+        lines.append(
+            f"| {region.name} | {place} | {configured} | {region.square:.3f} | {largest} | {tilt} |"
+        )
+    lines += [
+        "",
+        "| level | above the cube's centre | gripper | reached | tilt |",
+        "| --- | ---: | --- | ---: | ---: |",
+    ]
     for level in found.levels:
         tilt = (
             f"{np.degrees(np.nanmin(level.tilt)):.0f}° to {np.degrees(np.nanmax(level.tilt)):.0f}°"
@@ -139,44 +160,74 @@ def to_markdown(found: ReachMap, notes: Sequence[str], picture: str = "") -> str
             else ""
         )
         share = f"{100.0 * level.reached.mean():.1f} %"
-        lines.append(f"| {level.name} | {level.height:.3f} m | {level.gripper} | {share} | {tilt} |")
+        lines.append(
+            f"| {level.name} | {level.height:.3f} m | {level.gripper} | {share} | {tilt} |"
+        )
     if picture:
         lines += ["", f"![{picture}]({picture})"]
     return "\n".join([*lines, "", *(f"- {note}" for note in notes)]) + "\n"
 
 
 def save_map(path: Path, found: ReachMap) -> None:
-    """Draws a panel per level: the tilt as colour, hatched where the arm does not get to, table, cubes and regions."""
+    """Draws a panel per level: the tilt as colour, hatched where the arm does not get to, table,
+    cubes and regions.
+    """
     width = found.x[-1] - found.x[0]
     panel = 3.6 * max(0.6, width / (found.y[-1] - found.y[0])) + 1.0
-    figure, panels = plt.subplots(1, len(found.levels), figsize=(panel * len(found.levels) + 1.2, 5.6), layout="constrained")
-    top = max((np.degrees(np.nanmax(level.tilt)) for level in found.levels if level.reached.any()), default=90.0)
+    figure, panels = plt.subplots(
+        1, len(found.levels), figsize=(panel * len(found.levels) + 1.2, 5.6), layout="constrained"
+    )
+    top = max(
+        (np.degrees(np.nanmax(level.tilt)) for level in found.levels if level.reached.any()),
+        default=90.0,
+    )
     image = None
     for axes, level in zip(np.atleast_1d(panels), found.levels, strict=True):
         axes.set_facecolor("0.92")
-        axes.add_patch(_box(_middle(found.x), _middle(found.y), _span(found.x), _span(found.y), hatch="////", ec="0.6", lw=0))
+        axes.add_patch(
+            _box(
+                _middle(found.x),
+                _middle(found.y),
+                _span(found.x),
+                _span(found.y),
+                hatch="////",
+                ec="0.6",
+                lw=0,
+            )
+        )
         drawn = np.ma.masked_invalid(np.degrees(level.tilt))
-        image = axes.pcolormesh(found.x, found.y, drawn, vmin=0.0, vmax=top, cmap="viridis", shading="nearest")
+        image = axes.pcolormesh(
+            found.x, found.y, drawn, vmin=0.0, vmax=top, cmap="viridis", shading="nearest"
+        )
         (x, y), (half_x, half_y) = found.table
         axes.add_patch(_box(x, y, half_x, half_y, fill=False, ec="k", lw=1.5))
         for region in found.regions:
             color = _COLORS[region.name.removesuffix("_cube")]
             axes.plot(*region.place, "s", color=color, markersize=7, markeredgecolor="w")
             axes.add_patch(_box(*region.place, *region.configured, fill=False, ec=color, lw=1.8))
-            axes.add_patch(_box(*region.place, *region.largest, fill=False, ec=color, lw=1.2, ls=":"))
-        axes.set(title=f"{level.name}: {level.height:.3f} m above, {level.gripper}", xlabel="x [m]", aspect="equal")
+            axes.add_patch(
+                _box(*region.place, *region.largest, fill=False, ec=color, lw=1.2, ls=":")
+            )
+        axes.set(
+            title=f"{level.name}: {level.height:.3f} m above, {level.gripper}",
+            xlabel="x [m]",
+            aspect="equal",
+        )
     np.atleast_1d(panels)[0].set_ylabel("y [m]")
     if image is not None:
         figure.colorbar(image, ax=panels, label="smallest tilt of the gripper from vertical [deg]")
     figure.suptitle(
-        f"{found.title}\nhatched: not reached; squares: cubes; solid: configured region; dotted: largest with margin"
+        f"{found.title}\nhatched: not reached; squares: cubes; solid: configured region; dotted:"
+        " largest with margin"
     )
     figure.savefig(path, dpi=100)
     plt.close(figure)
 
 
 def _box(x: float, y: float, half_x: float, half_y: float, **style: Any) -> Rectangle:
-    return Rectangle((x - half_x, y - half_y), 2.0 * half_x, 2.0 * half_y, **({"fill": False} | style))
+    return Rectangle(
+        (x - half_x, y - half_y), 2.0 * half_x, 2.0 * half_y, **({"fill": False} | style)
+    )
 
 
 def _middle(values: np.ndarray) -> float:

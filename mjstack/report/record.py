@@ -92,12 +92,16 @@ class Report:
             "gates": gates,
             "pictures": self.pictures,
         }
-        write_atomic(folder / "report.json", json.dumps(_finite(data), indent=2, allow_nan=False) + "\n")
+        write_atomic(
+            folder / "report.json", json.dumps(_finite(data), indent=2, allow_nan=False) + "\n"
+        )
         write_atomic(folder / "report.md", to_markdown(self))
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Writes a file beside its place and moves it there: a full disk or a kill leaves the old one."""
+    """Writes a file beside its place and moves it there: a full disk or a kill leaves the
+    old one.
+    """
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -22,21 +22,23 @@ class ScalingRow:
         backend: ``mjwarp`` or ``native``.
         status: pass, fail, out of memory, timeout, crashed, or not run.
         reason: Why, in one line; empty for a pass.
-        accepted: Worlds whose episode was accepted.
-        ms_per_step: One batched physics step under a held command [ms], median; ``_min`` and ``_max`` as well.
+        succeeded: Worlds whose episode succeeded.
+        ms_per_step: One batched physics step under a held command [ms], median; ``_min`` and
+            ``_max`` as well.
         world_steps_per_s: The same as physics steps of all worlds per second.
         ms_per_env_step: ``env.step`` with all managers [ms], median.
         env_steps_per_s: The same as control intervals of all worlds per second.
-        managers_over_physics: What the managers add to physics in ``env.step``, as a fraction of it.
+        managers_over_physics: What the managers add to physics in ``env.step``, as a fraction of
+            it.
         managers_alone_over_physics: The time of the managers alone, likewise.
         episode_s: The validated episode [s], median.
         bare_ratio: That over bare steps of the same commands.
         gpu_memory_arrays_mib: GPU memory that arrays hold [MiB], most of all sections.
         gpu_memory_whole_gpu_mib: GPU memory that is taken on the whole GPU [MiB], likewise.
-        gpu_power_mean_w: Mean power during the episodes' frames alone [W].
+        gpu_power_mean_w: Mean power during the episodes' steps alone [W].
         process_peak_mib: Host memory [MiB]; of native cases.
         build_s: Building the worlds, compilation included [s].
-        warm_up_s: An episode's first frame, which runs eagerly [s].
+        warm_up_s: An episode's first step, which runs eagerly [s].
         capture_s: Capturing an episode's graph, its warm-up not included [s].
         seconds: The whole case, start of its process included [s].
         hardware: Backend and hardware.
@@ -47,7 +49,7 @@ class ScalingRow:
     backend: str
     status: str = NOT_RUN
     reason: str = ""
-    accepted: Value = None
+    succeeded: Value = None
     ms_per_step: Value = None
     ms_per_step_min: Value = None
     ms_per_step_max: Value = None
@@ -74,7 +76,9 @@ class ScalingRow:
     git_commit: str = ""
 
 
-def to_markdown(rows: Sequence[ScalingRow], title: str, notes: Sequence[str], picture: str = "") -> str:
+def to_markdown(
+    rows: Sequence[ScalingRow], title: str, notes: Sequence[str], picture: str = ""
+) -> str:
     """The table for people, what it says about the crossover, and where its rows come from."""
     lines = [f"# {title}", ""]
     lines += [
@@ -87,15 +91,20 @@ def to_markdown(rows: Sequence[ScalingRow], title: str, notes: Sequence[str], pi
         lines += ["", f"![{title}]({picture})"]
     lines += ["", describe_crossover(rows), ""]
     lines += [f"- {note}" for note in notes]
-    for name, values in (("hardware", {row.hardware for row in rows}), ("commit", {row.git_commit for row in rows})):
+    for name, values in (
+        ("hardware", {row.hardware for row in rows}),
+        ("commit", {row.git_commit for row in rows}),
+    ):
         lines += [f"- {name}: {value}" for value in sorted(values - {""})]
     return "\n".join(lines) + "\n"
 
 
 def crossover(rows: Sequence[ScalingRow]) -> float | None:
-    """Number of worlds from which MJWarp makes more world-steps/s than native MuJoCo; None where the rows do not show it.
+    """Number of worlds from which MJWarp makes more world-steps/s than native MuJoCo; None where
+    the rows do not show it.
 
-    Interpolated between the two numbers of worlds that bracket it, straight in logarithms. Cases that failed do not count.
+    Interpolated between the two numbers of worlds that bracket it, straight in logarithms. Cases
+    that failed do not count.
     """
     rates = {
         (row.backend, row.nworld): float(row.world_steps_per_s)
@@ -104,7 +113,9 @@ def crossover(rows: Sequence[ScalingRow]) -> float | None:
     }
     both = sorted({n for _, n in rates if ("mjwarp", n) in rates and ("native", n) in rates})
     gap = [math.log(rates["mjwarp", n] / rates["native", n]) for n in both]
-    for (n0, g0), (n1, g1) in zip(zip(both, gap, strict=True), list(zip(both, gap, strict=True))[1:], strict=False):
+    for (n0, g0), (n1, g1) in zip(
+        zip(both, gap, strict=True), list(zip(both, gap, strict=True))[1:], strict=False
+    ):
         if g0 <= 0.0 < g1:
             return math.exp(math.log(n0) + (math.log(n1) - math.log(n0)) * -g0 / (g1 - g0))
     return None
@@ -115,7 +126,10 @@ def describe_crossover(rows: Sequence[ScalingRow]) -> str:
     at = crossover(rows)
     if at is None:
         return "Crossover: the cases that passed do not show MJWarp passing native MuJoCo."
-    return f"Crossover: from about {at:,.0f} worlds on MJWarp makes more physics steps than native MuJoCo on all cores."
+    return (
+        f"Crossover: from about {at:,.0f} worlds on MJWarp makes more physics steps than native"
+        " MuJoCo on all cores."
+    )
 
 
 def _number(value: Value, form: str = ",.0f") -> str:
@@ -125,7 +139,7 @@ def _number(value: Value, form: str = ",.0f") -> str:
 _COLUMNS = (
     ("worlds", lambda r: f"{r.nworld:,}"),
     ("backend", lambda r: r.backend),
-    ("accepted", lambda r: _number(r.accepted)),
+    ("succeeded", lambda r: _number(r.succeeded)),
     ("ms per step", lambda r: _number(r.ms_per_step, ".4g")),
     ("world-steps/s", lambda r: _number(r.world_steps_per_s)),
     ("env-steps/s", lambda r: _number(r.env_steps_per_s)),

@@ -15,7 +15,8 @@ class StudyRow:
     Attributes:
         variant: Its name.
         changes: What it changes.
-        status: ``pass`` if it was measured, ``fail`` with its reason, ``skip`` if it changes nothing.
+        status: ``pass`` if it was measured, ``fail`` with its reason, ``skip`` if it changes
+            nothing.
         reason: Why.
         ms_per_batched_step: Median time of one step of all worlds, cube in hand [ms].
         ms_min: Shortest of the repetitions [ms].
@@ -25,9 +26,10 @@ class StudyRow:
         ratio_min: Smallest.
         ratio_max: Largest.
         worlds: Number of worlds.
-        accepted: Worlds that the acceptance of the whole episode passed.
+        succeeded: Worlds that the check of the whole episode passed.
         broken_rules: Which rules the others broke, and how many each.
-        iteration_limit_worlds: Worlds whose solver stopped at its iteration limit in some step of the episode.
+        iteration_limit_worlds: Worlds whose solver stopped at its iteration limit in some step of
+            the episode.
         line_search_limit_worlds: Likewise at the limit of the line search.
         peak_rows: Most constraint rows of a world.
         xy_err_max_m: Largest distance of the stack's centres at the end [m].
@@ -45,7 +47,7 @@ class StudyRow:
     ratio_min: float | None = None
     ratio_max: float | None = None
     worlds: int | None = None
-    accepted: int | None = None
+    succeeded: int | None = None
     broken_rules: str = ""
     iteration_limit_worlds: int | None = None
     line_search_limit_worlds: int | None = None
@@ -53,18 +55,38 @@ class StudyRow:
     xy_err_max_m: float | None = None
 
 
-def to_markdown(rows: Sequence[StudyRow], title: str, notes: Sequence[str], picture: str = "") -> str:
+def to_markdown(
+    rows: Sequence[StudyRow], title: str, notes: Sequence[str], picture: str = ""
+) -> str:
     """The columns that a reader compares."""
-    head = ("variant", "changes", "ms per step", "ratio to base", "accepted", "iteration limit", "line-search limit", "notes")
-    lines = [f"# {title}", "", f"| {' | '.join(head)} |", "| --- | --- | ---: | ---: | ---: | ---: | ---: | --- |"]
+    head = (
+        "variant",
+        "changes",
+        "ms per step",
+        "ratio to base",
+        "succeeded",
+        "iteration limit",
+        "line-search limit",
+        "notes",
+    )
+    lines = [
+        f"# {title}",
+        "",
+        f"| {' | '.join(head)} |",
+        "| --- | --- | ---: | ---: | ---: | ---: | ---: | --- |",
+    ]
     for row in rows:
-        ratio = "" if row.ratio is None else f"{row.ratio:.2f} ({row.ratio_min:.2f} to {row.ratio_max:.2f})"
+        ratio = (
+            ""
+            if row.ratio is None
+            else f"{row.ratio:.2f} ({row.ratio_min:.2f} to {row.ratio_max:.2f})"
+        )
         cells = (
             row.variant,
             row.changes,
             "" if row.ms_per_batched_step is None else f"{row.ms_per_batched_step:.3g}",
             ratio,
-            "" if row.accepted is None else f"{row.accepted} of {row.worlds}",
+            "" if row.succeeded is None else f"{row.succeeded} of {row.worlds}",
             _count(row.iteration_limit_worlds),
             _count(row.line_search_limit_worlds),
             "; ".join(text for text in (row.broken_rules, row.reason) if text),

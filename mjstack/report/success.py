@@ -19,17 +19,18 @@ _COLORS = ("#cc2a24", "#2457c7")
 def save_places(
     path: Path,
     places: np.ndarray,
-    accepted: np.ndarray,
+    succeeded: np.ndarray,
     table: tuple[Sequence[float], Sequence[float]],
     title: str,
     names: Sequence[str] = ("red", "blue"),
 ) -> None:
-    """Draws every start as two dots, one per cube; a failed one as crosses on its cubes, joined by a line.
+    """Draws every start as two dots, one per cube; a failed one as crosses on its cubes, joined by
+    a line.
 
     Args:
         path: The picture.
         places: x and y [m] of each cube first, shape ``(n, cubes, 2 or more)``.
-        accepted: Whether each episode was, shape ``(n,)``, bool.
+        succeeded: Whether each episode was, shape ``(n,)``, bool.
         table: Centre and half size of the table in x and y [m].
         title: What is shown.
         names: Of the cubes.
@@ -37,26 +38,48 @@ def save_places(
     figure, axes = plt.subplots(figsize=(7.5, 6.5), layout="constrained")
     (x, y), (half_x, half_y) = table
     # As seen by someone who stands behind the arm: y to the left, x away from the base.
-    axes.add_patch(Rectangle((y - half_y, x - half_x), 2.0 * half_y, 2.0 * half_x, fill=False, ec="k", lw=1.5))
+    axes.add_patch(
+        Rectangle((y - half_y, x - half_x), 2.0 * half_y, 2.0 * half_x, fill=False, ec="k", lw=1.5)
+    )
     axes.plot(0.0, 0.0, "k^", markersize=9, label="base")
     size, alpha = (12.0, 0.5) if len(places) <= 2000 else (3.0, 0.25)
-    failed = places[~accepted]
+    failed = places[~succeeded]
     for number, (name, color) in enumerate(zip(names, _COLORS, strict=True)):
-        good = places[accepted, number]
-        axes.scatter(good[:, 1], good[:, 0], s=size, color=color, alpha=alpha, lw=0, label=f"{name}, accepted: {len(good):,}")
+        good = places[succeeded, number]
+        axes.scatter(
+            good[:, 1],
+            good[:, 0],
+            s=size,
+            color=color,
+            alpha=alpha,
+            lw=0,
+            label=f"{name}, succeeded: {len(good):,}",
+        )
     for pair in failed:
         axes.plot(pair[:, 1], pair[:, 0], color="0.3", lw=0.5, alpha=0.6)
     for number, (name, color) in enumerate(zip(names, _COLORS, strict=True)):
         bad = failed[:, number]
         axes.scatter(bad[:, 1], bad[:, 0], s=45.0, marker="x", color="k", lw=2.6)
-        axes.scatter(bad[:, 1], bad[:, 0], s=40.0, marker="x", color=color, lw=1.2, label=f"{name}, failed: {len(bad):,}")
+        axes.scatter(
+            bad[:, 1],
+            bad[:, 0],
+            s=40.0,
+            marker="x",
+            color=color,
+            lw=1.2,
+            label=f"{name}, failed: {len(bad):,}",
+        )
     axes.set(xlabel="y [m]", ylabel="x [m]", aspect="equal")
     axes.set_title(title, wrap=True)
     axes.invert_xaxis()
     axes.grid(alpha=0.3)
-    legend = axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5)
+    legend = axes.legend(
+        frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5
+    )
     for handle in legend.legend_handles:
-        if isinstance(handle, PathCollection):  # the dots of ten thousand worlds are too small and faint to tell apart here
+        if isinstance(
+            handle, PathCollection
+        ):  # the dots of ten thousand worlds are too small and faint to tell apart here
             handle.set_sizes([40.0])
             handle.set_alpha(1.0)
     figure.savefig(path, dpi=110)

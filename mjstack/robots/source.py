@@ -22,7 +22,8 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
         model: Where its description comes from.
 
     Returns:
-        A spec with the robot's two aperture sites and, where the profile says so, the arm's raised force limit.
+        A spec with the robot's two grasp_point sites and, where the profile says so, the arm's
+        raised force limit.
 
     Raises:
         SourceError: The description cannot be found or read.
@@ -31,11 +32,13 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, FileNotFoundError) as error:
-        raise SourceError(f"{path} cannot be read: {str(error).splitlines()[0]}. Use model=builtin.") from error
+        raise SourceError(
+            f"{path} cannot be read: {str(error).splitlines()[0]}. Use model=builtin."
+        ) from error
     if model.source is ModelSource.menagerie:
         if robot.replace_collision:
             _replace_collision(spec, robot)
-        _add_aperture_sites(spec, robot)
+        _add_grasp_sites(spec, robot)
     for key in list(spec.keys):  # a robot's keyframes have no place for the scene's cubes
         spec.delete(key)
     if robot.arm_force_limit is not None:
@@ -50,14 +53,17 @@ def builtin_path(robot: RobotCfg) -> Path:
 
 
 def menagerie_path(robot: RobotCfg) -> Path:
-    """The file in MuJoCo Menagerie: below ``MENAGERIE_ROOT`` if that is set, else fetched and cached by its package."""
+    """The file in MuJoCo Menagerie: below ``MENAGERIE_ROOT`` if that is set, else fetched and
+    cached by its package.
+    """
     root = os.environ.get("MENAGERIE_ROOT")
     if root:
         path = Path(root) / robot.menagerie_name / robot.menagerie_file
         if not path.is_file():
             raise SourceError(
-                f"MENAGERIE_ROOT={root}: there is no {robot.menagerie_name}/{robot.menagerie_file} below it, expected a "
-                "checkout of MuJoCo Menagerie. Correct or unset it, or use model=builtin."
+                f"MENAGERIE_ROOT={root}: there is no {robot.menagerie_name}/{robot.menagerie_file}"
+                " below it, expected a checkout of MuJoCo Menagerie. Correct or unset it, or use"
+                " model=builtin."
             )
         return path
     import mujoco_menagerie
@@ -66,8 +72,9 @@ def menagerie_path(robot: RobotCfg) -> Path:
         return Path(mujoco_menagerie.get(robot.menagerie_name).path()) / robot.menagerie_file
     except (mujoco_menagerie.MenagerieError, OSError) as error:
         raise SourceError(
-            f"model=menagerie: {robot.menagerie_name} is neither cached nor can it be fetched "
-            f"({type(error).__name__}). Set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie, or use model=builtin."
+            f"model=menagerie: {robot.menagerie_name} is neither cached nor can it be fetched"
+            f" ({type(error).__name__}). Set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie, or"
+            " use model=builtin."
         ) from error
 
 
@@ -97,11 +104,13 @@ def _replace_collision(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
         )
 
 
-def _add_aperture_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
-    for site in robot.aperture_sites:
-        if site in robot.aperture_geoms:
-            geoms = [spec.geom(name) for name in robot.aperture_geoms[site]]
-            body, pos = geoms[0].parent, np.mean([geom.pos for geom in geoms], axis=0)
+def _add_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
+    for site in robot.grasp_sites:
+        if site in robot.grasp_geoms:
+            geoms = [spec.geom(name) for name in robot.grasp_geoms[site]]
+            body = geoms[0].parent
+            pos = np.mean([geom.pos for geom in geoms], axis=0)
         else:
-            body, pos = spec.body(robot.aperture_bodies[site]), np.zeros(3)
+            body = spec.body(robot.grasp_bodies[site])
+            pos = np.zeros(3)
         body.add_site(name=site, pos=pos, group=4)

@@ -1,4 +1,6 @@
-"""Builds a scene around a robot: floor, table, two cubes and perhaps a box, timestep and solver, all set before compilation."""
+"""Builds a scene around a robot: floor, table, two cubes and perhaps a box, timestep and solver,
+all set before compilation.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +11,14 @@ import mujoco
 from mjstack.config.schema import BoxCfg, Cone, Config, SceneCfg, SolverCfg, TimingCfg
 from mjstack.robots import robot_spec
 
-RED, BLUE = "red_cube", "blue_cube"
+RED = "red_cube"
+BLUE = "blue_cube"
 WORLD = "world"  # MuJoCo's name of the body that never moves
 CUBES_SENSOR = f"{RED}/{BLUE}"
-_CONES = {Cone.elliptic: mujoco.mjtCone.mjCONE_ELLIPTIC, Cone.pyramidal: mujoco.mjtCone.mjCONE_PYRAMIDAL}
+_CONES = {
+    Cone.elliptic: mujoco.mjtCone.mjCONE_ELLIPTIC,
+    Cone.pyramidal: mujoco.mjtCone.mjCONE_PYRAMIDAL,
+}
 _NETFORCE = 3  # the contact sensor's reduction to one force and torque, in the world frame
 
 
@@ -21,10 +27,13 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
 
     Args:
         cfg: The configuration.
-        visuals: Keep geoms that only pictures need. The physics is the same without them, and steps faster.
+        visuals: Keep geoms that only pictures need. The physics is the same without them, and steps
+            faster.
     """
     spec = robot_spec(cfg.robot, cfg.model)
-    return build_scene(spec, cfg.scene, cfg.timing, cfg.solver, jaw_bodies=cfg.robot.jaw_bodies, visuals=visuals)
+    return build_scene(
+        spec, cfg.scene, cfg.timing, cfg.solver, jaw_bodies=cfg.robot.jaw_bodies, visuals=visuals
+    )
 
 
 def build_scene(
@@ -66,7 +75,13 @@ def build_scene(
             for geom in spec.body(jaw).geoms:
                 geom.condim = solver.gripper_condim
     world = spec.worldbody
-    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], rgba=[0.32, 0.36, 0.42, 1], condim=3)
+    world.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.05],
+        rgba=[0.32, 0.36, 0.42, 1],
+        condim=3,
+    )
     world.add_geom(
         name="table",
         type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -79,7 +94,10 @@ def build_scene(
     if scene.box is not None:
         _add_box(spec, scene.box, table_top(scene))
     z = table_top(scene) + scene.cube_half
-    for name, xy, rgba in ((RED, scene.red_xy, [0.80, 0.16, 0.14, 1]), (BLUE, scene.blue_xy, [0.14, 0.34, 0.78, 1])):
+    for name, xy, rgba in (
+        (RED, scene.red_xy, [0.80, 0.16, 0.14, 1]),
+        (BLUE, scene.blue_xy, [0.14, 0.34, 0.78, 1]),
+    ):
         body = world.add_body(name=name, pos=[*xy, z])
         body.add_freejoint(name=name)
         body.add_geom(
@@ -102,7 +120,8 @@ def build_scene(
         world.add_light(pos=[0.2, -0.6, 1.6], dir=[0.1, 0.4, -1.0], diffuse=[0.6, 0.6, 0.6])
         spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
         spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
-        spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+        spec.visual.global_.offwidth = 1280
+        spec.visual.global_.offheight = 960
     else:
         spec.compiler.discardvisual = True
     return spec.compile()
@@ -114,19 +133,32 @@ def jaw_sensor(jaw: str, cube: str) -> str:
 
 
 def support_sensor(cube: str) -> str:
-    """Name of the sensor of the force between a cube and what is fixed to the world: floor, table and box."""
+    """Name of the sensor of the force between a cube and what is fixed to the world: floor, table
+    and box.
+    """
     return f"{WORLD}/{cube}"
 
 
 def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
-    """Adds a box to the world, its floor and walls on a surface at height top [m]. Every geom's name begins with ``box_``."""
+    """Adds a box to the world, its floor and walls on a surface at height top [m]. Every geom's
+    name begins with ``box_``.
+    """
     x, y = box.center
     half_x, half_y = box.half
-    thick, up = 0.5 * box.wall, 0.5 * box.height
+    thick = 0.5 * box.wall
+    up = 0.5 * box.height
     # The walls across x close the corners.
     parts = {
-        "floor": ([x, y, top + 0.5 * box.floor], [half_x, half_y, 0.5 * box.floor], box.floor_solref),
-        "near": ([x - half_x - thick, y, top + up], [thick, half_y + box.wall, up], box.wall_solref),
+        "floor": (
+            [x, y, top + 0.5 * box.floor],
+            [half_x, half_y, 0.5 * box.floor],
+            box.floor_solref,
+        ),
+        "near": (
+            [x - half_x - thick, y, top + up],
+            [thick, half_y + box.wall, up],
+            box.wall_solref,
+        ),
         "far": ([x + half_x + thick, y, top + up], [thick, half_y + box.wall, up], box.wall_solref),
         "right": ([x, y - half_y - thick, top + up], [half_x, thick, up], box.wall_solref),
         "left": ([x, y + half_y + thick, top + up], [half_x, thick, up], box.wall_solref),

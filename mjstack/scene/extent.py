@@ -10,15 +10,18 @@ import torch
 
 from mjstack.math import quat_z_row
 
-_CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
-_SPHERE, _BOX = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX)
+_CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+_CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+_SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
+_BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 
 
 class LowestPoint:
     """The lowest point of the colliding geoms of some bodies.
 
-    Each geom is a box, a ball around it, and a disc across its z axis, some of them of size 0: together they are a box, sphere,
-    capsule or cylinder. Of other shapes, such as meshes, the bounding box counts, which reaches lower, never higher.
+    Each geom is a box, a ball around it, and a disc across its z axis, some of them of size 0:
+    together they are a box, sphere, capsule or cylinder. Of other shapes, such as meshes, the
+    bounding box counts, which reaches lower, never higher.
     """
 
     def __init__(self, model: mujoco.MjModel, bodies: Sequence[str], device: torch.device) -> None:
@@ -32,19 +35,26 @@ class LowestPoint:
         wanted = [model.body(name).id for name in bodies]
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         geoms = np.flatnonzero(collides & np.isin(model.geom_bodyid, wanted))
-        center, axes = np.zeros((len(geoms), 3)), np.zeros((len(geoms), 3, 3))
-        box, ball, disc = np.zeros((len(geoms), 3)), np.zeros(len(geoms)), np.zeros(len(geoms))
+        center = np.zeros((len(geoms), 3))
+        axes = np.zeros((len(geoms), 3, 3))
+        box = np.zeros((len(geoms), 3))
+        ball = np.zeros(len(geoms))
+        disc = np.zeros(len(geoms))
         for i, geom in enumerate(geoms):
-            kind, size = int(model.geom_type[geom]), model.geom_size[geom]
+            kind = int(model.geom_type[geom])
+            size = model.geom_size[geom]
             turn = np.empty(9)
             mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-            axes[i], center[i] = turn.reshape(3, 3), model.geom_pos[geom]
+            axes[i] = turn.reshape(3, 3)
+            center[i] = model.geom_pos[geom]
             if kind == _SPHERE:
                 ball[i] = size[0]
             elif kind == _CAPSULE:
-                ball[i], box[i, 2] = size[0], size[1]
+                ball[i] = size[0]
+                box[i, 2] = size[1]
             elif kind == _CYLINDER:
-                disc[i], box[i, 2] = size[0], size[1]
+                disc[i] = size[0]
+                box[i, 2] = size[1]
             elif kind == _BOX:
                 box[i] = size
             else:
@@ -56,7 +66,9 @@ class LowestPoint:
             return torch.tensor(values, dtype=torch.float32, device=device)
 
         self._body = torch.tensor(model.geom_bodyid[geoms].copy(), dtype=torch.int64, device=device)
-        self._center, self._axes, self._box, self._ball, self._disc = map(constant, (center, axes, box, ball, disc))
+        self._center, self._axes, self._box, self._ball, self._disc = map(
+            constant, (center, axes, box, ball, disc)
+        )
 
     def height(self, xpos: torch.Tensor, xquat: torch.Tensor) -> torch.Tensor:
         """Height of the lowest point [m], shape ``(nworld,)``.
@@ -68,5 +80,9 @@ class LowestPoint:
         up = quat_z_row(xquat.index_select(1, self._body).float())  # world z in each geom's body
         along = (up[..., None] * self._axes).sum(-2)  # and in each geom
         middle = xpos[..., 2].index_select(1, self._body).float() + (up * self._center).sum(-1)
-        reach = (along.abs() * self._box).sum(-1) + self._ball + self._disc * torch.linalg.vector_norm(along[..., :2], dim=-1)
+        reach = (
+            (along.abs() * self._box).sum(-1)
+            + self._ball
+            + self._disc * torch.linalg.vector_norm(along[..., :2], dim=-1)
+        )
         return (middle - reach).amin(1)

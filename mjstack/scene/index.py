@@ -17,7 +17,9 @@ CUBES = (RED, BLUE)
 
 
 class Columns:
-    """Some columns of a batched view. Where they lie side by side, reading them costs nothing and writing is one copy."""
+    """Some columns of a batched view. Where they lie side by side, reading them costs nothing and
+    writing is one copy.
+    """
 
     def __init__(self, indices: Sequence[int] | np.ndarray, device: torch.device) -> None:
         """Takes the columns, in the order in which values are given."""
@@ -31,8 +33,14 @@ class Columns:
         return len(self.indices)
 
     def read(self, view: torch.Tensor) -> torch.Tensor:
-        """The columns, shape ``(nworld, n, ...)``. It may be the view's own memory: do not write into it."""
-        return view.index_select(1, self._scattered) if self._together is None else view[:, self._together]
+        """The columns, shape ``(nworld, n, ...)``. It may be the view's own memory: do not write
+        into it.
+        """
+        return (
+            view.index_select(1, self._scattered)
+            if self._together is None
+            else view[:, self._together]
+        )
 
     def write(self, view: torch.Tensor, value: torch.Tensor) -> None:
         """Writes all worlds."""
@@ -82,7 +90,8 @@ class SceneIndex:
     """Where each named thing of a scene lies in MuJoCo's arrays.
 
     Attributes:
-        cube_qpos: First qpos address of the red and of the blue cube (7 numbers each: position, quaternion).
+        cube_qpos: First qpos address of the red and of the blue cube (7 numbers each: position,
+            quaternion).
         cube_qvel: First qvel address of the red and of the blue cube (6 numbers each).
         robot_qpos: qpos addresses of the arm's and then the gripper's joints.
         robot_qvel: qvel addresses in the same order.
@@ -90,12 +99,14 @@ class SceneIndex:
         ctrl: Actuator indices in the same order.
         ctrl_range: Limits of the commands in the same order, shape ``(n, 2)``.
         n_arm: How many of them are the arm's.
-        aperture_sites: The two site indices whose midpoint is the aperture centre.
+        grasp_sites: The two site indices whose midpoint is the grasp point.
         objects: First qpos and qvel address of every object that moves freely, by name.
         bodies: Body index of those objects.
         geoms: Geom indices of those objects.
-        jaw_force: First sensordata address of each jaw's force on an object (3 numbers), by the object's name.
-        support_force: Likewise of the world's and the other cube's force on it; only a scene with a box measures them.
+        jaw_force: First sensordata address of each jaw's force on an object (3 numbers), by the
+            object's name.
+        support_force: Likewise of the world's and the other cube's force on it; only a scene with a
+            box measures them.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
@@ -109,13 +120,17 @@ class SceneIndex:
         self.ctrl = np.array([find(model, "actuator", n) for n in names])
         self.ctrl_range = model.actuator_ctrlrange[self.ctrl].copy()
         self.n_arm = len(robot.arm_joints)
-        self.aperture_sites = [find(model, "site", n) for n in robot.aperture_sites]
+        self.grasp_sites = [find(model, "site", n) for n in robot.grasp_sites]
         cubes = [find(model, "joint", n) for n in CUBES]
         self.cube_qpos = [int(model.jnt_qposadr[j]) for j in cubes]
         self.cube_qvel = [int(model.jnt_dofadr[j]) for j in cubes]
-        self.objects = {n: (q, v) for n, q, v in zip(CUBES, self.cube_qpos, self.cube_qvel, strict=True)}
+        self.objects = {
+            n: (q, v) for n, q, v in zip(CUBES, self.cube_qpos, self.cube_qvel, strict=True)
+        }
         self.bodies = {n: int(model.jnt_bodyid[j]) for n, j in zip(CUBES, cubes, strict=True)}
-        self.geoms = {n: np.flatnonzero(model.geom_bodyid == body).tolist() for n, body in self.bodies.items()}
+        self.geoms = {
+            n: np.flatnonzero(model.geom_bodyid == body).tolist() for n, body in self.bodies.items()
+        }
         self.jaw_force: dict[str, list[int]] = {}
         for cube in CUBES:
             sensors = [find(model, "sensor", jaw_sensor(jaw, cube)) for jaw in robot.jaw_bodies]
@@ -123,7 +138,9 @@ class SceneIndex:
         self.support_force: dict[str, list[int]] = {}
         if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, CUBES_SENSOR) >= 0:
             for cube in CUBES:
-                sensors = [find(model, "sensor", name) for name in (support_sensor(cube), CUBES_SENSOR)]
+                sensors = [
+                    find(model, "sensor", name) for name in (support_sensor(cube), CUBES_SENSOR)
+                ]
                 self.support_force[cube] = [int(model.sensor_adr[s]) for s in sensors]
 
     def on(self, device: torch.device, dtype: torch.dtype) -> RobotTensors:
@@ -140,22 +157,35 @@ class SceneIndex:
                 self._robot.gripper_open,
                 self._robot.gripper_closed,
             )
-            numbers = [torch.as_tensor(np.asarray(v, dtype=float), dtype=dtype, device=device) for v in values]
+            numbers = [
+                torch.as_tensor(np.asarray(v, dtype=float), dtype=dtype, device=device)
+                for v in values
+            ]
             self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]
 
     def object_address(self, name: str) -> tuple[int, int]:
-        """First qpos and qvel address of an object; an unknown name is an error that lists the known ones."""
+        """First qpos and qvel address of an object; an unknown name is an error that lists the
+        known ones.
+        """
         if name not in self.objects:
             raise UnknownName("object", name, self.objects)
         return self.objects[name]
 
 
 def find(model: mujoco.MjModel, kind: str, name: str) -> int:
-    """Index of a named body, joint, actuator, site or sensor; an unknown name is an error that lists the known ones."""
+    """Index of a named body, joint, actuator, site or sensor; an unknown name is an error that
+    lists the known ones.
+    """
     index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
     if index < 0:
-        counts = {"body": model.nbody, "joint": model.njnt, "actuator": model.nu, "site": model.nsite, "sensor": model.nsensor}
+        counts = {
+            "body": model.nbody,
+            "joint": model.njnt,
+            "actuator": model.nu,
+            "site": model.nsite,
+            "sensor": model.nsensor,
+        }
         count = counts[kind]
         raise UnknownName(kind, name, [getattr(model, kind)(i).name for i in range(count)])
     return index

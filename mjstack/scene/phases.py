@@ -1,4 +1,4 @@
-"""The phases of the scripted motion: when they are, and where the aperture centre goes in each."""
+"""The phases of the scripted motion: when they are, and where the grasp point goes in each."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from dataclasses import dataclass
 from mjstack.config.schema import Config, PhaseCfg, SceneCfg
 from mjstack.errors import ConfigError
 
-RED, BLUE, FIXED = 0, 1, 2
+RED = 0
+BLUE = 1
+FIXED = 2
 _NUMBERS = {"red": RED, "blue": BLUE, None: -1}
 
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """A phase as frames ``start`` to ``stop`` (exclusive) of the episode."""
+    """A phase as steps ``start`` to ``stop`` (exclusive) of the episode."""
 
     name: str
     start: int
@@ -38,7 +40,7 @@ class Anchor:
 
 @dataclass(frozen=True, slots=True)
 class CubeTarget:
-    """Where a phase brings the aperture centre above a cube that stands on the table.
+    """Where a phase brings the grasp point above a cube that stands on the table.
 
     Attributes:
         phase: The first phase that does.
@@ -52,10 +54,11 @@ class CubeTarget:
 
 
 def build_phases(cfg: Config) -> list[Phase]:
-    """The controller's phases laid out over the episode's frames."""
-    phases, start = [], 0
+    """The controller's phases laid out over the episode's steps."""
+    phases = []
+    start = 0
     for name, phase in cfg.controller.phases.items():
-        stop = start + round(phase.seconds / cfg.timing.frame_dt)
+        stop = start + round(phase.seconds / cfg.timing.step_dt)
         phases.append(Phase(name, start, stop))
         start = stop
     return phases
@@ -64,10 +67,12 @@ def build_phases(cfg: Config) -> list[Phase]:
 def build_anchors(scene: SceneCfg) -> dict[str, Anchor]:
     """The anchors of a scene, by the name that a phase uses.
 
-    ``red``, ``blue``: a cube's centre. ``on_blue``: red's centre once it is stacked. ``over_red``, ``over_blue``: the table's
-    surface where a cube stands. ``red_slot``, ``blue_slot``: the table's surface under a cube's place in the box.
+    ``red``, ``blue``: a cube's centre. ``on_blue``: red's centre once it is stacked. ``over_red``,
+    ``over_blue``: the table's surface where a cube stands. ``red_slot``, ``blue_slot``: the table's
+    surface under a cube's place in the box.
     """
-    top, half = scene.table_center[2] + scene.table_half[2], scene.cube_half
+    top = scene.table_center[2] + scene.table_half[2]
+    half = scene.cube_half
     anchors = {
         "red": Anchor(RED, (0.0, 0.0), top + half),
         "blue": Anchor(BLUE, (0.0, 0.0), top + half),
@@ -82,24 +87,31 @@ def build_anchors(scene: SceneCfg) -> dict[str, Anchor]:
 
 
 def anchor_of(cfg: Config, phase: str) -> Anchor | None:
-    """The anchor of a phase, its height being that of the phase's target; None where the last target holds.
+    """The anchor of a phase, its height being that of the phase's target; None where the last
+    target holds.
 
     Raises:
         ConfigError: The scene has no such anchor.
     """
-    spec, anchors = cfg.controller.phases[phase], build_anchors(cfg.scene)
+    spec = cfg.controller.phases[phase]
+    anchors = build_anchors(cfg.scene)
     if spec.anchor is None:
         return None
     if spec.anchor not in anchors:
         expected = f"one of {', '.join(anchors)} (scene {cfg.scene.name})"
         raise ConfigError(f"controller.phases.{phase}.anchor", spec.anchor, expected)
     found = anchors[spec.anchor]
-    above = spec.h_scale * cfg.robot.approach_height + spec.offset + (cfg.scene.grasp_offset if spec.in_hand else 0.0)
+    above = (
+        spec.h_scale * cfg.robot.approach_height
+        + spec.offset
+        + (cfg.scene.grasp_offset if spec.in_hand else 0.0)
+    )
     return Anchor(found.source, found.xy, found.z + above)
 
 
 def cube_targets(cfg: Config) -> tuple[list[CubeTarget], list[CubeTarget]]:
-    """What the phases ask of the place of red, and of blue, in their order; each height and opening once.
+    """What the phases ask of the place of red, and of blue, in their order; each height and opening
+    once.
 
     Raises:
         ConfigError: The scene lacks the anchor of a phase.
@@ -121,7 +133,8 @@ def grasped_cubes(specs: Sequence[PhaseCfg]) -> list[int]:
 
 def carried_cubes(specs: Sequence[PhaseCfg]) -> list[int]:
     """Number of the cube that is in the hand all through each phase, or -1."""
-    out, cube = [], -1
+    out = []
+    cube = -1
     for spec in specs:
         if spec.gripper == "open":
             cube = -1

@@ -9,7 +9,13 @@ from mjstack.sim.build import (
     resolve_backend,
     resolve_device,
 )
-from mjstack.sim.simulation import LOST_PHYSICS, Overflow, Simulation, SolverLimit, describe_overflow
+from mjstack.sim.simulation import (
+    LOST_PHYSICS,
+    Overflow,
+    Simulation,
+    SolverLimit,
+    describe_overflow,
+)
 from mjstack.sim.sizes import BatchSizes, resolve_sizes
 from mjstack.sim.views import Fields
 

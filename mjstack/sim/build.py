@@ -27,8 +27,13 @@ def resolve_device(requested: str) -> str:
     if requested == "auto":
         return "cuda:0" if count else "cpu"
     if requested.startswith("cuda") and int(requested.partition(":")[2]) >= count:
-        found = f"cuda:0 to cuda:{count - 1}" if count > 1 else "cuda:0" if count else "no CUDA device"
-        raise DeviceError(f"sim.device={requested}: this machine has {found}. Use sim.device=auto or sim.device=cpu.")
+        found = (
+            f"cuda:0 to cuda:{count - 1}" if count > 1 else "cuda:0" if count else "no CUDA device"
+        )
+        raise DeviceError(
+            f"sim.device={requested}: this machine has {found}. Use sim.device=auto or"
+            " sim.device=cpu."
+        )
     return requested
 
 
@@ -39,7 +44,12 @@ def resolve_backend(cfg: Config) -> tuple[Backend, str]:
     if backend is Backend.auto:
         backend = Backend.mjwarp if device.startswith("cuda") else Backend.native
     if backend is Backend.native and cfg.sim.device.startswith("cuda"):
-        raise ConfigError("sim.device", cfg.sim.device, "cpu or auto, because native MuJoCo runs on the CPU", "Use sim=mjwarp")
+        raise ConfigError(
+            "sim.device",
+            cfg.sim.device,
+            "cpu or auto, because native MuJoCo runs on the CPU",
+            "Use sim=mjwarp",
+        )
     return backend, "cpu" if backend is Backend.native else device
 
 
@@ -68,12 +78,18 @@ def make_simulation(
         UnknownName: A field does not exist, or cannot differ.
         UnsupportedModel: MJWarp does not implement a feature of the model.
     """
-    chosen, where = resolve_backend(cfg) if backend is None else (backend, device or resolve_device(cfg.sim.device))
+    chosen, where = (
+        resolve_backend(cfg)
+        if backend is None
+        else (backend, device or resolve_device(cfg.sim.device))
+    )
     if chosen is Backend.native:
         return NativeSimulation(model, nworld, fields=fields)
     from mjstack.sim.mjwarp import MjwarpSimulation  # loads Warp, which native runs do not need
 
-    return MjwarpSimulation(model, nworld, sizes or resolve_sizes(cfg), where, cfg.graph, fields=fields)
+    return MjwarpSimulation(
+        model, nworld, sizes or resolve_sizes(cfg), where, cfg.graph, fields=fields
+    )
 
 
 def cuda_name(device: str) -> str:
@@ -87,10 +103,11 @@ def cuda_uuid(device: str) -> str:
 
 
 def device_memory(device: str) -> tuple[int, int] | None:
-    """GPU memory in bytes: what torch's and Warp's arrays of this process hold, and what is taken on the whole GPU.
+    """GPU memory in bytes: what torch's and Warp's arrays of this process hold, and what is taken
+    on the whole GPU.
 
-    The second has the captured graphs, CUDA's own share, freed memory that a pool keeps, and other processes in it too.
-    None on a CPU.
+    The second has the captured graphs, CUDA's own share, freed memory that a pool keeps, and other
+    processes in it too. None on a CPU.
     """
     if device == "cpu":
         return None
@@ -103,7 +120,9 @@ def device_memory(device: str) -> tuple[int, int] | None:
 
 
 def cuda_driver() -> str:
-    """Version of the NVIDIA driver, from the kernel module or NVML; ``unknown`` where neither tells."""
+    """Version of the NVIDIA driver, from the kernel module or NVML; ``unknown`` where neither
+    tells.
+    """
     try:
         text = Path("/proc/driver/nvidia/version").read_text()
     except OSError:
@@ -113,6 +132,10 @@ def cuda_driver() -> str:
         return match.group(1)
     try:
         query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-        return subprocess.run(query, capture_output=True, text=True, timeout=10, check=True).stdout.splitlines()[0].strip()
+        return (
+            subprocess.run(query, capture_output=True, text=True, timeout=10, check=True)
+            .stdout.splitlines()[0]
+            .strip()
+        )
     except (OSError, subprocess.SubprocessError, IndexError):
         return "unknown"

@@ -22,10 +22,12 @@ def record_usage(
     limits: wp.array[int],
     steps: wp.array[wp.int64],
 ) -> None:
-    """Counts each world's contacts, and keeps the largest counters and every overflow bit seen so far.
+    """Counts each world's contacts, and keeps the largest counters and every overflow bit seen so
+    far.
 
-    ``contacts`` is zero before. The packed list may claim more contacts than it holds after an overflow. A world's last
-    increment of its counter is its number of contacts, so the largest one seen is the peak.
+    ``contacts`` is zero before. The packed list may claim more contacts than it holds after an
+    overflow. A world's last increment of its counter is its number of contacts, so the largest one
+    seen is the peak.
     """
     i = wp.tid()
     for c in range(i, wp.min(nacon[0], worldid.shape[0]), stride):  # type: ignore[arg-type]
@@ -51,10 +53,12 @@ def record_convex_contacts(
     counts: wp.array[int],
     peak_pool: wp.array[int],
 ) -> None:
-    """Keeps the most contacts that convex collision found for one combination of geom types; ``counts`` is zero before.
+    """Keeps the most contacts that convex collision found for one combination of geom types;
+    ``counts`` is zero before.
 
-    MJWarp has room for naccdmax penetrating pairs of each combination, and each such pair gives at least one contact.
-    ``kinds`` numbers the combinations, and is negative for those that are no convex collision.
+    MJWarp has room for naccdmax penetrating pairs of each combination, and each such pair gives at
+    least one contact. ``kinds`` numbers the combinations, and is negative for those that are no
+    convex collision.
     """
     i = wp.tid()
     for c in range(i, wp.min(nacon[0], geom.shape[0]), stride):  # type: ignore[arg-type]

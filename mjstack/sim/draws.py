@@ -1,4 +1,6 @@
-"""`mjstack.rng.uniform` as one Warp kernel: in a captured step, five dozen small launches would cost more than the numbers."""
+"""`mjstack.rng.uniform` as one Warp kernel: in a captured step, five dozen small launches would
+cost more than the numbers.
+"""
 
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
 import torch
@@ -6,7 +8,8 @@ import warp as wp
 
 from mjstack.sim.streams import torch_stream_scope
 
-# Without this the compiler may fuse a product and a sum, and the last digit would differ from torch's.
+# Without this the compiler may fuse a product and a sum, and the last digit would differ from
+# torch's.
 wp.set_module_options({"fuse_fp": False, "enable_backward": False})
 
 
@@ -27,7 +30,9 @@ def _philox_uniform(
     half_width: float,
     out: wp.array2d[float],
 ) -> None:
-    """Philox4x32-10 with counter (world, episode, step, block) and key (seed, stream); four numbers per thread."""
+    """Philox4x32-10 with counter (world, episode, step, block) and key (seed, stream); four numbers
+    per thread.
+    """
     w, block = wp.tid()  # type: ignore[misc]
     c0 = wp.uint32(world[w])
     c1 = wp.uint32(episode[w])

@@ -1,4 +1,6 @@
-"""Captures fixed work once and replays it: Warp's and torch's in one CUDA graph, or Warp's alone on its CPU device."""
+"""Captures fixed work once and replays it: Warp's and torch's in one CUDA graph, or Warp's alone on
+its CPU device.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ import warp as wp
 
 from mjstack.config.schema import GraphMode
 from mjstack.errors import CaptureError
-from mjstack.sim.arena import Arena
+from mjstack.sim.scratch import Scratch
 from mjstack.sim.streams import torch_stream_scope
 
 log = logging.getLogger(__name__)
@@ -26,7 +28,9 @@ _side_streams: dict[str, list[torch.cuda.Stream]] = {}
 
 
 def inside_graph() -> bool:
-    """Whether the work going on belongs to a graph that is warming up or being captured: inner graphs then step aside."""
+    """Whether the work going on belongs to a graph that is warming up or being captured: inner
+    graphs then step aside.
+    """
     return _nesting > 0
 
 
@@ -43,9 +47,9 @@ def _inside() -> Iterator[None]:
 class StepGraph:
     """Work that is the same at every call: no host read, fixed shapes, the same memory.
 
-    The first call runs it eagerly, which compiles kernels and makes allocations happen. The second captures it, and from then
-    on a call replays it. Whatever the work bakes in (a Python number, a solver option, an address) stays as it was at the
-    capture, until `drop` or a new version.
+    The first call runs it eagerly, which compiles kernels and makes allocations happen. The second
+    captures it, and from then on a call replays it. Whatever the work bakes in (a Python number, a
+    solver option, an address) stays as it was at the capture, until `drop` or a new version.
 
     Attributes:
         captured: Whether the next call replays.
@@ -69,18 +73,22 @@ class StepGraph:
         Args:
             work: What is captured.
             device: Where it runs.
-            mode: ``off`` never captures; ``auto`` goes on eagerly, with one warning, where the capture fails; ``require``
-                raises there.
+            mode: ``off`` never captures; ``auto`` goes on eagerly, with one warning, where the
+                capture fails; ``require`` raises there.
             name: What it is called in messages.
             version: A number that changes when the graph has to be captured anew.
-            culprit: Names what was running, for the message of a failed capture.
-            scratch: Whether Warp's temporaries come from an `Arena`.
+            culprit: Names what was current_term, for the message of a failed capture.
+            scratch: Whether Warp's temporaries come from an `Scratch`.
         """
-        self._work, self._mode, self._name = work, mode, name
-        self._version, self._culprit, self._scratch = version, culprit, scratch
+        self._work = work
+        self._mode = mode
+        self._name = name
+        self._version = version
+        self._culprit = culprit
+        self._scratch = scratch
         self._device = wp.get_device(str(device))
         self._replay: Callable[[], None] | None = None
-        self._memory: tuple[torch.cuda.MemPool, Arena | None] | None = None
+        self._memory: tuple[torch.cuda.MemPool, Scratch | None] | None = None
         self._warm = self._failed = False
         self._seen = version()
         self.warm_up_seconds = self.capture_seconds = 0.0
@@ -108,19 +116,26 @@ class StepGraph:
 
     def drop(self) -> None:
         """Forgets the capture: the next call runs eagerly again, and the one after it captures."""
-        self._replay, self._memory, self._warm, self._failed = None, None, False, False
+        self._replay = None
+        self._memory = None
+        self._warm = False
+        self._failed = False
         self._seen = self._version()
 
     def _warm_up(self) -> None:
         began = time.perf_counter()
         with _inside():
             self._work()
-            wp.synchronize_device(self._device)  # Warp's temporaries are freed on a stream that torch's do not wait for
+            wp.synchronize_device(
+                self._device
+            )  # Warp's temporaries are freed on a stream that torch's do not wait for
         self._warm = True
         self.warm_up_seconds = time.perf_counter() - began
 
     def _capture(self) -> bool:
-        """Captures the work; Python's collector waits, so that nothing is freed in the middle of it."""
+        """Captures the work; Python's collector waits, so that nothing is freed in the middle of
+        it.
+        """
         began = time.perf_counter()
         wp.synchronize_device(self._device)
         collecting = gc.isenabled()
@@ -146,33 +161,38 @@ class StepGraph:
 
     def _capture_cuda(self) -> Callable[[], None]:
         torch_device = wp.device_to_torch(self._device)
-        # A stream of torch's own making: newer torch refuses to capture on a blocking one. The same for ever, because a
-        # second Warp object for it would unregister it when freed.
+        # A stream of torch's own making: newer torch refuses to capture on a blocking one. The same
+        # for ever, because a second Warp object for it would unregister it when freed.
         if torch_device not in _capture_streams:
             _capture_streams[torch_device] = torch.cuda.Stream(torch_device)
         stream = _capture_streams[torch_device]
         graph = torch.cuda.CUDAGraph()
-        # A conditional node makes Warp interrupt the capture, and what goes on after it has another number. By that number
-        # torch knows what to allocate from the graph's own memory, which nobody else gets. So there is a second such pool.
-        memory, pool = torch.cuda.MemPool(), torch.cuda.graph_pool_handle()
-        arena = Arena(self._device) if self._scratch() else None
+        # A conditional node makes Warp interrupt the capture, and what goes on after it has another
+        # number. By that number torch knows what to allocate from the graph's own memory, which
+        # nobody else gets. So there is a second such pool.
+        memory = torch.cuda.MemPool()
+        pool = torch.cuda.graph_pool_handle()
+        scratch = Scratch(self._device) if self._scratch() else None
         _abandoned.append((graph, memory))
         try:
             with (
-                torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
+                torch.cuda.graph(
+                    graph, pool=pool, stream=stream, capture_error_mode="thread_local"
+                ),
                 torch.cuda.use_mem_pool(memory),
-                wp.ScopedAllocator(self._device, arena),
+                wp.ScopedAllocator(self._device, scratch),
                 torch_stream_scope(self._device),
                 wp.ScopedCapture(stream=wp.get_stream(self._device), external=True),
             ):
                 self._work()
         except Exception:
-            # Torch leaves it open where the end of the capture fails, and then aborts the process when any pool is destroyed.
+            # Torch leaves it open where the end of the capture fails, and then aborts the process
+            # when any pool is destroyed.
             with suppress(AttributeError, RuntimeError):
                 torch._C._cuda_endAllocateToPool(stream.device_index, pool)
             raise
         _abandoned.pop()
-        self._memory = memory, arena
+        self._memory = memory, scratch
         return graph.replay
 
     def _capture_cpu(self) -> Callable[[], None]:
@@ -183,11 +203,13 @@ class StepGraph:
 
 
 def side_by_side(device: torch.device, *works: Callable[[], None], branches: bool = True) -> None:
-    """Does independent works: in a CUDA graph that is being captured as parallel branches, else one after the other.
+    """Does independent works: in a CUDA graph that is being captured as parallel branches, else one
+    after the other.
 
     Args:
         device: Where they run.
-        works: No one may write what another reads or writes, nor keep a temporary that another one uses.
+        works: No one may write what another reads or writes, nor keep a temporary that another one
+            uses.
         branches: False for one after the other in any case.
     """
     if not branches or device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
@@ -217,4 +239,6 @@ def _recover(device: wp.Device) -> None:
     try:
         torch.cuda.synchronize(wp.device_to_torch(device))
     except RuntimeError:
-        log.debug("the first synchronize after a failed capture reports it once more", exc_info=True)
+        log.debug(
+            "the first synchronize after a failed capture reports it once more", exc_info=True
+        )

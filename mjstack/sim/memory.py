@@ -1,4 +1,6 @@
-"""What worlds cost in memory: arrays that stay, what a step borrows, and what the device has given out."""
+"""What worlds cost in memory: arrays that stay, what a step borrows, and what the device has given
+out.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ def array_bytes(node: object) -> int:
 def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
     """What `MjwarpSimulation.memory_bytes` would be for these sizes, without allocating it.
 
-    Every array is as long as nworld, as the contact pool, or constant. So two small ones on the CPU tell the rest.
+    Every array is as long as nworld, as the contact pool, or constant. So two small ones on the CPU
+    tell the rest.
 
     Args:
         model: The compiled model.
@@ -37,7 +40,9 @@ def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
     share = dataclasses.replace(sizes, naconmax=None, naccdmax=None)
     with wp.ScopedDevice("cpu"):
         one, two, longer = (
-            array_bytes(mjw.make_data(model, nworld=n, **dataclasses.replace(share, nconmax=c).as_kwargs(n)))
+            array_bytes(
+                mjw.make_data(model, nworld=n, **dataclasses.replace(share, nconmax=c).as_kwargs(n))
+            )
             for n, c in ((1, sizes.nconmax), (2, sizes.nconmax), (1, sizes.nconmax + 1))
         )
     per_contact = longer - one
@@ -47,7 +52,9 @@ def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
 
 
 def borrowed_bytes(call: Callable[[], None], device: str) -> int | None:
-    """The most that Warp allocates at once on a device in a call, or None if its report cannot be read."""
+    """The most that Warp allocates at once on a device in a call, or None if its report cannot be
+    read.
+    """
     lines: list[str] = []
     with wp.ScopedMemoryTracker("mjstack", report_func=lines.append) as tracker:
         tracker.clear()
@@ -58,7 +65,9 @@ def borrowed_bytes(call: Callable[[], None], device: str) -> int | None:
 
 
 def used_bytes(device: str) -> int | None:
-    """Bytes that Warp's memory pool of a CUDA device has given out, or None where there is no such pool."""
+    """Bytes that Warp's memory pool of a CUDA device has given out, or None where there is no such
+    pool.
+    """
     where = wp.get_device(device)
     if not where.is_cuda or not wp.is_mempool_enabled(where):
         return None

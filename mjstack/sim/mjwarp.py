@@ -31,16 +31,18 @@ from mjstack.sim.views import Fields, FixedViews, check_mask
 class MjwarpSimulation(FixedViews):
     """`Simulation` on MuJoCo Warp, float32.
 
-    Box against box uses the primitive collider, as native MuJoCo does: with MJWarp's convex one the kept contacts of a
-    resting stack can alternate, and it never comes to rest. The substeps of one `step(n)` are captured into a graph, unless
-    they are a part of a larger one.
+    Box against box uses the primitive collider, as native MuJoCo does: with MJWarp's convex one the
+    kept contacts of a resting stack can alternate, and it never comes to rest. The decimation of
+    one `step(n)` are captured into a graph, unless they are a part of a larger one.
 
     Attributes:
-        peak_pool: Most contacts, broad-phase pairs, and contacts of one kind of convex collision, of all worlds at once since
-            the last full reset, shape ``(3,)``, int32. The third bounds what nccdmax must hold.
+        peak_pool: Most contacts, broad-phase pairs, and contacts of one kind of convex collision,
+            of all worlds at once since the last full reset, shape ``(3,)``, int32. The third bounds
+            what nccdmax must hold.
         version: Grows whenever something changes that a graph has baked in.
         arrangement: How a captured step is arranged.
-        solver_limits: Bits of `SolverLimit` for worlds whose solver stopped at a limit, shape ``(nworld,)``, int32.
+        solver_limits: Bits of `SolverLimit` for worlds whose solver stopped at a limit, shape
+            ``(nworld,)``, int32.
     """
 
     backend = "mjwarp"
@@ -69,12 +71,15 @@ class MjwarpSimulation(FixedViews):
             UnknownName: A field does not exist, or cannot differ.
             UnsupportedModel: MJWarp does not implement a feature of the model.
         """
-        self.model, self.nworld, self.sizes = model, nworld, sizes
+        self.model = model
+        self.nworld = nworld
+        self.sizes = sizes
         self.device = torch.device(device)
         self._device = wp.get_device(device)
         self._graph_mode = graph
         self._graphs: dict[tuple[int, bool], StepGraph] = {}
-        self.version, self.arrangement = 0, Arrangement()
+        self.version = 0
+        self.arrangement = Arrangement()
         names = check_fields(fields)
         self._placing = not PLACING_FIELDS.isdisjoint(names)
         name = self._device.name if self._device.is_cuda else "Warp's CPU device"
@@ -85,7 +90,9 @@ class MjwarpSimulation(FixedViews):
                     warnings.filterwarnings("error", category=UserWarning)
                     self._m = mjw.put_model(model, batch_sizes=dict.fromkeys(names, nworld))
             except (NotImplementedError, ValueError, UserWarning) as error:
-                raise UnsupportedModel((str(error) or repr(error)).splitlines()[0].rstrip(".")) from error
+                raise UnsupportedModel(
+                    (str(error) or repr(error)).splitlines()[0].rstrip(".")
+                ) from error
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
@@ -102,13 +109,22 @@ class MjwarpSimulation(FixedViews):
             self._steps = wp.zeros(nworld, dtype=wp.int64)
             self._mask = wp.zeros(nworld, dtype=bool)
         d = self._d
-        self.qpos, self.qvel, self.act, self.ctrl = map(wp.to_torch, (d.qpos, d.qvel, d.act, d.ctrl))
-        self.xpos, self.xquat = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
-        self.site_xpos, self.geom_xpos = wp.to_torch(d.site_xpos), wp.to_torch(d.geom_xpos)
-        self.qfrc_actuator, self.sensordata = wp.to_torch(d.qfrc_actuator), wp.to_torch(d.sensordata)
-        # `view` never copies: a field that MJWarp holds as vectors or matrices keeps its memory under MuJoCo's shape.
+        self.qpos, self.qvel, self.act, self.ctrl = map(
+            wp.to_torch, (d.qpos, d.qvel, d.act, d.ctrl)
+        )
+        self.xpos = wp.to_torch(d.xpos)
+        self.xquat = wp.to_torch(d.xquat)
+        self.site_xpos = wp.to_torch(d.site_xpos)
+        self.geom_xpos = wp.to_torch(d.geom_xpos)
+        self.qfrc_actuator = wp.to_torch(d.qfrc_actuator)
+        self.sensordata = wp.to_torch(d.sensordata)
+        # `view` never copies: a field that MJWarp holds as vectors or matrices keeps its memory
+        # under MuJoCo's shape.
         self.fields = Fields(
-            {name: wp.to_torch(getattr(self._m, name)).view(nworld, *getattr(model, name).shape) for name in names}
+            {
+                name: wp.to_torch(getattr(self._m, name)).view(nworld, *getattr(model, name).shape)
+                for name in names
+            }
         )
         self.constraint_count = wp.to_torch(d.nefc)
         self.contact_count = wp.to_torch(self._contacts)
@@ -119,16 +135,21 @@ class MjwarpSimulation(FixedViews):
         self.solver_limits = wp.to_torch(self._limits)
         self.step_count = wp.to_torch(self._steps)
         self._torch_mask = wp.to_torch(self._mask)
-        # What masked resets would erase. It is taken in there, just before, and not in every substep: nothing else lowers a
-        # counter, so the two together never miss one, and it costs a captured step three small operations.
-        self._most_contacts, self._most_constraints, self._overflow_ever = (torch.zeros_like(self.overflow) for _ in range(3))
+        # What masked resets would erase. It is taken in there, just before, and not in every
+        # substep: nothing else lowers a counter, so the two together never miss one, and it costs a
+        # captured step three small operations.
+        self._most_contacts, self._most_constraints, self._overflow_ever = (
+            torch.zeros_like(self.overflow) for _ in range(3)
+        )
         self._warm_up()
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
-        """Advances every world by n physics steps under the current ctrl; the poses follow with kinematics."""
+        """Advances every world by n physics steps under the current ctrl; the poses follow with
+        kinematics.
+        """
         with torch_stream_scope(self._device):
             if n == 0 or inside_graph():
-                self._substeps(n, kinematics)
+                self._decimation(n, kinematics)
             else:
                 self._graph(n, kinematics)()
 
@@ -147,7 +168,9 @@ class MjwarpSimulation(FixedViews):
             self._pose()
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Puts the masked worlds back to qpos0, at rest, and clears their counters and overflow bits."""
+        """Puts the masked worlds back to qpos0, at rest, and clears their counters and overflow
+        bits.
+        """
         if mask is None:
             self._torch_mask.fill_(True)
             self.peak_pool.zero_()
@@ -161,7 +184,14 @@ class MjwarpSimulation(FixedViews):
                 clear_counters,
                 dim=self.nworld,
                 inputs=[self._mask],
-                outputs=[self._peak_contacts, self._peak_nefc, self._contacts, self._lost, self._limits, self._steps],
+                outputs=[
+                    self._peak_contacts,
+                    self._peak_nefc,
+                    self._contacts,
+                    self._lost,
+                    self._limits,
+                    self._steps,
+                ],
             )
 
     @property
@@ -180,11 +210,15 @@ class MjwarpSimulation(FixedViews):
         return self._overflow_ever | self.overflow
 
     def memory_bytes(self) -> int:
-        """Bytes of MJWarp's data: all that grows with nworld, but for per-world fields and what a step borrows."""
+        """Bytes of MJWarp's data: all that grows with nworld, but for per-world fields and what a
+        step borrows.
+        """
         return array_bytes(self._d)
 
     def borrowed_bytes(self) -> int | None:
-        """The most that a step borrows at once beside it, or None if Warp does not tell. Convex pairs are most of it."""
+        """The most that a step borrows at once beside it, or None if Warp does not tell. Convex
+        pairs are most of it.
+        """
         return borrowed_bytes(self.forward, self._device.alias)
 
     def option_values(self) -> dict[str, float | int | str]:
@@ -204,14 +238,21 @@ class MjwarpSimulation(FixedViews):
         }
 
     def bare_step(self) -> StepGraph:
-        """One plain ``mujoco_warp.step``, captured and replayed with nothing else: what the rest is measured by."""
+        """One plain ``mujoco_warp.step``, captured and replayed with nothing else: what the rest is
+        measured by.
+        """
 
         def work() -> None:
             with torch_stream_scope(self._device):
                 mjw.step(self._m, self._d)
 
         return StepGraph(
-            work, self.device, self._graph_mode, name="a bare step", version=lambda: self.version, scratch=lambda: False
+            work,
+            self.device,
+            self._graph_mode,
+            name="a bare step",
+            version=lambda: self.version,
+            scratch=lambda: False,
         )
 
     def graph_of(self, n: int = 1, *, kinematics: bool = False) -> StepGraph:
@@ -224,7 +265,8 @@ class MjwarpSimulation(FixedViews):
             self._count(steps=0)
 
     def resize(self, sizes: BatchSizes) -> None:
-        """Gives the worlds other buffer sizes. Their state and every view stay; contacts and rows are empty until a step.
+        """Gives the worlds other buffer sizes. Their state and every view stay; contacts and rows
+        are empty until a step.
 
         Args:
             sizes: The new sizes.
@@ -236,11 +278,14 @@ class MjwarpSimulation(FixedViews):
             _keep_arrays(fresh, self._d)
             for count in (fresh.nacon, fresh.nefc, fresh.ncollision):
                 count.zero_()
-        self._d, self.sizes = fresh, sizes
+        self._d = fresh
+        self.sizes = sizes
         self.version += 1
 
     def arrange(self, arrangement: Arrangement) -> None:
-        """Chooses how a captured step is arranged; for measurements, because the numbers stay the same."""
+        """Chooses how a captured step is arranged; for measurements, because the numbers stay the
+        same.
+        """
         self.arrangement = arrangement
         self.version += 1
 
@@ -252,7 +297,8 @@ class MjwarpSimulation(FixedViews):
         tolerance: float | None = None,
         impratio: float | None = None,
     ) -> None:
-        """Changes the constraint solver's limits; graphs, which have them baked in, are captured anew.
+        """Changes the constraint solver's limits; graphs, which have them baked in, are captured
+        anew.
 
         Args:
             iterations: Most Newton iterations.
@@ -287,7 +333,7 @@ class MjwarpSimulation(FixedViews):
         torch.maximum(self._most_constraints, self.peak_constraints, out=self._most_constraints)
         self._overflow_ever |= self.overflow
 
-    def _substeps(self, n: int, kinematics: bool) -> None:
+    def _decimation(self, n: int, kinematics: bool) -> None:
         self._place()
         count = partial(self._count, steps=1)
         arrangement = self.arrangement
@@ -298,7 +344,8 @@ class MjwarpSimulation(FixedViews):
             if kinematics:
                 self._pose()
             return
-        # What a step has used is counted while the next one begins, which touches neither contacts nor rows.
+        # What a step has used is counted while the next one begins, which touches neither contacts
+        # nor rows.
         beside: tuple[Callable[[], None], ...] = ()
         for i in range(n):
             rearranged_step(
@@ -310,38 +357,68 @@ class MjwarpSimulation(FixedViews):
                 beside_kinematics=beside,
             )
             beside = (count,)
-        side_by_side(self.device, *((self._pose,) if kinematics else ()), *beside, branches=arrangement.branches)
+        side_by_side(
+            self.device,
+            *((self._pose,) if kinematics else ()),
+            *beside,
+            branches=arrangement.branches,
+        )
 
     def _pose(self) -> None:
-        """Poses of the current qpos, and nothing that a later step would start from: its forward computes them anew."""
+        """Poses of the current qpos, and nothing that a later step would start from: its forward
+        computes them anew.
+        """
         mjw.kinematics(self._m, self._d)
         self._place(posed=True)
 
     def _place(self, *, posed: bool = False) -> None:
-        """Puts the geoms that never move where the fields say: MJWarp does it once, when it makes the data."""
+        """Puts the geoms that never move where the fields say: MJWarp does it once, when it makes
+        the data.
+        """
         if not self._placing:
             return
-        m, d = self._m, self._d
+        m = self._m
+        d = self._d
         if not posed:
             mjw.kinematics(m, d)
         wp.launch(
             place_static_geoms,
             dim=(self.nworld, m.ngeom),
-            inputs=[m.body_rootid, m.body_weldid, m.body_mocapid, m.geom_bodyid, m.geom_pos, m.geom_quat, d.xpos, d.xquat],
+            inputs=[
+                m.body_rootid,
+                m.body_weldid,
+                m.body_mocapid,
+                m.geom_bodyid,
+                m.geom_pos,
+                m.geom_quat,
+                d.xpos,
+                d.xquat,
+            ],
             outputs=[d.geom_xpos, d.geom_xmat],
         )
 
     def _count(self, *, steps: int) -> None:
         """Steps made, what each world uses now, and the most it has used."""
-        d, contacts = self._d, self._d.contact
+        d = self._d
+        contacts = self._d.contact
         pool = contacts.worldid.shape[0]
-        # A thread per world, and at least one for every eighth place of the pool, which is mostly empty.
+        # A thread per world, and at least one for every eighth place of the pool, which is mostly
+        # empty.
         stride = max(self.nworld, pool // 8)
         self._contacts.zero_()
         wp.launch(
             record_usage,
             dim=stride,
-            inputs=[d.nacon, contacts.worldid, d.nefc, d.ncollision, d.overflow, LOST_PHYSICS, steps, stride],
+            inputs=[
+                d.nacon,
+                contacts.worldid,
+                d.nefc,
+                d.ncollision,
+                d.overflow,
+                LOST_PHYSICS,
+                steps,
+                stride,
+            ],
             outputs=[
                 self._contacts,
                 self._peak_contacts,
@@ -364,7 +441,7 @@ class MjwarpSimulation(FixedViews):
     def _warm_up(self) -> None:
         """Compiles and loads every kernel, then leaves the worlds as new."""
         with torch_stream_scope(self._device):
-            self._substeps(1, kinematics=True)
+            self._decimation(1, kinematics=True)
         self.synchronize()
         self.reset()
         self.synchronize()
@@ -373,7 +450,7 @@ class MjwarpSimulation(FixedViews):
         key = (n, kinematics)
         if key not in self._graphs:
             self._graphs[key] = StepGraph(
-                lambda: self._substeps(n, kinematics),
+                lambda: self._decimation(n, kinematics),
                 self.device,
                 self._graph_mode,
                 name=f"step({n})",
@@ -384,9 +461,12 @@ class MjwarpSimulation(FixedViews):
 
 
 def _keep_arrays(fresh: object, old: object) -> None:
-    """Hands the arrays whose size is the same over to new data, so that whoever looks at them goes on doing so."""
+    """Hands the arrays whose size is the same over to new data, so that whoever looks at them goes
+    on doing so.
+    """
     for field in dataclass_fields(fresh):  # type: ignore[arg-type]
-        ours, theirs = getattr(fresh, field.name), getattr(old, field.name)
+        ours = getattr(fresh, field.name)
+        theirs = getattr(old, field.name)
         if isinstance(ours, wp.array) and ours.shape == theirs.shape and ours.dtype == theirs.dtype:
             setattr(fresh, field.name, theirs)
         elif is_dataclass(ours):

@@ -1,4 +1,6 @@
-"""Native MuJoCo over many worlds: one state row per world, one MjData per thread, a pool over all cores."""
+"""Native MuJoCo over many worlds: one state row per world, one MjData per thread, a pool over all
+cores.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,14 @@ from mjstack.sim.simulation import Overflow
 from mjstack.sim.views import Fields, FixedViews, check_mask
 
 _S = mujoco.mjtState
-_SPEC = int(_S.mjSTATE_TIME | _S.mjSTATE_QPOS | _S.mjSTATE_QVEL | _S.mjSTATE_ACT | _S.mjSTATE_WARMSTART | _S.mjSTATE_CTRL)
+_SPEC = int(
+    _S.mjSTATE_TIME
+    | _S.mjSTATE_QPOS
+    | _S.mjSTATE_QVEL
+    | _S.mjSTATE_ACT
+    | _S.mjSTATE_WARMSTART
+    | _S.mjSTATE_CTRL
+)
 _CONTACT_FULL = int(mujoco.mjtWarning.mjWARN_CONTACTFULL)
 _CONSTRAINT_FULL = int(mujoco.mjtWarning.mjWARN_CNSTRFULL)
 _SAMEFRAME = {
@@ -37,7 +46,9 @@ def available_cores() -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Worker:
-    """What one thread works with. Each pair is an array of all worlds and the one of the thread's model or data beside it."""
+    """What one thread works with. Each pair is an array of all worlds and the one of the thread's
+    model or data beside it.
+    """
 
     model: mujoco.MjModel
     data: mujoco.MjData
@@ -47,9 +58,16 @@ class _Worker:
 
 
 def native_bytes(model: mujoco.MjModel, nworld: int) -> int:
-    """Bytes of the state and the poses that a `NativeSimulation` keeps, counted without allocating them."""
+    """Bytes of the state and the poses that a `NativeSimulation` keeps, counted without allocating
+    them.
+    """
     numbers = (
-        mujoco.mj_stateSize(model, _SPEC) + 7 * model.nbody + 3 * model.nsite + 3 * model.ngeom + model.nv + model.nsensordata
+        mujoco.mj_stateSize(model, _SPEC)
+        + 7 * model.nbody
+        + 3 * model.nsite
+        + 3 * model.ngeom
+        + model.nv
+        + model.nsensordata
     )
     return 8 * nworld * numbers
 
@@ -57,16 +75,24 @@ def native_bytes(model: mujoco.MjModel, nworld: int) -> int:
 class NativeSimulation(FixedViews):
     """`Simulation` on native MuJoCo, float64 on the CPU.
 
-    A world's whole state, warm start included (``qacc_warmstart``), is one row that goes into a thread's MjData before its
-    substeps and comes back after them; so do its model fields into the thread's MjModel, if there are any. MuJoCo's
-    automatic reset of a diverged world is switched off, because it would hide the divergence; a world whose state is not
-    finite is not stepped any more, and its derived arrays are NaN.
+    A world's whole state, warm start included (``qacc_warmstart``), is one row that goes into a
+    thread's MjData before its decimation and comes back after them; so do its model fields into the
+    thread's MjModel, if there are any. MuJoCo's automatic reset of a diverged world is switched
+    off, because it would hide the divergence; a world whose state is not finite is not stepped any
+    more, and its derived arrays are NaN.
     """
 
     backend = "native"
     version = 0  # nothing is ever captured
 
-    def __init__(self, model: mujoco.MjModel, nworld: int, *, fields: Sequence[str] = (), nthread: int | None = None) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        nworld: int,
+        *,
+        fields: Sequence[str] = (),
+        nthread: int | None = None,
+    ) -> None:
         """Allocates nworld worlds at qpos0.
 
         Args:
@@ -83,17 +109,25 @@ class NativeSimulation(FixedViews):
         self.nworld = nworld
         self.device = torch.device("cpu")
         self.nthread = nthread = max(1, min(nthread or available_cores(), nworld))
-        self.description = f"MuJoCo {mujoco.__version__} on {nthread} threads, {platform.machine()} CPU"
+        self.description = (
+            f"MuJoCo {mujoco.__version__} on {nthread} threads, {platform.machine()} CPU"
+        )
         self._pool = ThreadPoolExecutor(nthread) if nthread > 1 else None
 
         m = self.model
         self._state = np.zeros((nworld, mujoco.mj_stateSize(m, _SPEC)))
         # mj_getState's order: time, qpos, qvel, act, warm start, ctrl.
-        q, v, a, u = 1, 1 + m.nq, 1 + m.nq + m.nv, self._state.shape[1] - m.nu
+        q = 1
+        v = 1 + m.nq
+        a = 1 + m.nq + m.nv
+        u = self._state.shape[1] - m.nu
         self._qpos = self._state[:, q:v]
         self._physics = self._state[:, q : a + m.na]
         self.qpos, self.qvel = torch.from_numpy(self._qpos), torch.from_numpy(self._state[:, v:a])
-        self.act, self.ctrl = torch.from_numpy(self._state[:, a : a + m.na]), torch.from_numpy(self._state[:, u:])
+        self.act, self.ctrl = (
+            torch.from_numpy(self._state[:, a : a + m.na]),
+            torch.from_numpy(self._state[:, u:]),
+        )
         self.qacc_warmstart = torch.from_numpy(self._state[:, u - m.nv : u])
         self._initial = self._state[0].copy()
         mujoco.mj_getState(m, mujoco.MjData(m), self._initial, _SPEC)
@@ -104,43 +138,67 @@ class NativeSimulation(FixedViews):
             "site_xpos": np.zeros((nworld, m.nsite, 3)),
             "geom_xpos": np.zeros((nworld, m.ngeom, 3)),
         }
-        self._others = {"qfrc_actuator": np.zeros((nworld, m.nv)), "sensordata": np.zeros((nworld, m.nsensordata))}
-        self.xpos, self.xquat, self.site_xpos, self.geom_xpos = map(torch.from_numpy, self._poses.values())
+        self._others = {
+            "qfrc_actuator": np.zeros((nworld, m.nv)),
+            "sensordata": np.zeros((nworld, m.nsensordata)),
+        }
+        self.xpos, self.xquat, self.site_xpos, self.geom_xpos = map(
+            torch.from_numpy, self._poses.values()
+        )
         self.qfrc_actuator, self.sensordata = map(torch.from_numpy, self._others.values())
         # Columns: contacts, rows, peak contacts, peak rows, overflow bits.
         self._counts = np.zeros((nworld, 5), dtype=np.int32)
-        self.contact_count, self.constraint_count, self.peak_contacts, self.peak_constraints, self.overflow = torch.from_numpy(
-            self._counts
-        ).unbind(1)
+        (
+            self.contact_count,
+            self.constraint_count,
+            self.peak_contacts,
+            self.peak_constraints,
+            self.overflow,
+        ) = torch.from_numpy(self._counts).unbind(1)
         # What masked resets would erase, in the columns of the last three.
         self._most = np.zeros((nworld, 3), dtype=np.int32)
         self._steps = np.zeros(nworld, dtype=np.int64)
         self.step_count = torch.from_numpy(self._steps)
         self._fields = {
-            name: np.repeat(np.asarray(getattr(m, name), dtype=float)[None], nworld, axis=0) for name in check_fields(fields)
+            name: np.repeat(np.asarray(getattr(m, name), dtype=float)[None], nworld, axis=0)
+            for name in check_fields(fields)
         }
-        self.fields = Fields({name: torch.from_numpy(values) for name, values in self._fields.items()})
+        self.fields = Fields(
+            {name: torch.from_numpy(values) for name, values in self._fields.items()}
+        )
         derive = not SimpleBodies.FIELDS.isdisjoint(self._fields) and m.dof_simplenum.any()
         self._simple = SimpleBodies(m, self._fields, nworld) if derive else None
         self._workers = [self._worker() for _ in range(nthread)]
         self.reset()
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
-        """Advances every world by n physics steps under the current ctrl; the poses follow with kinematics."""
+        """Advances every world by n physics steps under the current ctrl; the poses follow with
+        kinematics.
+        """
         if n == 0:
             if kinematics:
                 self.kinematics()
             return
-        self._visit(partial(self._step, n=n, kinematics=kinematics), self._finite_worlds(self._poses, self._others))
+        self._visit(
+            partial(self._step, n=n, kinematics=kinematics),
+            self._finite_worlds(self._poses, self._others),
+        )
         if kinematics:
             self._finite_worlds(self._poses)
 
     def forward(self) -> None:
-        """Computes everything that derives from the state, without advancing time; warm starts stay as they are."""
-        self._visit(partial(self._step, n=0, kinematics=False), self._finite_worlds(self._poses, self._others))
+        """Computes everything that derives from the state, without advancing time; warm starts stay
+        as they are.
+        """
+        self._visit(
+            partial(self._step, n=0, kinematics=False),
+            self._finite_worlds(self._poses, self._others),
+        )
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
-        """Brings the poses of the masked worlds up to the current qpos; the other worlds are not visited."""
+        """Brings the poses of the masked worlds up to the current qpos; the other worlds are not
+        visited.
+        """
         rows = self._rows(mask)
         self._visit(self._pose, self._finite_worlds(self._poses, rows=rows))
 
@@ -194,7 +252,12 @@ class NativeSimulation(FixedViews):
         impratio: float | None = None,
     ) -> None:
         """Changes the constraint solver's limits."""
-        given = {"iterations": iterations, "ls_iterations": ls_iterations, "tolerance": tolerance, "impratio": impratio}
+        given = {
+            "iterations": iterations,
+            "ls_iterations": ls_iterations,
+            "tolerance": tolerance,
+            "impratio": impratio,
+        }
         for model in (self.model, *(worker.model for worker in self._workers)):
             for name, value in given.items():
                 if value is not None:
@@ -217,7 +280,9 @@ class NativeSimulation(FixedViews):
                 getattr(model, kind)[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
         data = mujoco.MjData(model)
 
-        def pairs(source: object, arrays: dict[str, np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+        def pairs(
+            source: object, arrays: dict[str, np.ndarray]
+        ) -> list[tuple[np.ndarray, np.ndarray]]:
             return [(array, getattr(source, name)) for name, array in arrays.items() if array.size]
 
         fields = pairs(model, self._fields)
@@ -226,8 +291,11 @@ class NativeSimulation(FixedViews):
         return _Worker(model, data, fields, pairs(data, self._poses), pairs(data, self._others))
 
     def _all_peaks(self) -> np.ndarray:
-        """Peak contacts, peak rows and overflow bits since the last full reset, shape ``(nworld, 3)``."""
-        peaks, bits = np.maximum(self._most[:, :2], self._counts[:, 2:4]), self._most[:, 2] | self._counts[:, 4]
+        """Peak contacts, peak rows and overflow bits since the last full reset, shape ``(nworld,
+        3)``.
+        """
+        peaks = np.maximum(self._most[:, :2], self._counts[:, 2:4])
+        bits = self._most[:, 2] | self._counts[:, 4]
         return np.column_stack((peaks, bits))
 
     def _rows(self, mask: torch.Tensor | None) -> np.ndarray:
@@ -237,10 +305,13 @@ class NativeSimulation(FixedViews):
         check_mask(mask, self.nworld, self.device)
         return mask.numpy()
 
-    def _finite_worlds(self, *derived: dict[str, np.ndarray], rows: np.ndarray | None = None) -> list[int]:
+    def _finite_worlds(
+        self, *derived: dict[str, np.ndarray], rows: np.ndarray | None = None
+    ) -> list[int]:
         """The worlds among rows that can be computed; the others' derived arrays become NaN.
 
-        A diverged world stays as it is: MuJoCo would spend every solver iteration on its NaN, and gain nothing.
+        A diverged world stays as it is: MuJoCo would spend every solver iteration on its NaN, and
+        gain nothing.
         """
         finite = np.isfinite(self._physics).all(axis=1)
         chosen = np.ones_like(finite) if rows is None else rows
@@ -258,13 +329,15 @@ class NativeSimulation(FixedViews):
         if self._pool is None or len(worlds) < 2:
             work(self._workers[0], worlds)
             return
-        # All threads draw from one iterator, so that none waits for another one's share. Which of them gets a world does not
-        # matter to it: the whole state is loaded. Taking the next item is atomic under the interpreter lock.
+        # All threads draw from one iterator, so that none waits for another one's share. Which of
+        # them gets a world does not matter to it: the whole state is loaded. Taking the next item
+        # is atomic under the interpreter lock.
         queue = iter(worlds)
         jobs = [self._pool.submit(work, worker, queue) for worker in self._workers]
         try:
             wait(jobs)
-        except BaseException:  # Ctrl-C: nobody may write into the state, or use a thread's data, after this call has ended
+        # Ctrl-C: nobody may write into the state, or use a thread's data, after this call has ended
+        except BaseException:
             for _ in queue:
                 pass
             wait(jobs)
@@ -283,7 +356,11 @@ class NativeSimulation(FixedViews):
 
         MuJoCo's functions release the interpreter lock; the rest is a few microseconds a world.
         """
-        m, data, state, counts, steps = worker.model, worker.data, self._state, self._counts, self._steps
+        m = worker.model
+        data = worker.data
+        state = self._state
+        counts = self._counts
+        steps = self._steps
         derived = worker.others if kinematics else worker.poses + worker.others
         warning = data.warning.number
         for w in worlds:
@@ -299,7 +376,8 @@ class NativeSimulation(FixedViews):
             for view, array in derived:
                 view[w] = array
             row = counts[w]
-            row[0], row[1] = data.ncon, data.nefc
+            row[0] = data.ncon
+            row[1] = data.nefc
             row[2] = max(row[2], data.maxuse_con, data.ncon)
             row[3] = max(row[3], data.maxuse_efc, data.nefc)
             if warning[_CONTACT_FULL]:
@@ -316,7 +394,9 @@ class NativeSimulation(FixedViews):
             self._write_poses(worker, w)
 
     def _write_poses(self, worker: _Worker, w: int) -> None:
-        """The poses of the state that the thread's data holds. The next world loads its whole state, so nothing leaks."""
+        """The poses of the state that the thread's data holds. The next world loads its whole
+        state, so nothing leaks.
+        """
         mujoco.mj_kinematics(worker.model, worker.data)
         for view, array in worker.poses:
             view[w] = array

@@ -1,7 +1,9 @@
-"""Inertia of the bodies that MuJoCo calls simple, such as a free cube, when it differs from world to world.
+"""Inertia of the bodies that MuJoCo calls simple, such as a free cube, when it differs from world
+to world.
 
-Native MuJoCo does not compute the mass matrix of a simple body: it reads ``dof_M0``, which the compiler made from mass, inertia
-and armature. A body whose mass is changed would weigh more and resist no more, so ``dof_M0`` has to follow.
+Native MuJoCo does not compute the mass matrix of a simple body: it reads ``dof_M0``, which the
+compiler made from mass, inertia and armature. A body whose mass is changed would weigh more and
+resist no more, so ``dof_M0`` has to follow.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ class SimpleBodies:
 
     FIELDS = frozenset({"body_mass", "body_inertia", "dof_armature"})
 
-    def __init__(self, model: mujoco.MjModel, fields: Mapping[str, np.ndarray], nworld: int) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, fields: Mapping[str, np.ndarray], nworld: int
+    ) -> None:
         """Finds the degrees of freedom and what their inertia is made of.
 
         Args:
@@ -32,14 +36,20 @@ class SimpleBodies:
         self.dof_M0 = np.repeat(model.dof_M0[None], nworld, axis=0)
         self._dofs = np.flatnonzero(model.dof_simplenum)
         self._bodies = model.dof_bodyid[self._dofs]
-        self._sources = [fields.get(name, getattr(model, name)[None]) for name in ("body_mass", "body_inertia", "dof_armature")]
-        # A simple body's inertial frame is its own frame, so inertia is diagonal there: M0 = armature + a * mass + b . inertia.
+        self._sources = [
+            fields.get(name, getattr(model, name)[None])
+            for name in ("body_mass", "body_inertia", "dof_armature")
+        ]
+        # A simple body's inertial step is its own frame, so inertia is diagonal there: M0 =
+        # armature + a * mass + b . inertia.
         self._a, self._b = np.zeros(len(self._dofs)), np.zeros((len(self._dofs), 3))
         for i, dof in enumerate(self._dofs):
             joint = model.dof_jntid[dof]
             k = int(dof - model.jnt_dofadr[joint])
             kind = model.jnt_type[joint]
-            if kind == mujoco.mjtJoint.mjJNT_SLIDE or (kind == mujoco.mjtJoint.mjJNT_FREE and k < 3):
+            if kind == mujoco.mjtJoint.mjJNT_SLIDE or (
+                kind == mujoco.mjtJoint.mjJNT_FREE and k < 3
+            ):
                 self._a[i] = 1.0
             elif kind == mujoco.mjtJoint.mjJNT_HINGE:
                 axis = model.jnt_axis[joint]
@@ -52,4 +62,6 @@ class SimpleBodies:
         """Computes dof_M0 from what the fields hold now."""
         mass, inertia, armature = self._sources
         spin = (inertia[:, self._bodies] * self._b).sum(-1)
-        self.dof_M0[:, self._dofs] = armature[:, self._dofs] + mass[:, self._bodies] * self._a + spin
+        self.dof_M0[:, self._dofs] = (
+            armature[:, self._dofs] + mass[:, self._bodies] * self._a + spin
+        )

@@ -1,4 +1,6 @@
-"""What every physics backend offers: torch views of batched state, `step`, `forward`, `reset` and what was lost on the way."""
+"""What every physics backend offers: torch views of batched state, `step`, `forward`, `reset` and
+what was lost on the way.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from mjstack.sim.views import Fields
 class Overflow(IntFlag):
     """What a world lost because a buffer was too small. The values are MJWarp's ``OverflowType``.
 
-    Iteration limits are not here: they say how far the solver converged, not that physics was dropped.
+    Iteration limits are not here: they say how far the solver converged, not that physics was
+    dropped.
     """
 
     NEFC = 1 << 0
@@ -30,7 +33,9 @@ class Overflow(IntFlag):
 
 
 class SolverLimit(IntFlag):
-    """Where a world's solver stopped short of its tolerance. The values are those of MJWarp's ``OverflowType`` again."""
+    """Where a world's solver stopped short of its tolerance. The values are those of MJWarp's
+    ``OverflowType`` again.
+    """
 
     ITERATIONS = 1 << 9
     LS_ITERATIONS = 1 << 10
@@ -47,17 +52,19 @@ LOST_PHYSICS = int(sum(Overflow))
 class Simulation(Protocol):
     """``nworld`` copies of one model, stepped together.
 
-    Views are allocated once and keep their address for life: write into them (``sim.ctrl[:] = ...``), never rebind them
-    (``sim.ctrl = ...`` raises). A mask selects worlds: a bool tensor of shape ``(nworld,)`` on ``device``.
+    Views are allocated once and keep their address for life: write into them (``sim.ctrl[:] =
+    ...``), never rebind them (``sim.ctrl = ...`` raises). A mask selects worlds: a bool tensor of
+    shape ``(nworld,)`` on ``device``.
 
     When the views are up to date, on every backend:
 
     - ``qpos``, ``qvel`` and ``act`` are the state, always current.
-    - After `step`, the poses (``xpos``, ``xquat``, ``site_xpos``, ``geom_xpos``) belong to the state before the last
-      integration, unless ``kinematics=True``. So do ``sensordata``, ``contact_count``, ``constraint_count`` and
-      ``qfrc_actuator``, always.
+    - After `step`, the poses (``xpos``, ``xquat``, ``site_xpos``, ``geom_xpos``) belong to the
+      state before the last integration, unless ``kinematics=True``. So do ``sensordata``,
+      ``contact_count``, ``constraint_count`` and ``qfrc_actuator``, always.
     - `kinematics` brings the poses to the current state, `forward` everything.
-    - `reset` leaves poses, ``qfrc_actuator`` and the contact buffers as they were, until `kinematics` or `forward`.
+    - `reset` leaves poses, ``qfrc_actuator`` and the contact buffers as they were, until
+      `kinematics` or `forward`.
 
     Attributes:
         model: The compiled model; per-world fields are not written into it.
@@ -75,23 +82,28 @@ class Simulation(Protocol):
         geom_xpos: Geom positions [m], shape ``(nworld, ngeom, 3)``.
         qfrc_actuator: Actuator forces in joint space [N, N m], shape ``(nworld, nv)``.
         sensordata: Sensor outputs, in the model's order, shape ``(nworld, nsensordata)``.
-        fields: Per-world model fields that were asked for, by MuJoCo's name. Each is a tensor of MuJoCo's shape of that field
-            with ``nworld`` in front, and has the model's values to begin with. What is written acts from the next step on.
-            Fields that MuJoCo derives at compile time do not follow: with a new ``body_mass`` write ``body_invweight0`` and
-            its like too. Two limits are MuJoCo's: ``body_gravcomp`` acts only if the model has some, and ``body_ipos`` and
-            ``body_iquat`` must stay as they are where ``body_simple`` is set (a free cube), because such a body's mass matrix
-            is diagonal by construction. `reset` leaves fields alone, and starts a world from its ``qpos0`` if that is one.
+        fields: Per-world model fields that were asked for, by MuJoCo's name. Each is a tensor of
+            MuJoCo's shape of that field with ``nworld`` in front, and has the model's values to
+            begin with. What is written acts from the next step on. Fields that MuJoCo derives at
+            compile time do not follow: with a new ``body_mass`` write ``body_invweight0`` and its
+            like too. Two limits are MuJoCo's: ``body_gravcomp`` acts only if the model has some,
+            and ``body_ipos`` and ``body_iquat`` must stay as they are where ``body_simple`` is set
+            (a free cube), because such a body's mass matrix is diagonal by construction. `reset`
+            leaves fields alone, and starts a world from its ``qpos0`` if that is one.
         contact_count: Contacts found by the last step or forward, shape ``(nworld,)``, int32.
         constraint_count: Constraint rows likewise, shape ``(nworld,)``, int32.
         step_count: Physics steps since the world's last reset, shape ``(nworld,)``, int64.
-        overflow: Bits of `Overflow` raised by `step`, sticky until the world is reset, shape ``(nworld,)``, int32. `forward`
-            alone raises none on MJWarp.
-        peak_contacts: Largest contact_count over all substeps since the world's last reset, shape ``(nworld,)``, int32.
+        overflow: Bits of `Overflow` raised by `step`, sticky until the world is reset, shape
+            ``(nworld,)``, int32. `forward` alone raises none on MJWarp.
+        peak_contacts: Largest contact_count over all decimation since the world's last reset, shape
+            ``(nworld,)``, int32.
         peak_constraints: Largest constraint_count likewise, shape ``(nworld,)``, int32.
-        most_contacts: Largest contact_count since the last full reset (one without a mask), shape ``(nworld,)``, int32. Masked
-            resets leave it alone, so it is the peak of a run in which worlds end and start anew. Computed when it is read.
+        most_contacts: Largest contact_count since the last full reset (one without a mask), shape
+            ``(nworld,)``, int32. Masked resets leave it alone, so it is the peak of a run in which
+            worlds end and start anew. Computed when it is read.
         most_constraints: Largest constraint_count likewise, shape ``(nworld,)``, int32.
-        overflow_ever: Bits of `Overflow` raised since the last full reset likewise, shape ``(nworld,)``, int32.
+        overflow_ever: Bits of `Overflow` raised since the last full reset likewise, shape
+            ``(nworld,)``, int32.
         version: Grows when something changes that a captured graph has baked in.
     """
 
@@ -136,11 +148,14 @@ class Simulation(Protocol):
 
         Args:
             n: Number of steps.
-            kinematics: Whether the poses are brought up to the state after the last of them. The physics is the same.
+            kinematics: Whether the poses are brought up to the state after the last of them. The
+                physics is the same.
         """
 
     def forward(self) -> None:
-        """Computes everything that derives from qpos, qvel, act and ctrl, without advancing time."""
+        """Computes everything that derives from qpos, qvel, act and ctrl, without
+        advancing time.
+        """
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
         """Brings the poses up to the current qpos, without advancing time.
@@ -150,13 +165,15 @@ class Simulation(Protocol):
         """
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Puts worlds back to the model's qpos0, at rest: act, ctrl, sensordata, counters and overflow bits become zero.
+        """Puts worlds back to the model's qpos0, at rest: act, ctrl, sensordata, counters and
+        overflow bits become zero.
 
         Args:
             mask: Worlds to reset (None: all).
 
         Raises:
-            ArgumentError: The mask is not a bool tensor of shape ``(nworld,)`` on the simulation's device.
+            ArgumentError: The mask is not a bool tensor of shape ``(nworld,)`` on the simulation's
+                device.
         """
 
     def option_values(self) -> dict[str, float | int | str]:

@@ -32,15 +32,17 @@ class BatchSizes:
     def as_kwargs(self, nworld: int) -> dict[str, int]:
         """Arguments for ``mujoco_warp.make_data``.
 
-        Convex pairs are some of the pairs in the contact pool. MJWarp refuses more room for them than that pool has, so what
-        could never be used is cut off.
+        Convex pairs are some of the pairs in the contact pool. MJWarp refuses more room for them
+        than that pool has, so what could never be used is cut off.
 
         Args:
             nworld: Number of worlds.
         """
         kwargs = {name: value for name in KEYS if (value := getattr(self, name)) is not None}
         if "nccdmax" in kwargs:
-            kwargs["nccdmax"] = min(kwargs["nccdmax"], self.nconmax, self.contact_pool(nworld) // nworld)
+            kwargs["nccdmax"] = min(
+                kwargs["nccdmax"], self.nconmax, self.contact_pool(nworld) // nworld
+            )
         if "naccdmax" in kwargs:
             kwargs["naccdmax"] = min(kwargs["naccdmax"], self.contact_pool(nworld))
         return kwargs
@@ -52,31 +54,40 @@ class BatchSizes:
     def convex_pool(self, nworld: int) -> int:
         """Convex pairs of one kind that fit into the pool of nworld worlds."""
         kwargs = self.as_kwargs(nworld)
-        return kwargs.get("naccdmax", kwargs["nccdmax"] * nworld if "nccdmax" in kwargs else self.contact_pool(nworld))
+        return kwargs.get(
+            "naccdmax",
+            kwargs["nccdmax"] * nworld if "nccdmax" in kwargs else self.contact_pool(nworld),
+        )
 
     def as_overrides(self) -> str:
         """The same on the command line: ``batch.nconmax=40 batch.njmax=184``."""
-        return " ".join(f"batch.{name}={value}" for name in KEYS if (value := getattr(self, name)) is not None)
+        return " ".join(
+            f"batch.{name}={value}" for name in KEYS if (value := getattr(self, name)) is not None
+        )
 
 
 def resolve_sizes(cfg: Config) -> BatchSizes:
     """The configured sizes, with the defaults of this robot and scene where they are null."""
-    layout = cfg.robot.layouts[cfg.scene.name]
-    return apply_configured(cfg, BatchSizes(nconmax=layout.nconmax, njmax=layout.njmax))
+    placements = cfg.robot.placements[cfg.scene.name]
+    return apply_configured(cfg, BatchSizes(nconmax=placements.nconmax, njmax=placements.njmax))
 
 
 def resolve_env_sizes(cfg: Config) -> BatchSizes:
     """Likewise with room for random actions, the worst case for contacts."""
-    layout = cfg.robot.layouts[cfg.scene.name]
-    return apply_configured(cfg, BatchSizes(nconmax=layout.env_nconmax, njmax=layout.env_njmax))
+    placements = cfg.robot.placements[cfg.scene.name]
+    return apply_configured(
+        cfg, BatchSizes(nconmax=placements.env_nconmax, njmax=placements.env_njmax)
+    )
 
 
 def resolve_measuring_sizes(cfg: Config) -> BatchSizes:
-    """Room to measure in: the robot's sizes for random actions, or the configured ones where those are larger."""
-    layout = cfg.robot.layouts[cfg.scene.name]
+    """Room to measure in: the robot's sizes for random actions, or the configured ones where those
+    are larger.
+    """
+    placements = cfg.robot.placements[cfg.scene.name]
     return BatchSizes(
-        nconmax=max(layout.env_nconmax, cfg.batch.nconmax or 0),
-        njmax=max(layout.env_njmax, cfg.batch.njmax or 0),
+        nconmax=max(placements.env_nconmax, cfg.batch.nconmax or 0),
+        njmax=max(placements.env_njmax, cfg.batch.njmax or 0),
         source="room to measure in",
     )
 

@@ -17,7 +17,9 @@ def place_static_geoms(
     geom_xpos: wp.array2d[wp.vec3],
     geom_xmat: wp.array2d[wp.mat33],
 ) -> None:
-    """Writes the poses of exactly those geoms that MJWarp's kinematics leaves out. Warp's own quaternions are xyzw."""
+    """Writes the poses of exactly those geoms that MJWarp's kinematics leaves out. Warp's own
+    quaternions are xyzw.
+    """
     world, geom = wp.tid()  # type: ignore[misc]
     body = geom_bodyid[geom]
     if body_weldid[body] != 0 or body_mocapid[body_rootid[body]] != -1:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-# One object per torch stream, for ever: a second one for the same stream would unregister it when freed.
+# One object per torch stream, for ever: a second one for the same stream would unregister it when
+# freed.
 _STREAMS: dict[tuple[str, int], wp.Stream] = {}
 
 
 def torch_stream_scope(device: wp.Device) -> wp.ScopedStream | wp.ScopedDevice:
     """A context in which Warp's work on a device goes to torch's current stream there.
 
-    Reads and writes of shared memory by torch, before and after, are then ordered with it, and nobody waits. On Warp's CPU
-    device, which has no streams, it only makes the device the current one.
+    Reads and writes of shared memory by torch, before and after, are then ordered with it, and
+    nobody waits. On Warp's CPU device, which has no streams, it only makes the device the current
+    one.
 
     Args:
         device: The Warp device.

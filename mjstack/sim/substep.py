@@ -14,14 +14,16 @@ from mjstack.sim.graph import side_by_side
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Arrangement:
-    """What is done to make a captured step faster than MJWarp's own. All of it leaves the numbers as they are.
+    """What is done to make a captured step faster than MJWarp's own. All of it leaves the numbers
+    as they are.
 
     Attributes:
-        branches: Contacts beside smooth dynamics, there inertia beside forces, and counting beside the next step's
-            kinematics, as parallel branches.
+        branches: Contacts beside smooth dynamics, there inertia beside forces, and counting beside
+            the next step's kinematics, as parallel branches.
         sensors_once: Sensors in the last of several steps alone: nobody sees the others'.
-        own_stages: Only the stages that the model needs: no cameras, lights, tendons, flexes or energy.
-        scratch: Temporaries at fixed addresses (`Arena`), not allocated and freed by the graph.
+        own_stages: Only the stages that the model needs: no cameras, lights, tendons, flexes or
+            energy.
+        scratch: Temporaries at fixed addresses (`Scratch`), not allocated and freed by the graph.
     """
 
     branches: bool = True
@@ -33,9 +35,10 @@ class Arrangement:
 def can_rearrange(model: mujoco.MjModel, m: mjw.Model) -> bool:
     """Whether `rearranged_step` does all that `mujoco_warp.step` does for this model.
 
-    It leaves out cameras and lights, which nothing in the physics reads, tendons, flexes, sleeping, energy and callbacks, and
-    it knows one integrator. Equalities between bodies read velocities of the step before, adhesion reads contacts among the
-    smooth forces, and sensors of acceleration or of a camera need stages of their own.
+    It leaves out cameras and lights, which nothing in the physics reads, tendons, flexes, sleeping,
+    energy and callbacks, and it knows one integrator. Equalities between bodies read velocities of
+    the step before, adhesion reads contacts among the smooth forces, and sensors of acceleration or
+    of a camera need stages of their own.
     """
     equalities = {int(kind) for kind in model.eq_type}
     seen_by = {int(kind) for kind in (*model.sensor_objtype, *model.sensor_reftype)}
@@ -47,7 +50,8 @@ def can_rearrange(model: mujoco.MjModel, m: mjw.Model) -> bool:
         and model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
         and model.ntendon == model.nflex == 0
         and model.nhistory == 0
-        and not model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
+        and not model.opt.enableflags
+        & int(mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
         and equalities <= {int(mujoco.mjtEq.mjEQ_JOINT)}
         and not m.sensor_rne_postconstraint
         and not m.opt.run_rne_postconstraint
@@ -64,7 +68,8 @@ def rearranged_step(
     branches: bool = True,
     beside_kinematics: tuple[Callable[[], None], ...] = (),
 ) -> None:
-    """`mujoco_warp.step`, with contacts and smooth dynamics as parallel branches: neither needs the other.
+    """`mujoco_warp.step`, with contacts and smooth dynamics as parallel branches: neither needs the
+    other.
 
     Args:
         m: The uploaded model.

@@ -1,4 +1,6 @@
-"""Views that keep their memory: what guards them against rebinding, and the check of a mask over worlds."""
+"""Views that keep their memory: what guards them against rebinding, and the check of a mask over
+worlds.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ from mjstack.errors import ArgumentError, MissingField, RebindError
 
 
 class Fields(Mapping[str, torch.Tensor]):
-    """Per-world model fields by MuJoCo's name. Write into a tensor; the mapping itself cannot be changed."""
+    """Per-world model fields by MuJoCo's name. Write into a tensor; the mapping itself cannot be
+    changed.
+    """
 
     def __init__(self, tensors: Mapping[str, torch.Tensor]) -> None:
         self._tensors = dict(tensors)
@@ -21,7 +25,8 @@ class Fields(Mapping[str, torch.Tensor]):
         return self._tensors[name]
 
     def __setitem__(self, name: str, value: torch.Tensor) -> None:
-        # Python ends `fields[name] *= 2` by setting the item to the tensor that it has just changed in place.
+        # Python ends `fields[name] *= 2` by setting the item to the tensor that it has just changed
+        # in place.
         if self[name] is not value:
             raise RebindError(f"sim.fields['{name}']")
 
@@ -35,14 +40,18 @@ class Fields(Mapping[str, torch.Tensor]):
 class FixedViews:
     """Base of a simulation: an attribute that holds a tensor keeps that tensor for life.
 
-    Captured graphs and the stepping code know the memory, not the attribute: a rebound view would be ignored without a word.
+    Captured graphs and the stepping code know the memory, not the attribute: a rebound view would
+    be ignored without a word.
     """
 
     def __setattr__(self, name: str, value: object) -> None:
         bound = self.__dict__.get(name)
-        # Python ends `sim.qpos += 1` by setting the attribute to the tensor that it has just changed in place.
+        # Python ends `sim.qpos += 1` by setting the attribute to the tensor that it has just
+        # changed in place.
         if isinstance(bound, (torch.Tensor, Fields)) and bound is not value:
-            raise RebindError(f"sim.{name}" if isinstance(bound, torch.Tensor) else f"sim.{name}[name]")
+            raise RebindError(
+                f"sim.{name}" if isinstance(bound, torch.Tensor) else f"sim.{name}[name]"
+            )
         super().__setattr__(name, value)
 
 
@@ -61,4 +70,6 @@ def check_mask(mask: torch.Tensor, nworld: int, device: torch.device) -> None:
     if not isinstance(mask, torch.Tensor):
         raise ArgumentError("mask", f"a {type(mask).__name__}", expected)
     if mask.dtype is not torch.bool or mask.shape != (nworld,) or mask.device != device:
-        raise ArgumentError("mask", f"a {mask.dtype} tensor of shape {tuple(mask.shape)} on {mask.device}", expected)
+        raise ArgumentError(
+            "mask", f"a {mask.dtype} tensor of shape {tuple(mask.shape)} on {mask.device}", expected
+        )

@@ -1,1 +1,1 @@
-"""Tasks: what has to be achieved, and the evidence for it."""
+"""Tasks: what has to be achieved, and the check for it."""

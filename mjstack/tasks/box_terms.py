@@ -9,7 +9,7 @@ import torch
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.base import EnvView, require_positive, shared
 from mjstack.math import quat_to_matrix
-from mjstack.mdp.geometry import above_table, aperture_center, jaw_forces, pose_w
+from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, pose_w
 from mjstack.scene import BLUE, RED, table_top
 from mjstack.tasks.box import CubesAndBox
 
@@ -28,7 +28,9 @@ class ToSlot:
             MjstackError: There is no such cube, or no box.
         """
         env.index.object_address(object)
-        scene, box, slots = env.cfg.scene, env.cfg.scene.box, {RED: env.cfg.scene.red_slot, BLUE: env.cfg.scene.blue_slot}
+        scene = env.cfg.scene
+        box = env.cfg.scene.box
+        slots = {RED: env.cfg.scene.red_slot, BLUE: env.cfg.scene.blue_slot}
         slot = slots.get(object)
         if object not in slots:
             raise UnknownName("cube", object, slots)
@@ -44,10 +46,11 @@ class ToSlot:
 
 
 class Place:
-    """Nearness of a cube to its place in the box, while it is off the table: ``1 - tanh(distance / scale)``.
+    """Nearness of a cube to its place in the box, while it is off the table: ``1 - tanh(distance /
+    scale)``.
 
-    Off the table is a cube whose lowest corner is higher than half the thickness of the box's floor, ``scene.box.floor``: also
-    one that rests in the box, however thin that floor is.
+    Off the table is a cube whose lowest corner is higher than half the thickness of the box's
+    floor, ``scene.box.floor``: also one that rests in the box, however thin that floor is.
     """
 
     def __init__(self, env: EnvView, *, object: str, scale: float) -> None:
@@ -62,7 +65,9 @@ class Place:
             MjstackError: There is no such cube, no box, or the scale is out of range.
         """
         require_positive("scale", scale)
-        self._to_slot, self._object, self._scale = ToSlot(env, object=object), object, scale
+        self._to_slot = ToSlot(env, object=object)
+        self._object = object
+        self._scale = scale
         assert env.cfg.scene.box is not None  # there would be no place
         self._off_table = 0.5 * env.cfg.scene.box.floor
 
@@ -85,7 +90,9 @@ class InBox:
 
 
 class ReachNext:
-    """Nearness of the aperture centre to the first cube that is not in the box yet, red first; 1 once both are."""
+    """Nearness of the grasp point to the first cube that is not in the box yet, red first; 1 once
+    both are.
+    """
 
     def __init__(self, env: EnvView, *, scale: float) -> None:
         """Reads the box's place.
@@ -98,18 +105,23 @@ class ReachNext:
             MjstackError: There is no box, or the scale is out of range.
         """
         require_positive("scale", scale)
-        self._cubes, self._scale = CubesAndBox(env.cfg, env.index, env.device), scale
+        self._cubes = CubesAndBox(env.cfg, env.index, env.device)
+        self._scale = scale
 
     def __call__(self, env: EnvView) -> torch.Tensor:
         """The reward, shape ``(nworld,)``."""
         red, blue = cubes_inside(env, self._cubes).unbind(1)
         aim = torch.where(red[:, None], pose_w(env, BLUE)[:, :3], pose_w(env, RED)[:, :3])
-        near = 1.0 - torch.tanh(torch.linalg.vector_norm(aim - aperture_center(env), dim=1) / self._scale)
+        near = 1.0 - torch.tanh(
+            torch.linalg.vector_norm(aim - grasp_point(env), dim=1) / self._scale
+        )
         return torch.where(red & blue, 1.0, near)
 
 
 class GraspNext:
-    """1 while both jaws press on the first cube that is not in the box yet, red first, or once both are; else 0."""
+    """1 while both jaws press on the first cube that is not in the box yet, red first, or once both
+    are; else 0.
+    """
 
     def __init__(self, env: EnvView, *, force: float = 0.05) -> None:
         """Reads the box's place.
@@ -123,7 +135,8 @@ class GraspNext:
         """
         if not 0.0 <= force < math.inf:
             raise ParameterError("force", force, "a number that is not negative")
-        self._cubes, self._force = CubesAndBox(env.cfg, env.index, env.device), force
+        self._cubes = CubesAndBox(env.cfg, env.index, env.device)
+        self._force = force
 
     def __call__(self, env: EnvView) -> torch.Tensor:
         """The reward, shape ``(nworld,)``."""

@@ -1,4 +1,4 @@
-"""Task *reach*: the aperture centre to a point above a cube."""
+"""Task *reach*: the grasp point to a point above a cube."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ import torch
 
 from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView
-from mjstack.mdp.geometry import aperture_center, pose_w
+from mjstack.mdp.geometry import grasp_point, pose_w
 
 
 class ReachSuccess:
-    """Achieved while the aperture centre has been near the point for some frames in a row."""
+    """Achieved while the grasp point has been near the point for some steps in a row."""
 
-    def __init__(self, env: EnvView, *, object: str, height: float, distance: float, frames: int) -> None:
+    def __init__(
+        self, env: EnvView, *, object: str, height: float, distance: float, steps: int
+    ) -> None:
         """Takes the thresholds.
 
         Args:
@@ -22,7 +24,7 @@ class ReachSuccess:
             object: The cube.
             height: How far above its centre the point is [m].
             distance: What counts as near [m].
-            frames: How many frames in a row.
+            steps: How many steps in a row.
 
         Raises:
             MjstackError: There is no such object, or a number is out of range.
@@ -30,18 +32,21 @@ class ReachSuccess:
         env.index.object_address(object)
         if not (math.isfinite(distance) and distance > 0.0):
             raise ParameterError("distance", distance, "a positive number [m]")
-        if frames < 1:
-            raise ParameterError("frames", frames, "an integer of at least 1")
-        self._object, self._height, self._distance, self._frames = object, height, distance, frames
+        if steps < 1:
+            raise ParameterError("steps", steps, "an integer of at least 1")
+        self._object = object
+        self._height = height
+        self._distance = distance
+        self._steps = steps
         self._run = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
 
     def __call__(self, env: EnvView) -> torch.Tensor:
-        """Takes in a frame; shape ``(nworld,)``, bool."""
-        offset = pose_w(env, self._object)[:, :3] - aperture_center(env)
+        """Takes in a step; shape ``(nworld,)``, bool."""
+        offset = pose_w(env, self._object)[:, :3] - grasp_point(env)
         offset[:, 2] += self._height
         near = torch.linalg.vector_norm(offset, dim=1) <= self._distance
         self._run.add_(1).mul_(near)
-        return self._run >= self._frames
+        return self._run >= self._steps
 
     def reset(self, mask: torch.Tensor) -> None:
         """Forgets the masked worlds."""

@@ -1,22 +1,38 @@
 """The configuration as dataclasses: one per group, and `Config`, which the library receives.
 
-Hydra merges `conf/` into these types, so that a misspelt key or a value of the wrong type is an error before anything runs.
-Lengths are in m, angles in rad, times in s. Values live in `conf/`, not here.
+Hydra merges `conf/` into these types, so that a misspelt key or a value of the wrong type is an
+error before anything runs. Lengths are in m, angles in rad, times in s. Values live in `conf/`, not
+here.
 """
 
 from mjstack.config.schema.gate import (
-    AcceptanceCfg,
     BatchGateCfg,
-    BoxAcceptanceCfg,
+    BoxCheckCfg,
     CapacityCfg,
     GateCfg,
     ParityCfg,
+    StackCheckCfg,
     SuccessGateCfg,
     ThroughputCfg,
 )
-from mjstack.config.schema.job import JOB_SCHEMAS, CollectJobCfg, JobCfg, ReachabilityJobCfg, ScalingJobCfg, StudyJobCfg
-from mjstack.config.schema.physics import Backend, BatchCfg, Cone, GraphMode, SimCfg, SolverCfg, TimingCfg
-from mjstack.config.schema.robot import LayoutCfg, ModelCfg, ModelSource, RobotCfg
+from mjstack.config.schema.job import (
+    JOB_SCHEMAS,
+    CollectJobCfg,
+    JobCfg,
+    ReachabilityJobCfg,
+    ScalingJobCfg,
+    StudyJobCfg,
+)
+from mjstack.config.schema.physics import (
+    Backend,
+    BatchCfg,
+    Cone,
+    GraphMode,
+    SimCfg,
+    SolverCfg,
+    TimingCfg,
+)
+from mjstack.config.schema.robot import ModelCfg, ModelSource, PlacementsCfg, RobotCfg
 from mjstack.config.schema.root import Config
 from mjstack.config.schema.scene import BoxCfg, SceneCfg
 from mjstack.config.schema.task import ControllerCfg, PhaseCfg, TaskCfg
@@ -31,13 +47,12 @@ from mjstack.config.schema.term import (
 
 __all__ = [
     "JOB_SCHEMAS",
-    "AcceptanceCfg",
     "ActionTermCfg",
     "Backend",
     "BatchCfg",
     "BatchGateCfg",
-    "BoxAcceptanceCfg",
     "BoxCfg",
+    "BoxCheckCfg",
     "CapacityCfg",
     "CollectJobCfg",
     "Cone",
@@ -46,13 +61,13 @@ __all__ = [
     "GateCfg",
     "GraphMode",
     "JobCfg",
-    "LayoutCfg",
     "ModelCfg",
     "ModelSource",
     "ObservationGroupCfg",
     "ObservationTermCfg",
     "ParityCfg",
     "PhaseCfg",
+    "PlacementsCfg",
     "ReachabilityJobCfg",
     "RewardTermCfg",
     "RobotCfg",
@@ -60,6 +75,7 @@ __all__ = [
     "SceneCfg",
     "SimCfg",
     "SolverCfg",
+    "StackCheckCfg",
     "StudyJobCfg",
     "SuccessGateCfg",
     "TaskCfg",

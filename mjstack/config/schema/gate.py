@@ -9,14 +9,14 @@ from omegaconf import MISSING
 
 
 @dataclass(kw_only=True, slots=True)
-class AcceptanceCfg:
+class StackCheckCfg:
     """Thresholds of the stack task's acceptance."""
 
     lift_phases: list[str] = MISSING
     carry_phase: str = MISSING
     airborne_height: float = MISSING
-    lift_frames: int = MISSING
-    carry_frames: int = MISSING
+    lift_steps: int = MISSING
+    carry_steps: int = MISSING
     carry_distance: float = MISSING
     window: int = MISSING
     xy_err: float = MISSING
@@ -29,14 +29,14 @@ class AcceptanceCfg:
 
 
 @dataclass(kw_only=True, slots=True)
-class BoxAcceptanceCfg:
+class BoxCheckCfg:
     """Thresholds of the box task's acceptance."""
 
     force: float = MISSING
-    grasp_frames: int = MISSING
+    grasp_steps: int = MISSING
     lift_height: float = MISSING
-    lift_frames: int = MISSING
-    carry_frames: int = MISSING
+    lift_steps: int = MISSING
+    carry_steps: int = MISSING
     carry_distance: float = MISSING
     open_fraction: float = MISSING
     inside: float = MISSING
@@ -47,7 +47,9 @@ class BoxAcceptanceCfg:
 
 @dataclass(kw_only=True, slots=True)
 class ParityCfg:
-    """Tolerances of MJWarp against native MuJoCo: ``step1`` and ``step50`` map a field to its largest difference."""
+    """Tolerances of MJWarp against native MuJoCo: ``step1`` and ``step50`` map a field to its
+    largest difference.
+    """
 
     states: dict[str, str] = MISSING
     step1: dict[str, float] = MISSING
@@ -60,23 +62,26 @@ class ParityCfg:
 class CapacityCfg:
     """How buffers are sized.
 
-    ``cpu_nworld`` worlds do where worlds are slow (any CPU backend); on CUDA all nworld do. Recommended sizes are ``margin``
-    times the peaks. Random actions last ``random_frames``, one whole episode if null. ``reset`` is how worlds start in the
-    workload of randomised starts. An environment with ``batch=auto`` is sized by ``probe_frames`` of random actions, on
-    CUDA in at most ``probe_nworld`` worlds.
+    ``cpu_nworld`` worlds do where worlds are slow (any CPU backend); on CUDA all nworld do.
+    Recommended sizes are ``margin`` times the peaks. Random actions last ``random_steps``, one
+    whole episode if null. ``reset`` is how worlds start in the workload of randomised starts. An
+    environment with ``batch=auto`` is sized by ``probe_steps`` of random actions, on CUDA in at
+    most ``probe_nworld`` worlds.
     """
 
     cpu_nworld: int = MISSING
     margin: float = MISSING
-    random_frames: int | None = None
+    random_steps: int | None = None
     probe_nworld: int = MISSING
-    probe_frames: int = MISSING
+    probe_steps: int = MISSING
     reset: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(kw_only=True, slots=True)
 class BatchGateCfg:
-    """The batch gate. It plays ``seeds`` seeds, the configured one and those after it, and judges their worlds together."""
+    """The batch gate. It plays ``seeds`` seeds, the configured one and those after it, and judges
+    their worlds together.
+    """
 
     seeds: int = MISSING
     failed_worlds: int = MISSING
@@ -89,8 +94,8 @@ class ThroughputCfg:
 
     sections: list[str] = MISSING
     repetitions: int = MISSING
-    frames: int = MISSING
-    env_frames: int = MISSING
+    steps: int = MISSING
+    env_steps: int = MISSING
     max_seconds: float = MISSING
     cpu_max_seconds: float = MISSING
     from_phase: str = MISSING
@@ -100,12 +105,14 @@ class ThroughputCfg:
 
 @dataclass(kw_only=True, slots=True)
 class SuccessGateCfg:
-    """The success gate: ``seeds`` seeds of nworld episodes each, of which the share ``rate`` must be accepted.
+    """The success gate: ``seeds`` seeds of nworld episodes each, of which the share ``rate`` must
+    succeed.
 
-    ``reset`` is how worlds start, unless ``reset=layout`` names a file. ``region`` sets the half-widths of the cubes' region in
-    x and y; null leaves them as ``reset`` has them. Start places are counted in cells ``cell`` wide, directions of a cube
-    relative to that of its place as seen from the base in bins of ``yaw_cell_deg``. The ``worst_regions`` worst cells with at
-    least ``cell_episodes`` episodes are in the report's text.
+    ``reset`` is how worlds start, unless ``reset=starts_file`` names a file. ``region`` sets the
+    half-widths of the cubes' region in x and y; null leaves them as ``reset`` has them. Start
+    places are counted in cells ``cell`` wide, directions of a cube relative to that of its place as
+    seen from the base in bins of ``yaw_cell_deg``. The ``worst_regions`` worst cells with at least
+    ``cell_episodes`` episodes are in the report's text.
     """
 
     seeds: int = MISSING
@@ -122,8 +129,8 @@ class SuccessGateCfg:
 class GateCfg:
     """Thresholds of every gate."""
 
-    acceptance: AcceptanceCfg = field(default_factory=AcceptanceCfg)
-    box: BoxAcceptanceCfg = field(default_factory=BoxAcceptanceCfg)
+    acceptance: StackCheckCfg = field(default_factory=StackCheckCfg)
+    box: BoxCheckCfg = field(default_factory=BoxCheckCfg)
     parity: ParityCfg = field(default_factory=ParityCfg)
     capacity: CapacityCfg = field(default_factory=CapacityCfg)
     batch: BatchGateCfg = field(default_factory=BatchGateCfg)

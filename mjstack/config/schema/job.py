@@ -19,9 +19,10 @@ class JobCfg:
 class ScalingJobCfg(JobCfg):
     """Throughput over numbers of worlds, each in a process of its own.
 
-    ``backends`` null: native, and MJWarp where there is CUDA, as far as ``sim`` allows. Above ``large`` worlds a case makes
-    ``repetitions_large`` repetitions. ``case_minutes`` ends a case that hangs; ``max_minutes`` ends a call, and the next one
-    goes on. ``retry``: cases that failed run again.
+    ``backends`` null: native, and MJWarp where there is CUDA, as far as ``sim`` allows. Above
+    ``large`` worlds a case makes ``repetitions_large`` repetitions. ``case_minutes`` ends a case
+    that hangs; ``max_minutes`` ends a call, and the next one goes on. ``retry``: cases that failed
+    run again.
     """
 
     nworlds: list[int] = MISSING
@@ -29,8 +30,8 @@ class ScalingJobCfg(JobCfg):
     repetitions: int = MISSING
     large: int = MISSING
     repetitions_large: int = MISSING
-    native_frames: int = MISSING
-    native_env_frames: int = MISSING
+    native_steps: int = MISSING
+    native_env_steps: int = MISSING
     case_minutes: float = MISSING
     max_minutes: float | None = None
     retry: bool = MISSING
@@ -38,14 +39,14 @@ class ScalingJobCfg(JobCfg):
 
 @dataclass(kw_only=True, slots=True)
 class StudyJobCfg(JobCfg):
-    """What settings of the solver cost, and whether every world is still accepted.
+    """What settings of the solver cost, and whether every world is still succeeded.
 
-    ``variants`` maps a name to what it changes in `SolverCfg`; typed, each is a whole one. ``repetitions`` of ``frames`` frames
-    are timed, or of as many as fit into ``max_seconds``.
+    ``variants`` maps a name to what it changes in `SolverCfg`; typed, each is a whole one.
+    ``repetitions`` of ``steps`` steps are timed, or of as many as fit into ``max_seconds``.
     """
 
     repetitions: int = MISSING
-    frames: int = MISSING
+    steps: int = MISSING
     max_seconds: float = MISSING
     # Variants by name, untyped until `type_terms`, so that the command line may add one.
     variants: dict[str, Any] = field(default_factory=dict)
@@ -55,7 +56,8 @@ class StudyJobCfg(JobCfg):
 class ReachabilityJobCfg(JobCfg):
     """What the arm reaches on the table, and how far cubes may stand from their places.
 
-    ``step`` is the distance of the map's points. A region counts as reached if it is still ``margin`` wider all round.
+    ``step`` is the distance of the map's points. A region counts as reached if it is still
+    ``margin`` wider all round.
     """
 
     step: float = MISSING
@@ -66,9 +68,10 @@ class ReachabilityJobCfg(JobCfg):
 class CollectJobCfg(JobCfg):
     """Demonstrations of the scripted expert, as a dataset.
 
-    ``episodes`` is how many the dataset is to have; a call adds what is missing. ``folder`` null: ``outputs/collect/<hash>``,
-    by what episodes depend on. Frames are kept on the device until their batch is over: ``buffer_gib`` is the most that they
-    may take, and fewer worlds are played at a time where more would not fit.
+    ``episodes`` is how many the dataset is to have; a call adds what is missing. ``folder`` null:
+    ``outputs/collect/<hash>``, by what episodes depend on. Steps are kept on the device until their
+    batch is over: ``buffer_gib`` is the most that they may take, and fewer worlds are played at a
+    time where more would not fit.
     """
 
     episodes: int = MISSING
@@ -78,4 +81,9 @@ class CollectJobCfg(JobCfg):
 
 
 # Jobs with keys of their own; the others have `JobCfg`.
-JOB_SCHEMAS = {"study": StudyJobCfg, "scaling": ScalingJobCfg, "reachability": ReachabilityJobCfg, "collect": CollectJobCfg}
+JOB_SCHEMAS = {
+    "study": StudyJobCfg,
+    "scaling": ScalingJobCfg,
+    "reachability": ReachabilityJobCfg,
+    "collect": CollectJobCfg,
+}

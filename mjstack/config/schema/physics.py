@@ -17,7 +17,7 @@ class Backend(Enum):
 
 
 class GraphMode(Enum):
-    """Whether MJWarp's substeps are captured into a graph and replayed."""
+    """Whether MJWarp's decimation are captured into a graph and replayed."""
 
     auto = "auto"
     require = "require"
@@ -36,12 +36,12 @@ class TimingCfg:
     """Physics step and control interval."""
 
     physics_dt: float = MISSING
-    substeps: int = MISSING
+    decimation: int = MISSING
 
     @property
-    def frame_dt(self) -> float:
+    def step_dt(self) -> float:
         """Time between two commands [s]."""
-        return self.physics_dt * self.substeps
+        return self.physics_dt * self.decimation
 
 
 @dataclass(kw_only=True, slots=True)
@@ -61,7 +61,8 @@ class SolverCfg:
 
 @dataclass(kw_only=True, slots=True)
 class BatchCfg:
-    """MJWarp's buffer sizes. ``null`` takes the default of this robot and scene (nconmax, njmax) or of MJWarp.
+    """MJWarp's buffer sizes. ``null`` takes the default of this robot and scene (nconmax, njmax) or
+    of MJWarp.
 
     With ``auto``, what is null is measured first, as `CapacityCfg` says.
     """

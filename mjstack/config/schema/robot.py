@@ -23,12 +23,12 @@ class ModelCfg:
 
 
 @dataclass(kw_only=True, slots=True)
-class LayoutCfg:
+class PlacementsCfg:
     """Where a scene's objects stand for one robot, and the buffer sizes its contacts need.
 
-    ``random_xy`` is how far ``reset=randomized`` moves each cube off its place in x and y. ``nconmax`` and ``njmax`` are for
-    the scripted task, ``env_nconmax`` and ``env_njmax`` for random actions. A scene with a box has a ``home`` of its own, clear
-    of it.
+    ``random_xy`` is how far ``reset=randomized`` moves each cube off its place in x and y.
+    ``nconmax`` and ``njmax`` are for the scripted task, ``env_nconmax`` and ``env_njmax`` for
+    random actions. A scene with a box has a ``home`` of its own, clear of it.
     """
 
     table_center: list[float] = MISSING
@@ -51,8 +51,8 @@ class LayoutCfg:
 class RobotCfg:
     """An arm: names of its parts and the commands of the task.
 
-    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments. ``finger_room`` is what the
-    open jaws need around a cube.
+    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments.
+    ``finger_room`` is what the open jaws need around a cube.
     """
 
     name: str = MISSING
@@ -68,9 +68,9 @@ class RobotCfg:
     ik_joints: list[str] = MISSING
     locked: dict[str, float] = MISSING
     arm_force_limit: float | None = None
-    aperture_sites: list[str] = MISSING
-    aperture_geoms: dict[str, list[str]] = field(default_factory=dict)
-    aperture_bodies: dict[str, str] = field(default_factory=dict)
+    grasp_sites: list[str] = MISSING
+    grasp_geoms: dict[str, list[str]] = field(default_factory=dict)
+    grasp_bodies: dict[str, str] = field(default_factory=dict)
     approach_body: str = MISSING
     approach_axis: list[float] = MISSING
     jaw_bodies: list[str] = MISSING
@@ -81,4 +81,4 @@ class RobotCfg:
     align: float = MISSING
     approach_height: float = MISSING
     finger_room: float = MISSING
-    layouts: dict[str, LayoutCfg] = MISSING
+    placements: dict[str, PlacementsCfg] = MISSING

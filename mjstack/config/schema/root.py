@@ -26,8 +26,8 @@ class Config:
     solver: SolverCfg = field(default_factory=SolverCfg)
     batch: BatchCfg = field(default_factory=BatchCfg)
     sim: SimCfg = field(default_factory=SimCfg)
-    # Terms by name. OmegaConf would not let a command line add a term to a typed dict, so the store types them:
-    # ActionTermCfg, ObservationGroupCfg, TermCfg, TerminationTermCfg and RewardTermCfg.
+    # Terms by name. OmegaConf would not let a command line add a term to a typed dict, so the store
+    # types them: ActionTermCfg, ObservationGroupCfg, TermCfg, TerminationTermCfg and RewardTermCfg.
     action: dict[str, Any] = field(default_factory=dict)
     observation: dict[str, Any] = field(default_factory=dict)
     reset: dict[str, Any] = field(default_factory=dict)
@@ -43,6 +43,6 @@ class Config:
     graph: GraphMode = MISSING
     view: bool = MISSING
     video: bool = MISSING
-    layout: str | None = None
+    starts: str | None = None
     run: str | None = None
     world: str | None = None

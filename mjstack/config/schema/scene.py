@@ -11,8 +11,8 @@ from omegaconf import MISSING
 class BoxCfg:
     """A receiving box on the table: a floor and four walls, fixed to the world.
 
-    ``center`` and ``half`` are of its inside, in x and y. Walls stand on the table around the floor; ``height`` is their rim's
-    above the table.
+    ``center`` and ``half`` are of its inside, in x and y. Walls stand on the table around the
+    floor; ``height`` is their rim's above the table.
     """
 
     center: list[float] = MISSING

@@ -25,8 +25,9 @@ class ActionTermCfg(TermCfg):
 class ObservationTermCfg(TermCfg):
     """A part of an observation group.
 
-    ``noise`` is the half-width of uniform noise in the term's own unit, added first; then values are clipped to ``clip``
-    (low, high) and multiplied by ``scale``. ``history`` frames are kept, oldest first.
+    ``noise`` is the half-width of uniform noise in the term's own unit, added first; then values
+    are clipped to ``clip`` (low, high) and multiplied by ``scale``. ``history`` steps are kept,
+    oldest first.
     """
 
     scale: float = 1.0
@@ -37,7 +38,9 @@ class ObservationTermCfg(TermCfg):
 
 @dataclass(kw_only=True, slots=True)
 class ObservationGroupCfg:
-    """Terms that are concatenated into one tensor; ``noise: false`` switches the noise of all of them off."""
+    """Terms that are concatenated into one tensor; ``noise: false`` switches the noise of all of
+    them off.
+    """
 
     noise: bool = True
     terms: dict[str, Any] = field(default_factory=dict)
@@ -45,7 +48,7 @@ class ObservationGroupCfg:
 
 @dataclass(kw_only=True, slots=True)
 class RewardTermCfg(TermCfg):
-    """A reward per second of simulated time: each frame adds weight x value x frame_dt."""
+    """A reward per second of simulated time: each step adds weight x value x step_dt."""
 
     weight: float = MISSING
 

@@ -4,23 +4,42 @@ from __future__ import annotations
 
 import math
 
-from mjstack.config.schema import AcceptanceCfg, BatchGateCfg, BoxAcceptanceCfg, CapacityCfg, Config, ParityCfg, ThroughputCfg
-from mjstack.config.validate.term import places_cubes, reads_layout
+from mjstack.config.schema import (
+    BatchGateCfg,
+    BoxCheckCfg,
+    CapacityCfg,
+    Config,
+    ParityCfg,
+    StackCheckCfg,
+    ThroughputCfg,
+)
+from mjstack.config.validate.term import places_cubes, reads_starts_file
 from mjstack.config.validate.values import length, positive, positive_int
 from mjstack.errors import ConfigError, UnknownName
 
 SECTIONS = ("physics", "episode", "env_step")
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
-BOX_ROLES = ("approach", "descend", "close", "lift", "carry", "hold", "open", "retreat", "settle")  # phases of each cube
+BOX_ROLES = (
+    "approach",
+    "descend",
+    "close",
+    "lift",
+    "carry",
+    "hold",
+    "open",
+    "retreat",
+    "settle",
+)  # phases of each cube
 
 
 def check_gates(cfg: Config) -> None:
     """The thresholds of every gate but *success*."""
-    gate, phases = cfg.gate, cfg.controller.phases
+    gate = cfg.gate
+    phases = cfg.controller.phases
     _phase_names(cfg)
-    frames = sum(round(phase.seconds / cfg.timing.frame_dt) for phase in phases.values())
-    _acceptance(gate.acceptance, frames)
-    _box_acceptance(gate.box, frames)
+    steps = sum(round(phase.seconds / cfg.timing.step_dt) for phase in phases.values())
+    _acceptance(gate.acceptance, steps)
+    _box_acceptance(gate.box, steps)
     _batch(gate.batch, cfg.seed)
     _parity(gate.parity)
     _capacity(gate.capacity)
@@ -28,38 +47,53 @@ def check_gates(cfg: Config) -> None:
 
 
 def _phase_names(cfg: Config) -> None:
-    """The phases that thresholds and the task's evidence name are there."""
-    gate, phases = cfg.gate, cfg.controller.phases
+    """The phases that thresholds and the task's check name are there."""
+    gate = cfg.gate
+    phases = cfg.controller.phases
     named = [("gate.parity.states", name) for name in gate.parity.states.values()]
-    if cfg.task.evidence.endswith(".StackEvidence"):
+    if cfg.task.check.endswith(".StackCheck"):
         named += [("gate.acceptance.carry_phase", gate.acceptance.carry_phase)]
         named += [("gate.acceptance.lift_phases", name) for name in gate.acceptance.lift_phases]
-    if cfg.task.evidence.endswith(".BoxEvidence"):
+    if cfg.task.check.endswith(".BoxCheck"):
         if cfg.scene.box is None:
-            raise ConfigError("scene", cfg.scene.name, "a scene with a box, for task.evidence BoxEvidence", "Set scene=box")
-        named += [("task.evidence", f"{role}_{cube}") for cube in ("red", "blue") for role in BOX_ROLES]
+            raise ConfigError(
+                "scene",
+                cfg.scene.name,
+                "a scene with a box, for task.check BoxCheck",
+                "Set scene=box",
+            )
+        named += [
+            ("task.check", f"{role}_{cube}") for cube in ("red", "blue") for role in BOX_ROLES
+        ]
     named += [("gate.throughput.from_phase", gate.throughput.from_phase)]
     for key, name in named:
         if name not in phases:
             raise UnknownName(f"{key}: phase", name, phases)
 
 
-def _acceptance(t: AcceptanceCfg, frames: int) -> None:
-    if not 2 <= t.window <= frames:
-        raise ConfigError("gate.acceptance.window", t.window, f"2 to {frames} frames (the episode)")
-    for name in ("lift_frames", "carry_frames"):
+def _acceptance(t: StackCheckCfg, steps: int) -> None:
+    if not 2 <= t.window <= steps:
+        raise ConfigError("gate.acceptance.window", t.window, f"2 to {steps} steps (the episode)")
+    for name in ("lift_steps", "carry_steps"):
         positive_int(f"gate.acceptance.{name}", getattr(t, name))
-    for name in ("carry_distance", "xy_err", "support_gap", "rest_speed", "rest_position", "rest_rotation_deg"):
+    for name in (
+        "carry_distance",
+        "xy_err",
+        "support_gap",
+        "rest_speed",
+        "rest_position",
+        "rest_rotation_deg",
+    ):
         positive(f"gate.acceptance.{name}", getattr(t, name))
 
 
-def _box_acceptance(t: BoxAcceptanceCfg, frames: int) -> None:
-    for name in ("grasp_frames", "lift_frames", "carry_frames"):
+def _box_acceptance(t: BoxCheckCfg, steps: int) -> None:
+    for name in ("grasp_steps", "lift_steps", "carry_steps"):
         positive_int(f"gate.box.{name}", getattr(t, name))
     for name in ("force", "lift_height", "carry_distance", "rest_speed", "jaw_clearance"):
         positive(f"gate.box.{name}", getattr(t, name))
-    if not 1 <= t.window <= frames:
-        raise ConfigError("gate.box.window", t.window, f"1 to {frames} frames (the episode)")
+    if not 1 <= t.window <= steps:
+        raise ConfigError("gate.box.window", t.window, f"1 to {steps} steps (the episode)")
     if not 0.0 < t.open_fraction <= 1.0:
         raise ConfigError("gate.box.open_fraction", t.open_fraction, "a number above 0 and up to 1")
     if not (math.isfinite(t.inside) and t.inside >= 0.0):
@@ -69,7 +103,9 @@ def _box_acceptance(t: BoxAcceptanceCfg, frames: int) -> None:
 def _batch(t: BatchGateCfg, seed: int) -> None:
     positive_int("gate.batch.seeds", t.seeds)
     if seed + t.seeds > 1 << 32:
-        raise ConfigError("gate.batch.seeds", t.seeds, f"at most {(1 << 32) - seed}, because seeds are 32-bit")
+        raise ConfigError(
+            "gate.batch.seeds", t.seeds, f"at most {(1 << 32) - seed}, because seeds are 32-bit"
+        )
     if t.failed_worlds < 0:
         raise ConfigError("gate.batch.failed_worlds", t.failed_worlds, "an integer of at least 0")
 
@@ -82,25 +118,31 @@ def _parity(t: ParityCfg) -> None:
                 raise UnknownName(f"gate.parity.{name}: field", field, PARITY_FIELDS)
         for field in PARITY_FIELDS:
             if not (field in limits and math.isfinite(limits[field]) and limits[field] >= 0.0):
-                raise ConfigError(f"gate.parity.{name}.{field}", limits.get(field), "a number that is not negative")
+                raise ConfigError(
+                    f"gate.parity.{name}.{field}",
+                    limits.get(field),
+                    "a number that is not negative",
+                )
 
 
 def _capacity(t: CapacityCfg) -> None:
-    for name in ("cpu_nworld", "probe_nworld", "probe_frames"):
+    for name in ("cpu_nworld", "probe_nworld", "probe_steps"):
         positive_int(f"gate.capacity.{name}", getattr(t, name))
-    if t.random_frames is not None:
-        positive_int("gate.capacity.random_frames", t.random_frames)
+    if t.random_steps is not None:
+        positive_int("gate.capacity.random_steps", t.random_steps)
     if not (math.isfinite(t.margin) and t.margin >= 1.0):
         raise ConfigError("gate.capacity.margin", t.margin, "a number of at least 1, such as 1.25")
 
 
 def _throughput(t: ThroughputCfg) -> None:
-    for name in ("repetitions", "frames", "env_frames", "start_worlds"):
+    for name in ("repetitions", "steps", "env_steps", "start_worlds"):
         positive_int(f"gate.throughput.{name}", getattr(t, name))
     for name in ("max_seconds", "cpu_max_seconds"):
         positive(f"gate.throughput.{name}", getattr(t, name), "s")
     if not t.sections:
-        raise ConfigError("gate.throughput.sections", "[]", f"at least one of {', '.join(SECTIONS)}")
+        raise ConfigError(
+            "gate.throughput.sections", "[]", f"at least one of {', '.join(SECTIONS)}"
+        )
     for name in t.sections:
         if name not in SECTIONS:
             raise UnknownName("gate.throughput.sections: section", name, SECTIONS)
@@ -109,34 +151,56 @@ def _throughput(t: ThroughputCfg) -> None:
 def check_success(cfg: Config) -> None:
     """The success gate."""
     t = cfg.gate.success
-    from_file = reads_layout(cfg.reset)
+    from_file = reads_starts_file(cfg.reset)
     positive_int("gate.success.seeds", t.seeds)
     if cfg.seed + t.seeds > 1 << 32:
-        raise ConfigError("gate.success.seeds", t.seeds, f"at most {(1 << 32) - cfg.seed}, because seeds are 32-bit")
+        raise ConfigError(
+            "gate.success.seeds",
+            t.seeds,
+            f"at most {(1 << 32) - cfg.seed}, because seeds are 32-bit",
+        )
     if from_file and t.seeds > 1:
-        raise ConfigError("gate.success.seeds", t.seeds, "1, because with reset=layout worlds start alike under every seed")
+        raise ConfigError(
+            "gate.success.seeds",
+            t.seeds,
+            "1, because with reset=starts_file worlds start alike under every seed",
+        )
     if not 0.0 <= t.rate <= 1.0:
         raise ConfigError("gate.success.rate", t.rate, "a share from 0 to 1")
     positive("gate.success.cell", t.cell, "m")
     if not 0.0 < t.yaw_cell_deg <= 90.0:
-        raise ConfigError("gate.success.yaw_cell_deg", t.yaw_cell_deg, "degrees, more than 0 and at most 90")
+        raise ConfigError(
+            "gate.success.yaw_cell_deg", t.yaw_cell_deg, "degrees, more than 0 and at most 90"
+        )
     for name in ("cell_episodes", "worst_regions"):
         positive_int(f"gate.success.{name}", getattr(t, name))
     if t.region is None:
         return
     length("gate.success.region", t.region, 2)
     if from_file:
-        raise ConfigError("gate.success.region", t.region, "null, because reset=layout says where cubes start")
+        raise ConfigError(
+            "gate.success.region",
+            t.region,
+            "null, because reset=starts_file says where cubes start",
+        )
     if not any(places_cubes(term) for term in t.reset.values()):
-        raise ConfigError("gate.success.region", t.region, "null, because no term of gate.success.reset has a region")
+        raise ConfigError(
+            "gate.success.region",
+            t.region,
+            "null, because no term of gate.success.reset has a region",
+        )
     scene = cfg.scene
     for axis in (0, 1):
         # A cube of any yaw is a disc of half its diagonal.
         room = scene.table_half[axis] - math.sqrt(2.0) * scene.cube_half
-        most = min(room - abs(place[axis] - scene.table_center[axis]) for place in (scene.red_xy, scene.blue_xy))
+        most = min(
+            room - abs(place[axis] - scene.table_center[axis])
+            for place in (scene.red_xy, scene.blue_xy)
+        )
         if not 0.0 <= t.region[axis] <= most:
             raise ConfigError(
                 "gate.success.region",
                 t.region,
-                f"half-widths that leave both cubes on the table, {'xy'[axis]} from 0 to {max(most, 0.0):.3f} m",
+                f"half-widths that leave both cubes on the table, {'xy'[axis]} from 0 to"
+                f" {max(most, 0.0):.3f} m",
             )

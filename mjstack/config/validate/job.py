@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from mjstack.config.schema import CollectJobCfg, JobCfg, ReachabilityJobCfg, ScalingJobCfg, StudyJobCfg
+from mjstack.config.schema import (
+    CollectJobCfg,
+    JobCfg,
+    ReachabilityJobCfg,
+    ScalingJobCfg,
+    StudyJobCfg,
+)
 from mjstack.config.validate.physics import check_solver
 from mjstack.config.validate.values import not_negative, positive, positive_int, world_count
 from mjstack.errors import ConfigError, UnknownName
@@ -31,8 +37,10 @@ def _scaling(job: ScalingJobCfg) -> None:
         if name not in SCALING_BACKENDS:
             raise UnknownName("job.backends: backend", name, SCALING_BACKENDS)
     if job.backends is not None and not job.backends:
-        raise ConfigError("job.backends", "[]", f"null, or at least one of {', '.join(SCALING_BACKENDS)}")
-    for key in ("repetitions", "large", "repetitions_large", "native_frames", "native_env_frames"):
+        raise ConfigError(
+            "job.backends", "[]", f"null, or at least one of {', '.join(SCALING_BACKENDS)}"
+        )
+    for key in ("repetitions", "large", "repetitions_large", "native_steps", "native_env_steps"):
         positive_int(f"job.{key}", getattr(job, key))
     positive("job.case_minutes", job.case_minutes, "min")
     if job.max_minutes is not None:
@@ -41,7 +49,7 @@ def _scaling(job: ScalingJobCfg) -> None:
 
 def _study(job: StudyJobCfg) -> None:
     positive_int("job.repetitions", job.repetitions)
-    positive_int("job.frames", job.frames)
+    positive_int("job.steps", job.steps)
     positive("job.max_seconds", job.max_seconds, "s")
     if not job.variants:
         raise ConfigError("job.variants", "{}", "at least one variant of the solver")

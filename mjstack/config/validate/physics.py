@@ -14,15 +14,16 @@ CONDIMS = (1, 3, 4, 6)
 def check_timing(cfg: Config) -> None:
     """The step, and that a control interval is a whole number of them."""
     positive("timing.physics_dt", cfg.timing.physics_dt, "s")
-    positive_int("timing.substeps", cfg.timing.substeps)
+    positive_int("timing.decimation", cfg.timing.decimation)
     positive("task.control_hz", cfg.task.control_hz, "Hz")
-    positive_int("task.episode_frames", cfg.task.episode_frames)
+    positive_int("task.episode_steps", cfg.task.episode_steps)
     wanted = 1.0 / cfg.task.control_hz
-    if not math.isclose(cfg.timing.frame_dt, wanted, rel_tol=1e-9):
+    if not math.isclose(cfg.timing.step_dt, wanted, rel_tol=1e-9):
         raise ConfigError(
-            "timing.physics_dt x timing.substeps",
-            f"{cfg.timing.frame_dt:g}",
-            f"{wanted:g} s, because task '{cfg.task.name}' is controlled at {cfg.task.control_hz:g} Hz",
+            "timing.physics_dt x timing.decimation",
+            f"{cfg.timing.step_dt:g}",
+            f"{wanted:g} s, because task '{cfg.task.name}' is controlled at"
+            f" {cfg.task.control_hz:g} Hz",
             "Change both together",
         )
 
@@ -47,4 +48,8 @@ def check_solver(key: str, solver: SolverCfg) -> None:
         if value is not None:
             positive(f"{key}.{name}", value)
     if solver.gripper_condim is not None and solver.gripper_condim not in CONDIMS:
-        raise ConfigError(f"{key}.gripper_condim", solver.gripper_condim, "1, 3, 4, 6, or null for the model's own")
+        raise ConfigError(
+            f"{key}.gripper_condim",
+            solver.gripper_condim,
+            "1, 3, 4, 6, or null for the model's own",
+        )

@@ -10,17 +10,22 @@ from mjstack.errors import ConfigError, UnknownName
 
 
 def check_robot(cfg: Config) -> None:
-    """The robot's lists have its joints' length, its names are its joints', and the scene has a place for it."""
+    """The robot's lists have its joints' length, its names are its joints', and the scene has a
+    place for it.
+    """
     robot = cfg.robot
-    n_arm, n_grip = len(robot.arm_joints), len(robot.gripper_joints)
+    n_arm = len(robot.arm_joints)
+    n_grip = len(robot.gripper_joints)
     length("robot.home", robot.home, n_arm + n_grip)
     length("robot.start", robot.start, n_arm + n_grip)
     length("robot.gripper_open", robot.gripper_open, n_grip)
     length("robot.gripper_closed", robot.gripper_closed, n_grip)
-    length("robot.aperture_sites", robot.aperture_sites, 2)
+    length("robot.grasp_sites", robot.grasp_sites, 2)
     length("robot.approach_axis", robot.approach_axis, 3)
     if abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3:
-        raise ConfigError("robot.approach_axis", robot.approach_axis, "a vector of length 1, such as [0, 0, -1]")
+        raise ConfigError(
+            "robot.approach_axis", robot.approach_axis, "a vector of length 1, such as [0, 0, -1]"
+        )
     for key, names in (
         ("robot.ik_joints", robot.ik_joints),
         ("robot.locked", list(robot.locked)),
@@ -30,11 +35,15 @@ def check_robot(cfg: Config) -> None:
             if name not in robot.arm_joints:
                 raise UnknownName(f"{key}: arm joint", name, robot.arm_joints)
     if set(robot.ik_joints) & set(robot.locked):
-        raise ConfigError("robot.locked", list(robot.locked), "joints that robot.ik_joints does not move")
+        raise ConfigError(
+            "robot.locked", list(robot.locked), "joints that robot.ik_joints does not move"
+        )
     length("robot.locked", list(robot.locked.values()), len(robot.locked))
     if robot.arm_force_limit is not None:
         positive("robot.arm_force_limit", robot.arm_force_limit, "N m")
     positive("robot.approach_height", robot.approach_height, "m")
     not_negative("robot.finger_room", robot.finger_room, "m")
-    if cfg.scene.name not in robot.layouts:
-        raise UnknownName(f"robot.layouts of {robot.name}: scene", cfg.scene.name, robot.layouts)
+    if cfg.scene.name not in robot.placements:
+        raise UnknownName(
+            f"robot.placements of {robot.name}: scene", cfg.scene.name, robot.placements
+        )

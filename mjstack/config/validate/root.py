@@ -11,7 +11,7 @@ from mjstack.config.validate.physics import check_solver_and_batch, check_timing
 from mjstack.config.validate.robot import check_robot
 from mjstack.config.validate.scene import check_scene
 from mjstack.config.validate.task import check_controller
-from mjstack.config.validate.term import reads_layout
+from mjstack.config.validate.term import reads_starts_file
 from mjstack.config.validate.values import world_count
 from mjstack.errors import ConfigError, UnknownName
 
@@ -34,12 +34,18 @@ def validate(cfg: Config) -> None:
     if cfg.job.name not in JOBS:
         raise UnknownName("job", cfg.job.name, JOBS)
     if cfg.world is not None and not _WORLD.fullmatch(cfg.world):
-        raise ConfigError("world", cfg.world, "a world such as 17, or a seed and a world such as 3:17")
+        raise ConfigError(
+            "world", cfg.world, "a world such as 17, or a seed and a world such as 3:17"
+        )
     for key in ("run", "world"):
         if getattr(cfg, key) is not None and cfg.job.name != "replay":
-            raise ConfigError(key, getattr(cfg, key), "null, because it is for job=replay alone", "Add job=replay")
-    if cfg.layout is not None and not reads_layout(cfg.reset):
-        raise ConfigError("layout", cfg.layout, "null, because no reset term reads it", "Add reset=layout")
+            raise ConfigError(
+                key, getattr(cfg, key), "null, because it is for job=replay alone", "Add job=replay"
+            )
+    if cfg.starts is not None and not reads_starts_file(cfg.reset):
+        raise ConfigError(
+            "starts", cfg.starts, "null, because no reset term reads it", "Add reset=starts_file"
+        )
     if not _DEVICE.fullmatch(cfg.sim.device):
         raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N, such as cuda:0")
     check_timing(cfg)

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from mjstack.config.schema import TermCfg
 
 
-def reads_layout(reset: Mapping[str, TermCfg]) -> bool:
+def reads_starts_file(reset: Mapping[str, TermCfg]) -> bool:
     """Whether worlds start as a file says."""
-    return any(term.func.endswith(".FromLayout") for term in reset.values())
+    return any(term.func.endswith(".FromStartsFile") for term in reset.values())
 
 
 def places_cubes(term: TermCfg) -> bool:

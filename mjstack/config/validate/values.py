@@ -19,7 +19,9 @@ def world_count(key: str, value: int) -> None:
     """Raises a `ConfigError` unless a value is a number of worlds that Warp can count."""
     positive_int(key, value)
     if value > MOST_WORLDS:
-        raise ConfigError(key, value, f"at most {MOST_WORLDS} worlds, because Warp counts them with 32 bits")
+        raise ConfigError(
+            key, value, f"at most {MOST_WORLDS} worlds, because Warp counts them with 32 bits"
+        )
 
 
 def positive(key: str, value: float, unit: str = "") -> None:
@@ -31,11 +33,15 @@ def positive(key: str, value: float, unit: str = "") -> None:
 def not_negative(key: str, value: float, unit: str = "") -> None:
     """Raises a `ConfigError` unless a value is finite and at least 0."""
     if not (math.isfinite(value) and value >= 0.0):
-        raise ConfigError(key, value, f"a number that is not negative{f' [{unit}]' if unit else ''}")
+        raise ConfigError(
+            key, value, f"a number that is not negative{f' [{unit}]' if unit else ''}"
+        )
 
 
 def length(key: str, value: list, size: int) -> None:
-    """Raises a `ConfigError` unless a list has so many items, none of them an infinite or undefined number."""
+    """Raises a `ConfigError` unless a list has so many items, none of them an infinite or undefined
+    number.
+    """
     if len(value) != size:
         raise ConfigError(key, value, f"{size} numbers or names")
     if any(isinstance(item, float) and not math.isfinite(item) for item in value):

@@ -1,0 +1,1 @@
+"""Benchmarks: what the throughput gate and the scripts measure, and with what."""

@@ -1,0 +1,87 @@
+"""Energy of a GPU over some work, from NVML's counter; or one line that says why there is none."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from mjstack.report.record import Value
+from mjstack.sim import cuda_uuid
+
+SHORTEST = 0.5  # s, of a stretch of work on average: the counter moves some ten times a second
+
+
+class EnergyMeter:
+    """Adds up what the GPU's energy counter moves from `start` to `stop`. It counts the whole GPU,
+    whoever uses it.
+
+    Attributes:
+        reason: Why there is no figure; empty where there is one.
+    """
+
+    def __init__(self, device: str) -> None:
+        """Opens the counter.
+
+        Args:
+            device: ``cpu`` or ``cuda:N``.
+        """
+        self._nvml: Any = None
+        self._handle: Any = None
+        self._began = self._read_first = 0.0
+        self.clear()
+        self.reason = ""
+        self._cpu = device == "cpu"
+        if self._cpu:
+            return
+        try:
+            import pynvml
+        except ImportError:
+            self.reason = "nvidia-ml-py is not installed: pip install 'mjstack[gpu]'"
+            return
+        try:
+            pynvml.nvmlInit()
+            self._handle = pynvml.nvmlDeviceGetHandleByUUID(cuda_uuid(device))
+            pynvml.nvmlDeviceGetTotalEnergyConsumption(self._handle)
+        except pynvml.NVMLError as error:  # a part of a GPU, or an old one, has no counter
+            self.reason = f"NVML: {error}"
+            return
+        self._nvml = pynvml
+
+    def clear(self) -> None:
+        """Forgets what was added up."""
+        self._joules = self._seconds = 0.0
+        self._stretches = 0
+
+    def start(self) -> None:
+        """Begins a stretch of work, the device idle."""
+        self._read_first = self._read()
+        self._began = time.perf_counter()
+
+    def stop(self) -> None:
+        """Ends it, the device idle again, and adds it."""
+        self._seconds += time.perf_counter() - self._began
+        self._joules += self._read() - self._read_first
+        self._stretches += 1
+
+    def metrics(self) -> dict[str, Value]:
+        """Energy and mean power of the stretches, or why they are missing; nothing on a CPU."""
+        if self._cpu:
+            return {}
+        reason = self.reason
+        each = self._seconds / max(self._stretches, 1)
+        if not reason and each < SHORTEST:
+            reason = f"stretches of {each:.2g} s are too short for NVML's counter"
+        if reason:
+            return {"gpu_power_mean_w": f"not measured: {reason}"}
+        return {"gpu_power_mean_w": self._joules / self._seconds, "gpu_energy_j": self._joules}
+
+    def _read(self) -> float:
+        """The counter [J]; 0 where there is none."""
+        if self._nvml is None:
+            return 0.0
+        try:
+            return 1e-3 * float(self._nvml.nvmlDeviceGetTotalEnergyConsumption(self._handle))
+        except self._nvml.NVMLError as error:
+            self._nvml = None
+            self.reason = f"NVML: {error}"
+            return 0.0

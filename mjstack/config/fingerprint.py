@@ -1,0 +1,53 @@
+"""A configuration as plain values that say what it leads to: files count by what is in them,
+wherever they are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+from omegaconf import OmegaConf
+
+from mjstack.config.schema import Config
+from mjstack.config.validate import reads_starts_file
+from mjstack.errors import ConfigError
+
+CONTENT = "sha256:"  # in front of what stands for a file
+
+
+def config_content(cfg: Config) -> dict[str, Any]:
+    """The whole configuration in JSON's types, with the SHA-256 of each starts file in place of its
+    path.
+
+    Raises:
+        ConfigError: A starts file cannot be read.
+    """
+    config = cast(
+        dict[str, Any], OmegaConf.to_container(OmegaConf.structured(cfg), enum_to_str=True)
+    )
+    for name, term in cfg.reset.items():
+        path = term.params.get("path")
+        params = config["reset"][name]["params"]
+        if reads_starts_file({name: term}) and path is not None:
+            if path == cfg.starts:
+                params["path"] = "${starts}"
+                config["starts"] = _content("starts", path)
+            else:
+                params["path"] = _content(f"reset.{name}.params.path", path)
+    return cast(dict[str, Any], json.loads(json.dumps(config)))
+
+
+def config_hash(config: Mapping[str, Any]) -> str:
+    """SHA-256 of a configuration in JSON's types."""
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
+
+
+def _content(key: str, path: str) -> str:
+    try:
+        return CONTENT + hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except OSError as error:
+        raise ConfigError(key, path, f"a file that can be read ({error.strerror})") from error

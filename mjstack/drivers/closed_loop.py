@@ -1,0 +1,330 @@
+"""The scripted controller: every world goes through its phases by itself, watches its cubes, and
+needs no host.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from mjstack.config.schema import Config
+from mjstack.drivers.open_loop import OpenLoopPlanner
+from mjstack.drivers.tilt import CarryTilt
+from mjstack.envs import Env
+from mjstack.errors import ArgumentError
+from mjstack.kinematics.batched_ik import BatchedIk
+from mjstack.managers.base import EnvView
+from mjstack.mdp.geometry import cubes_in_hand, pose_w, robot
+from mjstack.scene.index import CUBES
+from mjstack.scene.phases import FIXED, anchor_of, build_phases, grasped_cubes
+
+_QUARTER = 0.5 * math.pi
+_STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
+_ROLL_STEP = 0.05  # rad per step
+_DONE = 1e-3  # steps: a phase is over this much before its last step would be
+
+
+class ClosedLoopDriver:
+    """Phase, time and targets of every world as tensors; targets from where its cubes are; batched
+    inverse kinematics.
+
+    A phase moves the grasp point by smoothstep from the last phase's target to its own. Where it
+    says ``look``, the cube's place is measured when it begins. A grasp without load on both jaws at
+    its end is tried again, from the phase ``retry``, once for each cube and if the rest can be done
+    in time: such a world then goes faster than the others, at most ``controller.hurry`` times.
+
+    Where the robot has an ``approach_gain``, the gripper leans at the grasp as it must where the
+    cube is let go (`CarryTilt`).
+
+    A world that the environment has reset starts over by itself.
+
+    Attributes:
+        phases: The phases, laid out as a world without a retry goes through them.
+        steps: Length of the episode.
+        phase: Number of the phase that each world's last command belonged to, shape ``(nworld,)``,
+            int64.
+        retries: Grasps tried again in this episode, shape ``(nworld,)``, int32.
+        error: Largest distance that inverse kinematics left at the end of any phase [m], shape
+            ``(nworld,)``.
+        unreachable: Whether a target was farther than ``controller.ik_tolerance``, shape
+            ``(nworld,)``, bool.
+    """
+
+    def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
+        """Allocates for the environment's worlds.
+
+        Args:
+            env: The environment; its action terms must take absolute joint commands.
+            nominal: Commands at the end of each phase in the nominal layout, which redundant joints
+                keep close to, shape ``(phases, nu)``.
+
+        Raises:
+            MjstackError: The scene lacks a phase's anchor, the environment takes other actions, or
+                worlds have moved on.
+        """
+        cfg = env.cfg
+        device = env.device
+        n = env.nworld
+        if list(cfg.action.values()) != list(cfg.controller.action.values()):
+            expected = "absolute joint commands, which the expert gives"
+            raise ArgumentError(
+                "env", "other actions", expected, "Build it with action=joint_absolute"
+            )
+        if bool((env.episode_step != 0).any()):  # it begins where the environment's episodes do
+            raise ArgumentError(
+                "env",
+                "worlds that have moved on",
+                "worlds at their start",
+                "Call env.reset() before",
+            )
+        self._env = env
+        self._cfg = cfg
+        self.phases = build_phases(cfg)
+        self.steps = self.phases[-1].stop
+        self._build_tables(cfg, device)
+        c = cfg.controller
+        self._ik = BatchedIk(
+            env.sim.model,
+            cfg.robot,
+            n,
+            device,
+            iterations=c.step_iterations,
+            posture_gain=c.posture_gain,
+            approach_gain=c.approach_gain,
+            tolerance=c.ik_tolerance,
+        )
+        self._uses_posture = c.posture_gain > 0.0
+        tensors = robot(env)
+        self._n_arm = env.index.n_arm
+        self._nominal = torch.as_tensor(nominal, dtype=torch.float32, device=device)
+        self._tilt = (
+            CarryTilt(env.sim.model, cfg, self._ik, self._nominal)
+            if c.approach_gain > 0.0
+            else None
+        )
+        self._home_grip = tensors.home[self._n_arm :].float()
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.zeros((n, *shape), dtype=dtype, device=device)
+
+        self.phase = zeros(dtype=torch.int64)
+        self._time = zeros()
+        self._rate = zeros()
+        self.retries = zeros(dtype=torch.int32)
+        self.error = zeros()
+        self.unreachable = zeros(dtype=torch.bool)
+        self._tried = zeros(len(CUBES), dtype=torch.bool)  # whose grasp has been tried again
+        self._again = zeros(dtype=torch.bool)  # the phase was entered to try a grasp once more
+        self._seen = zeros(3, 2)  # x and y of red, of blue, and of a fixed place
+        self._from = zeros(3)
+        self._to = zeros(3)
+        n_grip = len(cfg.robot.gripper_joints)
+        self._grip_from = zeros(n_grip)
+        self._grip_to = zeros(n_grip)
+        self._command = zeros(len(cfg.robot.home))
+        self._yaw = zeros(3)
+        self._roll = zeros()
+        self._roll_column, self._roll_sign = self._find_roll()
+
+    def command(self) -> torch.Tensor:
+        """Commands of the next step, shape ``(nworld, nu)``, float32. The controller's own memory:
+        do not write into it.
+        """
+        fresh = self._env.episode_step == 0
+        self._advance(fresh)
+        length = self._length.index_select(0, self.phase)
+        u = (self._time / length).clamp(max=1.0)
+        s = _smoothstep(u)[:, None]
+        # After an empty grasp straight up first, and only then to where the cube is now: it may
+        # stand beside the jaws.
+        up = _smoothstep((2.0 * u).clamp(max=1.0))
+        over = _smoothstep((2.0 * u - 1.0).clamp(min=0.0))
+        share = torch.where(self._again[:, None], torch.stack((over, over, up), dim=1), s)
+        target = torch.lerp(self._from, self._to, share)
+        grip = torch.lerp(self._grip_from, self._grip_to, s)
+        posture = self._nominal.index_select(0, self.phase)
+        start = torch.where(fresh[:, None], posture, self._command)
+        start[:, self._n_arm :] = grip
+        if self._cfg.controller.align > 0.0:
+            self._turn(start, fresh)
+        approach = None
+        if self._tilt is not None:
+            approach = self._tilt.wish(
+                start, self.phase, self._aim(self._tilt.place.index_select(0, self.phase)), fresh
+            )
+        command, distance = self._ik.solve(
+            start, target, posture if self._uses_posture else None, approach
+        )
+        self._command.copy_(command)
+        last = self._time >= length - _DONE
+        self.error.copy_(torch.where(last, torch.maximum(self.error, distance), self.error))
+        self.unreachable |= last & ~(distance <= self._cfg.controller.ik_tolerance)
+        return self._command
+
+    def _advance(self, fresh: torch.Tensor) -> None:
+        """Time goes on by a step; worlds whose phase is over enter the next one, or try their grasp
+        again.
+        """
+        length = self._length.index_select(0, self.phase)
+        over = (self._time >= length - _DONE) & (self.phase < len(self.phases) - 1) & ~fresh
+        retry, rate = self._judge_grasp(over)
+        phase = torch.where(retry, self._retry_to.index_select(0, self.phase), self.phase + over)
+        phase.masked_fill_(fresh, 0)
+        self._rate.copy_(torch.where(retry, rate, self._rate)).masked_fill_(fresh, 1.0)
+        left_over = (self._time - length).clamp(min=0.0) * over
+        entering = over | fresh
+        self._time.copy_(torch.where(entering, left_over * ~fresh, self._time)).add_(self._rate)
+        self.retries += retry
+        self._again.copy_(torch.where(entering, retry, self._again))
+        self.phase.copy_(phase)
+        for buffer in (self.retries, self.error, self.unreachable):
+            buffer.masked_fill_(fresh, 0)
+        self._tried.masked_fill_(fresh[:, None], False)
+
+        self._look(entering, fresh)
+        rows = entering[:, None]
+        to = torch.where(self._holds.index_select(0, phase)[:, None], self._to, self._aim(phase))
+        self._from.copy_(torch.where(rows, torch.where(fresh[:, None], to, self._to), self._from))
+        self._to.copy_(torch.where(rows, to, self._to))
+        closing = torch.where(fresh[:, None], self._home_grip, self._grip_to)
+        self._grip_from.copy_(torch.where(rows, closing, self._grip_from))
+        self._grip_to.copy_(torch.where(rows, self._grip.index_select(0, phase), self._grip_to))
+
+    def _aim(self, phase: torch.Tensor) -> torch.Tensor:
+        """Target of each world's phase, from where its cubes were last seen [m], shape ``(nworld,
+        3)``.
+        """
+        table = self._target.index_select(0, phase)
+        source = self._source.index_select(0, phase)
+        seen = self._seen.gather(1, source[:, None, None].expand(-1, 1, 2))[:, 0]
+        return torch.cat((table[:, :2] + seen, table[:, 2:]), dim=1)
+
+    def _judge_grasp(self, over: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Worlds that try their grasp again, ``(nworld,)`` bool, and how fast they go on,
+        ``(nworld,)``.
+        """
+        held = cubes_in_hand(self._env.index, self._env.sim)
+        grasps = self._grasps.index_select(0, self.phase)
+        cube = grasps.clamp(min=0)[:, None]
+        empty = over & (grasps >= 0) & ~held.gather(1, cube)[:, 0]
+        again = self._retry_to.index_select(0, self.phase)
+        time_left = (self.steps - self._rest - self._env.episode_step).clamp(min=1)
+        rate = (self._needed.index_select(0, again) / time_left).clamp(min=1.0)
+        first = ~self._tried.gather(1, cube)[:, 0] & self._can_retry.index_select(0, self.phase)
+        retry = empty & first & (rate <= self._hurry)
+        self._tried |= retry[:, None] & (grasps[:, None] == self._cubes)
+        return retry, rate
+
+    def _turn(self, command: torch.Tensor, fresh: torch.Tensor) -> None:
+        """Rolls the open jaws towards a face of the cube that a phase looks at, by a little per
+        step.
+
+        A cube looks the same every quarter turn. A roll about the approach axis turns the closing
+        axis less in the horizontal plane than about the axis, the more the gripper is tilted.
+        """
+        self._roll.masked_fill_(fresh, 0.0)
+        column = self._nominal[0, self._roll_column]
+        command[:, self._roll_column] = column + self._roll
+        closing, approach = self._ik.directions(command)
+        yaw = self._yaw.gather(1, self._source.index_select(0, self.phase)[:, None])[:, 0]
+        off = yaw - torch.atan2(closing[:, 1], closing[:, 0])
+        off = off - _QUARTER * torch.round(off / _QUARTER)
+        # Two faces are in question, a quarter turn apart; what has been turned so far counts for
+        # its own.
+        both = torch.stack((off, off - torch.copysign(torch.full_like(off, _QUARTER), off)))
+        upright = (-approach[:, 2]).clamp(min=0.2)
+        wanted = self._roll + self._roll_sign * torch.atan2(
+            torch.sin(both), torch.cos(both) * upright
+        )
+        cost = (wanted - _STAY * self._roll).abs()
+        wanted = torch.where(cost[0] <= cost[1], wanted[0], wanted[1])
+        step = (self._cfg.controller.align * wanted - self._roll).clamp(-_ROLL_STEP, _ROLL_STEP)
+        self._roll += step * self._aligns.index_select(0, self.phase)
+        command[:, self._roll_column] = column + self._roll
+
+    def _find_roll(self) -> tuple[int, float]:
+        """Column of the joint that rolls the gripper, and which way it turns the closing axis, seen
+        from above.
+        """
+        names = [*self._cfg.robot.arm_joints, *self._cfg.robot.gripper_joints]
+        column = names.index(self._cfg.robot.roll_joint)
+        command = self._nominal[:1].expand(self._env.nworld, -1).clone()
+        before = self._ik.directions(command)[0][0].double().cpu()
+        command[:, column] += 0.1
+        after = self._ik.directions(command)[0][0].double().cpu()
+        return column, math.copysign(1.0, float(before[0] * after[1] - before[1] * after[0]))
+
+    def _look(self, entering: torch.Tensor, fresh: torch.Tensor) -> None:
+        """Measures the cubes that the phases which begin ask for; all of them where an episode
+        begins.
+        """
+        wanted = self._looks.index_select(0, self.phase)
+        for number, name in enumerate(CUBES):
+            now = fresh | entering & (wanted == number)
+            seen = self._seen[:, number]
+            pose = pose_w(self._env, name).float()
+            seen.copy_(torch.where(now[:, None], pose[:, :2], seen))
+            w, x, y, z = pose[:, 3:].unbind(1)
+            yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            self._yaw[:, number] = torch.where(now, yaw, self._yaw[:, number])
+
+    def _build_tables(self, cfg: Config, device: torch.device) -> None:
+        """What each phase says, as tensors."""
+        names = list(cfg.controller.phases)
+        specs = list(cfg.controller.phases.values())
+        anchors = [anchor_of(cfg, name) for name in names]
+        grips = {"open": cfg.robot.gripper_open, "closed": cfg.robot.gripper_closed}
+        steps = [phase.stop - phase.start for phase in self.phases]
+
+        def table(values: list, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.tensor(values, dtype=dtype, device=device)
+
+        self._length = table(steps)
+        self._target = table([[*a.xy, a.z] if a else [0.0] * 3 for a in anchors])
+        self._source = table([FIXED if a is None else a.source for a in anchors], torch.int64)
+        self._holds = table([a is None for a in anchors], torch.bool)
+        self._grip = table([grips[spec.gripper] for spec in specs])
+        looks = [
+            -1 if a is None or not spec.look else a.source
+            for a, spec in zip(anchors, specs, strict=True)
+        ]
+        self._looks = table(looks, torch.int64)
+        self._aligns = table(
+            [look >= 0 and spec.gripper == "open" for look, spec in zip(looks, specs, strict=True)],
+            torch.bool,
+        )
+        self._grasps = table(grasped_cubes(specs), torch.int64)
+        self._cubes = torch.arange(len(CUBES), device=device)
+        self._can_retry = table([spec.retry is not None for spec in specs], torch.bool)
+        self._retry_to = table(
+            [names.index(spec.retry) if spec.retry else 0 for spec in specs], torch.int64
+        )
+        # From the start of a phase to that of the last one, where the arm rests.
+        self._needed = table([self.phases[-1].start - phase.start for phase in self.phases])
+        self._hurry = cfg.controller.hurry
+        window = cfg.gate.acceptance.window if cfg.scene.box is None else cfg.gate.box.window
+        self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)
+
+
+def _smoothstep(u: torch.Tensor) -> torch.Tensor:
+    return u * u * (3.0 - 2.0 * u)
+
+
+def make_expert(env: Env) -> ClosedLoopDriver:
+    """The scripted controller of an environment of one's own: call ``command()`` once before every
+    ``env.episode_step``.
+
+    Worlds may end and start anew whenever they like; each goes through its own phases from its own
+    reset on.
+
+    Args:
+        env: The environment, built with ``action=joint_absolute``.
+
+    Raises:
+        ArgumentError: Its actions are not absolute joint commands, or its worlds have moved on
+            since their reset.
+        Unreachable: The nominal layout is out of the arm's reach.
+    """
+    return ClosedLoopDriver(env, OpenLoopPlanner(env.cfg).nominal)

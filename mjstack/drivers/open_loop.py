@@ -1,0 +1,263 @@
+"""The scripted grasp: phases, targets of the grasp point, and the command tape of every world."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Generator
+from contextlib import closing
+
+import numpy as np
+import torch
+
+from mjstack.config.schema import Config
+from mjstack.drivers.planning_pool import PARALLEL_FROM, WORLDS_PER_PROCESS, Plan, plan_in_parallel
+from mjstack.errors import Unreachable
+from mjstack.kinematics.mink_ik import GraspIk
+from mjstack.scene.phases import FIXED, anchor_of, build_phases
+from mjstack.sim.native import available_cores
+
+
+class JointTrajectory:
+    """Commands of every world for the whole episode, held as a few knots per phase.
+
+    The arm's motion between two targets is a polynomial in the smoothstep parameter through
+    Chebyshev points, so that 600 steps need some 40 solutions of inverse kinematics a world, and
+    memory does not grow with the episode.
+    """
+
+    def __init__(
+        self,
+        knots: np.ndarray,
+        weights: np.ndarray,
+        segments: np.ndarray,
+        waypoint_error: np.ndarray,
+    ) -> None:
+        """Wraps a plan.
+
+        Args:
+            knots: Commands, shape ``(nworld, n, nu)``.
+            weights: Weight of each knot of a step's segment, shape ``(steps, k)``.
+            segments: First knot of each step's segment, shape ``(steps,)``.
+            waypoint_error: Largest distance [m] from a target at any knot, shape ``(nworld,)``.
+        """
+        self.waypoint_error = waypoint_error
+        self.steps, self._k = weights.shape
+        self._segments = torch.from_numpy(segments)
+        self._weights = torch.from_numpy(weights)
+        self._knots = torch.from_numpy(knots)
+        self._offsets = torch.arange(self._k)
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> JointTrajectory:
+        """The same tape on a device."""
+        moved = copy.copy(self)
+        moved._weights, moved._knots = (
+            self._weights.to(device, dtype),
+            self._knots.to(device, dtype),
+        )
+        moved._segments, moved._offsets = self._segments.to(device), self._offsets.to(device)
+        return moved
+
+    def command(self, step: int | torch.Tensor) -> torch.Tensor:
+        """Commands of one step.
+
+        Args:
+            step: Its number; or shape ``(1,)``, int64, on the tape's device, for a captured graph.
+
+        Returns:
+            Shape ``(nworld, nu)``.
+        """
+        if isinstance(step, int):
+            step = torch.tensor([step], device=self._offsets.device)
+        knots = self._knots.index_select(1, self._segments.index_select(0, step) + self._offsets)
+        # Not einsum, whose rounding depends on nworld: a world's commands would not be those it
+        # gets alone.
+        return (self._weights.index_select(0, step)[0][:, None] * knots).sum(1)
+
+
+class OpenLoopPlanner:
+    """Plans command tapes for cubes at given places, with mink."""
+
+    def __init__(
+        self, cfg: Config, *, parallel_from: int = PARALLEL_FROM, processes: int | None = None
+    ) -> None:
+        """Plans the nominal layout, from which every other plan starts.
+
+        Args:
+            cfg: The configuration.
+            parallel_from: Number of distinct worlds from which on other processes help with them.
+            processes: How many plan then, this one among them; by default as many as there are
+                cores and work for.
+
+        Raises:
+            Unreachable: A nominal target is out of reach.
+        """
+        self._cfg = cfg
+        self._parallel_from = parallel_from
+        self._processes = processes
+        self.phases = build_phases(cfg)
+        self.ik = GraspIk(
+            cfg.robot,
+            cfg.model,
+            tolerance=cfg.controller.ik_tolerance,
+            iterations=cfg.controller.ik_iterations,
+        )
+        self._nodes = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, cfg.controller.knots))
+        self._weights, self._segments = self._step_weights()
+        self._seed: np.ndarray | None = None
+        self._last: tuple[np.ndarray, JointTrajectory] | None = None
+        nominal = np.array([[*cfg.scene.red_xy, *cfg.scene.blue_xy]])
+        self._seed = self.plan_world(0, nominal[0])[0]
+
+    def plan(
+        self, cubes_xy: np.ndarray, progress: Callable[[int], None] | None = None
+    ) -> JointTrajectory:
+        """Plans one tape per world; worlds whose cubes stand alike share the work.
+
+        Args:
+            cubes_xy: Red x, y and blue x, y at the start [m], shape ``(nworld, 4)``.
+            progress: Called with the number of worlds done.
+
+        Raises:
+            Unreachable: A target is out of reach; names the world (the first one), the phase and
+                the distance.
+            WorkerLost: A process that helps has ended.
+        """
+        if self._last is not None and np.array_equal(self._last[0], cubes_xy):
+            return self._last[1]  # the gates of one run play the same batch
+        nworld = cubes_xy.shape[0]
+        knots = np.full(
+            (nworld, len(self.phases) * len(self._nodes), len(self._cfg.robot.home)), np.nan
+        )
+        error = np.full(nworld, np.nan)
+        first: dict[bytes, int] = {}
+        twin = np.array(
+            [first.setdefault(xy.tobytes(), world) for world, xy in enumerate(cubes_xy)],
+            dtype=np.intp,
+        )
+        alike = np.bincount(twin, minlength=nworld)
+        done = 0
+        with closing(self._plans(list(first.values()), cubes_xy)) as plans:
+            for world, *plan in plans:
+                knots[world], error[world] = plan
+                done += int(alike[world])
+                if progress is not None:
+                    progress(done)
+        if len(first) < nworld:
+            knots = knots[twin]
+            error = error[twin]
+        tape = JointTrajectory(knots, self._weights, self._segments, error)
+        if nworld > 1:
+            self._last = (cubes_xy.copy(), tape)
+        return tape
+
+    @property
+    def nominal(self) -> np.ndarray:
+        """Commands at the end of each phase in the nominal layout, shape ``(phases, nu)``."""
+        assert self._seed is not None
+        return self._seed[len(self._nodes) - 1 :: len(self._nodes)]
+
+    def path_error(self, cubes_xy: np.ndarray) -> float:
+        """Largest distance [m] of the grasp point from its straight path at any step, for one
+        layout ``(4,)``.
+        """
+        tape = self.plan(cubes_xy[None])
+        worst = 0.0
+        for phase, (start, end, _, _) in zip(self.phases, self._targets(cubes_xy), strict=True):
+            for step in range(phase.start, phase.stop):
+                s = _smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
+                at = self.ik.grasp_point(tape.command(step)[0].numpy())
+                worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start)))))
+        return worst
+
+    def plan_world(self, world: int, xy: np.ndarray) -> tuple[np.ndarray, float]:
+        """Plans one world, starting from the nominal plan, so that its neighbours do not matter.
+
+        Args:
+            world: Its number, for the error.
+            xy: Red x, y and blue x, y at the start [m], shape ``(4,)``.
+
+        Returns:
+            Commands at the knots, shape ``(n, nu)``, and the largest distance [m] from a target at
+            any.
+
+        Raises:
+            Unreachable: A target is out of reach.
+        """
+        n = len(self._nodes)
+        knots = np.empty((len(self.phases) * n, len(self._cfg.robot.home)))
+        worst = 0.0
+        command = self.ik.home
+        for i, (phase, (start, end, grip0, grip1)) in enumerate(
+            zip(self.phases, self._targets(xy), strict=True)
+        ):
+            still = bool((start == end).all() and (grip0 == grip1).all())
+            for j, s in enumerate(self._nodes):
+                k = i * n + j
+                repeated = (still and j > 0) or (j == 0 and i > 0)
+                if not repeated:
+                    guess = command if self._seed is None else self._seed[k]
+                    target = start + s * (end - start)
+                    command, distance = self.ik.solve(target, grip0 + s * (grip1 - grip0), guess)
+                    if not distance <= self.ik.tolerance:
+                        raise Unreachable(
+                            world, phase.name, target.tolist(), distance, self.ik.tolerance
+                        )
+                    worst = max(worst, distance)
+                knots[k] = command
+        return knots, worst
+
+    def _plans(self, worlds: list[int], cubes_xy: np.ndarray) -> Generator[Plan]:
+        """The plans of some worlds, one after the other here, or shared out where there are many;
+        then in any order.
+        """
+        if len(worlds) >= self._parallel_from:
+            processes = self._processes or min(available_cores(), len(worlds) // WORLDS_PER_PROCESS)
+            if processes > 1:
+                yield from plan_in_parallel(self._cfg, self.plan_world, worlds, cubes_xy, processes)
+                return
+        for world in worlds:
+            yield world, *self.plan_world(world, cubes_xy[world])
+
+    def _targets(
+        self, xy: np.ndarray
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """Start and end of the grasp point and of the gripper command, per phase."""
+        robot = self._cfg.robot
+        sources = (xy[:2], xy[2:])
+        grips = {"open": np.array(robot.gripper_open), "closed": np.array(robot.gripper_closed)}
+        out: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+        for name, cfg in self._cfg.controller.phases.items():
+            grip = grips[cfg.gripper]
+            anchor = anchor_of(self._cfg, name)
+            if anchor is None:
+                end = out[-1][1]
+            else:
+                end = np.array(
+                    [*(anchor.xy if anchor.source == FIXED else sources[anchor.source]), anchor.z]
+                )
+            # The first phase's target stands from the first step; only the gripper moves from home.
+            start = out[-1][1] if out else end
+            grip0 = out[-1][3] if out else np.array(robot.home[len(robot.arm_joints) :])
+            out.append((start, end, grip0, grip))
+        return out
+
+    def _step_weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Barycentric Lagrange weights of the Chebyshev points, for every step."""
+        n = len(self._nodes)
+        bary = (-1.0) ** np.arange(n)
+        bary[[0, -1]] *= 0.5
+        rows = []
+        segments = []
+        for i, phase in enumerate(self.phases):
+            for step in range(phase.start, phase.stop):
+                s = _smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
+                gap = s - self._nodes
+                hit = np.abs(gap) < 1e-12
+                row = hit.astype(float) if hit.any() else (bary / gap) / (bary / gap).sum()
+                rows.append(row)
+                segments.append(i * n)
+        return np.array(rows), np.array(segments)
+
+
+def _smoothstep(u: float) -> float:
+    return u * u * (3.0 - 2.0 * u)

@@ -1,0 +1,137 @@
+"""How the gripper is to lean, so that a cube arrives as it stood."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import mujoco
+import torch
+
+from mjstack.config.schema import Config, PhaseCfg
+from mjstack.errors import ConfigError
+from mjstack.kinematics.batched_ik import BatchedIk
+from mjstack.scene.index import find
+from mjstack.scene.phases import carried_cubes
+
+
+class CarryTilt:
+    """Where every world's gripper is to point: when it grasps, as it can at the cube's place; from
+    then on, as it grasped.
+
+    An arm that grasps near its base can point straight down, and far from it must lean. A cube
+    grasped upright would arrive there tilted by the difference, on an edge, and may fall. So
+    another arm, a thought one, follows the place at which the cube will be let go, a few iterations
+    per step, and says how it leans there. The open hand keeps its tilt until it looks for the next
+    cube, so that it does not turn the one that it lets go.
+
+    The wish is turned about the vertical with the arm's first joint: it is the angle to the
+    vertical that is kept.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, cfg: Config, ik: BatchedIk, nominal: torch.Tensor
+    ) -> None:
+        """Allocates for the worlds of the solver.
+
+        Args:
+            model: The compiled scene.
+            cfg: The configuration; ``controller.approach_gain`` must be positive.
+            ik: The controller's solver.
+            nominal: Commands at the end of each phase in the nominal layout, shape ``(phases,
+                nu)``, float32.
+
+        Raises:
+            ConfigError: The arm's first joint does not turn about the vertical.
+        """
+        self._ik = ik
+        self._nominal = nominal
+        c = cfg.controller
+        device = ik.device
+        self._there_ik = BatchedIk(
+            model,
+            cfg.robot,
+            ik.nworld,
+            device,
+            iterations=c.step_iterations,
+            approach_gain=c.approach_gain,
+        )
+        self._sign = turn_sign(model, cfg)
+        specs = list(c.phases.values())
+        self._keeps = torch.tensor(_keeps(specs), device=device)
+        self._grasps = torch.tensor([spec.grasps is not None for spec in specs], device=device)
+        self.place = torch.tensor(_places(specs), device=device)
+        self._there = nominal.new_zeros((ik.nworld, nominal.shape[1]))
+        self._kept = nominal.new_zeros((ik.nworld, 3))
+        self._kept_turn = nominal.new_zeros(ik.nworld)
+
+    def wish(
+        self, command: torch.Tensor, phase: torch.Tensor, there: torch.Tensor, fresh: torch.Tensor
+    ) -> torch.Tensor:
+        """Where the approach axis is to point in the next step. Fixed shapes, no host read.
+
+        Args:
+            command: What the arm starts from [rad, m], shape ``(nworld, nu)``, float32.
+            phase: Number of each world's phase, shape ``(nworld,)``, int64.
+            there: Target of the phase ``place[phase]``, where the next cube or the held one is let
+                go [m], shape ``(nworld, 3)``.
+            fresh: Worlds that start an episode, shape ``(nworld,)``, bool.
+
+        Returns:
+            Unit vectors, shape ``(nworld, 3)``, float32.
+        """
+        nominal = self._nominal.index_select(0, self.place.index_select(0, phase))
+        start = torch.where(fresh[:, None], nominal, self._there)
+        self._there.copy_(self._there_ik.solve(start, there)[0])
+        grasps = self._grasps.index_select(0, phase)
+        keeps = self._keeps.index_select(0, phase)
+        self._kept.copy_(torch.where(grasps[:, None], self._ik.approach(command), self._kept))
+        self._kept_turn.copy_(torch.where(grasps, command[:, 0], self._kept_turn))
+        x, y, z = torch.where(
+            keeps[:, None], self._kept, self._there_ik.approach(self._there)
+        ).unbind(1)
+        turn = self._sign * (command[:, 0] - torch.where(keeps, self._kept_turn, self._there[:, 0]))
+        cos = torch.cos(turn)
+        sin = torch.sin(turn)
+        return torch.stack((cos * x - sin * y, sin * x + cos * y, z), dim=1)
+
+
+def turn_sign(model: mujoco.MjModel, cfg: Config) -> float:
+    """1.0 where the arm's first joint turns to the left, seen from above; -1.0 where to the right.
+
+    Raises:
+        ConfigError: It does not turn about the vertical.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    up = float(data.xaxis[find(model, "joint", cfg.robot.arm_joints[0])][2])
+    if abs(up) < 0.999:
+        expected = f"0, because joint {cfg.robot.arm_joints[0]} does not turn about the vertical"
+        raise ConfigError("robot.approach_gain", cfg.robot.approach_gain, expected)
+    return math.copysign(1.0, up)
+
+
+def _keeps(specs: Sequence[PhaseCfg]) -> list[bool]:
+    """Whether the tilt of the last grasp is kept in each phase."""
+    out = []
+    kept = False
+    for spec in specs:
+        kept = kept and not (spec.look and spec.gripper == "open")
+        out.append(kept and spec.grasps is None)
+        kept = kept or spec.grasps is not None
+    return out
+
+
+def _places(specs: Sequence[PhaseCfg]) -> list[int]:
+    """For each phase the one at whose target the next cube, or the held one, is let go; after all
+    of them, the last.
+    """
+    carries = [cube >= 0 for cube in carried_cubes(specs)]
+    ends = [k for k, held in enumerate(carries) if held and not any(carries[k + 1 : k + 2])] or [
+        len(carries) - 1
+    ]
+    # Without an anchor the target before holds.
+    at = {
+        end: max(k for k in range(end + 1) if k == 0 or specs[k].anchor is not None) for end in ends
+    }
+    return [at[next((end for end in ends if end >= k), ends[-1])] for k in range(len(carries))]

@@ -1,0 +1,284 @@
+"""Sizes MJWarp's buffers from what worlds use: peaks over a run, sizes with a margin, and random
+actions to find them.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+import torch
+
+from mjstack.config.schema import Backend, Config
+from mjstack.envs.env import Env
+from mjstack.errors import FaultError, name_worlds
+from mjstack.managers.base import random_uniform
+from mjstack.managers.reset import required_fields
+from mjstack.scene import SceneIndex
+from mjstack.sim import (
+    LOST_PHYSICS,
+    BatchSizes,
+    Overflow,
+    Simulation,
+    describe_overflow,
+    make_simulation,
+)
+from mjstack.sim.sizes import apply_configured, resolve_env_sizes, resolve_measuring_sizes
+
+log = logging.getLogger(__name__)
+
+ROWS = int(Overflow.NEFC | Overflow.NJMAX_NNZ)
+POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
+SIZED = ROWS | POOL | int(Overflow.CCD)
+_GROWTHS = 3  # of the room to measure in, each by 2
+_STEP = 8  # sizes are multiples of this
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Peaks:
+    """The most that worlds used over all decimation of a run, and what they lost.
+
+    Worlds that start anew in between are counted on: the simulation keeps what a masked reset
+    erases (``most_contacts``, ``most_constraints``, ``overflow_ever``). So nothing is read while
+    the run goes on.
+
+    Attributes:
+        nworld: Number of worlds.
+        contacts: Contacts of each world, shape ``(nworld,)``.
+        rows: Constraint rows of each world, shape ``(nworld,)``.
+        overflow: Bits of `Overflow` raised in each world, shape ``(nworld,)``.
+        pool_contacts: Contacts of all worlds at once. Native MuJoCo has no pool: the sum of the
+            worlds' peaks, which bounds it.
+        pool_pairs: Broad-phase pairs of all worlds at once, which the pool must hold too; None
+            where they are not counted.
+        pool_ccd_pairs: Convex pairs of one combination of geom types, of all worlds at once; None
+            where they are not counted.
+    """
+
+    nworld: int
+    contacts: np.ndarray
+    rows: np.ndarray
+    overflow: np.ndarray
+    pool_contacts: int
+    pool_pairs: int | None = None
+    pool_ccd_pairs: int | None = None
+
+    @property
+    def pool(self) -> int:
+        """Entries that the contact pool must have."""
+        return max(self.pool_contacts, self.pool_pairs or 0)
+
+
+def read_peaks(sim: Simulation) -> Peaks:
+    """The peaks since the simulation's last full reset. Waits for the device."""
+    contacts = sim.most_contacts.cpu().numpy().astype(np.int64)
+    pool: list[int | None] = [int(contacts.sum())]
+    if (counted := getattr(sim, "peak_pool", None)) is not None:
+        pool = counted.tolist()
+    used, pairs, convex, *_ = [*pool, None, None]
+    return Peaks(
+        nworld=sim.nworld,
+        contacts=contacts,
+        rows=sim.most_constraints.cpu().numpy().astype(np.int64),
+        overflow=sim.overflow_ever.cpu().numpy() & LOST_PHYSICS,
+        pool_contacts=used or 0,
+        pool_pairs=pairs,
+        pool_ccd_pairs=convex,
+    )
+
+
+def join_peaks(a: Peaks, b: Peaks) -> Peaks:
+    """The larger of the peaks of two runs of the same worlds."""
+
+    def larger(x: int | None, y: int | None) -> int | None:
+        return None if x is None or y is None else max(x, y)
+
+    return Peaks(
+        nworld=a.nworld,
+        contacts=np.maximum(a.contacts, b.contacts),
+        rows=np.maximum(a.rows, b.rows),
+        overflow=a.overflow | b.overflow,
+        pool_contacts=max(a.pool_contacts, b.pool_contacts),
+        pool_pairs=larger(a.pool_pairs, b.pool_pairs),
+        pool_ccd_pairs=larger(a.pool_ccd_pairs, b.pool_ccd_pairs),
+    )
+
+
+def recommend_sizes(peaks: Peaks, margin: float, source: str) -> BatchSizes:
+    """Sizes with a margin over the peaks, in multiples of 8.
+
+    Pools are shared: what all worlds had at once, divided by their number, is what each needs.
+    Where convex pairs are not counted, their room stays MJWarp's default, as much as there is for
+    contacts.
+    """
+    nconmax = _with_margin(peaks.pool / peaks.nworld, margin)
+    convex = peaks.pool_ccd_pairs
+    return BatchSizes(
+        nconmax=nconmax,
+        njmax=_with_margin(float(peaks.rows.max()), margin),
+        nccdmax=(
+            None if convex is None else min(nconmax, _with_margin(convex / peaks.nworld, margin))
+        ),
+        source=source,
+    )
+
+
+def measure_peaks(cfg: Config, run: Callable[[BatchSizes], Peaks]) -> tuple[Peaks, BatchSizes]:
+    """Runs something with room to spare, and with twice the room wherever even that was too little.
+
+    Peaks of a run that lost physics are those of another motion. Where the last run has lost some
+    too, its ``overflow`` tells: nothing may be sized from it (`require_physics`).
+
+    Args:
+        cfg: The configuration.
+        run: Plays it in worlds of some sizes.
+
+    Returns:
+        Peaks of the last run, and the room that it had.
+    """
+    sizes = resolve_measuring_sizes(cfg)
+    peaks = run(sizes)
+    for _ in range(_GROWTHS):
+        bits = int(np.bitwise_or.reduce(peaks.overflow)) & SIZED
+        if not bits:
+            break
+        # In this room convex pairs have as much as contacts, so they grow together.
+        sizes = replace(
+            sizes,
+            njmax=sizes.njmax * (2 if bits & ROWS else 1),
+            nconmax=sizes.nconmax * (2 if bits & ~ROWS else 1),
+        )
+        log.info(
+            "%s overflowed while sizes were measured: again with %s",
+            Overflow(bits),
+            sizes.as_overrides(),
+        )
+        peaks = run(sizes)
+    return peaks, sizes
+
+
+def describe_loss(overflow: np.ndarray, sizes: BatchSizes | None) -> tuple[str, str]:
+    """What was lost although there was room to spare, and what to do; both empty if nothing was.
+
+    Args:
+        overflow: Bits of `Overflow` raised in each world, shape ``(nworld,)``.
+        sizes: The room there was, or None on native MuJoCo.
+    """
+    bits = int(np.bitwise_or.reduce(overflow))
+    worlds = np.flatnonzero(overflow).tolist()
+    if not bits:
+        return "", ""
+    # In the room to measure in convex pairs have as much as contacts: the same key gives more of
+    # both.
+    keys = [
+        f"batch.{key}"
+        for key, flags in (("njmax", ROWS), ("nconmax", SIZED & ~ROWS))
+        if bits & flags
+    ]
+    fix = (
+        f"Set {' and '.join(keys)} higher still"
+        if keys
+        else "Simplify the model, or run sim=native"
+    )
+    room = "" if sizes is None else f" even with {sizes.as_overrides()}"
+    return f"{describe_overflow(bits)} overflow in {name_worlds(worlds, len(overflow))}{room}", fix
+
+
+def require_physics(what: str, peaks: Peaks, sizes: BatchSizes | None) -> None:
+    """Refuses to size anything from motion that lost physics.
+
+    Args:
+        what: What was run, such as ``the scripted task``.
+        peaks: What it used and lost.
+        sizes: The room it had.
+
+    Raises:
+        FaultError: A world lost physics; names the worlds and what to do.
+    """
+    loss, fix = describe_loss(peaks.overflow, sizes)
+    if loss:
+        raise FaultError(f"batch=auto: what {what} needs cannot be measured: {loss}", fix)
+
+
+def play_random_actions(env: Env, steps: int, advance: Callable[[int], None] | None = None) -> None:
+    """Steps worlds that have started with actions drawn evenly from the action range; worlds that
+    end start anew.
+
+    Args:
+        env: The environment.
+        steps: How long.
+        advance: Told how many steps are done.
+    """
+    low = env.action_manager.low
+    high = env.action_manager.high
+    for step in range(steps):
+        draw = random_uniform(
+            env, "probe.action", env.action_manager.action_dim, 0.0, 1.0, step=env.episode_step
+        )
+        env.step(low + (high - low) * draw)
+        if advance is not None:
+            advance(step + 1)
+
+
+def probe_env_sizes(
+    cfg: Config, model: mujoco.MjModel, nworld: int, backend: Backend, device: str
+) -> BatchSizes:
+    """Sizes for an environment with ``batch=auto``, from a probe of random actions; what the
+    configuration sets wins.
+
+    Args:
+        cfg: The configuration.
+        model: The compiled scene.
+        nworld: Worlds of the environment.
+        backend: Its backend. Native MuJoCo has no buffers: nothing is measured there.
+        device: Its device.
+
+    Raises:
+        FaultError: Physics was lost in all the room that the probe tried.
+    """
+    if backend is Backend.native:
+        return resolve_env_sizes(cfg)
+    c = cfg.gate.capacity
+    worlds = min(nworld, c.probe_nworld if device.startswith("cuda") else c.cpu_nworld)
+
+    def play(sizes: BatchSizes) -> Peaks:
+        fields = required_fields(cfg.reset)
+        sim = make_simulation(
+            model, cfg, worlds, backend=backend, device=device, fields=fields, sizes=sizes
+        )
+        env = Env(
+            sim, SceneIndex(model, cfg.robot), cfg, check_faults=False
+        )  # a lack of room is what it looks for
+        try:
+            env.reset(seed=cfg.seed)
+            play_random_actions(env, c.probe_steps)
+            return read_peaks(sim)
+        finally:
+            env.close()
+
+    def run(sizes: BatchSizes) -> Peaks:
+        try:
+            return play(sizes)
+        finally:
+            # the environment and its managers refer to each other, and hold the worlds
+            gc.collect()
+
+    with torch.no_grad():
+        peaks, room = measure_peaks(cfg, run)
+    require_physics(f"an environment of {worlds} worlds", peaks, room)
+    source = (
+        f"batch=auto: {c.probe_steps} steps of random actions in {worlds} worlds, times"
+        f" {c.margin:g}"
+    )
+    sizes = apply_configured(cfg, recommend_sizes(peaks, c.margin, source))
+    log.info("%s (%s)", sizes.as_overrides(), source)
+    return sizes
+
+
+def _with_margin(peak: float, margin: float) -> int:
+    return max(_STEP, _STEP * math.ceil(margin * peak / _STEP))

@@ -1,0 +1,1 @@
+"""Episodes: the rollout that every gate and job plays, and what is kept of it."""

@@ -1,0 +1,289 @@
+"""What a gate is given and what it shares with the others."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+import mujoco
+import numpy as np
+
+from mjstack.config.schema import Backend, Config
+from mjstack.drivers.open_loop import OpenLoopPlanner
+from mjstack.episodes.rollout import NOMINAL, Advance, Episode, Reset, State, StepHook, run_episode
+from mjstack.episodes.workloads import size_batch
+from mjstack.managers.reset import required_fields
+from mjstack.report.record import GateResult, Status
+from mjstack.scene import SceneIndex, build_model
+from mjstack.sim import (
+    BatchSizes,
+    Simulation,
+    make_simulation,
+    resolve_backend,
+    resolve_device,
+    resolve_sizes,
+)
+from mjstack.sim.sizes import apply_configured
+from mjstack.tasks.check import CheckResult, EpisodeCheck, Rule, check_class, describe_rules
+
+log = logging.getLogger(__name__)
+
+Say = Callable[[str], None]
+Record = TypeVar("Record")
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+@dataclass(kw_only=True, slots=True)
+class TimedEpisode:
+    """How long an episode took, and where it failed.
+
+    Attributes:
+        description: Backend and hardware.
+        nworld: Number of worlds.
+        seconds: Wall time of the steps [s].
+        warm_up_seconds: The eager first call of what is captured [s].
+        capture_seconds: The capture alone [s].
+        captured: Whether whole steps were replayed.
+        failed: Worlds that failed.
+    """
+
+    description: str
+    nworld: int
+    seconds: float
+    warm_up_seconds: float
+    capture_seconds: float
+    captured: bool
+    failed: list[int]
+
+    @classmethod
+    def of(cls, episode: Episode, sim: Simulation) -> TimedEpisode:
+        """What is kept of an episode once its simulation is gone."""
+        failed = np.flatnonzero(episode.result.failed.cpu().numpy()).tolist()
+        return cls(
+            description=sim.description,
+            nworld=sim.nworld,
+            seconds=episode.seconds,
+            warm_up_seconds=episode.warm_up_seconds,
+            capture_seconds=episode.capture_seconds,
+            captured=episode.captured,
+            failed=failed,
+        )
+
+
+@dataclass(eq=False)
+class GateContext:
+    """Everything gates need, and what one leaves for the next.
+
+    Attributes:
+        cfg: The configuration.
+        folder: Where the run's files go, or None for none.
+        say: Prints a line.
+        advance: Told about progress.
+        on_step: Called after each frame of the one-world episode that is shown (viewer).
+        results: Results so far, by gate.
+        measured: Sizes that the scripted task needs, with a margin, once they have been measured.
+        measured_env: Sizes that environments need likewise.
+        shown: The one-world episode that pictures show, and ``shown_by``, what it is.
+        pictures: Files that gates have drawn.
+    """
+
+    cfg: Config
+    folder: Path | None = None
+    say: Say = _silent
+    advance: Advance | None = None
+    on_step: StepHook | None = None
+    results: dict[str, GateResult] = field(default_factory=dict)
+    measured: BatchSizes | None = None
+    measured_env: BatchSizes | None = None
+    carry_start: State | None = None
+    timed_episode: TimedEpisode | None = None
+    shown: Episode | None = None
+    shown_by: str = ""
+    pictures: list[str] = field(default_factory=list)
+
+    def with_config(self, cfg: Config) -> GateContext:
+        """A context for another configuration of the same scene and plan, which it shares; sizes
+        and pictures are its own.
+        """
+        # Other starts and another controller have other peaks: sizes of the batch, or of random
+        # actions, would say nothing.
+        other = replace(self, cfg=cfg, measured=None, measured_env=None, pictures=[])
+        other.__dict__.update(model=self.model, planner=self.planner)
+        return other
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The scene for physics."""
+        return build_model(self.cfg)
+
+    @cached_property
+    def visual_model(self) -> mujoco.MjModel:
+        """The same scene with everything that only pictures need."""
+        return build_model(self.cfg, visuals=True)
+
+    @cached_property
+    def index(self) -> SceneIndex:
+        """Addresses in the model."""
+        return SceneIndex(self.model, self.cfg.robot)
+
+    @cached_property
+    def check(self) -> type[EpisodeCheck]:
+        """How the task is judged."""
+        return check_class(self.cfg)
+
+    @cached_property
+    def planner(self) -> OpenLoopPlanner:
+        """The planner, its nominal plan made."""
+        return OpenLoopPlanner(self.cfg)
+
+    @cached_property
+    def backend(self) -> tuple[Backend, str]:
+        """Backend and device of batch, capacity and throughput."""
+        return resolve_backend(self.cfg)
+
+    @cached_property
+    def nominal(self) -> tuple[Simulation, Episode]:
+        """One native world's episode from the nominal layout: the reference of baseline
+        and parity.
+        """
+        sim = make_simulation(self.model, self.cfg, 1, backend=Backend.native)
+        steps = frozenset(self.phase_end(name) for name in self.cfg.gate.parity.states.values())
+        hook = self.on_step if "parity" not in self.cfg.gates else None
+        episode = self.run(sim, NOMINAL, record=True, snapshots=steps, on_step=hook)
+        return sim, episode
+
+    def tell(self, what: str, done: int, total: int) -> None:
+        """Reports progress, if anyone listens."""
+        if self.advance is not None:
+            self.advance(what, done, total)
+
+    def run(
+        self, sim: Simulation, reset: Reset, *, seed: int | None = None, **kwargs: Any
+    ) -> Episode:
+        """`run_episode` with this context's scene and planner, under the configured seed or another
+        one.
+        """
+        cfg = self.cfg if seed is None else replace(self.cfg, seed=seed)
+        return run_episode(
+            sim, self.index, cfg, self.planner, reset, advance=self.advance, **kwargs
+        )
+
+    def batch_simulation(self, nworld: int) -> Simulation:
+        """Worlds on the backend of the batch."""
+        return self.simulation(nworld, *self.backend)
+
+    def simulation(self, nworld: int, backend: Backend, device: str) -> Simulation:
+        """Worlds that can start as the configuration says."""
+        fields = required_fields(self.cfg.reset)
+        sizes = self.sizes if backend is Backend.mjwarp else None
+        return make_simulation(
+            self.model, self.cfg, nworld, backend=backend, device=device, fields=fields, sizes=sizes
+        )
+
+    @property
+    def sizes(self) -> BatchSizes:
+        """Buffer sizes of the batch; with ``batch=auto`` they are measured first, unless *capacity*
+        has done so.
+        """
+        if (
+            not self.cfg.batch.auto or self.backend[0] is Backend.native
+        ):  # native MuJoCo has no fixed buffers
+            return resolve_sizes(self.cfg)
+        if self.measured is None:
+            self.measured = size_batch(self)
+            self.say(
+                f"{apply_configured(self.cfg, self.measured).as_overrides()}"
+                f" ({self.measured.source})"
+            )
+        return apply_configured(self.cfg, self.measured)
+
+    @property
+    def env_sizes(self) -> BatchSizes | None:
+        """Buffer sizes of environments with ``batch=auto``, if *capacity* has measured them; None
+        leaves it to `build_env`.
+        """
+        return (
+            apply_configured(self.cfg, self.measured_env)
+            if self.cfg.batch.auto and self.measured_env
+            else None
+        )
+
+    def parity_simulation(self) -> Simulation:
+        """One MJWarp world."""
+        return make_simulation(
+            self.model,
+            self.cfg,
+            1,
+            backend=Backend.mjwarp,
+            device=resolve_device(self.cfg.sim.device),
+        )
+
+    def phase_end(self, name: str) -> int:
+        """Last step of a phase."""
+        return next(phase.stop for phase in self.planner.phases if phase.name == name) - 1
+
+    def phase_start(self, name: str) -> int:
+        """First step of a phase."""
+        return next(phase.start for phase in self.planner.phases if phase.name == name)
+
+
+def judge_one(rules: type[Rule], result: CheckResult) -> tuple[Status, str, dict]:
+    """Status, reason and metrics of a one-world episode."""
+    bits = int(result.failed[0])
+    metrics = {name: float(values[0]) for name, values in measured_values(result).items()}
+    status = Status.failed if bits else Status.passed
+    return status, f"failed: {describe_rules(rules, bits)}" if bits else "", metrics
+
+
+def measured_values(result: CheckResult) -> dict[str, np.ndarray]:
+    """What the check measured, by name with unit, on the host; each of shape ``(nworld,)``."""
+    return {name: value.double().cpu().numpy() for name, value in result.values.items()}
+
+
+def play_seeds(
+    first: int, count: int, play: Callable[[int], Record], keep: Callable[[Record], None]
+) -> list[str]:
+    """Plays seed after seed. One that breaks ends it, and those before it still count; the very
+    first one's error is raised.
+
+    Args:
+        first: The first seed.
+        count: How many.
+        play: Plays one.
+        keep: Takes in what it gave, before the next one can break or be stopped.
+
+    Returns:
+        What was not played, and why: one line, or none.
+    """
+    for seed in range(first, first + count):
+        try:
+            record = play(seed)
+        except Exception as error:
+            if seed == first:
+                raise
+            log.exception("seed %d broke", seed)
+            what = (str(error) or type(error).__name__).splitlines()[0]
+            left = (
+                f"seed {seed}"
+                if seed == first + count - 1
+                else f"seeds {seed} to {first + count - 1}"
+            )
+            return [f"{left} not played: {what} (run.log has the traceback)"]
+        keep(record)
+    return []
+
+
+def failing_rules(rules: type[Rule], failed: np.ndarray) -> dict[Rule, list[int]]:
+    """Which worlds broke which rule."""
+    return {
+        rule: np.flatnonzero(failed & int(rule)).tolist()
+        for rule in rules
+        if (failed & int(rule)).any()
+    }

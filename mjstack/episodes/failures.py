@@ -1,0 +1,158 @@
+"""Where an episode goes wrong: the first sign of failure of every world, kept on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+import torch
+
+from mjstack.config.schema import Config
+from mjstack.drivers.driver import Controller
+from mjstack.envs import Env
+from mjstack.math import not_finite
+from mjstack.mdp.geometry import cubes_in_hand
+from mjstack.scene.index import CUBES
+from mjstack.scene.phases import carried_cubes, grasped_cubes
+from mjstack.sim.simulation import LOST_PHYSICS
+from mjstack.tasks.check import EpisodeCheck
+
+GONE_FRAMES = 3  # in a row without load on both jaws: less may be a touch in passing
+
+
+class Sign(IntEnum):
+    """What the first sign of failure was. Of several in one step, the lowest number counts."""
+
+    NONE = 0
+    PHYSICS = 1
+    EMPTY = 2
+    DROPPED = 3
+    MISSED = 4
+    LEFT = 5
+
+    @property
+    def text(self) -> str:
+        """The sign in words."""
+        return _TEXT[self]
+
+
+_TEXT = {
+    Sign.NONE: "no sign before the result",
+    Sign.PHYSICS: "physics lost",
+    Sign.EMPTY: "grasp empty, and not tried again",
+    Sign.DROPPED: "held cube lost its load",
+    Sign.MISSED: "not in place when let go",
+    Sign.LEFT: "left its place",
+}
+
+
+def describe_sign(sign: int, phase: str) -> str:
+    """A sign in words, with the phase's name if there is one."""
+    return f"{phase}: {Sign(sign).text}" if phase else Sign(sign).text
+
+
+class FailureMonitor:
+    """Notes the first sign of failure in every world, and the phase and step in which it was seen.
+
+    What counts as a sign:
+
+    - PHYSICS: the state is not finite, or a buffer overflowed.
+    - EMPTY: a phase that grasps is over, both jaws did not press on its cube in its last step, and
+      the world goes on.
+    - DROPPED: between that phase and the next opening of the gripper, both jaws have not pressed on
+      the cube for three steps.
+    - MISSED: a cube's release, the first phase after the last one that carries it, is over, and the
+      cube is not where it belongs. Cubes that no phase carries have none.
+    - LEFT: later, a cube that was where it belongs is so no more. That may be in a phase of the
+      other cube.
+
+    A grasp that is tried again is no sign. A sign need not lead to failure, nor has every failure
+    one: cubes that are in place but move break their rule alone.
+
+    Attributes:
+        sign: Number of the `Sign`, shape ``(nworld,)``, int64.
+        phase: Number of the phase in which it was seen, -1 without one, shape ``(nworld,)``, int64.
+        step: The step in whose end it was seen, likewise; where a phase ended with it, the first
+            one after that phase.
+    """
+
+    sign: torch.Tensor
+    phase: torch.Tensor
+    step: torch.Tensor
+
+    def __init__(self, cfg: Config) -> None:
+        """Reads the phases."""
+        specs = list(cfg.controller.phases.values())
+        self._tables = grasped_cubes(specs), carried_cubes(specs)
+        self._releases = _releases(self._tables[1])
+
+    def start(self, env: Env) -> None:
+        """Allocates for the environment's worlds."""
+        n = env.nworld
+        device = env.device
+
+        def full(value: int, dtype: torch.dtype = torch.int64, size: int = n) -> torch.Tensor:
+            return torch.full((size,), value, dtype=dtype, device=device)
+
+        self._grasped, self._carried = (
+            torch.tensor(table, device=device) for table in self._tables
+        )
+        self.sign = full(0)
+        self.phase = full(-1)
+        self.step = full(-1)
+        self._now = full(0, size=1)
+        self._at = full(0)
+        self._release = torch.tensor(self._releases, device=device)
+        self._loaded = torch.zeros((n, len(CUBES)), dtype=torch.bool, device=device)
+        self._placed = torch.zeros_like(self._loaded)
+        self._gone = full(0, torch.int32)
+
+    def update(self, env: Env, controller: Controller, check: EpisodeCheck) -> None:
+        """Takes in the end of a step. Fixed shapes, no host read."""
+        sim = env.sim
+        phase = controller.phase
+        loaded = cubes_in_hand(env.index, sim)
+        placed = check.placed(sim)
+
+        lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
+        entered = phase > self._at
+        grasped = self._grasped.index_select(0, self._at)
+        empty = entered & (grasped >= 0) & ~_of(self._loaded, grasped)
+        carried = self._carried.index_select(0, phase)
+        self._gone.add_(1).mul_((carried >= 0) & ~_of(loaded, carried))
+        dropped = self._gone >= GONE_FRAMES
+        missed = entered & ((self._at[:, None] == self._release) & ~self._placed).any(1)
+        left = ((phase[:, None] > self._release) & self._placed & ~placed).any(1)
+
+        seen = torch.zeros_like(self.sign)
+        signs = {
+            Sign.LEFT: left,
+            Sign.MISSED: missed,
+            Sign.DROPPED: dropped,
+            Sign.EMPTY: empty,
+            Sign.PHYSICS: lost,
+        }
+        for sign, found in signs.items():
+            seen.masked_fill_(found, sign)
+        first = (self.sign == 0) & (seen > 0)
+        ended = (seen == Sign.EMPTY) | (seen == Sign.MISSED)  # what the phase before has left
+        self.sign.copy_(torch.where(first, seen, self.sign))
+        self.phase.copy_(torch.where(first, torch.where(ended, self._at, phase), self.phase))
+        self.step.copy_(torch.where(first, self._now, self.step))
+        self._at.copy_(phase)
+        self._loaded.copy_(loaded)
+        self._placed.copy_(placed)
+        self._now += 1
+
+
+def _of(table: torch.Tensor, cube: torch.Tensor) -> torch.Tensor:
+    """Each world's column, shape ``(nworld,)``; the first one where there is none (-1)."""
+    return table.gather(1, cube.clamp(min=0)[:, None])[:, 0]
+
+
+def _releases(carried: Sequence[int]) -> list[int]:
+    """Number of the phase in which each cube is let go for good; one that never comes for a cube
+    that is not carried.
+    """
+    last = {cube: number for number, cube in enumerate(carried)}
+    return [last[cube] + 1 if cube in last else len(carried) for cube in range(len(CUBES))]

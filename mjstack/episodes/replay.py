@@ -1,0 +1,263 @@
+"""One world of a batch played again, alone: its trajectory, and every acceptance rule with what was
+found and wanted.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mjstack.config.schema import Backend, Config
+from mjstack.episodes.context import GateContext, measured_values
+from mjstack.episodes.rollout import (
+    Episode,
+    State,
+    StepHook,
+    Watch,
+    place_worlds,
+    snapshot,
+    start_worlds,
+)
+from mjstack.managers.reset import required_fields
+from mjstack.math import lowest_corner
+from mjstack.report.record import write_atomic
+from mjstack.scene import table_top
+from mjstack.sim import Simulation, describe_overflow, make_simulation, resolve_sizes
+from mjstack.sim.sizes import BatchSizes
+from mjstack.tasks.check import Rule
+
+_SHARES = 4  # of the contact pool, for a world that is alone
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RuleFinding:
+    """One acceptance rule of one world: whether it held, what was found, and what it wants."""
+
+    rule: Rule
+    held: bool
+    found: str
+    wanted: str
+
+    def __str__(self) -> str:
+        result = "held" if self.held else f"BROKEN, {self.rule.text}"
+        return f"{self.rule.name}: {result}: {self.found} (wanted: {self.wanted})"
+
+
+@dataclass(eq=False, kw_only=True, slots=True)
+class ReplayedWorld:
+    """What a replay leaves behind.
+
+    Attributes:
+        episode: The episode of the one world.
+        start: Its state before the first step.
+        fields: Model fields that its start wrote, by MuJoCo's name.
+        steps: State and task check at step ends, by name, each with steps first.
+        findings: The rules, all of them.
+        description: Backend and hardware.
+        qpos_end: Final positions in the backend's precision, shape ``(nq,)``.
+    """
+
+    episode: Episode
+    start: State
+    fields: dict[str, np.ndarray]
+    steps: dict[str, np.ndarray]
+    findings: list[RuleFinding]
+    description: str
+    qpos_end: np.ndarray
+
+    @property
+    def failed(self) -> int:
+        """Bits of the task's rules."""
+        return int(self.episode.result.failed[0])
+
+    def write(self, path: Path, *, seed: int, world: int) -> None:
+        """Writes the trajectory as an npz file, in one step."""
+        arrays: dict[str, Any] = {
+            "seed": seed,
+            "world": world,
+            "backend": self.description,
+            "failed": self.failed,
+            "start_qpos": self.start.qpos[0],
+            "start_qvel": self.start.qvel[0],
+            **{f"field.{name}": values for name, values in self.fields.items()},
+            **self.steps,
+        }
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays)
+        write_atomic(path, buffer.getvalue())
+
+
+def replay_world(
+    context: GateContext,
+    *,
+    seed: int,
+    world: int,
+    backend: Backend,
+    device: str,
+    on_step: StepHook | None = None,
+    watch: Watch | None = None,
+) -> ReplayedWorld:
+    """Plays one world as it started in its batch.
+
+    Random numbers depend on the seed, the world's number and the episode, not on the other worlds,
+    so it needs no others.
+
+    Args:
+        context: The run's configuration; its ``nworld`` is the batch's.
+        seed: The seed.
+        world: The world's number in the batch.
+        backend: Native or MJWarp.
+        device: ``cpu`` or ``cuda:N``.
+        on_step: Called after each step.
+        watch: Looks on.
+    """
+    cfg = replace(context.cfg, seed=seed)
+    sim = _alone(context, backend, device)
+    try:
+        start_worlds(sim, context.index, cfg, cfg.reset, context.planner, worlds=[world])
+        start = snapshot(sim)
+        fields = {name: field[0].cpu().numpy().copy() for name, field in sim.fields.items()}
+        states: list[State] = []
+
+        def keep(step: int, sim: Simulation) -> None:
+            states.append(snapshot(sim))
+            if on_step is not None:
+                on_step(step, sim)
+
+        episode = context.run(
+            sim, cfg.reset, seed=seed, worlds=[world], on_step=keep, record=True, watch=watch
+        )
+        steps = _steps(states, episode, cfg, context)
+        return ReplayedWorld(
+            episode=episode,
+            start=start,
+            fields=fields,
+            steps=steps,
+            findings=_explain(episode, steps, sim, cfg, context),
+            description=sim.description,
+            qpos_end=sim.qpos[0].cpu().numpy().copy(),
+        )
+    finally:
+        sim.close()
+
+
+def start_of_world(
+    context: GateContext, *, seed: int, world: int, backend: Backend, device: str
+) -> np.ndarray:
+    """Positions at which a world starts, shape ``(nq,)``; arguments as of `replay_world`."""
+    cfg = replace(context.cfg, seed=seed)
+    sim = _alone(context, backend, device)
+    try:
+        place_worlds(sim, context.index, cfg, cfg.reset, worlds=[world])
+        return sim.qpos[0].cpu().numpy().copy()
+    finally:
+        sim.close()
+
+
+def _alone(context: GateContext, backend: Backend, device: str) -> Simulation:
+    """A simulation for one world of the batch."""
+    cfg = context.cfg
+    return make_simulation(
+        context.model,
+        cfg,
+        1,
+        backend=backend,
+        device=device,
+        fields=required_fields(cfg.reset),
+        sizes=_sizes_alone(resolve_sizes(cfg), cfg.nworld),
+    )
+
+
+def _sizes_alone(sizes: BatchSizes, nworld: int) -> BatchSizes:
+    """Buffers for one world. In its batch it could take more than its share of the contact pool, so
+    it gets some more.
+    """
+
+    def room(share: int, pool: int | None) -> int:
+        return min(_SHARES * share, share * nworld if pool is None else pool)
+
+    naconmax = room(sizes.nconmax, sizes.naconmax)
+    naccdmax = sizes.naccdmax
+    if sizes.nccdmax is not None or naccdmax is not None:
+        naccdmax = min(room(sizes.nccdmax or sizes.nconmax, naccdmax), naconmax)
+    return replace(
+        sizes,
+        nconmax=min(sizes.nconmax, naconmax),
+        naconmax=naconmax,
+        nccdmax=None,
+        naccdmax=naccdmax,
+    )
+
+
+def _steps(
+    states: list[State], episode: Episode, cfg: Config, context: GateContext
+) -> dict[str, np.ndarray]:
+    """State and what the check looks at, at step ends; red is 0 and blue is 1."""
+    index = context.index
+    qpos, qvel, ctrl = (
+        np.concatenate([getattr(s, name) for s in states]) for name in ("qpos", "qvel", "ctrl")
+    )
+    pose = torch.from_numpy(np.stack([qpos[:, a : a + 7] for a in index.cube_qpos], 1)).float()
+    velocity = np.stack([qvel[:, a : a + 6] for a in index.cube_qvel], 1)
+    half = cfg.scene.cube_half
+    low = lowest_corner(pose[..., :3], pose[..., 3:], half).numpy() - np.float32(
+        table_top(cfg.scene)
+    )
+    spin = math.sqrt(3.0) * half * np.linalg.norm(velocity[..., 3:], axis=-1)
+    red = pose[:, 0, :3].numpy()
+    blue = pose[:, 1, :3].numpy()  # float32, as the check computes
+    names = np.array([phase.name for phase in context.planner.phases])
+    assert episode.phase is not None
+    return {
+        "time_s": np.arange(1, len(states) + 1) * cfg.timing.step_dt,
+        "phase": names[episode.phase],
+        "qpos": qpos,
+        "qvel": qvel,
+        "ctrl": ctrl,
+        "cube_pos_m": pose[..., :3].numpy(),
+        "xy_err_m": np.linalg.norm(red[:, :2] - blue[:, :2], axis=1),
+        "dz_m": red[:, 2] - blue[:, 2],
+        "cube_speed_m_per_s": np.linalg.norm(velocity[..., :3], axis=-1) + spin,
+        "cube_height_m": low,
+    }
+
+
+def _explain(
+    episode: Episode,
+    steps: dict[str, np.ndarray],
+    sim: Simulation,
+    cfg: Config,
+    context: GateContext,
+) -> list[RuleFinding]:
+    """Every rule with what was found. Whether it held is the check's own result; the numbers say
+    why.
+    """
+    bits = int(episode.result.failed[0])
+    rules = context.check.rules
+    values = {name: float(v[0]) for name, v in measured_values(episode.result).items()}
+    finite = np.isfinite(steps["qpos"]).all(1) & np.isfinite(steps["qvel"]).all(1)
+    lost = int(finite.argmin())  # the first step, if any
+    told = {
+        "FINITE": (
+            "always" if finite.all() else f"not in step {lost}, in {steps['phase'][lost]}",
+            "always",
+        ),
+        "STEPS": (
+            f"{int(sim.step_count[0])} steps",
+            f"{len(finite) * cfg.timing.decimation} steps",
+        ),
+        "OVERFLOW": (describe_overflow(int(sim.overflow[0])) or "none", "none"),
+        **context.check.explain(cfg, steps, values),
+    }
+    return [
+        RuleFinding(
+            rule=r, held=not bits & r, found=told[r.name or ""][0], wanted=told[r.name or ""][1]
+        )
+        for r in rules
+    ]

@@ -1,0 +1,229 @@
+"""What jobs share whose outcome is a report: written from the first moment on, kept current, never
+lost.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from omegaconf import OmegaConf
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from mjstack.config.schema import Config
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.rollout import StepHook
+from mjstack.errors import ConfigError, MjstackError
+from mjstack.jobs.progress import ProgressBar
+from mjstack.jobs.result import STATUS_COLOR, JobResult
+from mjstack.report.markdown import headline
+from mjstack.report.picture import require_video, save_pictures, save_video
+from mjstack.report.provenance import collect_provenance
+from mjstack.report.record import GateResult, Report, Status
+from mjstack.sim import Simulation, cuda_driver, cuda_name
+
+log = logging.getLogger(__name__)
+
+Record = Callable[[GateResult], None]
+Work = Callable[[GateContext, ProgressBar, Record], None]
+
+
+def check_showing(cfg: Config) -> None:
+    """Raises if this machine cannot show an episode as ``view`` or ``video`` ask for."""
+    if (
+        cfg.view
+        and sys.platform.startswith("linux")
+        and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    ):
+        raise ConfigError(
+            "view", "true", "a display, and DISPLAY is not set", "Use video=true instead"
+        )
+    if cfg.video:
+        try:
+            require_video()
+        except MjstackError as error:
+            error.exit_code = 2
+            raise
+
+
+def run_reported(
+    cfg: Config, folder: Path, overrides: list[str], title: str, work: Work
+) -> JobResult:
+    """Does some work and writes its report after each result.
+
+    Args:
+        cfg: The configuration.
+        folder: Where report.json, report.md, pictures and logs go.
+        overrides: What was asked for on the command line.
+        title: What is done, in one line.
+        work: Does it. Hands over each result as soon as there is one.
+
+    Returns:
+        How it ended. Ctrl-C is an outcome, not an exception: the finished results are in the
+        report.
+    """
+    console = Console(highlight=False)
+    context = GateContext(cfg=cfg, folder=folder)
+    report: Report | None = None
+    outcome = JobResult(status=Status.interrupted, folder=folder, overrides=overrides)
+    try:
+        console.print(
+            f"[bold]{cfg.robot.title}[/], {escape(title)} -> {escape(str(folder))}", soft_wrap=True
+        )
+        report = Report(provenance=run_provenance(cfg, context))
+        report.write(folder)
+        with ProgressBar(console) as bar:
+            context.say = bar.say
+            context.advance = bar.advance
+            context.on_step = _viewer(context) if cfg.view else None
+            work(context, bar, lambda result: _record(report, result, folder, bar))
+        report.conclude()
+        outcome.status = report.status
+        report.write(folder)
+        _draw(context, report, folder, console)
+        report.pictures += context.pictures
+        report.write(folder)
+    except KeyboardInterrupt:
+        outcome.status = Status.interrupted
+        if report is not None:
+            report.status = Status.interrupted
+            report.write(folder)
+        kept = (
+            "the finished gates are in the report"
+            if report is not None
+            else "nothing had been finished"
+        )
+        console.print(f"interrupted; {kept}")
+    except OSError as error:
+        outcome.status = _mark_failed(report)
+        Console(stderr=True).print(
+            f"mjstack: {folder} cannot be written: {error.strerror}. Free space, or set"
+            " hydra.run.dir."
+        )
+    except MjstackError as error:
+        outcome.status = _mark_failed(report)
+        with contextlib.suppress(OSError):
+            if report is not None:
+                report.write(folder)
+        log.error("%s", error)
+        Console(stderr=True, soft_wrap=True).print(f"mjstack: {escape(str(error))}")
+    if report is not None:
+        outcome.gates = report.gates
+        _print_summary(console, report, folder)
+    return outcome
+
+
+def _mark_failed(report: Report | None) -> Status:
+    if report is not None:
+        report.status = Status.failed
+    return Status.failed
+
+
+def _record(report: Report, result: GateResult, folder: Path, bar: ProgressBar) -> None:
+    report.gates.append(result)
+    report.write(folder)
+    bar.finish(result)
+
+
+def run_provenance(cfg: Config, context: GateContext) -> dict:
+    """Versions, device, and hashes of configuration and model."""
+    backend, device = context.backend
+    driver = "no CUDA device"
+    name = (
+        f"native MuJoCo on {os.cpu_count()} cores"
+        if backend.value == "native"
+        else "Warp's CPU device"
+    )
+    if device.startswith("cuda"):
+        name = cuda_name(device)
+        driver = cuda_driver()
+    text = model_text(context.model)
+    config = OmegaConf.to_yaml(OmegaConf.structured(cfg))
+    return collect_provenance(
+        config_yaml=config, model_text=text, device=f"{device}: {name}", driver=driver
+    )
+
+
+def model_text(model: mujoco.MjModel) -> str:
+    """The compiled model's numbers as text: what the physics sees, whatever file it came from."""
+    size = mujoco.mj_sizeModel(model)
+    buffer = np.empty(size, np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes().hex()
+
+
+def _draw(context: GateContext, report: Report, folder: Path, console: Console) -> None:
+    """Pictures and video of the one-world episode, if there was one. Their failure fails
+    no gate.
+    """
+    episode = context.shown
+    cfg = context.cfg
+    if episode is None or episode.qpos is None:
+        return
+    cubes = np.stack([episode.qpos[:, a : a + 3] for a in context.index.cube_qpos], axis=1)
+    title = f"{cfg.robot.title}, {cfg.task.name}: {context.shown_by}"
+    try:
+        report.pictures = save_pictures(
+            folder, context.visual_model, episode.qpos[-1], cubes, cfg.scene.cube_half, title
+        )
+        if cfg.video:
+            save_video(
+                folder / "episode.mp4", context.visual_model, episode.qpos, cfg.timing.step_dt
+            )
+            console.print(f"video: {folder}/episode.mp4", soft_wrap=True)
+    except Exception as error:  # drawing must not take back what the gates found
+        log.exception("drawing failed")
+        console.print(f"no picture: {escape(str(error) or type(error).__name__)}", soft_wrap=True)
+
+
+def _viewer(context: GateContext) -> StepHook:
+    """Shows a one-world episode in MuJoCo's viewer, in real time; closing the window lets the run
+    go on.
+    """
+    import mujoco.viewer
+
+    model = context.visual_model
+    data = mujoco.MjData(model)
+    handle = mujoco.viewer.launch_passive(model, data)
+
+    def show(step: int, sim: Simulation) -> None:
+        if not handle.is_running():
+            return
+        began = time.perf_counter()
+        data.qpos[:] = sim.qpos[0].cpu().numpy()
+        mujoco.mj_forward(model, data)
+        handle.sync()
+        time.sleep(max(0.0, context.cfg.timing.step_dt - (time.perf_counter() - began)))
+
+    return show
+
+
+def _print_summary(console: Console, report: Report, folder: Path) -> None:
+    table = Table()
+    table.add_column("gate")
+    table.add_column("status")
+    table.add_column("s", justify="right")
+    table.add_column("what it says", overflow="fold")
+    for gate in report.gates:
+        color = STATUS_COLOR[gate.status]
+        table.add_row(
+            gate.name,
+            f"[{color}]{gate.status.value}[/]",
+            f"{gate.seconds:.1f}",
+            escape(headline(gate)),
+        )
+    console.print(table)
+    console.print(f"report: {escape(str(folder))}/report.md", soft_wrap=True)
+    for gate in report.gates:
+        if gate.status is Status.skipped:
+            console.print(f"skipped: {gate.name}: {escape(gate.reason)}", soft_wrap=True)
+    console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status.value}[/]")

@@ -1,0 +1,1 @@
+"""How worlds start: placement, domain randomization, files of starts."""

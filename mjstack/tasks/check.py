@@ -1,0 +1,143 @@
+"""What a task's acceptance gives the gates: rules as bits, check fed step by step, and a result."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import ClassVar, TypeVar, cast
+
+import numpy as np
+import torch
+
+from mjstack.config.schema import Config
+from mjstack.errors import TermError
+from mjstack.managers.base import resolve_func
+from mjstack.report.record import Value
+from mjstack.scene import SceneIndex
+from mjstack.scene.phases import Phase
+from mjstack.sim.simulation import Simulation
+
+
+class Rule(IntFlag):
+    """What a world can fail by; a world passes with none set. A task's rules begin with FINITE,
+    STEPS and OVERFLOW.
+    """
+
+    @property
+    def text(self) -> str:
+        """What went wrong, in words, of a single rule."""
+        raise NotImplementedError
+
+
+AnyRule = TypeVar("AnyRule", bound=Rule)
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """What the check says, on the device.
+
+    Attributes:
+        failed: Bits of the task's rules, shape ``(nworld,)``, int32.
+        values: What was measured, by name with unit, each ``(nworld,)``.
+    """
+
+    failed: torch.Tensor
+    values: dict[str, torch.Tensor]
+
+    @classmethod
+    def of(
+        cls, held: Mapping[AnyRule, torch.Tensor], values: dict[str, torch.Tensor]
+    ) -> CheckResult:
+        """From whether each rule held, ``(nworld,)`` bool."""
+        failed = torch.zeros_like(next(iter(held.values())), dtype=torch.int32)
+        for rule, ok in held.items():
+            failed |= int(rule) * (~ok).to(failed.dtype)
+        return cls(failed, values)
+
+
+class EpisodeCheck(ABC):
+    """Collects what a task's rules of the check need, for every world at once, on the device.
+
+    Memory does not grow with the episode. The step is counted on the device, so that a captured
+    graph can hold `update`.
+
+    Attributes:
+        rules: The task's rules.
+        summaries: What a batch reports: name of the metric, and of the value, and whether its
+            ``min`` or ``max`` counts.
+    """
+
+    rules: ClassVar[type[Rule]]
+    summaries: ClassVar[Mapping[str, tuple[str, str]]]
+
+    @abstractmethod
+    def __init__(
+        self, cfg: Config, index: SceneIndex, phases: list[Phase], nworld: int, device: torch.device
+    ) -> None:
+        """Allocates for nworld worlds."""
+
+    @abstractmethod
+    def update(self, sim: Simulation, phase: torch.Tensor) -> None:
+        """Takes in the state at the end of a step. Fixed shapes, no host read.
+
+        Args:
+            sim: The worlds.
+            phase: Number of the phase that each world's command belonged to, shape ``(nworld,)``,
+                int64.
+        """
+
+    @abstractmethod
+    def result(self, sim: Simulation) -> CheckResult:
+        """Judges the episode; every rule that was not shown to hold has failed."""
+
+    @abstractmethod
+    def placed(self, sim: Simulation) -> torch.Tensor:
+        """Whether each cube is where it belongs right now, red first, shape ``(nworld, 2)``, bool.
+        No host read.
+        """
+
+    @classmethod
+    @abstractmethod
+    def thresholds(cls, cfg: Config) -> dict[str, Value]:
+        """The rules' numbers, with units, for a report."""
+
+    @classmethod
+    @abstractmethod
+    def explain(
+        cls, cfg: Config, steps: Mapping[str, np.ndarray], values: Mapping[str, float]
+    ) -> dict[str, tuple[str, str]]:
+        """What a world's recording says to each rule: by the rule's name, what was found, and what
+        it wants.
+
+        Args:
+            cfg: The configuration.
+            steps: What a replay keeps at step ends, by name, steps first.
+            values: What the check measured.
+        """
+
+    @classmethod
+    @abstractmethod
+    def headline(cls, values: Mapping[str, float]) -> str:
+        """A world's values in a few words."""
+
+
+def check_class(cfg: Config) -> type[EpisodeCheck]:
+    """The check of the configured task.
+
+    Raises:
+        TermError: ``task.check`` names none.
+    """
+    found = resolve_func("task.check", cfg.task.check)
+    if not (isinstance(found, type) and issubclass(found, EpisodeCheck)):
+        raise TermError(
+            "task.check",
+            f"{cfg.task.check}: expected a subclass of mjstack.tasks.check.EpisodeCheck",
+        )
+    return cast(type[EpisodeCheck], found)
+
+
+def describe_rules(rules: type[Rule], bits: int) -> str:
+    """The rules in a bit set, in words."""
+    return ", ".join(rule.text for rule in rules if bits & rule)

@@ -1,0 +1,281 @@
+"""The scripted controller: phases, looks, turns, retries and restarts of every world by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from mjstack import make_env
+from mjstack.config import load_config
+from mjstack.drivers.closed_loop import ClosedLoopDriver, make_expert
+from mjstack.drivers.tilt import _keeps, _places
+from mjstack.envs import Env, driven_config
+from mjstack.episodes.context import GateContext
+from mjstack.errors import ArgumentError
+from mjstack.managers.reset import required_fields
+from mjstack.scene.phases import anchor_of
+from mjstack.sim import make_simulation
+
+Stage = Callable[[str], GateContext]
+
+
+def driven(
+    context: GateContext, *overrides: str, nworld: int = 3, backend: str = "native"
+) -> tuple[Env, ClosedLoopDriver]:
+    """Worlds that have started, and their controller."""
+    robot = context.cfg.robot.name
+    cfg = driven_config(
+        load_config(
+            [f"robot={robot}", f"sim={backend}", "sim.device=cpu", f"nworld={nworld}", *overrides]
+        )
+    )
+    sim = make_simulation(context.model, cfg, nworld, fields=required_fields(cfg.reset))
+    env = Env(sim, context.index, cfg, check_faults=False)
+    env.reset(seed=0)
+    return env, ClosedLoopDriver(env, context.planner.nominal)
+
+
+def centre(env: Env) -> torch.Tensor:
+    """The grasp point [m]."""
+    return env.sim.site_xpos[:, env.index.grasp_sites].mean(1)
+
+
+def test_phases_follow_their_times_and_targets(robot: str, stage: Stage) -> None:
+    context = stage(robot)
+    env, controller = driven(context)
+    red = env.sim.qpos[:, env.index.cube_qpos[0] :][:, :3].clone()
+    ends = {phase.stop - 1: number for number, phase in enumerate(controller.phases)}
+    for step in range(controller.phases[1].stop):
+        command = controller.command()
+        assert torch.isfinite(command).all()
+        phase = next(n for n, p in enumerate(controller.phases) if p.start <= step < p.stop)
+        assert controller.phase.tolist() == [phase] * 3
+        env.step(command)
+        if step in ends:  # commanded to the target; the servos lag by a few millimetres
+            anchor = anchor_of(env.cfg, controller.phases[ends[step]].name)
+            assert anchor is not None
+            wanted = torch.cat((red[:, :2], torch.full((3, 1), anchor.z, dtype=red.dtype)), 1)
+            reached = controller._ik.grasp_point(command).double()
+            assert (reached - wanted).norm(dim=1).max() < env.cfg.controller.ik_tolerance
+            assert (centre(env) - wanted).norm(dim=1).max() < 0.012
+    assert float(controller.error.max()) < env.cfg.controller.ik_tolerance
+    assert not controller.unreachable.any()
+    env.close()
+
+
+def test_every_world_looks_at_its_own_cube(stage: Stage) -> None:
+    """A cube that is moved before the descent is followed; in the other world nothing changes."""
+    env, controller = driven(stage("so101"), nworld=2)
+    address = env.index.cube_qpos[0]
+    for step in range(controller.phases[1].stop):
+        if step == controller.phases[0].stop:
+            env.sim.qpos[1, address] += 0.02
+        env.step(controller.command())
+    grasp_point = controller._ik.grasp_point(controller._command)
+    assert (grasp_point[:, :2] - env.sim.qpos[:, address : address + 2]).norm(dim=1).max() < 0.004
+    env.close()
+
+
+def test_jaws_turn_to_a_face(stage: Stage) -> None:
+    """SO-101's closing axis ends across two faces of the cube, whatever its yaw; without alignment
+    it does not.
+    """
+    off = {}
+    for align in (0.0, 1.0):
+        env, controller = driven(stage("so101"), f"controller.align={align}", nworld=4)
+        address = env.index.cube_qpos[0]
+        yaw = torch.tensor([0.3, -0.6, 1.1, 2.0], dtype=torch.float64)
+        env.sim.qpos[:, address + 3] = torch.cos(yaw / 2)
+        env.sim.qpos[:, address + 6] = torch.sin(yaw / 2)
+        env.sim.qpos[:, address + 4 : address + 6] = 0.0
+        for _ in range(controller.phases[1].stop):
+            env.step(controller.command())
+        closing = controller._ik.closing_axis(controller._command).double()
+        angle = torch.rad2deg(yaw - torch.atan2(closing[:, 1], closing[:, 0]))
+        off[align] = (torch.remainder(angle + 45.0, 90.0) - 45.0).abs()
+        env.close()
+    assert off[1.0].max() < 3.0
+    assert off[0.0].max() > 15.0
+
+
+def test_an_empty_grasp_is_tried_once_more_in_time(robot: str, stage: Stage) -> None:
+    """World 1 loses its cube to the side as the jaws close. It goes back, looks again, hurries, and
+    stacks all the same.
+    """
+    env, controller = driven(stage(robot), nworld=2)
+    names = [phase.name for phase in controller.phases]
+    grasp = names.index("grasp_red")
+    address = env.index.cube_qpos[0]
+    velocity = env.index.cube_qvel[0]
+    place = env.sim.qpos[1, address : address + 7].clone()
+    place[0] += 0.03
+    visited: list[int] = []
+    for step in range(controller.steps):
+        if step == controller.phases[grasp].stop - 1:
+            # Where the open jaws do not reach it, and from where they can take it.
+            env.sim.qpos[1, address : address + 7] = place
+            env.sim.qpos[1, address + 1] -= 0.10 if robot == "rebot" else 0.08
+            env.sim.qvel[1, velocity : velocity + 6] = 0.0
+        env.step(controller.command())
+        visited.append(int(controller.phase[1]))
+    assert controller.retries.tolist() == [0, 1]
+    back = controller.phases[grasp].stop
+    assert visited[back - 1] == grasp
+    assert visited[back] == names.index("above_red")
+    # The rest at rate 1 would need 530 steps; it was over before the window in which cubes must
+    # rest.
+    rest = env.cfg.gate.acceptance.window
+    assert visited[-rest:] == [len(names) - 1] * rest
+    red, blue = (env.sim.qpos[:, a : a + 3] for a in env.index.cube_qpos)
+    apart = red - blue
+    assert (apart[:, :2].norm(dim=1) < env.cfg.gate.acceptance.xy_err).all()
+    assert ((apart[:, 2] > 0.035) & (apart[:, 2] < 0.055)).all()
+    env.close()
+
+
+def test_a_cube_arrives_as_it_stood() -> None:
+    """From near the base, where the gripper could point down, to far from it, where it must lean;
+    and the other way round.
+    """
+    env = make_env(["task=stack", "action=joint_absolute", "sim=native"], nworld=2)
+    env.reset(seed=0)
+    red, blue = env.index.cube_qpos
+    for world, (near, far) in enumerate([(red, blue), (blue, red)]):
+        for address, x in ((near, 0.29), (far, 0.375)):
+            env.sim.qpos[world, address] = x
+    expert = make_expert(env)
+    ends = {phase.stop - 1: phase.name for phase in expert.phases}
+    lean = {}
+    tilt = {}
+    for step in range(expert.steps):
+        env.step(expert.command())
+        if name := ends.get(step):
+            lean[name] = torch.rad2deg(torch.acos(-expert._ik.approach(expert._command)[:, 2]))
+            x, y = env.sim.qpos[:, red + 4 : red + 6].unbind(1)
+            tilt[name] = torch.rad2deg(torch.acos(1.0 - 2.0 * (x * x + y * y)))
+    # If it pointed down wherever it can: 23 degrees both, and cubes tilted by 23 and 22.
+    assert (lean["place_stack"] - lean["grasp_red"]).abs().max() < 6.0
+    assert tilt["place_stack"].max() < 10.0
+    assert tilt["retreat"].max() < 1.0
+    env.close()
+
+
+def test_tilt_follows_the_phases() -> None:
+    """In the box task red's tilt is kept until blue is looked for; a place without an anchor is
+    where the target was before.
+    """
+    phases = load_config(["task=box"]).controller.phases
+    names = list(phases)
+    specs = list(phases.values())
+    kept = [name for name, keeps in zip(names, _keeps(specs), strict=True) if keeps]
+    roles = ("lift", "carry", "hold", "open", "retreat", "settle")
+    assert kept == [f"{role}_{cube}" for cube in ("red", "blue") for role in roles] + ["done"]
+    assert [names[place] for place in _places(specs)] == ["hold_red"] * 6 + ["hold_blue"] * 13
+    phases["hold_red"].anchor = None
+    assert [names[place] for place in _places(specs)][:7] == ["carry_red"] * 6 + ["hold_blue"]
+    for spec in specs:
+        spec.grasps = None
+    assert [names[place] for place in _places(specs)] == ["retreat_blue"] * 19
+
+
+def test_no_retry_without_time(stage: Stage) -> None:
+    env, controller = driven(stage("so101"), "controller.hurry=1.2", nworld=1)
+    grasp = [phase.name for phase in controller.phases].index("grasp_red")
+    for step in range(controller.phases[grasp + 1].start + 5):
+        if step == controller.phases[grasp].stop - 1:
+            env.sim.qpos[0, env.index.cube_qpos[0]] += 0.2
+        env.step(controller.command())
+    assert controller.retries.tolist() == [0]
+    assert int(controller.phase[0]) == grasp + 1
+    env.close()
+
+
+def test_worlds_start_over_by_themselves() -> None:
+    """A world that ends in the middle of a phase is in its first phase in the step after, the
+    others go on.
+    """
+    env = make_env(["task=stack", "action=joint_absolute", "sim=native", "reset=jitter"], nworld=3)
+    env.reset(seed=3)
+    expert = make_expert(env)
+    for _ in range(150):
+        env.step(expert.command())
+    first = expert.command().clone()
+    env.step(first)
+    env.reset(mask=torch.tensor([False, True, False]))
+    command = expert.command()
+    assert expert.phase.tolist() == [2, 0, 2]
+    assert (command[1] - first[1]).abs().max() > 0.05
+    again = make_env(
+        ["task=stack", "action=joint_absolute", "sim=native", "reset=jitter"], nworld=3
+    )
+    again.reset(seed=3)
+    again.reset()  # episode 1 of every world
+    np.testing.assert_allclose(
+        make_expert(again).command()[1].numpy(), command[1].numpy(), atol=1e-6
+    )
+    env.close()
+    again.close()
+
+
+def test_a_world_does_not_depend_on_its_neighbours(stage: Stage) -> None:
+    context = stage("so101")
+    runs = []
+    for nworld in (1, 4):
+        env, controller = driven(context, nworld=nworld)
+        commands = []
+        for _ in range(140):
+            commands.append(controller.command()[0].clone())
+            env.step(commands[-1].expand(nworld, -1) if nworld == 1 else controller._command)
+        runs.append(torch.stack(commands))
+        env.close()
+    torch.testing.assert_close(runs[0], runs[1], rtol=0.0, atol=1e-6)
+
+
+def test_out_of_reach_is_flagged_in_its_world(stage: Stage) -> None:
+    env, controller = driven(stage("so101"), nworld=2)
+    env.sim.qpos[1, env.index.cube_qpos[0]] = 0.9
+    for _ in range(controller.phases[0].stop):
+        env.step(controller.command())
+    assert controller.unreachable.tolist() == [False, True]
+    assert float(controller.error[1]) > 0.1 > float(controller.error[0])
+    env.close()
+
+
+def test_other_actions_are_refused() -> None:
+    env = make_env(["task=stack", "sim=native"], nworld=1)
+    with pytest.raises(ArgumentError, match=r"action=joint_absolute"):
+        make_expert(env)
+    env.close()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+def test_captured_commands_are_the_eager_ones() -> None:
+    """Steps with the controller in them replay as one graph, and it reads nothing from
+    the device.
+    """
+    commands = {}
+    for graph in ("require", "off"):
+        env = make_env(
+            ["task=stack", "action=joint_absolute", "reset=randomized", f"graph={graph}"],
+            nworld=64,
+            device="cuda:0",
+        )
+        env.reset(seed=0)
+        expert = make_expert(env)
+
+        def work(env: Env = env, expert: ClosedLoopDriver = expert) -> None:
+            env.action_manager.take(expert.command())
+            env.advance()
+
+        play = env.captured(work, "a step with its controller")
+        for _ in range(100):
+            play()
+        assert play.captured == (graph == "require")
+        commands[graph] = expert._command.clone()
+        play.drop()
+        env.close()
+    torch.testing.assert_close(commands["require"], commands["off"], rtol=0.0, atol=1e-4)

@@ -1,0 +1,371 @@
+"""The batched check on the device against the plain checker, world by world."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from check_cases import STOPPED_EARLY, Altered, Cases
+from stack_checker import BLUE, RED, Outcome, check_world
+
+from mjstack.tasks.check import CheckResult, describe_rules
+from mjstack.tasks.stack import StackCheck, StackRule
+
+CASES = Cases(StackRule)
+HAIR = 2e-6  # [m], [m/s], [rad]: a good deal more than float32 rounds at these sizes
+NUMBERS = {
+    "xy_err": "xy_err_m",
+    "dz": "dz_m",
+    "rest_speed": "rest_speed_m_per_s",
+    "peak_speed": "peak_speed_m_per_s",
+    "rest_position": "rest_position_m",
+    "rest_rotation": "rest_rotation_deg",
+}
+
+
+@dataclass
+class World:
+    """A recording to be altered."""
+
+    pose: np.ndarray
+    velocity: np.ndarray
+    step_count: int
+    rec: SimpleNamespace
+    overflow: int = 0
+    arm: float = 0.0
+
+    def steps(self, name: str) -> slice:
+        phase = next(p for p in self.rec.phases if p.name == name)
+        return slice(phase.start, phase.stop)
+
+    @property
+    def window(self) -> slice:
+        return slice(-self.rec.cfg.gate.acceptance.window, None)
+
+
+def feed(
+    worlds: list[World], rec: SimpleNamespace, dtype: torch.dtype = torch.float64
+) -> CheckResult:
+    """Plays recordings through the check; the state also has one coordinate of an arm."""
+    index = SimpleNamespace(cube_qpos=[1, 8], cube_qvel=[1, 7])
+    n = len(worlds)
+    check = StackCheck(rec.cfg, index, rec.phases, n, torch.device("cpu"))
+    phase_at = torch.tensor([i for i, p in enumerate(rec.phases) for _ in range(p.start, p.stop)])
+    arm = np.array([[w.arm] for w in worlds])
+    pose = np.stack([w.pose.reshape(len(w.pose), 14) for w in worlds])
+    velocity = np.stack([w.velocity.reshape(len(w.velocity), 12) for w in worlds])
+    sim = SimpleNamespace(
+        nworld=n,
+        device=torch.device("cpu"),
+        step_count=torch.tensor([w.step_count for w in worlds]),
+        overflow=torch.tensor([w.overflow for w in worlds], dtype=torch.int32),
+    )
+    for step in range(pose.shape[1]):
+        sim.qpos = torch.tensor(np.hstack([arm, pose[:, step]]), dtype=dtype)
+        sim.qvel = torch.tensor(np.hstack([arm, velocity[:, step]]), dtype=dtype)
+        check.update(sim, phase_at[min(step, len(phase_at) - 1)].expand(n))
+    return check.result(sim)
+
+
+def reference(w: World) -> Outcome:
+    return check_world(
+        w.pose,
+        w.velocity,
+        w.rec.cfg,
+        w.rec.phases,
+        step_count=w.step_count,
+        overflow=bool(w.overflow & ~STOPPED_EARLY),
+        finite_elsewhere=math.isfinite(w.arm),
+    )
+
+
+def assert_same(result: CheckResult, k: int, expected: Outcome) -> None:
+    assert CASES.broken(result, k) == expected.failed
+    for name, value in NUMBERS.items():
+        wanted = getattr(expected, name)
+        wanted = math.degrees(wanted) if value.endswith("_deg") else wanted
+        tolerance = math.degrees(1e-6) if value.endswith("_deg") else 1e-6
+        assert float(result.values[value][k]) == pytest.approx(
+            wanted, abs=tolerance, rel=1e-4, nan_ok=True
+        ), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_recorded_episodes(
+    robot: str, recorded: Callable[[str], SimpleNamespace], dtype: torch.dtype
+) -> None:
+    rec = recorded(robot)
+    worlds = [
+        World(rec.pose[k], rec.velocity[k], int(rec.step_count[k]), rec)
+        for k in range(len(rec.pose))
+    ]
+    result = feed(worlds, rec, dtype)
+    for k, world in enumerate(worlds):
+        expected = reference(world)
+        assert expected.failed == set()
+        assert_same(result, k, expected)
+        assert_same(rec.result, k, expected)
+
+
+# Alterations of a recording whose last steps have been made ideal.
+
+
+@CASES.case("STACKED")
+def red_teleported_after_release(w: World) -> None:
+    w.pose[w.steps("retreat").start :, RED, 0] += 0.06
+
+
+@CASES.case("STACKED")
+def fallen_off_in_the_last_step_only(w: World) -> None:
+    w.pose[-1, RED, :2] = w.pose[-1, BLUE, :2] + [0.0153, 0.0]
+    w.pose[-2, RED, :2] = w.pose[-2, BLUE, :2] + [0.0147, 0.0]
+    w.pose[w.window, RED, 0] = np.where(np.arange(50) == 49, w.pose[-1, RED, 0], w.pose[-2, RED, 0])
+
+
+@CASES.case("STACKED")
+def stacked_late_by_one_step(w: World) -> None:
+    first = len(w.pose) - w.rec.cfg.gate.acceptance.window
+    w.pose[w.window, RED, 0] += 0.0149
+    w.pose[first, RED, 0] += 0.0002
+
+
+@CASES.case()
+def not_stacked_just_before_the_window(w: World) -> None:
+    w.pose[: len(w.pose) - 50][-1, RED, 0] += 0.05
+
+
+@CASES.case("SUPPORTED", "STACKED")
+def blue_sunk_into_the_table(w: World) -> None:
+    w.pose[w.window, BLUE, 2] -= 0.012
+
+
+@CASES.case("SUPPORTED")
+def both_off_the_table_edge(w: World) -> None:
+    reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.cube_half
+    w.pose[w.window, :, 1] = w.rec.cfg.scene.table_center[1] + reach + HAIR
+
+
+@CASES.case()
+def both_at_the_table_edge(w: World) -> None:
+    reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.cube_half
+    w.pose[w.window, :, 1] = w.rec.cfg.scene.table_center[1] + reach - HAIR
+
+
+@CASES.case("SUPPORTED")
+def both_off_the_far_edge(w: World) -> None:
+    reach = w.rec.cfg.scene.table_half[0] - w.rec.cfg.scene.cube_half
+    w.pose[w.window, :, 0] = w.rec.cfg.scene.table_center[0] - reach - HAIR
+
+
+@CASES.case("SUPPORTED")
+def blue_tilted_off_its_support(w: World) -> None:
+    w.pose[w.window, BLUE, 3:] = [math.cos(0.2), math.sin(0.2), 0.0, 0.0]
+
+
+@CASES.case("REST_POSITION")
+def slow_drift(w: World) -> None:
+    w.pose[w.window, :, 1] += np.linspace(0.0, 0.0052, 50)[:, None]
+
+
+@CASES.case("REST_POSITION")
+def drift_there_and_back(w: World) -> None:
+    w.pose[w.window, :, 1] += (0.0026 * np.sin(np.linspace(0.0, 2.0 * np.pi, 50)))[:, None]
+
+
+@CASES.case("REST_ROTATION")
+def slow_turn_of_blue(w: World) -> None:
+    half = 0.5 * np.radians(np.linspace(0.0, 3.1, 50))
+    w.pose[w.window, BLUE, 3:] = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
+
+
+@CASES.case("REST_ROTATION")
+def turn_between_the_middle_and_the_ends(w: World) -> None:
+    half = 0.5 * np.radians(1.6 * np.sin(np.linspace(0.0, 2.0 * np.pi, 50)))
+    w.pose[w.window, RED, 3:] = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
+
+
+@CASES.case()
+def quaternion_of_either_sign(w: World) -> None:
+    w.pose[::2, :, 3:] *= -1.0
+
+
+@CASES.case("REST_SPEED")
+def jitter_in_place(w: World) -> None:
+    w.velocity[w.window, RED, 0] = 0.06 * (-1.0) ** np.arange(50)
+
+
+@CASES.case("REST_SPEED")
+def spin_in_place(w: World) -> None:
+    w.velocity[w.window, BLUE, 5] = 0.0502 / (math.sqrt(3.0) * 0.022)
+
+
+@CASES.case()
+def one_fast_step(w: World) -> None:
+    w.velocity[-20, RED, 0] = 0.3
+
+
+@CASES.case("LIFT", "CARRY")
+def never_lifted(w: World) -> None:
+    w.pose[w.steps("lift_red").start : w.steps("above_blue").stop, RED, 2] = w.pose[0, RED, 2]
+
+
+@CASES.case("LIFT", "CARRY")
+def airborne_runs_of_nine_steps(w: World) -> None:
+    steps = range(w.steps("lift_red").start, w.steps("above_blue").stop)
+    for k, step in enumerate(steps):
+        if k % 10 == 0:
+            w.pose[step, RED, 2] = w.pose[0, RED, 2]
+
+
+@CASES.case("CARRY")
+def dragged_in_above_blue(w: World) -> None:
+    w.pose[w.steps("above_blue"), RED, 2] = w.pose[0, RED, 2]
+
+
+@CASES.case("CARRY")
+def carried_in_hops_of_nine_steps(w: World) -> None:
+    for k, step in enumerate(range(w.steps("above_blue").start, w.steps("above_blue").stop)):
+        if k % 10 == 0:
+            w.pose[step, RED, 2] = w.pose[0, RED, 2]
+
+
+@CASES.case("CARRY")
+def moved_between_two_flights_only(w: World) -> None:
+    part = w.steps("above_blue")
+    middle = (part.start + part.stop) // 2
+    w.pose[part.start : middle, RED, :2] = w.pose[0, RED, :2]
+    w.pose[middle, RED, 2] = w.pose[0, RED, 2]
+    w.pose[middle : part.stop, RED, :2] = w.pose[-1, RED, :2]
+
+
+@CASES.case("FINITE")
+def not_a_number_in_one_step(w: World) -> None:
+    w.velocity[100, RED, 3] = math.nan
+
+
+@CASES.case("FINITE", "LIFT", "CARRY", "STACKED", "REST_SPEED", "REST_POSITION", "REST_ROTATION")
+def red_not_a_number_from_the_grasp(w: World) -> None:
+    w.pose[w.steps("grasp_red").start :, RED] = math.nan
+    w.velocity[w.steps("grasp_red").start :, RED] = math.nan
+
+
+@CASES.case("FINITE", "REST_SPEED")
+def infinite_velocity_at_the_end(w: World) -> None:
+    w.velocity[-1, BLUE, 0] = math.inf
+
+
+@CASES.case("FINITE")
+def arm_not_a_number(w: World) -> None:
+    w.arm = math.nan
+
+
+def hair(name: str, amount: Callable[[World, float], None], *broken: str) -> None:
+    """Registers both sides of a threshold."""
+    CASES.add(f"{name}_inside", set(), lambda w: amount(w, -HAIR))
+    CASES.add(f"{name}_outside", {*broken}, lambda w: amount(w, HAIR))
+
+
+def _xy(w: World, by: float) -> None:
+    w.pose[w.window, RED, 0] = w.pose[w.window, BLUE, 0] + w.rec.cfg.gate.acceptance.xy_err + by
+
+
+def _dz_min(w: World, by: float) -> None:
+    w.pose[w.window, RED, 2] = w.pose[w.window, BLUE, 2] + w.rec.cfg.gate.acceptance.dz_min - by
+
+
+def _dz_max(w: World, by: float) -> None:
+    w.pose[w.window, RED, 2] = w.pose[w.window, BLUE, 2] + w.rec.cfg.gate.acceptance.dz_max + by
+
+
+def _gap_above(w: World, by: float) -> None:
+    w.pose[w.window, :, 2] += w.rec.cfg.gate.acceptance.support_gap + by
+
+
+def _gap_below(w: World, by: float) -> None:
+    w.pose[w.window, :, 2] -= w.rec.cfg.gate.acceptance.support_gap + by
+
+
+def _speed(w: World, by: float) -> None:
+    w.velocity[w.window, RED, 1] = w.rec.cfg.gate.acceptance.rest_speed + by
+
+
+def _position(w: World, by: float) -> None:
+    w.pose[-30, :, 1] += w.rec.cfg.gate.acceptance.rest_position + by
+
+
+def _rotation(w: World, by: float) -> None:
+    half = 0.5 * (math.radians(w.rec.cfg.gate.acceptance.rest_rotation_deg) + by)
+    w.pose[-30, RED, 3:] = [math.cos(half), 0.0, 0.0, math.sin(half)]
+
+
+def _height(w: World, by: float) -> None:
+    top = w.rec.cfg.scene.table_center[2] + w.rec.cfg.scene.table_half[2]
+    flight = slice(w.steps("lift_red").start, w.steps("above_blue").stop)
+    w.pose[flight, RED, 3:] = [1.0, 0.0, 0.0, 0.0]
+    w.pose[flight, RED, 2] = top + 0.022 + w.rec.cfg.gate.acceptance.airborne_height - by
+
+
+def _carry_distance(w: World, by: float) -> None:
+    w.pose[w.steps("above_blue"), RED, :2] = w.pose[0, RED, :2]
+    w.pose[w.steps("above_blue").stop - 1, RED, 0] += w.rec.cfg.gate.acceptance.carry_distance - by
+
+
+hair("xy_err", _xy, "STACKED")
+hair("dz_min", _dz_min, "STACKED")
+hair("dz_max", _dz_max, "STACKED")
+hair("gap_above", _gap_above, "SUPPORTED")
+hair("gap_below", _gap_below, "SUPPORTED")
+hair("rest_speed", _speed, "REST_SPEED")
+hair("rest_position", _position, "REST_POSITION")
+hair("rest_rotation", _rotation, "REST_ROTATION")
+hair("carry_distance", _carry_distance, "CARRY")
+hair("airborne_height", _height, "LIFT", "CARRY")
+
+
+@pytest.fixture(scope="module")
+def altered(recorded: Callable[[str], SimpleNamespace]) -> Altered:
+    rec = recorded("so101")
+
+    def fresh() -> World:
+        world = World(rec.pose[0].copy(), rec.velocity[0].copy(), int(rec.step_count[0]), rec)
+        _make_ideal(world)
+        return world
+
+    return CASES.play(fresh, lambda worlds: feed(worlds, rec))
+
+
+def _make_ideal(w: World) -> None:
+    """The last steps at rest, one cube exactly on the other."""
+    top = w.rec.cfg.scene.table_center[2] + w.rec.cfg.scene.table_half[2]
+    xy = w.pose[-1, BLUE, :2].copy()
+    w.pose[w.window, :, 3:] = [1.0, 0.0, 0.0, 0.0]
+    w.pose[w.window, RED, :3] = [*xy, top + 0.066]
+    w.pose[w.window, BLUE, :3] = [*xy, top + 0.022]
+    w.velocity[w.window] = 0.0
+
+
+@pytest.mark.parametrize("name", CASES.alter)
+def test_altered_recording(name: str, altered: Altered) -> None:
+    result, k, world = altered[name]
+    assert CASES.broken(result, k) == CASES.breaks[name]
+    assert_same(result, k, reference(world))
+
+
+def test_episode_cut_short_fails_whatever_came_before(
+    recorded: Callable[[str], SimpleNamespace],
+) -> None:
+    rec = recorded("so101")
+    world = World(rec.pose[0][:-1], rec.velocity[0][:-1], int(rec.step_count[0]), rec)
+    assert {"STEPS", "STACKED", "SUPPORTED"} <= CASES.broken(feed([world], rec))
+
+
+def test_every_rule_has_words_and_a_case() -> None:
+    assert {rule.name for rule in StackRule} == set().union(*CASES.breaks.values())
+    for rule in StackRule:
+        assert describe_rules(StackRule, int(rule))
+    assert describe_rules(StackRule, int(StackRule.LIFT | StackRule.STACKED)).count(",") == 1
