@@ -143,7 +143,7 @@ def held(env: Env, views: tuple[str, ...] = VIEWS) -> dict[str, torch.Tensor]:
     out |= {f"fields.{name}": field.clone() for name, field in env.sim.fields.items()}
     out |= {
         name: getattr(env, name).clone()
-        for name in ("episode", "step", "success", "action", "previous_action")
+        for name in ("episode", "episode_step", "success", "action", "previous_action")
     }
     out["episode_sums"] = env.reward_manager.episode_sums.clone()
     return out
@@ -161,7 +161,7 @@ def play(env: Env, moves: list[torch.Tensor], before: Callable[[int], None] | No
         row |= {
             name: getattr(env.sim, name).clone() for name in (*STATE, "site_xpos", "sensordata")
         }
-        trace.append(row | {"episode": env.episode.clone(), "step": env.episode_step.clone()})
+        trace.append(row | {"episode": env.episode.clone(), "episode_step": env.episode_step.clone()})
     return trace
 
 

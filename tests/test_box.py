@@ -424,7 +424,7 @@ def test_bad_input_is_one_line(overrides: list[str], parts: list[str]) -> None:
 @pytest.mark.parametrize(
     ("override", "parts"),
     [
-        ("reward.place_red.params.object=red_cub", ["reward.place_red", "red_cub", "red_cube"]),
+        ("reward.place_red.params.object=red_cub", ["reward.place_red", "red_cub", "red"]),
         ("reward.reach.params.scale=0", ["reward.reach.params.scale=0", "positive"]),
         ("task.success.params.open_fraction=2", ["task.success.params.open_fraction=2", "0 to 1"]),
     ],

@@ -345,9 +345,9 @@ def test_missing_and_misspelt_parameters(cfg: Config, kind: str) -> None:
 
 
 def test_parameters_of_functions_and_actions(cfg: Config) -> None:
-    cfg.reward["lift"].params = {"object": "red_cube"}
+    cfg.reward["lift"].params = {"object": "red"}
     fails(TermError, lambda: build(cfg), "reward.lift: parameter 'height' is missing")
-    cfg.reward["lift"].params = {"object": "red_cube", "hieght": 0.05}
+    cfg.reward["lift"].params = {"object": "red", "hieght": 0.05}
     fails(
         TermError,
         lambda: build(cfg),
@@ -360,7 +360,7 @@ def test_parameters_of_functions_and_actions(cfg: Config) -> None:
         lambda: build(cfg),
         "reward.lift",
         "'red_cub' does not exist",
-        "Did you mean 'red_cube'?",
+        "Did you mean 'red'?",
     )
     cfg.reward.pop("lift")
     cfg.action["arm"].params["sacle"] = 1.0

@@ -122,8 +122,8 @@ def test_joints_stay_within_both_ranges(stage: Stage, robot: str) -> None:
 
 
 REGIONS = [
-    ("so101", "[0.12,0.05]", "red_cube at (0.450, -0.180) m the point"),
-    ("so101", "[0.05,0.3]", "red_cube at"),
+    ("so101", "[0.12,0.05]", "red at (0.450, -0.180) m the point"),
+    ("so101", "[0.05,0.3]", "red at"),
     ("rebot", "[0.3,0.0]", None),  # the whole depth of its table is within reach
     ("so101", "[0.03,0.03]", None),
 ]
@@ -168,7 +168,7 @@ def test_finger_room_is_what_the_open_jaws_need(stage: Stage, robot: str) -> Non
     index = stage(robot).index
     scene = cfg.scene
     data = mujoco.MjData(model)
-    blue = index.geoms["blue_cube"][0]
+    blue = index.geoms["blue"][0]
     distance = 2.0 * math.sqrt(2.0) * scene.cube_half + cfg.robot.finger_room
     ik = GraspIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
     z = table_top(scene) + scene.cube_half
@@ -243,7 +243,7 @@ def test_nothing_starts_in_a_wall(robot: str, euler: float) -> None:
     )
     offsets, free = placement._choose(draws)
     assert free.all()
-    cube = model.geom("red_cube").id
+    cube = model.geom("red").id
     data = mujoco.MjData(model)
     nearest = math.inf
     for number, (dx, dy) in enumerate(offsets[:, 0].tolist()):
@@ -277,7 +277,7 @@ def touches_arm(
     data.qpos[red + 3 : red + 7] = math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_collision(model, data)
-    cube = index.geoms["red_cube"][0]
+    cube = index.geoms["red"][0]
     pairs = [set(pair) for pair in data.contact.geom[: data.ncon].tolist()]
     return any(cube in pair and model.geom("table").id not in pair for pair in pairs)
 
@@ -388,7 +388,7 @@ def test_regions_stay_inside_what_is_reached() -> None:
     cfg = mjstack.load_config(["job=reachability", "job.step=0.005", "job.margin=0.01"])
     x0, y0 = cfg.scene.red_xy
     half_plane = level(cfg, lambda x, y: (x <= x0 + 0.08) & (y >= y0 - 0.09))
-    region = find_region(cfg, [half_plane], "red_cube", [x0, y0])
+    region = find_region(cfg, [half_plane], "red", [x0, y0])
     # From the last point that is reached, a step short of the first that is not: a margin less.
     assert region.square == pytest.approx(0.07, abs=0.005)
     assert 0.0 <= 0.07 - region.largest[0] <= 0.005
@@ -396,11 +396,11 @@ def test_regions_stay_inside_what_is_reached() -> None:
     assert region.reached
     assert region.tilt == pytest.approx(0.3)
     near = level(cfg, lambda x, y: x <= x0 + 0.055)
-    assert not find_region(cfg, [half_plane, near], "red_cube", [x0, y0]).reached
-    island = find_region(cfg, [level(cfg, lambda x, y: x < x0 - 0.05)], "red_cube", [x0, y0])
+    assert not find_region(cfg, [half_plane, near], "red", [x0, y0]).reached
+    island = find_region(cfg, [level(cfg, lambda x, y: x < x0 - 0.05)], "red", [x0, y0])
     assert (island.square, island.largest, island.reached) == (0.0, (0.0, 0.0), False)
     assert math.isnan(island.tilt)
-    everywhere = find_region(cfg, [level(cfg, lambda x, y: x < 9.0)], "red_cube", [x0, y0])
+    everywhere = find_region(cfg, [level(cfg, lambda x, y: x < 9.0)], "red", [x0, y0])
     scene = cfg.scene
     for k in (0, 1):  # the table's edge ends it, for a cube of any yaw
         edge = (
@@ -432,7 +432,7 @@ def test_the_job_leaves_a_map(
     status = run([*args, "job.margin=0"])
     report = json.loads((tmp_path / "report.json").read_text())
     gates = {gate["name"]: gate for gate in report["gates"]}
-    assert list(gates) == ["grasp", "approach", "carry", "red_cube", "blue_cube"]
+    assert list(gates) == ["grasp", "approach", "carry", "red", "blue"]
     # Between points that are 40 mm apart the worse counts, which the SO-101's region may not
     # survive.
     assert status == (0 if report["status"] == "pass" else 1)
@@ -453,7 +453,7 @@ def test_the_job_leaves_a_map(
     assert int(held["reached"][0].sum()) == sum(row["grasp_reached"] == "1" for row in rows)
     assert gates["grasp"]["metrics"]["reached_fraction"] == pytest.approx(held["reached"][0].mean())
     text = (tmp_path / "reachability.md").read_text()
-    assert "| red_cube | (" in text
+    assert "| red | (" in text
     assert "![reachability.png](reachability.png)" in text
     assert (tmp_path / "reachability.png").stat().st_size > 10_000
     assert "largest square" in capsys.readouterr().out

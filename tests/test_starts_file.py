@@ -171,7 +171,7 @@ def test_some_columns_of_a_kind_are_enough(backend: str, tmp_path: Path) -> None
     write_rows(tmp_path / "worlds.csv", rows)
     env = started(backend, cfg)
     m = env.sim.model
-    red, blue = (m.body(name).id for name in ("red_cube", "blue_cube"))
+    red, blue = (m.body(name).id for name in ("red", "blue"))
     assert env.sim.fields["body_mass"][:, [red, blue]].cpu().numpy() == pytest.approx(
         np.tile([0.1, 0.08], (N, 1))
     )
@@ -231,7 +231,7 @@ def test_writing_is_refused_where_worlds_have_moved_on(tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match=r"path: .*no/worlds\.csv.*folder"):
         write_starts(env, tmp_path / "no" / "worlds.csv")
     env.sim.qpos[1, env.index.cube_qpos[0] + 2] += 0.1
-    with pytest.raises(ArgumentError, match="red_cube of world 1 off the table"):
+    with pytest.raises(ArgumentError, match="red of world 1 off the table"):
         write_starts(env, tmp_path / "worlds.csv")
     env.reset(seed=0)
     env.step(torch.zeros((N, env.action_manager.action_dim)))
@@ -307,19 +307,19 @@ BAD: dict[str, tuple[Callable[[Rows], Rows], str]] = {
     "off the table": (
         change(1, red_x_m="0.2", red_yaw_rad="0.785"),
         (
-            ", line 3, column red_x_m: expected 0.222 to 0.478, so that red_cube is on the table,"
+            ", line 3, column red_x_m: expected 0.222 to 0.478, so that red is on the table,"
             " turned as it is; 0.2 is 21.1 mm"
         ),
     ),
     "over the edge": (
         change(0, blue_y_m="0.3"),
-        ", line 2, column blue_y_m: expected -0.269 to 0.189, so that blue_cube is on",
+        ", line 2, column blue_y_m: expected -0.269 to 0.189, so that blue is on",
     ),
     "touching": (
         change(3, blue_x_m="0.33", blue_y_m="-0.09", blue_yaw_rad="0.8"),
         (
             ", line 5, columns red_x_m, red_y_m, blue_x_m, blue_y_m: expected cubes that touch"
-            " nothing but the table; red_cube and blue_cube touch in world 3. Move them apart."
+            " nothing but the table; red and blue touch in world 3. Move them apart."
         ),
     ),
     "in the arm": (
@@ -330,7 +330,7 @@ BAD: dict[str, tuple[Callable[[Rows], Rows], str]] = {
         change(1, red_x_m="0.47", red_y_m="-0.2"),
         (
             ", line 3, columns red_x_m, red_y_m: expected a place that the arm reaches; with"
-            " red_cube at (0.470, -0.200) m"
+            " red at (0.470, -0.200) m"
         ),
     ),
     "too light": (
@@ -441,7 +441,7 @@ def test_values_within_the_configured_ranges_alone(tmp_path: Path) -> None:
     write_rows(tmp_path / "worlds.csv", column("red_mass_kg", "0.05")(plain_rows(cfg)))
     cfg.reset["starts"].params["mass"] = [0.5, 1.5]
     env = started("native", cfg)
-    assert float(env.sim.fields["body_mass"][0, env.index.bodies["red_cube"]]) == 0.05
+    assert float(env.sim.fields["body_mass"][0, env.index.bodies["red"]]) == 0.05
 
 
 @pytest.mark.parametrize(

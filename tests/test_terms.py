@@ -36,8 +36,8 @@ from mjstack.scene import SceneIndex
 from mjstack.tasks.reach import ReachSuccess
 from mjstack.tasks.stack import StackSuccess
 
-CUBES = ("red_cube", "blue_cube")
-OBJECT = {"object": "red_cube"}
+CUBES = ("red", "blue")
+OBJECT = {"object": "red"}
 Stage = Callable[[str], GateContext]
 
 
@@ -52,7 +52,7 @@ OBSERVATIONS = {
     "joint_vel": ({}, "n"),
     "grasp_point_pos": ({}, 3),
     "grasp_point_to_object": (OBJECT, 3),
-    "object_to_object": ({"a": "red_cube", "b": "blue_cube"}, 3),
+    "object_to_object": ({"a": "red", "b": "blue"}, 3),
     "object_pose": (OBJECT, 7),
     "object_velocity": (OBJECT, 6),
     "jaw_force": (OBJECT, 2),
@@ -62,7 +62,7 @@ REWARDS = {  # whether it is a fraction, from 0 to 1
     "reach": ({**OBJECT, "scale": 0.1}, True),
     "grasp": (OBJECT, True),
     "lift": ({**OBJECT, "height": 0.05}, True),
-    "place": ({"a": "red_cube", "b": "blue_cube", "scale": 0.1}, True),
+    "place": ({"a": "red", "b": "blue", "scale": 0.1}, True),
     "success": ({}, True),
     "action_rate": ({}, False),
     "joint_vel": ({}, False),
@@ -161,9 +161,9 @@ class Reference:
             "grasp_point_to_red": red - self.grasp_point,
             "grasp_point_to_goal": red + np.array([0.0, 0.0, 0.06]) - self.grasp_point,
             "red_to_blue": blue - red,
-            "red_pose": np.concatenate((red, self.data.body("red_cube").xquat)),
-            "red_velocity": self.data.joint("red_cube").qvel,
-            "blue_pose": np.concatenate((blue, self.data.body("blue_cube").xquat)),
+            "red_pose": np.concatenate((red, self.data.body("red").xquat)),
+            "red_velocity": self.data.joint("red").qvel,
+            "blue_pose": np.concatenate((blue, self.data.body("blue").xquat)),
             "last_action": action,
         }
 
@@ -354,12 +354,12 @@ def test_jaw_force_has_a_column_for_each_jaw(robot: str) -> None:
                 expected[1, column] = 13.0 * (other == cube)
                 assert torch.equal(observation_terms.jaw_force(env, object=other), expected)
     env.sim.sensordata[:] = 1.0  # both jaws of both cubes
-    assert reward_terms.grasp(env, object="red_cube", force=1.7).tolist() == [1.0] * 3
-    assert reward_terms.grasp(env, object="red_cube", force=1.8).tolist() == [0.0] * 3
-    env.sim.sensordata[
-        2, int(env.sim.model.sensor(f"{env.cfg.robot.jaw_bodies[1]}/red_cube").adr[0]) :
-    ][:3] = 0.0
-    assert reward_terms.grasp(env, object="red_cube").tolist() == [
+    assert reward_terms.grasp(env, object="red", force=1.7).tolist() == [1.0] * 3
+    assert reward_terms.grasp(env, object="red", force=1.8).tolist() == [0.0] * 3
+    env.sim.sensordata[2, int(env.sim.model.sensor(f"{env.cfg.robot.jaw_bodies[1]}/red").adr[0]) :][
+        :3
+    ] = 0.0
+    assert reward_terms.grasp(env, object="red").tolist() == [
         1.0,
         1.0,
         0.0,
@@ -374,7 +374,7 @@ def jaw_forces(env: Env, world: int) -> list[float]:
         v[world].double().cpu() for v in (env.sim.qpos, env.sim.qvel, env.sim.ctrl)
     )
     mujoco.mj_forward(m, data)
-    cube = m.body("red_cube").id
+    cube = m.body("red").id
     out = []
     for name in env.cfg.robot.jaw_bodies:
         jaw = m.body(name).id
@@ -692,7 +692,7 @@ def test_reach_success_counts_steps_in_a_row() -> None:
     near = np.random.default_rng(0).random((steps, n)) < 0.85
     index = SimpleNamespace(grasp_sites=[0, 2], object_address=lambda name: (3, 0))
     env = SimpleNamespace(nworld=n, device=torch.device("cpu"), index=index, sim=SimpleNamespace())
-    term = ReachSuccess(env, object="red_cube", height=0.06, distance=0.02, steps=5)
+    term = ReachSuccess(env, object="red", height=0.06, distance=0.02, steps=5)
     run = np.zeros(n, dtype=int)
     seen = []
     for step in range(steps):
@@ -725,7 +725,7 @@ def test_reaching_ends_the_episode_after_ten_steps_in_a_row(backend: str) -> Non
     cfg.termination.pop("cube_off_table")
     env = on_shared_sim(backend, 3, cfg)
     env.reset(seed=0)
-    q, v = env.index.objects["red_cube"]
+    q, v = env.index.objects["red"]
     hold = torch.zeros((3, env.action_manager.action_dim), device=env.device)
     for step in range(1, 17):
         grasp_point = env.sim.site_xpos[:, env.index.grasp_sites].mean(1)

@@ -11,8 +11,8 @@ import mujoco
 from mjstack.config.schema import BoxCfg, Cone, Config, SceneCfg, SolverCfg, TimingCfg
 from mjstack.robots import robot_spec
 
-RED = "red_cube"
-BLUE = "blue_cube"
+RED = "red"
+BLUE = "blue"
 WORLD = "world"  # MuJoCo's name of the body that never moves
 CUBES_SENSOR = f"{RED}/{BLUE}"
 _CONES = {

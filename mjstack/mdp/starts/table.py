@@ -34,7 +34,7 @@ def column_names(objects: Sequence[str], joints: Sequence[str], friction: Sequen
     """The columns, in the order in which they are written.
 
     Args:
-        objects: Names of the cubes, such as ``red_cube``.
+        objects: Names of the cubes, such as ``red``.
         joints: Names of the robot's joints.
         friction: Whose friction may be given: the cubes, and ``grip`` where the jaws have their
             own.
@@ -49,7 +49,7 @@ def column_names(objects: Sequence[str], joints: Sequence[str], friction: Sequen
 
 
 def short(name: str) -> str:
-    """``red`` for ``red_cube``."""
+    """``red`` for ``red``."""
     return name.removesuffix("_cube")
 
 
