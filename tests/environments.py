@@ -161,7 +161,9 @@ def play(env: Env, moves: list[torch.Tensor], before: Callable[[int], None] | No
         row |= {
             name: getattr(env.sim, name).clone() for name in (*STATE, "site_xpos", "sensordata")
         }
-        trace.append(row | {"episode": env.episode.clone(), "episode_step": env.episode_step.clone()})
+        trace.append(
+            row | {"episode": env.episode.clone(), "episode_step": env.episode_step.clone()}
+        )
     return trace
 
 
