@@ -1,4 +1,4 @@
-"""A minute that tells whether the house stands: both robots, every task, one episode and one step each."""
+"""Does it work at all: both robots, an environment step and an episode."""
 
 from __future__ import annotations
 
