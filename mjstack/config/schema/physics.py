@@ -7,6 +7,8 @@ from enum import Enum
 
 from omegaconf import MISSING
 
+from mjstack.config.fields import spec
+
 
 class Backend(Enum):
     """Which physics engine steps the worlds of batch and throughput."""
@@ -35,8 +37,11 @@ class Cone(Enum):
 class TimingCfg:
     """Physics step and control interval."""
 
-    physics_dt: float = MISSING
-    decimation: int = MISSING
+    physics_dt: float = spec(unit="s", gt=0.0)
+    """Duration of one physics step."""
+
+    decimation: int = spec(unit="physics steps", ge=1)
+    """Physics steps of one control step."""
 
     @property
     def step_dt(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+from mjstack.config.fields import check_fields
 from mjstack.config.schema import Config
 from mjstack.config.validate.gate import check_gates, check_success
 from mjstack.config.validate.job import check_job_keys
@@ -23,6 +24,7 @@ _WORLD = re.compile(r"((batch|success):)?(\d+:)?\d+")
 
 def validate(cfg: Config) -> None:
     """Raises a `ConfigError` or `UnknownName` for the first value that cannot be used."""
+    check_fields("", cfg)
     world_count("nworld", cfg.nworld)
     if not 0 <= cfg.seed < 1 << 32:
         raise ConfigError("seed", cfg.seed, "an integer from 0 to 4294967295")
