@@ -6,10 +6,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import IntFlag
 from typing import Any
 
-from mjstack.tasks.check import CheckResult
+from mjstack.tasks.check import CheckResult, Rules
 
 Alter = Callable[[Any], None]
 Altered = dict[str, tuple[CheckResult, int, Any]]
@@ -22,7 +21,7 @@ STOPPED_EARLY = (
 class Cases:
     """Cases by name. A world has at least ``step_count`` and ``overflow``."""
 
-    rules: type[IntFlag]
+    rules: Rules
     alter: dict[str, Alter] = field(default_factory=dict)
     breaks: dict[str, set[str]] = field(default_factory=dict)
 
@@ -65,4 +64,4 @@ class Cases:
 
     def broken(self, result: CheckResult, k: int = 0) -> set[str]:
         """Names of the rules that a world broke."""
-        return {rule.name or "" for rule in self.rules if int(result.failed[k]) & rule}
+        return set(self.rules.broken(int(result.failed[k])))

@@ -24,7 +24,7 @@ from mjstack.errors import RunError
 from mjstack.gates.batch import run_batch
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
-from mjstack.tasks.stack import StackRule
+from mjstack.tasks.stack import RULES
 
 TIGHT = "gate.acceptance.xy_err=0.0015"  # some worlds end farther off than this
 
@@ -112,7 +112,7 @@ def test_failing_worlds_are_a_table(two_seeds: tuple[Path, GateResult, list[str]
     for row in rows:
         record = BatchRecord.read(folder, int(row["seed"]))
         assert record is not None
-        assert record.failed[int(row["world"])] == StackRule.STACKED
+        assert record.failed[int(row["world"])] == RULES["STACKED"]
         assert row["rules"] == "STACKED"
         assert float(row["xy_err_m"]) > 0.0015
         for name, values in record.values.items():
@@ -194,7 +194,7 @@ def test_what_stops_the_second_seed_keeps_the_first(
     assert len((tmp_path / FAILING).read_text().splitlines()) == 3
     record = BatchRecord.read(tmp_path, 0)
     assert record is not None
-    assert (record.failed == StackRule.STACKED).all()
+    assert (record.failed == RULES["STACKED"]).all()
 
 
 def test_full_disk_takes_no_verdict_back(

@@ -26,10 +26,10 @@ from mjstack.episodes.rollout import NOMINAL
 from mjstack.gates.success import run_success
 from mjstack.report.record import Status
 from mjstack.sim import make_simulation
-from mjstack.tasks.box import BoxCheck, BoxRule
-from mjstack.tasks.check import CheckResult, describe_rules
+from mjstack.tasks.box import RULES, BoxCheck
+from mjstack.tasks.check import CheckResult
 
-CASES = Cases(BoxRule)
+CASES = Cases(RULES)
 HAIR = 2e-6  # [m], [m/s]: a good deal more than float32 rounds at these sizes
 
 
@@ -175,7 +175,7 @@ def test_mjwarp_fills_the_box(robot: str, controller: str, device: str) -> None:
     sim = make_simulation(context.model, cfg, nworld, backend=Backend.mjwarp, device=device)
     episode = context.run(sim, reset)
     for failed in episode.result.failed.tolist():
-        assert failed == 0, describe_rules(BoxRule, failed)
+        assert failed == 0, RULES.describe(failed)
     assert episode.captured == (not cpu)
     sizes = cfg.robot.placements["box"]
     assert int(sim.peak_contacts.max()) <= sizes.nconmax
@@ -592,17 +592,16 @@ def test_episode_that_goes_on_fails_for_its_length_alone() -> None:
 def test_every_rule_has_words_and_a_case_of_its_own() -> None:
     alone = {next(iter(rules)) for rules in CASES.breaks.values() if len(rules) == 1}
     # Where red never is released, it was not before blue was grasped either.
-    assert {rule.name for rule in BoxRule} - alone == {"RELEASE_RED"}
+    assert set(RULES) - alone == {"RELEASE_RED"}
     assert {"RELEASE_RED", "ORDER"} in CASES.breaks.values()
-    for rule in BoxRule:
-        assert describe_rules(BoxRule, int(rule))
+    assert all(RULES.texts.values())
 
 
 def test_explained_rules_are_the_rules(robot: str) -> None:
     rec = planned(robot)
     values = {name: float(v[0]) for name, v in rec.result.values.items()}
     told = BoxCheck.explain(rec.context.cfg, {}, values)
-    assert set(told) | {"FINITE", "STEPS", "OVERFLOW"} == {rule.name for rule in BoxRule}
+    assert set(told) | {"FINITE", "STEPS", "OVERFLOW"} == set(RULES)
     assert all(found and wanted for found, wanted in told.values())
     assert {value for value, _ in BoxCheck.summaries.values()} <= set(values)
     assert f"{1e3 * values['slot_err_red_m']:.1f} mm" in BoxCheck.headline(values)

@@ -20,7 +20,7 @@ from mjstack.gates.capacity import run_capacity
 from mjstack.gates.throughput import run_throughput
 from mjstack.report.record import Status
 from mjstack.sim import Overflow, Simulation
-from mjstack.tasks.stack import StackCheck, StackRule
+from mjstack.tasks.stack import RULES, StackCheck
 
 
 def teleport(context: GateContext, world: int) -> Callable[[int, Simulation], None]:
@@ -35,7 +35,7 @@ def teleport(context: GateContext, world: int) -> Callable[[int, Simulation], No
 
 
 def rules(bits: torch.Tensor) -> list[set[str]]:
-    return [{rule.name for rule in StackRule if int(b) & rule} for b in bits]
+    return [set(RULES.broken(int(b))) for b in bits]
 
 
 def test_native(

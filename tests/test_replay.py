@@ -28,7 +28,7 @@ from mjstack.episodes.rollout import snapshot, start_worlds
 from mjstack.jobs.archived_starts import STEM, archive_starts, copy_names
 from mjstack.jobs.replay import _compare
 from mjstack.sim import BatchSizes
-from mjstack.tasks.stack import StackRule
+from mjstack.tasks.stack import RULES
 
 FAILING = "0:4"
 SUCCEEDED = "1:3"  # of the run below
@@ -95,7 +95,7 @@ def test_failing_world_fails_again_bit_for_bit(
     earlier: Path, failing: tuple[Path, int, dict]
 ) -> None:
     record = record_of(earlier, 0)
-    assert record.failed[4] == StackRule.STACKED
+    assert record.failed[4] == RULES["STACKED"]
     out, status, report = failing
     assert status == 1
     assert report["status"] == "fail"
@@ -112,13 +112,13 @@ def test_failing_world_fails_again_bit_for_bit(
         f"STACKED: BROKEN, not stacked: xy_err up to {1e3 * record.values['xy_err_m'][4]:.3g} mm"
     )
     assert "at most 1.5 mm" in broken[0]
-    assert len(gate["details"]) == len(StackRule)
+    assert len(gate["details"]) == len(RULES)
     with np.load(out / "trajectory.npz") as held:
         assert np.array_equal(held["qpos"][-1], record.qpos[4])
         assert (int(held["seed"]), int(held["world"]), int(held["failed"])) == (
             0,
             4,
-            int(StackRule.STACKED),
+            RULES["STACKED"],
         )
     assert sorted(path.name for path in (out).iterdir()) == [
         ".hydra",
@@ -204,7 +204,7 @@ def test_another_verdict_is_said(
 ) -> None:
     folder = copy_of(earlier, tmp_path)
     record = record_of(folder, 0)
-    record.failed[3] = int(StackRule.CARRY)
+    record.failed[3] = RULES["CARRY"]
     record.qpos[3, 14] += 0.002  # somewhere in blue's position
     record.write(folder)
     status, report = replay(folder, "world=3")
@@ -258,7 +258,7 @@ def test_another_verdict_is_said(
             "as recorded, but its cubes end 1e-06 mm from where they did, and runs on CUDA agree",
         ),
         (
-            StackRule.CARRY,
+            RULES["CARRY"],
             0.0,
             "cpu",
             [],
@@ -266,7 +266,7 @@ def test_another_verdict_is_said(
             "NOT as recorded (red not carried): it ends bit for bit where it did",
         ),
         (
-            StackRule.CARRY,
+            RULES["CARRY"],
             0.002,
             "cpu",
             [],
@@ -274,7 +274,7 @@ def test_another_verdict_is_said(
             "NOT as recorded (red not carried): its cubes end 2 mm from where they did",
         ),
         (
-            StackRule.CARRY,
+            RULES["CARRY"],
             0.002,
             "cuda:0",
             [],
@@ -282,7 +282,7 @@ def test_another_verdict_is_said(
             "NOT as recorded (red not carried): its cubes end 2 mm",
         ),
         (
-            StackRule.OVERFLOW,
+            RULES["OVERFLOW"],
             0.002,
             "cpu",
             [],

@@ -13,10 +13,10 @@ import torch
 from check_cases import STOPPED_EARLY, Altered, Cases
 from stack_checker import BLUE, RED, Outcome, check_world
 
-from mjstack.tasks.check import CheckResult, describe_rules
-from mjstack.tasks.stack import StackCheck, StackRule
+from mjstack.tasks.check import CheckResult
+from mjstack.tasks.stack import RULES, StackCheck
 
-CASES = Cases(StackRule)
+CASES = Cases(RULES)
 HAIR = 2e-6  # [m], [m/s], [rad]: a good deal more than float32 rounds at these sizes
 NUMBERS = {
     "xy_err": "xy_err_m",
@@ -365,7 +365,6 @@ def test_episode_cut_short_fails_whatever_came_before(
 
 
 def test_every_rule_has_words_and_a_case() -> None:
-    assert {rule.name for rule in StackRule} == set().union(*CASES.breaks.values())
-    for rule in StackRule:
-        assert describe_rules(StackRule, int(rule))
-    assert describe_rules(StackRule, int(StackRule.LIFT | StackRule.STACKED)).count(",") == 1
+    assert set(RULES) == set().union(*CASES.breaks.values())
+    assert all(RULES.texts.values())
+    assert RULES.describe(RULES["LIFT"] | RULES["STACKED"]).count(",") == 1

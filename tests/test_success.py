@@ -32,7 +32,7 @@ from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation
-from mjstack.tasks.stack import StackRule
+from mjstack.tasks.stack import RULES
 
 PHASES = list(configure().controller.phases)
 
@@ -263,7 +263,7 @@ def test_replay_plays_the_gates_world(passed: Path, warp: Path, tmp_path: Path) 
     assert run(["job=replay", f"run={passed}", "world=5", f"hydra.run.dir={out}"]) == 0
     gate = gate_of(out)
     assert gate["reason"].endswith("; as recorded, and it ends bit for bit where it did")
-    assert len(gate["details"]) == len(StackRule) + 1
+    assert len(gate["details"]) == len(RULES) + 1
     assert gate["details"][-1] == "first sign of failure: none; grasps tried again: 0"
     both = tmp_path / "both"
     assert run(["job=replay", f"run={warp}", "world=3", f"hydra.run.dir={both}"]) == 0
@@ -542,7 +542,7 @@ def test_signs_in_real_episodes(new_context: Callable[..., GateContext]) -> None
         ("PHYSICS", "above_blue"),
     ]
     assert [bits == 0 for bits in failed] == [True, False, True, False, False, False]
-    assert failed[5] & StackRule.FINITE
+    assert failed[5] & RULES["FINITE"]
     assert retries == [0, 0, 1, 0, 0, 0]
     assert watch.step.tolist()[4] == at["done"] + 6
 
@@ -643,7 +643,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
     )  # has no place among the worst
     (table,) = _tables(
         load_config(["gate.success.worst_regions=2"]),
-        _Tally(False, StackRule, PHASES),
+        _Tally(False, RULES, PHASES),
         [],
         [*found[:1], well],
     )

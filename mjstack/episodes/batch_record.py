@@ -17,7 +17,7 @@ from mjstack.episodes.rollout import Episode
 from mjstack.errors import RunError
 from mjstack.report.record import write_atomic
 from mjstack.sim import Simulation
-from mjstack.tasks.check import Rule
+from mjstack.tasks.check import Rules
 
 FAILING = "failing_worlds.csv"
 WORLDS = "worlds"  # the batch gate's files begin with this
@@ -111,7 +111,7 @@ class BatchRecord:
         np.savez_compressed(buffer, **arrays)
         write_atomic(folder / _file_name(self.seed, stem), buffer.getvalue())
 
-    def failing_rows(self, rules: type[Rule]) -> list[str]:
+    def failing_rows(self, rules: Rules) -> list[str]:
         """A line of the table for every failing world: the rules that it broke, and all that was
         measured.
         """
@@ -120,7 +120,7 @@ class BatchRecord:
                 (
                     str(self.seed),
                     str(world),
-                    " ".join(rule.name or "" for rule in rules if self.failed[world] & int(rule)),
+                    " ".join(rules.broken(self.failed[world])),
                     *(f"{values[world]:.6g}" for values in self.values.values()),
                 )
             )

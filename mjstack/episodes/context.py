@@ -28,7 +28,7 @@ from mjstack.sim import (
     resolve_sizes,
 )
 from mjstack.sim.sizes import apply_configured
-from mjstack.tasks.check import CheckResult, EpisodeCheck, Rule, check_class, describe_rules
+from mjstack.tasks.check import CheckResult, EpisodeCheck, Rules, check_class
 
 log = logging.getLogger(__name__)
 
@@ -234,12 +234,12 @@ class GateContext:
         return next(phase.start for phase in self.planner.phases if phase.name == name)
 
 
-def judge_one(rules: type[Rule], result: CheckResult) -> tuple[Status, str, dict]:
+def judge_one(rules: Rules, result: CheckResult) -> tuple[Status, str, dict]:
     """Status, reason and metrics of a one-world episode."""
     bits = int(result.failed[0])
     metrics = {name: float(values[0]) for name, values in measured_values(result).items()}
     status = Status.failed if bits else Status.passed
-    return status, f"failed: {describe_rules(rules, bits)}" if bits else "", metrics
+    return status, f"failed: {rules.describe(bits)}" if bits else "", metrics
 
 
 def measured_values(result: CheckResult) -> dict[str, np.ndarray]:
@@ -278,12 +278,3 @@ def play_seeds(
             return [f"{left} not played: {what} (run.log has the traceback)"]
         keep(record)
     return []
-
-
-def failing_rules(rules: type[Rule], failed: np.ndarray) -> dict[Rule, list[int]]:
-    """Which worlds broke which rule."""
-    return {
-        rule: np.flatnonzero(failed & int(rule)).tolist()
-        for rule in rules
-        if (failed & int(rule)).any()
-    }

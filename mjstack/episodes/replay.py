@@ -30,7 +30,6 @@ from mjstack.report.record import write_atomic
 from mjstack.scene import table_top
 from mjstack.sim import Simulation, describe_overflow, make_simulation, resolve_sizes
 from mjstack.sim.sizes import BatchSizes
-from mjstack.tasks.check import Rule
 
 _SHARES = 4  # of the contact pool, for a world that is alone
 
@@ -39,14 +38,15 @@ _SHARES = 4  # of the contact pool, for a world that is alone
 class RuleFinding:
     """One acceptance rule of one world: whether it held, what was found, and what it wants."""
 
-    rule: Rule
+    rule: str
+    text: str
     held: bool
     found: str
     wanted: str
 
     def __str__(self) -> str:
-        result = "held" if self.held else f"BROKEN, {self.rule.text}"
-        return f"{self.rule.name}: {result}: {self.found} (wanted: {self.wanted})"
+        result = "held" if self.held else f"BROKEN, {self.text}"
+        return f"{self.rule}: {result}: {self.found} (wanted: {self.wanted})"
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -257,7 +257,11 @@ def _explain(
     }
     return [
         RuleFinding(
-            rule=r, held=not bits & r, found=told[r.name or ""][0], wanted=told[r.name or ""][1]
+            rule=name,
+            text=rules.texts[name],
+            held=not bits & bit,
+            found=told[name][0],
+            wanted=told[name][1],
         )
-        for r in rules
+        for name, bit in rules.items()
     ]

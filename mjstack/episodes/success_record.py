@@ -19,7 +19,7 @@ from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.rollout import Episode
 from mjstack.mdp.geometry import pose_w
 from mjstack.sim import Simulation
-from mjstack.tasks.check import Rule
+from mjstack.tasks.check import Rules
 
 STEM = "success"
 REGIONS = "success_regions.csv"
@@ -108,16 +108,14 @@ class SuccessRecord:
             phase_names=np.array(phases),
         )
 
-    def failing_rows(self, rules: type[Rule], phases: list[str]) -> list[str]:
+    def failing_rows(self, rules: Rules, phases: list[str]) -> list[str]:
         """A line of the table for every failing episode: rules, first sign, start, and all that was
         measured.
         """
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         for world in np.flatnonzero(~self.succeeded).tolist():
-            broken = " ".join(
-                rule.name or "" for rule in rules if self.batch.failed[world] & int(rule)
-            )
+            broken = " ".join(rules.broken(self.batch.failed[world]))
             phase = phases[self.phase[world]] if self.phase[world] >= 0 else ""
             step = self.step[world] if self.step[world] >= 0 else ""
             cells = [self.batch.seed, world, broken, Sign(self.sign[world]).name, phase, step]

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mjstack.episodes.batch_record import FAILING, BatchRecord, write_failing
-from mjstack.episodes.context import GateContext, TimedEpisode, failing_rules, play_seeds
+from mjstack.episodes.context import GateContext, TimedEpisode, play_seeds
 from mjstack.episodes.rollout import Episode
 from mjstack.errors import name_worlds
 from mjstack.math import wilson_interval
 from mjstack.report.markdown import format_percent
 from mjstack.report.record import GateResult, Status, Value
 from mjstack.sim import Simulation
-from mjstack.tasks.check import Rule
+from mjstack.tasks.check import Rules
 
 log = logging.getLogger(__name__)
 
@@ -37,11 +37,11 @@ class _Tally:
     """
 
     several: bool
-    rules: type[Rule]
+    rules: Rules
     seeds: int = 0
     worlds: int = 0
     failed: list[str] = field(default_factory=list)
-    broken: dict[Rule, list[str]] = field(default_factory=dict)
+    broken: dict[str, list[str]] = field(default_factory=dict)
     rows: list[str] = field(default_factory=list)
     low: dict[str, float] = field(default_factory=dict)
     high: dict[str, float] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class _Tally:
         self.failed += [
             self._name(record.seed, world) for world in np.flatnonzero(record.failed).tolist()
         ]
-        for rule, worlds in failing_rules(self.rules, record.failed).items():
+        for rule, worlds in self.rules.failing(record.failed).items():
             self.broken.setdefault(rule, []).extend(
                 self._name(record.seed, world) for world in worlds
             )
@@ -181,18 +181,20 @@ def _judge(
         "peak_contacts_per_world": int(tally.high["peak_contacts"]),
         "peak_constraint_rows_per_world": int(tally.high["peak_constraint_rows"]),
         **metrics,
-        **{f"failed.{rule.name}": len(worlds) for rule, worlds in tally.broken.items()},
+        **{f"failed.{rule}": len(worlds) for rule, worlds in tally.broken.items()},
     }
     if not bad:  # how fast worlds are that do not do the task is no figure
         metrics |= {"episode_s": tally.seconds, "world_steps_per_s": tally.steps / tally.seconds}
     details = [
         *(
-            f"{rule.text}: {name_worlds(worlds, tally.worlds, _NAMED, what)}"
+            f"{tally.rules.texts[rule]}: {name_worlds(worlds, tally.worlds, _NAMED, what)}"
             for rule, worlds in tally.broken.items()
         ),
         *details,
     ]
-    counts = "; ".join(f"{rule.text} in {len(worlds)}" for rule, worlds in tally.broken.items())
+    counts = "; ".join(
+        f"{tally.rules.texts[rule]} in {len(worlds)}" for rule, worlds in tally.broken.items()
+    )
     interval = (
         f"{format_percent(rate)}, 95 % interval {format_percent(low, '')} to {format_percent(high)}"
     )

@@ -15,7 +15,7 @@ from mjstack.config.schema import Config
 from mjstack.config.validate import places_cubes, reads_starts_file
 from mjstack.envs import Env
 from mjstack.episodes.batch_record import FAILING, write_failing
-from mjstack.episodes.context import GateContext, failing_rules, play_seeds
+from mjstack.episodes.context import GateContext, play_seeds
 from mjstack.episodes.failures import FailureMonitor, describe_sign
 from mjstack.episodes.regions import Region, find_regions
 from mjstack.episodes.rollout import CLOSED_LOOP
@@ -35,7 +35,7 @@ from mjstack.report.markdown import format_percent
 from mjstack.report.record import GateResult, Status, Table, Value, write_atomic
 from mjstack.report.success import save_places
 from mjstack.sim import Simulation
-from mjstack.tasks.check import Rule
+from mjstack.tasks.check import Rules
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ class _Tally:
     """
 
     several: bool
-    rules: type[Rule]
+    rules: Rules
     phases: list[str]
     seeds: list[int] = field(default_factory=list)
     succeeded: list[np.ndarray] = field(default_factory=list)
@@ -98,7 +98,7 @@ class _Tally:
     seconds: float = 0.0
     failed: list[str] = field(default_factory=list)
     unreachable: list[str] = field(default_factory=list)
-    broken: dict[Rule, list[str]] = field(default_factory=dict)
+    broken: dict[str, list[str]] = field(default_factory=dict)
     signs: dict[tuple[int, int], list[str]] = field(default_factory=dict)
     rows: list[str] = field(default_factory=list)
 
@@ -130,7 +130,7 @@ class _Tally:
         self.seconds += seconds
         self.failed += names(np.flatnonzero(failed).tolist())
         self.unreachable += names(np.flatnonzero(record.unreachable).tolist())
-        for rule, worlds in failing_rules(self.rules, record.batch.failed).items():
+        for rule, worlds in self.rules.failing(record.batch.failed).items():
             self.broken.setdefault(rule, []).extend(names(worlds))
         for world in np.flatnonzero(failed).tolist():
             key = int(record.phase[world]), int(record.sign[world])
@@ -261,7 +261,7 @@ def _judge(
         "unreachable": len(tally.unreachable),
         "waypoint_error_max_m": tally.waypoint_error,
         "episode_s": tally.seconds,
-        **{f"failed.{rule.name}": len(worlds) for rule, worlds in tally.broken.items()},
+        **{f"failed.{rule}": len(worlds) for rule, worlds in tally.broken.items()},
     }
     per_seed = [int(part.sum()) for part in tally.succeeded]
     if t.seeds > 1:
@@ -276,7 +276,9 @@ def _judge(
     if retried.any():
         reason += f"; {retried.sum()} retried, {(retried & succeeded).sum()} of them succeeded"
     if tally.failed:
-        counts = "; ".join(f"{rule.text} in {len(worlds)}" for rule, worlds in tally.broken.items())
+        counts = "; ".join(
+            f"{tally.rules.texts[rule]} in {len(worlds)}" for rule, worlds in tally.broken.items()
+        )
         reason += f"; {name_worlds(tally.failed, n, what='episodes')} failed: {counts}"
     reason = "; ".join([reason, *problems])
     if rate < t.rate:
@@ -293,7 +295,7 @@ def _judge(
             f"target out of reach: {name_worlds(tally.unreachable, n, _NAMED, 'episodes')}"
         )
     details += [
-        f"{rule.text}: {name_worlds(worlds, n, _NAMED, 'episodes')}"
+        f"{tally.rules.texts[rule]}: {name_worlds(worlds, n, _NAMED, 'episodes')}"
         for rule, worlds in tally.broken.items()
     ]
     if context.folder is not None:

@@ -19,7 +19,7 @@ from mjstack.config.fingerprint import config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
 from mjstack.datasets import DatasetWriter, EpisodeData, lerobot
 from mjstack.envs import Env, build_env, demonstration_config
-from mjstack.episodes.context import GateContext, failing_rules
+from mjstack.episodes.context import GateContext
 from mjstack.episodes.rollout import NOMINAL
 from mjstack.errors import ConfigError, UnwrittenError
 from mjstack.jobs.collect_record import FILE, CollectedBatch, read_batches, write_batches
@@ -38,7 +38,6 @@ from mjstack.report.collect import ColumnRange, to_markdown
 from mjstack.report.record import GateResult, Status, Value, write_atomic
 from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation
-from mjstack.tasks.check import describe_rules
 
 DATASET = "dataset"  # within the job's folder
 _SPARE = 1.05  # worlds played over episodes that are missing: some fail
@@ -208,14 +207,14 @@ class Collection:
             worlds=len(played.worlds),
             succeeded=int((played.failed == 0).sum()),
             missing={
-                played.worlds[place]: describe_rules(rules, int(played.failed[place]))
+                played.worlds[place]: rules.describe(int(played.failed[place]))
                 for place in keep[:wanted]
             },
             not_finite=len(good) - len(keep),
             retries=int(played.retries.sum()),
             broken={
-                rule.text: len(places)
-                for rule, places in failing_rules(rules, played.failed).items()
+                rules.texts[name]: len(places)
+                for name, places in rules.failing(played.failed).items()
             },
         )
 
@@ -229,7 +228,7 @@ class Collection:
         for count, (place, arrays) in enumerate(played.episodes(places), 1):
             copied = time.perf_counter()
             self._spend(batch, "copy", copied - began)
-            broken = describe_rules(self._context.check.rules, int(played.failed[place]))
+            broken = self._context.check.rules.describe(int(played.failed[place]))
             if broken != batch.missing[played.worlds[place]] or not played.finite(place):
                 changed.append(played.worlds[place])
             else:

@@ -30,7 +30,6 @@ from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, check_showing, run_provenance, run_reported
 from mjstack.report.record import GateResult, Status, Value, write_atomic
 from mjstack.sim import resolve_backend, resolve_device
-from mjstack.tasks.check import describe_rules
 
 KEYS = ("job", "run", "world", "sim", "view", "video")
 """What its command line may set. All else is the earlier run's."""
@@ -280,7 +279,7 @@ def _replay(
     }
     if plan.record is not None:
         values["recorded"] = (
-            describe_rules(context.check.rules, int(plan.record.failed[plan.world])) or "succeeded"
+            context.check.rules.describe(int(plan.record.failed[plan.world])) or "succeeded"
         )
     name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
     assert context.folder is not None
@@ -331,7 +330,7 @@ def _compare(
         return True, f"that run recorded no result, because its {plan.gate} gate did not get there"
     bits = int(record.failed[plan.world])
     rules = context.check.rules
-    told = describe_rules(rules, bits) or "succeeded"
+    told = rules.describe(bits) or "succeeded"
     same = bits == done.failed
     if record.backend != backend.value:
         return (

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
-from mjstack.episodes.context import GateContext, failing_rules
+from mjstack.episodes.context import GateContext
 from mjstack.episodes.rollout import State, restore, snapshot, start_worlds
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.jobs.gates import check_machine
@@ -172,9 +172,10 @@ def _measure(context: GateContext, job: StudyJobCfg, base: _Base, row: StudyRow)
         failed = result.failed.cpu().numpy()
         row.worlds = sim.nworld
         row.succeeded = int((failed == 0).sum())
-        broken = failing_rules(context.check.rules, failed)
+        rules = context.check.rules
         row.broken_rules = ", ".join(
-            f"{rule.text} in {len(worlds)}" for rule, worlds in broken.items()
+            f"{rules.texts[name]} in {len(worlds)}"
+            for name, worlds in rules.failing(failed).items()
         )
         row.peak_rows = int(sim.peak_constraints.max())
         row.xy_err_max_m = float(result.values["xy_err_m"].max())

@@ -23,38 +23,10 @@ from mjstack.scene.index import CUBES, Columns
 from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS, Simulation
 from mjstack.tasks.box_report import report_box
-from mjstack.tasks.check import CheckResult, EpisodeCheck, Rule
+from mjstack.tasks.check import CheckResult, EpisodeCheck, Rules
 from mjstack.tasks.streaks import extend_carry, extend_run
 
 COLORS = ("red", "blue")  # the order of every dimension over cubes
-
-
-class BoxRule(Rule):
-    """What a world can fail by; a world passes with none set."""
-
-    FINITE = 1 << 0
-    STEPS = 1 << 1
-    OVERFLOW = 1 << 2
-    GRASP_RED = 1 << 3
-    GRASP_BLUE = 1 << 4
-    LIFT_RED = 1 << 5
-    LIFT_BLUE = 1 << 6
-    CARRY_RED = 1 << 7
-    CARRY_BLUE = 1 << 8
-    DROP_RED = 1 << 9
-    DROP_BLUE = 1 << 10
-    RELEASE_RED = 1 << 11
-    RELEASE_BLUE = 1 << 12
-    SETTLED_RED = 1 << 13
-    SETTLED_BLUE = 1 << 14
-    ORDER = 1 << 15
-    INSIDE = 1 << 16
-    JAW_CLEAR = 1 << 17
-
-    @property
-    def text(self) -> str:
-        """What went wrong, in words."""
-        return _TEXT[self]
 
 
 _PER_CUBE = {
@@ -65,19 +37,16 @@ _PER_CUBE = {
     "RELEASE": "not released",
     "SETTLED": "not at rest in the box after its release",
 }
-_TEXT = {
-    BoxRule.FINITE: "state not finite",
-    BoxRule.STEPS: "step counter off",
-    BoxRule.OVERFLOW: "buffer overflow",
-    **{
-        BoxRule[f"{name}_{c.upper()}"]: f"{c} {text}"
-        for name, text in _PER_CUBE.items()
-        for c in COLORS
-    },
-    BoxRule.ORDER: "blue grasped before red was released",
-    BoxRule.INSIDE: "a cube not at rest in the box at the end",
-    BoxRule.JAW_CLEAR: "gripper too low at the end",
-}
+RULES = Rules(
+    {
+        **{
+            f"{name}_{c.upper()}": f"{c} {text}" for name, text in _PER_CUBE.items() for c in COLORS
+        },
+        "ORDER": "blue grasped before red was released",
+        "INSIDE": "a cube not at rest in the box at the end",
+        "JAW_CLEAR": "gripper too low at the end",
+    }
+)
 
 
 class CubesAndBox:
@@ -197,7 +166,7 @@ class BoxCheck(EpisodeCheck):
     and touches no support.
     """
 
-    rules = BoxRule
+    rules = RULES
     summaries: ClassVar = {
         "slot_err_red_max_m": ("slot_err_red_m", "max"),
         "slot_err_blue_max_m": ("slot_err_blue_m", "max"),
@@ -327,17 +296,17 @@ class BoxCheck(EpisodeCheck):
             "SETTLED": self._settled >= t.window,
         }
         held = {
-            BoxRule.FINITE: self._finite,
-            BoxRule.STEPS: (sim.step_count == self._steps * self._timing.decimation) & complete,
-            BoxRule.OVERFLOW: (sim.overflow & LOST_PHYSICS) == 0,
+            "FINITE": self._finite,
+            "STEPS": (sim.step_count == self._steps * self._timing.decimation) & complete,
+            "OVERFLOW": (sim.overflow & LOST_PHYSICS) == 0,
             **{
-                BoxRule[f"{n}_{c.upper()}"]: ok[:, i]
+                f"{n}_{c.upper()}": ok[:, i]
                 for n, ok in per_cube.items()
                 for i, c in enumerate(COLORS)
             },
-            BoxRule.ORDER: ~self._too_early,
-            BoxRule.INSIDE: (self._rest_run >= t.window).all(1) & complete,
-            BoxRule.JAW_CLEAR: (clearance >= t.jaw_clearance) & complete,
+            "ORDER": ~self._too_early,
+            "INSIDE": (self._rest_run >= t.window).all(1) & complete,
+            "JAW_CLEAR": (clearance >= t.jaw_clearance) & complete,
         }
         values = {
             "beyond_m": beyond.amax(1),
@@ -361,7 +330,7 @@ class BoxCheck(EpisodeCheck):
             for name, value in kept.items()
             for i, color in enumerate(COLORS)
         }
-        return CheckResult.of(held, values)
+        return CheckResult.of(RULES, held, values)
 
     def placed(self, sim: Simulation) -> torch.Tensor:
         """Whether each cube is in the box right now."""

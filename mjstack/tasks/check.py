@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from enum import IntFlag
-from typing import ClassVar, TypeVar, cast
+from typing import ClassVar, cast
 
 import numpy as np
 import torch
@@ -20,18 +19,53 @@ from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import Simulation
 
 
-class Rule(IntFlag):
-    """What a world can fail by; a world passes with none set. A task's rules begin with FINITE,
-    STEPS and OVERFLOW.
+class Rules(Mapping[str, int]):
+    """A task's rules: the bit of each by its name, in order. A world passes with none set.
+
+    FINITE, STEPS and OVERFLOW come first, whatever the task.
     """
 
-    @property
-    def text(self) -> str:
-        """What went wrong, in words, of a single rule."""
-        raise NotImplementedError
+    def __init__(self, texts: Mapping[str, str]) -> None:
+        """Numbers the rules.
+
+        Args:
+            texts: What went wrong if a rule of the task is broken, by the rule's name.
+        """
+        self.texts = {**_EVERY_TASK, **texts}
+        self._bits = {name: 1 << number for number, name in enumerate(self.texts)}
+
+    def __getitem__(self, name: str) -> int:
+        return self._bits[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._bits)
+
+    def __len__(self) -> int:
+        return len(self._bits)
+
+    def broken(self, bits: int) -> list[str]:
+        """Names of the rules in a bit set."""
+        return [name for name, bit in self.items() if bits & bit]
+
+    def describe(self, bits: int) -> str:
+        """What went wrong, in words."""
+        return ", ".join(self.texts[name] for name in self.broken(bits))
+
+    def failing(self, failed: np.ndarray) -> dict[str, list[int]]:
+        """Which worlds broke which rule, by its name.
+
+        Args:
+            failed: Bits of every world, shape ``(nworld,)``.
+        """
+        worlds = {name: np.flatnonzero(failed & bit).tolist() for name, bit in self.items()}
+        return {name: found for name, found in worlds.items() if found}
 
 
-AnyRule = TypeVar("AnyRule", bound=Rule)
+_EVERY_TASK = {
+    "FINITE": "state not finite",
+    "STEPS": "step counter off",
+    "OVERFLOW": "buffer overflow",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +82,12 @@ class CheckResult:
 
     @classmethod
     def of(
-        cls, held: Mapping[AnyRule, torch.Tensor], values: dict[str, torch.Tensor]
+        cls, rules: Rules, held: Mapping[str, torch.Tensor], values: dict[str, torch.Tensor]
     ) -> CheckResult:
         """From whether each rule held, ``(nworld,)`` bool."""
-        failed = torch.zeros_like(next(iter(held.values())), dtype=torch.int32)
-        for rule, ok in held.items():
-            failed |= int(rule) * (~ok).to(failed.dtype)
+        failed = torch.zeros_like(held["FINITE"], dtype=torch.int32)
+        for name, bit in rules.items():
+            failed |= bit * (~held[name]).to(failed.dtype)
         return cls(failed, values)
 
 
@@ -69,7 +103,7 @@ class EpisodeCheck(ABC):
             ``min`` or ``max`` counts.
     """
 
-    rules: ClassVar[type[Rule]]
+    rules: ClassVar[Rules]
     summaries: ClassVar[Mapping[str, tuple[str, str]]]
 
     @abstractmethod
@@ -136,8 +170,3 @@ def check_class(cfg: Config) -> type[EpisodeCheck]:
             f"{cfg.task.check}: expected a subclass of mjstack.tasks.check.EpisodeCheck",
         )
     return cast(type[EpisodeCheck], found)
-
-
-def describe_rules(rules: type[Rule], bits: int) -> str:
-    """The rules in a bit set, in words."""
-    return ", ".join(rule.text for rule in rules if bits & rule)

@@ -20,43 +20,21 @@ from mjstack.report.record import Value
 from mjstack.scene import SceneIndex, table_top
 from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS, Simulation
-from mjstack.tasks.check import CheckResult, EpisodeCheck, Rule
+from mjstack.tasks.check import CheckResult, EpisodeCheck, Rules
 from mjstack.tasks.stack_report import report_stack
 from mjstack.tasks.streaks import extend_carry, extend_run
 
-
-class StackRule(Rule):
-    """What a world can fail by; a world passes with none set."""
-
-    FINITE = 1 << 0
-    STEPS = 1 << 1
-    OVERFLOW = 1 << 2
-    LIFT = 1 << 3
-    CARRY = 1 << 4
-    STACKED = 1 << 5
-    SUPPORTED = 1 << 6
-    REST_SPEED = 1 << 7
-    REST_POSITION = 1 << 8
-    REST_ROTATION = 1 << 9
-
-    @property
-    def text(self) -> str:
-        """What went wrong, in words."""
-        return _TEXT[self]
-
-
-_TEXT = {
-    StackRule.FINITE: "state not finite",
-    StackRule.STEPS: "step counter off",
-    StackRule.OVERFLOW: "buffer overflow",
-    StackRule.LIFT: "red not lifted",
-    StackRule.CARRY: "red not carried",
-    StackRule.STACKED: "not stacked",
-    StackRule.SUPPORTED: "blue not on the table",
-    StackRule.REST_SPEED: "cube moving",
-    StackRule.REST_POSITION: "cube drifting",
-    StackRule.REST_ROTATION: "cube turning",
-}
+RULES = Rules(
+    {
+        "LIFT": "red not lifted",
+        "CARRY": "red not carried",
+        "STACKED": "not stacked",
+        "SUPPORTED": "blue not on the table",
+        "REST_SPEED": "cube moving",
+        "REST_POSITION": "cube drifting",
+        "REST_ROTATION": "cube turning",
+    }
+)
 
 
 class CubePair:
@@ -114,7 +92,7 @@ class StackCheck(EpisodeCheck):
     episode's length.
     """
 
-    rules = StackRule
+    rules = RULES
     summaries: ClassVar = {
         "xy_err_max_m": ("xy_err_m", "max"),
         "dz_min_m": ("dz_m", "min"),
@@ -197,19 +175,20 @@ class StackCheck(EpisodeCheck):
         complete = int(self._step) == self._steps
         wanted = self._steps * self._timing.decimation
         held = {
-            StackRule.FINITE: finite,
-            StackRule.STEPS: (sim.step_count == wanted) & complete,
-            StackRule.OVERFLOW: (sim.overflow & LOST_PHYSICS) == 0,
-            StackRule.LIFT: self._lift_best >= t.lift_steps,
-            StackRule.CARRY: self._carried,
-            StackRule.STACKED: stacked & complete,
-            StackRule.SUPPORTED: supported & complete,
-            StackRule.REST_SPEED: rms <= t.rest_speed,
-            StackRule.REST_POSITION: position <= t.rest_position,
-            StackRule.REST_ROTATION: rotation <= math.radians(t.rest_rotation_deg),
+            "FINITE": finite,
+            "STEPS": (sim.step_count == wanted) & complete,
+            "OVERFLOW": (sim.overflow & LOST_PHYSICS) == 0,
+            "LIFT": self._lift_best >= t.lift_steps,
+            "CARRY": self._carried,
+            "STACKED": stacked & complete,
+            "SUPPORTED": supported & complete,
+            "REST_SPEED": rms <= t.rest_speed,
+            "REST_POSITION": position <= t.rest_position,
+            "REST_ROTATION": rotation <= math.radians(t.rest_rotation_deg),
         }
         peak = self._speed.amax((1, 2))
         return CheckResult.of(
+            RULES,
             held,
             {
                 "xy_err_m": self._xy_err,
