@@ -5,9 +5,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 READY_DEV := $(VENV)/.installed-dev
+READY_DOCS := $(VENV)/.installed-docs
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-.PHONY: run test setup clean
+.PHONY: run test docs setup clean
 
 run: $(READY)
 	$(BIN)/python scripts/run.py robot=so101 nworld=32 $(ARGS)
@@ -20,6 +21,10 @@ test: $(READY_DEV)
 	$(BIN)/mypy
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
+# build/site/index.html opens from the disk. The build fetches nothing.
+docs: $(READY_DOCS)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
 setup: $(READY_DEV)
 
 # Installed again only when what is to be installed changes.
@@ -31,6 +36,10 @@ $(READY): pyproject.toml constraints.txt
 
 $(READY_DEV): $(READY)
 	$(PIP) --editable '.[dev]'
+	touch $@
+
+$(READY_DOCS): $(READY)
+	$(PIP) --editable '.[docs]'
 	touch $@
 
 clean:
