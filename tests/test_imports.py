@@ -10,7 +10,7 @@ import mjstack
 ROOT = Path(mjstack.__file__).parent
 # A module may import from its own layer and from earlier ones.
 LAYERS = [
-    {"errors", "math", "rng", "startup"},
+    {"errors", "math", "rng", "startup", "files"},
     {"config"},
     {"robots"},
     {"scene"},
@@ -27,7 +27,9 @@ LAYERS = [
     {"cli"},
     {"__main__"},
 ]
-LEAVES = {"report": {"errors", "report"}}  # anything may import it, and it imports only these
+LEAVES = {
+    "report": {"errors", "files", "report"}
+}  # anything may import it, and it imports only these
 HOMES = {
     "mujoco_warp": ("sim/",),
     "warp": ("sim/", "kinematics/"),

@@ -212,7 +212,7 @@ def test_another_verdict_is_said(
     differs = "NOT as recorded (red not carried): its cubes end 2 mm from where they did, "
     assert gate["reason"].startswith("succeeded, ")
     assert gate["reason"].endswith(f"{differs}expected bit for bit there")
-    assert gate["metrics"]["recorded"] == "red not carried"
+    assert gate["notes"]["recorded"] == "red not carried"
     assert (status, report["status"], gate["status"]) == (1, "fail", "fail")
 
     told = json.loads((folder / "report.json").read_text())

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from mjstack.report.record import GateResult, Report, Status, write_atomic
+from mjstack.files import write_atomic
+from mjstack.report.record import GateResult, Report, Status
 
 
 def gate(status: Status, name: str = "g", **metrics: float) -> GateResult:
@@ -64,7 +65,7 @@ def test_numbers_that_are_not_finite_stay_json(tmp_path: Path) -> None:
     report.write(tmp_path)
     data = strict_json(tmp_path / "report.json")
     assert data["gates"][0]["metrics"] == {"a": "nan", "b": "inf", "c": "-inf", "d": 0.5}
-    assert data["schema"] == 1
+    assert data["schema"] == 2
     assert data["status"] == "fail"
     assert "nan" in (tmp_path / "report.md").read_text()
 

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,13 @@ from matplotlib.axes import Axes
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.errors import ConfigError
+from mjstack.files import to_csv
 from mjstack.jobs import scaling
 from mjstack.jobs.case import OutOfTime, _row, read_case
 from mjstack.jobs.scaling import case_overrides, scaling_folder
-from mjstack.report.csv_table import to_csv
 from mjstack.report.curves import save_scaling_curves
 from mjstack.report.scaling import (
+    COLUMNS,
     NOT_RUN,
     PASS,
     ScalingRow,
@@ -187,7 +189,11 @@ def test_out_of_memory_is_said_as_that_and_the_next_case_runs(folder: Path) -> N
 def test_how_a_case_ended(
     tmp_path: Path, code: int, reason: str, output: str, status: str, says: str
 ) -> None:
-    gates = [{"name": "batch", "status": "fail", "reason": reason, "metrics": {}}] if reason else []
+    gates = (
+        [{"name": "batch", "status": "fail", "reason": reason, "metrics": {}, "notes": {}}]
+        if reason
+        else []
+    )
     (tmp_path / "report.json").write_text(
         json.dumps({"gates": gates, "provenance": {"git_commit": "abc"}})
     )
@@ -567,5 +573,6 @@ def test_table_shows_gaps_and_where_rows_come_from() -> None:
     assert "- commit: a\n- commit: b\n" in text
     assert text.count("- hardware") == 1
     assert [
-        row["ms_per_step"] for row in csv.DictReader(to_csv(ScalingRow, [good, bad]).splitlines())
+        row["ms_per_step"]
+        for row in csv.DictReader(to_csv(COLUMNS, map(asdict, [good, bad])).splitlines())
     ] == ["1.376", ""]

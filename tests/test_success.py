@@ -103,7 +103,7 @@ def test_small_region_passes(passed: Path) -> None:
     ) == (6, 6, 6, 0)
     assert (metrics["success_rate_low95"], metrics["success_rate_high95"]) == wilson_interval(6, 6)
     assert gate["thresholds"]["success_rate_min"] == 0.99
-    assert "cubes within 0.03 x 0.03 m" in metrics["starts"]
+    assert "cubes within 0.03 x 0.03 m" in gate["notes"]["starts"]
     assert sorted(path.name for path in passed.iterdir()) == [
         ".hydra",
         "starts_seed0.csv",
@@ -250,9 +250,9 @@ def test_both_backends_start_and_end_alike(passed: Path, warp: Path) -> None:
         )
     assert np.array_equal(native.failed, other.failed)
     assert np.abs(native.values["xy_err_m"] - other.values["xy_err_m"]).max() < 0.003
-    metrics = gate_of(warp)["metrics"]
-    assert metrics["starts"] == f"starts={passed}/starts_seed0.csv"
-    assert "Warp" in metrics["backend"]
+    notes = gate_of(warp)["notes"]
+    assert notes["starts"] == f"starts={passed}/starts_seed0.csv"
+    assert "Warp" in notes["backend"]
 
 
 def test_replay_plays_the_gates_world(passed: Path, warp: Path, tmp_path: Path) -> None:

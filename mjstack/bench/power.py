@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from mjstack.report.record import Value
 from mjstack.sim import cuda_uuid
 
 SHORTEST = 0.5  # s, of a stretch of work on average: the counter moves some ten times a second
@@ -63,17 +62,23 @@ class EnergyMeter:
         self._joules += self._read() - self._read_first
         self._stretches += 1
 
-    def metrics(self) -> dict[str, Value]:
-        """Energy and mean power of the stretches, or why they are missing; nothing on a CPU."""
-        if self._cpu:
-            return {}
-        reason = self.reason
+    @property
+    def missing(self) -> str:
+        """Why there is no figure; empty where there is one, and on a CPU."""
         each = self._seconds / max(self._stretches, 1)
-        if not reason and each < SHORTEST:
-            reason = f"stretches of {each:.2g} s are too short for NVML's counter"
-        if reason:
-            return {"gpu_power_mean_w": f"not measured: {reason}"}
+        if self._cpu or self.reason or each >= SHORTEST:
+            return self.reason
+        return f"stretches of {each:.2g} s are too short for NVML's counter"
+
+    def metrics(self) -> dict[str, float]:
+        """Energy and mean power of the stretches; nothing where they are missing."""
+        if self._cpu or self.missing:
+            return {}
         return {"gpu_power_mean_w": self._joules / self._seconds, "gpu_energy_j": self._joules}
+
+    def notes(self) -> dict[str, str]:
+        """Why they are missing."""
+        return {"gpu_power_mean_w": f"not measured: {self.missing}"} if self.missing else {}
 
     def _read(self) -> float:
         """The counter [J]; 0 where there is none."""

@@ -39,7 +39,6 @@ from mjstack.episodes.rollout import (
 from mjstack.errors import name_worlds
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import cubes_in_hand
-from mjstack.report.record import Value
 from mjstack.scene.phases import carried_cubes
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Simulation, device_memory
 
@@ -55,6 +54,7 @@ class Section:
         name: physics, episode or env_step.
         figures: Speeds: void where there is a problem.
         facts: What else is worth knowing, with or without figures.
+        notes: Facts in words.
         problem: Why the figures do not count; empty where they do.
         headline: The section in a few words.
         missing: Why there are no figures, which is no failure; empty where there are.
@@ -63,20 +63,24 @@ class Section:
     """
 
     name: str
-    figures: dict[str, Value] = field(default_factory=dict)
-    facts: dict[str, Value] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)
+    facts: dict[str, float] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
     problem: str = ""
     headline: str = ""
     missing: str = ""
     rejected: bool = False
     step_seconds: float | None = None
 
-    def metrics(self) -> dict[str, Value]:
+    def metrics(self) -> dict[str, float]:
         """Everything that may be shown, under the section's name."""
         shown = self.facts if self.problem else self.figures | self.facts
-        if self.missing:
-            shown = shown | {"status": f"not measured: {self.missing}"}
         return {f"{self.name}.{key}": value for key, value in shown.items()}
+
+    def named_notes(self) -> dict[str, str]:
+        """The notes, under the section's name."""
+        missing = {"status": f"not measured: {self.missing}"} if self.missing else {}
+        return {f"{self.name}.{key}": text for key, text in (self.notes | missing).items()}
 
 
 @dataclass(slots=True)
@@ -133,6 +137,7 @@ def measure_physics(
     captured = graph is not None and graph.captured
     section.step_seconds = timing.median / steps
     section.figures = timing.step_metrics() | meter.metrics()
+    section.notes |= meter.notes()
     section.facts |= {
         "steps_per_repetition": steps,
         "repetitions": watch.repetitions,
@@ -267,9 +272,10 @@ def measure_episode(
             section.figures |= spread("controller_over_step", controlled)
             section.headline += f", controller {100.0 * statistics.median(controlled):+.1f} %"
     elif mjwarp:
-        section.facts["bare_ratio"] = "not measured: no time for an episode and as many bare steps"
+        section.notes["bare_ratio"] = "not measured: no time for an episode and as many bare steps"
     if len(played) > sum(p is before for p in played):
         section.figures |= meter.metrics()
+        section.notes |= meter.notes()
         section.facts |= _memory(sim)
     if failed:
         section.rejected = True
@@ -314,6 +320,7 @@ def measure_env_steps(
     if sizes is not None:
         section.facts |= {"naconmax": sizes.contact_pool(sim.nworld), "njmax": sizes.njmax}
     section.figures |= meter.metrics()
+    section.notes |= meter.notes()
     section.facts |= _memory(sim)
     section.problem = times.problem
     rate = env.nworld * times.steps / timing.median
@@ -402,13 +409,13 @@ def _lost(sim: Simulation) -> torch.Tensor:
     return not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
 
 
-def _physics_captured(sim: Simulation, decimation: int) -> dict[str, Value]:
+def _physics_captured(sim: Simulation, decimation: int) -> dict[str, float]:
     """On Warp's CPU device, where whole steps never are captured: whether their physics was."""
     graph = None if sim.device.type == "cuda" else step_graph(sim, decimation, kinematics=True)
     return {} if graph is None else {"physics_captured": graph.captured}
 
 
-def _memory(sim: Simulation) -> dict[str, Value]:
+def _memory(sim: Simulation) -> dict[str, float]:
     """What the worlds take on the GPU."""
     used = device_memory(str(sim.device))
     if used is None:

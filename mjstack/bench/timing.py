@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from mjstack.bench.power import EnergyMeter
 from mjstack.config.schema import GraphMode
 from mjstack.envs.halves import Repeated
-from mjstack.report.record import Value
 from mjstack.sim import Simulation
 
 WARM_UP = 3  # calls: eager, captured, replayed
@@ -45,7 +44,7 @@ def capture_problem(sim: Simulation, mode: GraphMode, captured: bool) -> str:
     return "it was not captured and ran eagerly (run.log says why); graph=off measures it like that"
 
 
-def spread(name: str, values: Sequence[float]) -> dict[str, Value]:
+def spread(name: str, values: Sequence[float]) -> dict[str, float]:
     """Median, least and largest of some values as three metrics."""
     return {
         f"{name}.median": statistics.median(values),
@@ -80,7 +79,7 @@ class Timing:
         """Physics steps of all worlds together per second, median."""
         return self.nworld * self.steps * self.decimation / self.median
 
-    def step_metrics(self) -> dict[str, Value]:
+    def step_metrics(self) -> dict[str, float]:
         """Per physics step: what a batched one costs, and how many world-steps are made in a
         second.
         """
@@ -89,7 +88,7 @@ class Timing:
             "world_steps_per_s", [self.nworld * steps / s for s in self.seconds]
         )
 
-    def env_step_metrics(self) -> dict[str, Value]:
+    def env_step_metrics(self) -> dict[str, float]:
         """Likewise per control interval."""
         return spread("ms_per_env_step", [1e3 * s / self.steps for s in self.seconds]) | spread(
             "env_steps_per_s", [self.nworld * self.steps / s for s in self.seconds]

@@ -15,7 +15,7 @@ import numpy as np
 from mjstack.episodes.context import measured_values
 from mjstack.episodes.rollout import Episode
 from mjstack.errors import RunError
-from mjstack.report.record import write_atomic
+from mjstack.files import write_atomic
 from mjstack.sim import Simulation
 from mjstack.tasks.check import Rules
 

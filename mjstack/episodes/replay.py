@@ -24,9 +24,9 @@ from mjstack.episodes.rollout import (
     snapshot,
     start_worlds,
 )
+from mjstack.files import write_atomic
 from mjstack.managers.reset import required_fields
 from mjstack.math import lowest_corner
-from mjstack.report.record import write_atomic
 from mjstack.scene import table_top
 from mjstack.sim import Simulation, describe_overflow, make_simulation, resolve_sizes
 from mjstack.sim.sizes import BatchSizes

@@ -23,13 +23,17 @@ def run_baseline(context: GateContext) -> list[GateResult]:
     )
     metrics["peak_contacts"] = int(sim.peak_contacts[0])
     metrics["peak_constraint_rows"] = int(sim.peak_constraints[0])
-    metrics["backend"] = sim.description
     context.shown = episode
     context.shown_by = "baseline world"
     thresholds = context.check.thresholds(cfg) | {"waypoint_error_m": cfg.controller.ik_tolerance}
     summary = reason or headline
     return [
         GateResult(
-            name="baseline", status=status, reason=summary, thresholds=thresholds, metrics=metrics
+            name="baseline",
+            status=status,
+            reason=summary,
+            thresholds=thresholds,
+            metrics=metrics,
+            notes={"backend": sim.description},
         )
     ]

@@ -14,7 +14,7 @@ from mjstack.episodes.rollout import Episode
 from mjstack.errors import name_worlds
 from mjstack.math import wilson_interval
 from mjstack.report.markdown import format_percent
-from mjstack.report.record import GateResult, Status, Value
+from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation
 from mjstack.tasks.check import Rules
 
@@ -88,12 +88,14 @@ def run_batch(context: GateContext) -> list[GateResult]:
     details: list[str] = []
     sim = context.batch_simulation(cfg.nworld)
     sizes = getattr(sim, "sizes", None)
-    metrics: dict[str, Value] = {
+    metrics: dict[str, float] = {}
+    notes = {
+        "backend": sim.description,
         "sizes": (
             f"{sizes.as_overrides()} ({sizes.source})"
             if sizes
             else "native MuJoCo has no fixed buffers"
-        )
+        ),
     }
 
     def keep(record: BatchRecord) -> None:
@@ -111,10 +113,9 @@ def run_batch(context: GateContext) -> list[GateResult]:
         problems = play_seeds(
             cfg.seed, t.seeds, lambda seed: _play(context, sim, seed, tally), keep
         )
-        description = sim.description
     finally:
         sim.close()
-    return [_judge(context, description, tally, metrics, problems, details)]
+    return [_judge(context, tally, metrics, notes, problems, details)]
 
 
 def _play(context: GateContext, sim: Simulation, seed: int, tally: _Tally) -> BatchRecord:
@@ -151,9 +152,9 @@ def _keep(context: GateContext, record: BatchRecord, tally: _Tally) -> list[str]
 
 def _judge(
     context: GateContext,
-    description: str,
     tally: _Tally,
-    metrics: dict[str, Value],
+    metrics: dict[str, float],
+    notes: dict[str, str],
     problems: list[str],
     details: list[str],
 ) -> GateResult:
@@ -164,7 +165,6 @@ def _judge(
     bad = tally.failed
     rate, (low, high) = succeeded / tally.worlds, wilson_interval(succeeded, tally.worlds)
     metrics = {
-        "backend": description,
         "worlds": cfg.nworld,
         "seeds": tally.seeds,
         "world_episodes": tally.worlds,
@@ -223,5 +223,6 @@ def _judge(
         reason=reason,
         thresholds=thresholds,
         metrics=metrics,
+        notes=notes,
         details=details,
     )

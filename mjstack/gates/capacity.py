@@ -21,7 +21,7 @@ from mjstack.episodes.workloads import (
     play_task,
 )
 from mjstack.errors import Unreachable, name_worlds
-from mjstack.report.record import GateResult, Status, Value
+from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, resolve_sizes
 from mjstack.sim.sizes import apply_configured, resolve_env_sizes
 
@@ -43,7 +43,8 @@ class _Trial:
     is to be known.
     """
 
-    metrics: dict[str, Value]
+    metrics: dict[str, float]
+    notes: dict[str, str]
     problem: str = ""
     remark: str = ""
 
@@ -122,13 +123,13 @@ def run_capacity(context: GateContext) -> list[GateResult]:
     problems += [trial.problem for trial in trials if trial.problem]
     details += [trial.remark for trial in trials if trial.remark]
 
-    metrics: dict[str, Value] = {
-        "backend": task.description,
-        "worlds": nworld,
-        "sizes_from": sizes.source,
-    }
+    metrics: dict[str, float] = {"worlds": nworld}
+    notes = {"backend": task.description, "sizes_from": sizes.source}
     for prefix, run in runs.items():
         metrics |= _peak_metrics(prefix, run)
+        if run.peaks.pool_pairs is None or run.peaks.pool_ccd_pairs is None:
+            who = " by native MuJoCo" if run.sizes is None else ""
+            notes[f"{prefix}pool_pairs"] = f"pairs are not all counted{who}"
     known = {
         name: (current, found)
         for name, current, found, lost in (
@@ -145,8 +146,11 @@ def run_capacity(context: GateContext) -> list[GateResult]:
         }
         metrics |= {
             f"{prefix}.njmax": found.njmax,
-            f"{prefix}.nccdmax": found.nccdmax or "not counted: MJWarp's default",
         }
+        if found.nccdmax:
+            metrics[f"{prefix}.nccdmax"] = found.nccdmax
+        else:
+            notes[f"{prefix}.nccdmax"] = "not counted: MJWarp's default"
     lines = []
     for name, title in (
         ("task", "scripted task"),
@@ -161,13 +165,14 @@ def run_capacity(context: GateContext) -> list[GateResult]:
             " (contacts alone: native MuJoCo does not count the collision pairs that share their"
             " pool)"
         )
-        metrics["rerun"] = f"sizes were not tried: {_NATIVE}"
-        metrics["memory"] = f"not reported: {_NATIVE}"
+        notes["rerun"] = f"sizes were not tried: {_NATIVE}"
+        notes["memory"] = f"not reported: {_NATIVE}"
     else:
         if len(known) < 2:
-            metrics["rerun"] = "sizes were not tried where peaks are not known"
+            notes["rerun"] = "sizes were not tried where peaks are not known"
         for trial in trials:
             metrics |= trial.metrics
+            notes |= trial.notes
         metrics |= _memory_metrics(context, known)
     for line in lines:
         context.say(line)
@@ -187,6 +192,7 @@ def run_capacity(context: GateContext) -> list[GateResult]:
             reason=summary,
             thresholds={"contacts_per_world": share, "njmax": sizes.njmax, "margin": margin},
             metrics=metrics,
+            notes=notes,
             details=lines + details,
         )
     ]
@@ -269,17 +275,20 @@ def _compare(name: str, first: Workload, again: Workload, *, judged: bool, exact
     ).tolist()
     trial = _Trial(
         {
-            f"{key}.sizes": again.sizes.as_overrides(),
             f"{key}.overflow_worlds": len(lost),
             f"{key}.peak_constraint_rows_per_world": int(again.peaks.rows.max()),
-        }
+        },
+        {f"{key}.sizes": again.sizes.as_overrides()},
     )
     if judged:
         trial.metrics |= {
             f"{key}.succeeded": again.succeeded,
             f"{key}.flipped_worlds": len(flipped),
         }
-    trial.metrics[f"{key}.same_final_state"] = not moved if exact else f"not compared: {_NO_ORDER}"
+    if exact:
+        trial.metrics[f"{key}.same_final_state"] = not moved
+    else:
+        trial.notes[f"{key}.same_final_state"] = f"not compared: {_NO_ORDER}"
     flip = f"{at}: another result in {name_worlds(flipped, count)}" if judged and flipped else ""
     if lost:
         trial.problem = f"{at}: overflow in {name_worlds(lost, count)}"
@@ -296,21 +305,20 @@ def _compare(name: str, first: Workload, again: Workload, *, judged: bool, exact
             "device": run.device_bytes,
         }
         for what, size in cost.items():
-            trial.metrics[f"memory.{name}.{part}.{what}_mb"] = (
-                "not known here" if size is None else size / 1e6
-            )
+            if size is not None:
+                trial.metrics[f"memory.{name}.{part}.{what}_mb"] = size / 1e6
     return trial
 
 
 def _memory_metrics(
     context: GateContext, pairs: dict[str, tuple[BatchSizes, BatchSizes]]
-) -> dict[str, Value]:
+) -> dict[str, float]:
     """What MJWarp's arrays take for the whole batch, with the sizes in force and with the
     recommended ones.
     """
     from mjstack.sim.memory import data_bytes  # loads Warp, which native runs do not need
 
-    out: dict[str, Value] = {}
+    out: dict[str, float] = {}
     for name, (current, wanted) in pairs.items():
         for which, sizes in (("current", current), ("recommended", wanted)):
             out[f"memory.{name}.{which}_mb"] = (
@@ -319,23 +327,17 @@ def _memory_metrics(
     return out
 
 
-def _peak_metrics(prefix: str, run: Workload) -> dict[str, Value]:
+def _peak_metrics(prefix: str, run: Workload) -> dict[str, float]:
+    """The peaks that were counted; native MuJoCo counts no pairs."""
     peaks = run.peaks
-
-    def counted(value: int | None) -> Value:
-        return (
-            ("not counted by native MuJoCo" if run.sizes is None else "not counted")
-            if value is None
-            else value
-        )
-
-    return {
-        f"{prefix}peak_contacts_per_world": int(peaks.contacts.max()),
-        f"{prefix}pool_contacts": peaks.pool_contacts,
-        f"{prefix}pool_pairs": counted(peaks.pool_pairs),
-        f"{prefix}pool_ccd_pairs": counted(peaks.pool_ccd_pairs),
-        f"{prefix}peak_constraint_rows_per_world": int(peaks.rows.max()),
+    found = {
+        "peak_contacts_per_world": int(peaks.contacts.max()),
+        "pool_contacts": peaks.pool_contacts,
+        "pool_pairs": peaks.pool_pairs,
+        "pool_ccd_pairs": peaks.pool_ccd_pairs,
+        "peak_constraint_rows_per_world": int(peaks.rows.max()),
     }
+    return {f"{prefix}{name}": value for name, value in found.items() if value is not None}
 
 
 def _overrides(cfg: Config, wanted: BatchSizes) -> str:

@@ -12,7 +12,7 @@ from mjstack.config.validate import PARITY_FIELDS
 from mjstack.episodes.context import GateContext, judge_one
 from mjstack.episodes.rollout import NOMINAL, State, restore
 from mjstack.math import quat_angle
-from mjstack.report.record import GateResult, Status, Value
+from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation, describe_overflow
 
 
@@ -23,8 +23,8 @@ def run_parity(context: GateContext) -> list[GateResult]:
     mjwarp = context.parity_simulation()
     problems: list[str] = []
     details: list[str] = []
-    metrics: dict[str, Value] = {"backend": mjwarp.description}
-    thresholds: dict[str, Value] = dict(context.check.thresholds(cfg))
+    metrics: dict[str, float] = {}
+    thresholds: dict[str, float] = dict(context.check.thresholds(cfg))
 
     for name, phase in cfg.gate.parity.states.items():
         state = reference.states[context.phase_end(phase)]
@@ -40,7 +40,6 @@ def run_parity(context: GateContext) -> list[GateResult]:
                     )
 
     for option, (asked, held, uploaded, equal) in compare_options(cfg, native, mjwarp).items():
-        metrics[f"option.{option}"] = f"{asked} / {held} / {uploaded}"
         line = f"option {option}: requested {asked}, native {held}, uploaded {uploaded}"
         details.append(line)
         if not equal:
@@ -86,7 +85,7 @@ def run_parity(context: GateContext) -> list[GateResult]:
     context.shown_by = "parity world"
     mjwarp.close()
     summary = "; ".join(problems) or (
-        f"{headline}; red {1e3 * float(metrics['final.red.position_m'] or 0):.2f} mm from native's"
+        f"{headline}; red {1e3 * metrics['final.red.position_m']:.2f} mm from native's"
     )
     return [
         GateResult(
@@ -95,6 +94,7 @@ def run_parity(context: GateContext) -> list[GateResult]:
             reason=summary,
             thresholds=thresholds,
             metrics=metrics,
+            notes={"backend": mjwarp.description},
             details=details,
         )
     ]

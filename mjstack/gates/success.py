@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +28,11 @@ from mjstack.episodes.success_record import (
     starts_name,
 )
 from mjstack.errors import MjstackError, name_worlds
+from mjstack.files import to_csv, write_atomic
 from mjstack.math import wilson_interval
 from mjstack.mdp.starts.starts_file import write_starts
-from mjstack.report.csv_table import to_csv
 from mjstack.report.markdown import format_percent
-from mjstack.report.record import GateResult, Status, Table, Value, write_atomic
+from mjstack.report.record import GateResult, Status, Table
 from mjstack.report.success import save_places
 from mjstack.sim import Simulation
 from mjstack.tasks.check import Rules
@@ -149,13 +149,15 @@ def run_success(context: GateContext) -> list[GateResult]:
     details: list[str] = []
     sim = own.batch_simulation(cfg.nworld)
     sizes = getattr(sim, "sizes", None)
-    metrics: dict[str, Value] = {
+    starts = f"starts={cfg.starts}" if reads_starts_file(cfg.reset) else _describe_start(cfg)
+    notes = {
         "backend": sim.description,
         "sizes": (
             f"{sizes.as_overrides()} ({sizes.source})"
             if sizes
             else "native MuJoCo has no fixed buffers"
         ),
+        "starts": starts,
     }
 
     def keep(record: SuccessRecord) -> None:
@@ -174,7 +176,7 @@ def run_success(context: GateContext) -> list[GateResult]:
         )
     finally:
         sim.close()
-    result = _judge(own, tally, metrics, problems, details)
+    result = _judge(own, tally, notes, problems, details)
     context.pictures += own.pictures
     return [result]
 
@@ -224,7 +226,7 @@ def _keep(context: GateContext, record: SuccessRecord, tally: _Tally, details: l
 def _judge(
     context: GateContext,
     tally: _Tally,
-    metrics: dict[str, Value],
+    notes: dict[str, str],
     problems: list[str],
     details: list[str],
 ) -> GateResult:
@@ -245,8 +247,7 @@ def _judge(
         episodes=t.cell_episodes,
         cubes=CUBES,
     )
-    metrics |= {
-        "starts": f"starts={cfg.starts}" if reads_starts_file(cfg.reset) else _describe_start(cfg),
+    metrics: dict[str, float] = {
         "worlds": cfg.nworld,
         "seeds": len(tally.seeds),
         "episodes": n,
@@ -317,6 +318,7 @@ def _judge(
         reason=reason,
         thresholds=dict(context.check.thresholds(cfg)) | {"success_rate_min": t.rate},
         metrics=metrics,
+        notes=notes,
         details=details,
         tables=_tables(cfg, tally, per_seed, regions),
     )
@@ -348,7 +350,9 @@ def _save(
     assert folder is not None
     table = (scene.table_center[:2], scene.table_half[:2])
     work: dict[str, Callable[[], None]] = {
-        REGIONS: lambda: write_atomic(folder / REGIONS, to_csv(Region, regions)),
+        REGIONS: lambda: write_atomic(
+            folder / REGIONS, to_csv([f.name for f in fields(Region)], map(asdict, regions))
+        ),
         PICTURE: lambda: save_places(
             folder / PICTURE, places, succeeded, table, f"{context.cfg.robot.title}: {title}", CUBES
         ),

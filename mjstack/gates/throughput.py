@@ -25,7 +25,7 @@ from mjstack.config.schema import Backend
 from mjstack.envs import build_env
 from mjstack.episodes.context import GateContext
 from mjstack.errors import MjstackError
-from mjstack.report.record import GateResult, Status, Value
+from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes
 
 log = logging.getLogger(__name__)
@@ -77,18 +77,21 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
     on_cuda = device.startswith("cuda")
     watch = TimeBudget(t.max_seconds if on_cuda else t.cpu_max_seconds, t.repetitions)
     meter = EnergyMeter(device)
-    facts: dict[str, Value] = {"worlds": cfg.nworld, "cpu_count": os.cpu_count()}
+    facts: dict[str, float] = {"worlds": cfg.nworld, "cpu_count": os.cpu_count() or 1}
+    notes: dict[str, str] = {}
     sections: list[Section] = []
     if {"physics", "episode"} & set(t.sections):
-        sections += _on_scripted_worlds(context, backend, device, watch, meter, facts)
+        sections += _on_scripted_worlds(context, backend, device, watch, meter, facts, notes)
     if "env_step" in t.sections:
         sections.append(
             _guarded(
-                "env_step", lambda: _on_environment(context, backend, device, watch, meter, facts)
+                "env_step",
+                lambda: _on_environment(context, backend, device, watch, meter, facts, notes),
             )
         )
     if not on_cuda:
-        facts |= {"gpu_power_and_memory": "not measured: no GPU"} | _peak_memory()
+        facts |= _peak_memory()
+        notes["gpu_power_and_memory"] = "not measured: no GPU"
 
     episode = next((section for section in sections if section.name == "episode"), None)
     if episode is not None and episode.rejected:
@@ -102,6 +105,7 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
     parts = []
     for section in sections:
         facts |= section.metrics()
+        notes |= section.named_notes()
         text = section.headline
         if section.problem:
             text = f"no figure: {section.problem}"
@@ -116,7 +120,9 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
     failed = any(section.problem for section in sections)
     measured = any(section.figures and not section.problem for section in sections)
     if not failed and not measured:
-        return GateResult(name=name, status=Status.skipped, reason=reason, metrics=facts)
+        return GateResult(
+            name=name, status=Status.skipped, reason=reason, metrics=facts, notes=notes
+        )
     return GateResult(
         name=name,
         status=Status.failed if failed else Status.passed,
@@ -124,6 +130,7 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
         seconds=time.perf_counter() - began,
         thresholds={"repetitions": t.repetitions, "max_seconds_per_section": watch.seconds},
         metrics=facts,
+        notes=notes,
     )
 
 
@@ -133,7 +140,8 @@ def _on_scripted_worlds(
     device: str,
     watch: TimeBudget,
     meter: EnergyMeter,
-    facts: dict[str, Value],
+    facts: dict[str, float],
+    notes: dict[str, str],
 ) -> list[Section]:
     """Sections *physics* and *episode*, on the same worlds."""
     cfg = context.cfg
@@ -148,7 +156,8 @@ def _on_scripted_worlds(
             for name in ("physics", "episode")
             if name in wanted
         ]
-    facts |= {"backend": sim.description, "build_and_compile_s": time.perf_counter() - began}
+    facts["build_and_compile_s"] = time.perf_counter() - began
+    notes["backend"] = sim.description
     sizes: BatchSizes | None = getattr(sim, "sizes", None)
     if sizes is not None:
         facts |= {
@@ -156,7 +165,7 @@ def _on_scripted_worlds(
             "naconmax": sizes.contact_pool(cfg.nworld),
             "njmax": sizes.njmax,
         }
-        facts["sizes_from"] = sizes.source
+        notes["sizes_from"] = sizes.source
     sections: list[Section] = []
     step_seconds: float | None = None
     if "physics" in wanted:
@@ -176,7 +185,8 @@ def _on_environment(
     device: str,
     watch: TimeBudget,
     meter: EnergyMeter,
-    facts: dict[str, Value],
+    facts: dict[str, float],
+    notes: dict[str, str],
 ) -> Section:
     """Section *env_step*, on an environment with room for random actions."""
     cfg = context.cfg
@@ -185,7 +195,7 @@ def _on_environment(
     env = build_env(
         cfg, model=context.model, backend=backend, device=device, sizes=context.env_sizes
     )
-    facts.setdefault("backend", env.sim.description)
+    notes.setdefault("backend", env.sim.description)
     build_seconds = time.perf_counter() - began
     try:
         section = measure_env_steps(context, env, watch, meter)
@@ -214,7 +224,7 @@ def _explain(name: str, error: Exception) -> str:
     )
 
 
-def _peak_memory() -> dict[str, Value]:
+def _peak_memory() -> dict[str, float]:
     """The most memory that this process has held so far."""
     try:
         import resource

@@ -12,7 +12,7 @@ from pathlib import Path
 from mjstack.config.schema import Config, TermCfg
 from mjstack.config.validate import reads_starts_file
 from mjstack.errors import ConfigError, RunError
-from mjstack.report.record import write_atomic
+from mjstack.files import write_atomic
 
 STEM = "starts_played"
 _COPY = re.compile(

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mjstack.errors import MjstackError, is_out_of_memory
-from mjstack.report.record import Value, write_atomic
+from mjstack.files import write_atomic
 from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow
 
 RESULT = "case.json"
@@ -126,6 +126,7 @@ def _row(folder: Path, nworld: int, backend: str, code: int | None) -> ScalingRo
     for name in ("throughput", "throughput_cuda"):
         if name in gates and gates[name]["status"] != "skip":
             _fill(row, gates[name]["metrics"])
+            row.hardware = gates[name]["notes"].get("backend", "")
     failed = [f"{g['name']}: {g['reason']}" for g in report["gates"] if g["status"] == "fail"]
     last = output.splitlines()[-1] if output else "no output"
     if code == 0:
@@ -149,12 +150,9 @@ def _row(folder: Path, nworld: int, backend: str, code: int | None) -> ScalingRo
 
 def _fill(row: ScalingRow, metrics: dict[str, Any]) -> None:
     """Takes the columns from a throughput gate's metrics. What is missing stays None."""
+    get = metrics.get
 
-    def get(name: str) -> Value:
-        value = metrics.get(name)
-        return value if isinstance(value, float | int) else None
-
-    def most(name: str) -> Value:
+    def most(name: str) -> float | None:
         found = [
             value
             for section in ("physics", "episode", "env_step")
@@ -162,7 +160,6 @@ def _fill(row: ScalingRow, metrics: dict[str, Any]) -> None:
         ]
         return max(map(float, found), default=None)
 
-    row.hardware = str(metrics.get("backend", ""))
     for column, name in (
         ("ms_per_step", "physics.ms_per_batched_step"),
         ("world_steps_per_s", "physics.world_steps_per_s"),

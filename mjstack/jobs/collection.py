@@ -22,6 +22,7 @@ from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.context import GateContext
 from mjstack.episodes.rollout import NOMINAL
 from mjstack.errors import ConfigError, UnwrittenError
+from mjstack.files import write_atomic
 from mjstack.jobs.collect_record import FILE, CollectedBatch, read_batches, write_batches
 from mjstack.jobs.demonstration import (
     ACTION,
@@ -35,7 +36,7 @@ from mjstack.jobs.demonstration_spec import episode_config, make_spec
 from mjstack.jobs.runner import run_provenance
 from mjstack.math import wilson_interval
 from mjstack.report.collect import ColumnRange, to_markdown
-from mjstack.report.record import GateResult, Status, Value, write_atomic
+from mjstack.report.record import GateResult, Status
 from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation
 
@@ -316,9 +317,8 @@ class Collection:
         asked = self._job.episodes
         new = self.committed - self._before
         size = sum(path.stat().st_size for path in self.path.rglob("*") if path.is_file()) / 1e6
-        metrics: dict[str, Value] = {
-            "dataset": str(self.path),
-            "config_sha256": self.spec.config_sha256,
+        notes = {"dataset": str(self.path), "config_sha256": self.spec.config_sha256}
+        metrics: dict[str, float] = {
             "episodes": self.committed,
             "episodes_of_this_call": new,
             "steps": self.steps,
@@ -335,10 +335,9 @@ class Collection:
                 for key in ("worlds", "succeeded")
             )
             rate, (low, high) = succeeded / worlds, wilson_interval(succeeded, worlds)
+            seeds = [batch.seed for batch in self.batches]
+            notes["seeds"] = f"{min(seeds)} to {max(seeds)}"
             metrics |= {
-                "seeds": (
-                    f"{min(b.seed for b in self.batches)} to {max(b.seed for b in self.batches)}"
-                ),
                 "worlds_played": worlds,
                 "succeeded": succeeded,
                 "success_rate": rate,
@@ -391,6 +390,7 @@ class Collection:
             seconds=seconds,
             thresholds={"episodes": asked},
             metrics=metrics,
+            notes=notes,
             details=details,
         )
 
@@ -411,7 +411,8 @@ class Collection:
         ]
         title = f"{self._cfg.robot.title}, task {self._cfg.task.name}: demonstrations"
         write_atomic(
-            folder / "dataset.md", to_markdown(title, result.metrics, ranges, str(self.path))
+            folder / "dataset.md",
+            to_markdown(title, {**result.notes, **result.metrics}, ranges, str(self.path)),
         )
         return True
 

@@ -16,6 +16,7 @@ import numpy as np
 from mjstack.config.schema import Config, ReachabilityJobCfg
 from mjstack.episodes.context import GateContext
 from mjstack.errors import ConfigError
+from mjstack.files import write_atomic
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, run_reported
@@ -29,7 +30,7 @@ from mjstack.report.reachability import (
     to_markdown,
     to_npz,
 )
-from mjstack.report.record import GateResult, Status, write_atomic
+from mjstack.report.record import GateResult, Status
 from mjstack.scene import BLUE, RED, table_top
 from mjstack.scene.phases import cube_targets
 from mjstack.sim import resolve_backend
@@ -230,7 +231,7 @@ def _map_edge(axis: np.ndarray, at: float) -> float:
 
 def _level_result(level: ReachLevel, seconds: float) -> GateResult:
     share = float(level.reached.mean())
-    metrics: dict[str, float | int | str | bool | None] = {
+    metrics: dict[str, float] = {
         "height_above_cube_center_m": level.height,
         "points": level.reached.size,
         "reached_fraction": share,

@@ -20,6 +20,7 @@ from mjstack.episodes.failures import FailureMonitor, describe_sign
 from mjstack.episodes.replay import ReplayedWorld, replay_world, start_of_world
 from mjstack.episodes.success_record import STEM
 from mjstack.errors import ConfigError, DeviceError, RunError
+from mjstack.files import write_atomic
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
 from mjstack.jobs.archived_starts import archived_starts, copy_names
@@ -28,7 +29,7 @@ from mjstack.jobs.gates import check_task
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, check_showing, run_provenance, run_reported
-from mjstack.report.record import GateResult, Status, Value, write_atomic
+from mjstack.report.record import GateResult, Status
 from mjstack.sim import resolve_backend, resolve_device
 
 KEYS = ("job", "run", "world", "sim", "view", "video")
@@ -271,21 +272,16 @@ def _replay(
     )
     for line in told:
         context.say(escape(f"  {line}"))
-    values: dict[str, Value] = {
-        "backend": done.description,
-        "seed": plan.seed,
-        "world": plan.world,
-        **metrics,
-    }
+    notes = {"backend": done.description}
     if plan.record is not None:
-        values["recorded"] = (
+        notes["recorded"] = (
             context.check.rules.describe(int(plan.record.failed[plan.world])) or "succeeded"
         )
     name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
     assert context.folder is not None
     try:
         done.write(context.folder / name, seed=plan.seed, world=plan.world)
-        values["trajectory"] = name
+        notes["trajectory"] = name
     except OSError as error:
         status = Status.failed
         reason = f"{reason}; {name} cannot be written ({error.strerror})"
@@ -295,7 +291,8 @@ def _replay(
             status=status,
             reason=reason,
             thresholds=context.check.thresholds(plan.cfg),
-            metrics=values,
+            metrics={"seed": plan.seed, "world": plan.world, **metrics},
+            notes=notes,
             details=told + plan.notes + changes,
         )
     ]

@@ -19,15 +19,22 @@ from rich.markup import escape
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.schema import Backend, Config, ScalingJobCfg
 from mjstack.errors import ConfigError
+from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.case import OutOfTime, is_done, read_case, run_case
 from mjstack.jobs.gates import check_machine
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import model_text
-from mjstack.report.csv_table import to_csv
 from mjstack.report.curves import save_scaling_curves
 from mjstack.report.provenance import collect_provenance
-from mjstack.report.record import GateResult, Report, Status, write_atomic
-from mjstack.report.scaling import NOT_RUN, PASS, ScalingRow, describe_crossover, to_markdown
+from mjstack.report.record import GateResult, Report, Status
+from mjstack.report.scaling import (
+    COLUMNS,
+    NOT_RUN,
+    PASS,
+    ScalingRow,
+    describe_crossover,
+    to_markdown,
+)
 from mjstack.scene import build_model
 from mjstack.sim import cuda_driver, resolve_device
 
@@ -239,7 +246,7 @@ def _describe(row: ScalingRow) -> str:
 
 
 def _write_tables(cfg: Config, folder: Path, rows: list[ScalingRow], picture: str = "") -> None:
-    write_atomic(folder / "scaling.csv", to_csv(ScalingRow, rows))
+    write_atomic(folder / "scaling.csv", to_csv(COLUMNS, map(asdict, rows)))
     write_atomic(folder / "scaling.md", to_markdown(rows, _title(cfg), _notes(cfg), picture))
 
 
@@ -325,11 +332,8 @@ def _as_gate(row: ScalingRow) -> GateResult:
     """A row as a result of the report."""
     status = {PASS: Status.passed, NOT_RUN: Status.skipped}.get(row.status, Status.failed)
     reason = "has not run" if row.status == NOT_RUN else _describe(row)
-    metrics = {
-        key: value
-        for key, value in asdict(row).items()
-        if value not in (None, "") and key not in ("status", "reason")
-    }
+    values = asdict(row).items()
+    metrics = {key: value for key, value in values if isinstance(value, float | int)}
     seconds = float(row.seconds) if isinstance(row.seconds, float) else 0.0
     return GateResult(
         name=f"{row.backend}-{row.nworld}",
@@ -337,4 +341,5 @@ def _as_gate(row: ScalingRow) -> GateResult:
         reason=reason,
         seconds=seconds,
         metrics=metrics,
+        notes={"hardware": row.hardware, "git_commit": row.git_commit},
     )

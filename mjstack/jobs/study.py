@@ -19,15 +19,15 @@ from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
 from mjstack.episodes.context import GateContext
 from mjstack.episodes.rollout import State, restore, snapshot, start_worlds
 from mjstack.errors import ConfigError, MjstackError
+from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.gates import check_machine
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, run_reported
 from mjstack.managers.reset import required_fields
-from mjstack.report.csv_table import to_csv
 from mjstack.report.picture import save_study
-from mjstack.report.record import GateResult, Status, write_atomic
-from mjstack.report.study import StudyRow, to_markdown
+from mjstack.report.record import GateResult, Status
+from mjstack.report.study import COLUMNS, StudyRow, to_markdown
 from mjstack.sim import LOST_PHYSICS, Simulation, SolverLimit, make_simulation
 from mjstack.sim.sizes import resolve_measuring_sizes
 
@@ -264,11 +264,8 @@ def _text(value: object) -> str:
 
 def _as_result(row: StudyRow, seconds: float) -> GateResult:
     """A row as a result of the report."""
-    metrics = {
-        key: value
-        for key, value in asdict(row).items()
-        if value not in (None, "") and key not in ("status", "reason")
-    }
+    values = asdict(row).items()
+    metrics = {key: value for key, value in values if isinstance(value, float | int)}
     reason = row.reason
     if row.status == Status.passed.value:
         reason = (
@@ -277,7 +274,12 @@ def _as_result(row: StudyRow, seconds: float) -> GateResult:
         )
         reason += f" ({row.broken_rules})" if row.broken_rules else ""
     return GateResult(
-        name=row.variant, status=Status(row.status), reason=reason, seconds=seconds, metrics=metrics
+        name=row.variant,
+        status=Status(row.status),
+        reason=reason,
+        seconds=seconds,
+        metrics=metrics,
+        notes={"changes": row.changes},
     )
 
 
@@ -307,7 +309,7 @@ def _notes(context: GateContext) -> list[str]:
 def _write_tables(
     context: GateContext, folder: Path, rows: list[StudyRow], picture: str = ""
 ) -> None:
-    write_atomic(folder / "study.csv", to_csv(StudyRow, rows))
+    write_atomic(folder / "study.csv", to_csv(COLUMNS, map(asdict, rows)))
     write_atomic(folder / "study.md", to_markdown(rows, _title(context), _notes(context), picture))
 
 

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from mjstack.report.markdown import escape_cell, format_value
-from mjstack.report.record import Value
 
 LOADING = """\
 import json
@@ -45,7 +44,7 @@ class ColumnRange:
 
 
 def to_markdown(
-    title: str, facts: Mapping[str, Value], ranges: Sequence[ColumnRange], folder: str
+    title: str, facts: Mapping[str, object], ranges: Sequence[ColumnRange], folder: str
 ) -> str:
     """Facts, ranges, and the lines that load the first episode.
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import matplotlib
 
-from mjstack.report.record import Value
 from mjstack.report.scaling import PASS, ScalingRow, crossover
 
 matplotlib.use("Agg")
@@ -78,5 +77,5 @@ def save_scaling_curves(
     plt.close(figure)
 
 
-def _number(value: Value) -> float:
+def _number(value: float | None) -> float:
     return float(value) if isinstance(value, float | int) else math.nan

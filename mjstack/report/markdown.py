@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
-from mjstack.report.record import GateResult, Report, Status, Table, Value
+from mjstack.report.record import GateResult, Report, Status, Table
 
 
 def to_markdown(report: Report) -> str:
@@ -22,6 +23,7 @@ def to_markdown(report: Report) -> str:
         if gate.reason:
             lines += [gate.reason, ""]
         lines += _table("metric", gate.metrics) + _table("threshold", gate.thresholds)
+        lines += _table("note", gate.notes)
         lines += [f"- {line}" for line in gate.details]
         for table in gate.tables:
             lines += ["", f"### {table.title}", "", *_rows(table)]
@@ -39,7 +41,7 @@ def to_markdown(report: Report) -> str:
     return "\n".join(lines) + "\n"
 
 
-def format_value(value: Value) -> str:
+def format_value(value: object) -> str:
     """A number with as many digits as a reader needs."""
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
@@ -73,7 +75,7 @@ def _rows(table: Table) -> list[str]:
     ]
 
 
-def _table(title: str, values: dict[str, Value]) -> list[str]:
+def _table(title: str, values: Mapping[str, object]) -> list[str]:
     if not values:
         return []
     rows = [f"| {name} | {escape_cell(format_value(value))} |" for name, value in values.items()]

@@ -10,14 +10,14 @@ from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 
-from mjstack.report.record import Value
+from mjstack.report.record import Provenance
 
 PACKAGES = ("mjstack", "mujoco", "mujoco-warp", "warp-lang", "torch", "mink", "hydra-core", "numpy")
 
 
 def collect_provenance(
     *, config_yaml: str, model_text: str, device: str, driver: str
-) -> dict[str, Value | dict[str, Value]]:
+) -> Provenance:
     """Collects what is needed to judge and to repeat a run.
 
     Args:
@@ -26,7 +26,7 @@ def collect_provenance(
         device: What the batch runs on, in words.
         driver: CUDA driver version, or a word why there is none.
     """
-    versions: dict[str, Value] = {"python": platform.python_version()}
+    versions: dict[str, str] = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
             versions[name] = metadata.version(name)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import tempfile
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from pathlib import Path
 
-Value = float | int | str | bool | None
+from mjstack.files import write_atomic
 
-SCHEMA = 1
+SCHEMA = 2
+
+
+Provenance = dict[str, str | int | dict[str, str] | None]
 
 
 class Status(Enum):
@@ -50,6 +51,7 @@ class GateResult:
         seconds: Wall time.
         thresholds: What was required, by name with unit.
         metrics: What was measured, by name with unit.
+        notes: Facts in words, by name: the backend, why something was not measured.
         details: Longer findings, a line each, for the report's text.
         tables: Tables for the report's text.
     """
@@ -58,8 +60,9 @@ class GateResult:
     status: Status
     reason: str = ""
     seconds: float = 0.0
-    thresholds: dict[str, Value] = field(default_factory=dict)
-    metrics: dict[str, Value] = field(default_factory=dict)
+    thresholds: dict[str, float] = field(default_factory=dict)
+    metrics: dict[str, float] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
     details: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
 
@@ -68,7 +71,7 @@ class GateResult:
 class Report:
     """A whole run, written after every gate so that nothing finished is lost."""
 
-    provenance: dict[str, Value | dict[str, Value]]
+    provenance: Provenance
     status: Status = Status.interrupted
     gates: list[GateResult] = field(default_factory=list)
     pictures: list[str] = field(default_factory=list)
@@ -96,23 +99,6 @@ class Report:
             folder / "report.json", json.dumps(_finite(data), indent=2, allow_nan=False) + "\n"
         )
         write_atomic(folder / "report.md", to_markdown(self))
-
-
-def write_atomic(path: Path, content: str | bytes) -> None:
-    """Writes a file beside its place and moves it there: a full disk or a kill leaves the
-    old one.
-    """
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def _finite(node: object) -> object:

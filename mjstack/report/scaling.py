@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from mjstack.report.markdown import escape_cell
-from mjstack.report.record import Value
 
 PASS = "pass"
 NOT_RUN = "not run"
@@ -49,31 +48,34 @@ class ScalingRow:
     backend: str
     status: str = NOT_RUN
     reason: str = ""
-    succeeded: Value = None
-    ms_per_step: Value = None
-    ms_per_step_min: Value = None
-    ms_per_step_max: Value = None
-    world_steps_per_s: Value = None
-    world_steps_per_s_min: Value = None
-    world_steps_per_s_max: Value = None
-    ms_per_env_step: Value = None
-    env_steps_per_s: Value = None
-    env_steps_per_s_min: Value = None
-    env_steps_per_s_max: Value = None
-    managers_over_physics: Value = None
-    managers_alone_over_physics: Value = None
-    episode_s: Value = None
-    bare_ratio: Value = None
-    gpu_memory_arrays_mib: Value = None
-    gpu_memory_whole_gpu_mib: Value = None
-    gpu_power_mean_w: Value = None
-    process_peak_mib: Value = None
-    build_s: Value = None
-    warm_up_s: Value = None
-    capture_s: Value = None
-    seconds: Value = None
+    succeeded: float | None = None
+    ms_per_step: float | None = None
+    ms_per_step_min: float | None = None
+    ms_per_step_max: float | None = None
+    world_steps_per_s: float | None = None
+    world_steps_per_s_min: float | None = None
+    world_steps_per_s_max: float | None = None
+    ms_per_env_step: float | None = None
+    env_steps_per_s: float | None = None
+    env_steps_per_s_min: float | None = None
+    env_steps_per_s_max: float | None = None
+    managers_over_physics: float | None = None
+    managers_alone_over_physics: float | None = None
+    episode_s: float | None = None
+    bare_ratio: float | None = None
+    gpu_memory_arrays_mib: float | None = None
+    gpu_memory_whole_gpu_mib: float | None = None
+    gpu_power_mean_w: float | None = None
+    process_peak_mib: float | None = None
+    build_s: float | None = None
+    warm_up_s: float | None = None
+    capture_s: float | None = None
+    seconds: float | None = None
     hardware: str = ""
     git_commit: str = ""
+
+
+COLUMNS = tuple(field.name for field in fields(ScalingRow))
 
 
 def to_markdown(
@@ -132,7 +134,7 @@ def describe_crossover(rows: Sequence[ScalingRow]) -> str:
     )
 
 
-def _number(value: Value, form: str = ",.0f") -> str:
+def _number(value: float | None, form: str = ",.0f") -> str:
     return format(value, form) if isinstance(value, float | int) else "-"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from mjstack.report.markdown import escape_cell
 
@@ -53,6 +53,9 @@ class StudyRow:
     line_search_limit_worlds: int | None = None
     peak_rows: int | None = None
     xy_err_max_m: float | None = None
+
+
+COLUMNS = tuple(field.name for field in fields(StudyRow))
 
 
 def to_markdown(

@@ -17,7 +17,6 @@ from mjstack.errors import ConfigError, ParameterError
 from mjstack.managers.base import EnvView
 from mjstack.math import not_finite, quat_to_matrix
 from mjstack.mdp.geometry import gripper_opening
-from mjstack.report.record import Value
 from mjstack.scene import LowestPoint, SceneIndex, table_top
 from mjstack.scene.index import CUBES, Columns
 from mjstack.scene.phases import Phase
@@ -338,7 +337,7 @@ class BoxCheck(EpisodeCheck):
         return self._cubes.inside(*self._cubes.bounds(pose[..., :3], quat_to_matrix(pose[..., 3:])))
 
     @classmethod
-    def thresholds(cls, cfg: Config) -> dict[str, Value]:
+    def thresholds(cls, cfg: Config) -> dict[str, float]:
         """The rules' numbers, with units."""
         t = cfg.gate.box
         return {

@@ -13,7 +13,6 @@ import torch
 from mjstack.config.schema import Config
 from mjstack.errors import TermError
 from mjstack.managers.base import resolve_func
-from mjstack.report.record import Value
 from mjstack.scene import SceneIndex
 from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import Simulation
@@ -134,7 +133,7 @@ class EpisodeCheck(ABC):
 
     @classmethod
     @abstractmethod
-    def thresholds(cls, cfg: Config) -> dict[str, Value]:
+    def thresholds(cls, cfg: Config) -> dict[str, float]:
         """The rules' numbers, with units, for a report."""
 
     @classmethod

@@ -16,7 +16,6 @@ from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView
 from mjstack.math import lowest_corner, not_finite, quat_angle
 from mjstack.mdp.geometry import gripper_opening
-from mjstack.report.record import Value
 from mjstack.scene import SceneIndex, table_top
 from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS, Simulation
@@ -208,7 +207,7 @@ class StackCheck(EpisodeCheck):
         return torch.stack((on_blue, cubes.supported(pose, cubes.clearance(pose))), dim=1)
 
     @classmethod
-    def thresholds(cls, cfg: Config) -> dict[str, Value]:
+    def thresholds(cls, cfg: Config) -> dict[str, float]:
         """The rules' numbers, with units."""
         t = cfg.gate.acceptance
         return {

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from mjstack.errors import ArgumentError, ConfigError, ParameterError
+from mjstack.files import write_atomic
 from mjstack.managers.base import EnvView, uses_fields
 from mjstack.mdp.geometry import joint_positions, named_pose, pose_w, robot
 from mjstack.mdp.starts.randomization import (
@@ -26,7 +27,6 @@ from mjstack.mdp.starts.randomization import (
 )
 from mjstack.mdp.starts.reach import out_of_reach
 from mjstack.mdp.starts.table import StartsTable, column_names, read_starts_table, short
-from mjstack.report.record import write_atomic
 
 _ROUNDING = 1e-6  # of a range's ends, which float32 does not hold exactly
 # [m], and of a quaternion: how far from standing on the table a cube may be that stands on it
