@@ -4,7 +4,7 @@ checker or for alterations.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from types import SimpleNamespace
@@ -19,12 +19,14 @@ from mjstack.config import load_config
 from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import Episode, Reset, Watch
+from mjstack.episodes.failures import FailureMonitor
+from mjstack.episodes.observers import Episode
+from mjstack.episodes.rollout import Observer, Reset
 from mjstack.scene import BLUE as BLUE_NAME
 from mjstack.scene import RED as RED_NAME
 from mjstack.sim import Simulation
 from mjstack.tasks.box import BoxCheck
-from mjstack.tasks.check import CheckResult, EpisodeCheck
+from mjstack.tasks.check import CheckResult
 
 NAMES = (RED_NAME, BLUE_NAME)
 STATE = ("qpos", "qvel", "sensordata")
@@ -32,34 +34,26 @@ Disturb = Callable[[Env, str], None]
 """Interferes at a step's end, after it was judged and kept; told the phase of the last world."""
 
 
-class Recorder:
-    """Keeps every world's state and phase at every step end; looks on, and hands on to what else
-    looks on.
-    """
+class Recorder(Observer):
+    """Keeps every world's state and phase at every step end."""
 
-    def __init__(self, context: GateContext, watch: Watch | None, disturb: Disturb | None) -> None:
+    def __init__(
+        self, context: GateContext, observers: Sequence[Observer], disturb: Disturb | None
+    ) -> None:
         self.context = context
-        self.watch = watch
+        self._observers = observers
         self._disturb = disturb
         self._names = [phase.name for phase in context.planner.phases]
         self._rows: dict[str, list[np.ndarray]] = {name: [] for name in (*STATE, "phase")}
 
-    def start(self, env: Env) -> None:
+    def start(self, env: Env, driver: Controller) -> None:
         self._env = env
-        if self.watch is not None:
-            self.watch.start(env)
+        self._driver = driver
 
-    def update(self, env: Env, controller: Controller, check: EpisodeCheck) -> None:
-        self._controller = (
-            controller  # a graph may hold this call: what is kept is copied in `keep`
-        )
-        if self.watch is not None:
-            self.watch.update(env, controller, check)
-
-    def keep(self, _: int, sim: Simulation) -> None:
+    def after_step(self, step: int) -> None:
         for name in STATE:
-            self._rows[name].append(getattr(sim, name).double().cpu().numpy().copy())
-        phase = self._controller.phase.cpu().numpy().copy()
+            self._rows[name].append(getattr(self._env.sim, name).double().cpu().numpy().copy())
+        phase = self._driver.phase.cpu().numpy().copy()
         self._rows["phase"].append(phase)
         if self._disturb is not None:
             self._disturb(self._env, self._names[phase[-1]])
@@ -75,7 +69,7 @@ class Recorder:
             context=self.context,
             episode=episode,
             result=episode.result,
-            watch=self.watch,
+            watch=next((o for o in self._observers if isinstance(o, FailureMonitor)), None),
             **rows,
             **ends,
         )
@@ -90,19 +84,11 @@ class RecordingContext(GateContext):
     disturb: Disturb | None = None
     recordings: list[SimpleNamespace] = field(default_factory=list)
 
-    def run(
-        self,
-        sim: Simulation,
-        reset: Reset,
-        *,
-        seed: int | None = None,
-        watch: Watch | None = None,
-        **kwargs: Any,
+    def play(
+        self, sim: Simulation, reset: Reset, observers: Sequence[Observer] = (), **kwargs: Any
     ) -> Episode:
-        recorder = Recorder(self, watch, self.disturb)
-        episode = super().run(
-            sim, reset, seed=seed, watch=recorder, on_step=recorder.keep, **kwargs
-        )
+        recorder = Recorder(self, observers, self.disturb)
+        episode = super().play(sim, reset, [*observers, recorder], **kwargs)
         self.recordings.append(recorder.recording(sim, episode))
         return episode
 

@@ -16,7 +16,7 @@ import torch
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import run_episode
+from mjstack.episodes.observers import Hook
 from mjstack.sim import Simulation, make_simulation
 
 ROBOTS = ("so101", "rebot")
@@ -147,9 +147,7 @@ def recorded(
                     )
                 )
 
-            episode = run_episode(
-                sim, context.index, context.cfg, context.planner, context.cfg.reset, on_step=keep
-            )
+            episode = context.play(sim, context.cfg.reset, [Hook(keep)])
             made[robot] = SimpleNamespace(
                 pose=np.stack(pose, 1),
                 velocity=np.stack(velocity, 1),

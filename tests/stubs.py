@@ -59,7 +59,7 @@ def pretended(
         return Played(
             seed=seed,
             worlds=worlds,
-            steps=cast(StepRecorder, SimpleNamespace(values=values, starts=LAYOUT)),
+            steps=cast(StepRecorder, SimpleNamespace(values=values, layout=LAYOUT)),
             failed=failed,
             retries=np.array([world % 3 for world in worlds], dtype=np.int32),
             seconds=0.5,

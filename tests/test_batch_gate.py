@@ -9,6 +9,7 @@ import os
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.batch_record import FAILING, BatchRecord, clear_records, write_failing
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import Episode, run_episode
+from mjstack.episodes.observers import Episode, play_episode
 from mjstack.errors import RunError
 from mjstack.gates.batch import run_batch
 from mjstack.math import wilson_interval
@@ -173,12 +174,12 @@ def test_what_stops_the_second_seed_keeps_the_first(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    def stops(*args: object, **kwargs: object) -> Episode:
+    def stops(*args: Any, **kwargs: Any) -> Episode:
         if (tmp_path / "worlds_seed0.npz").exists():
             raise error
-        return run_episode(*args, **kwargs)
+        return play_episode(*args, **kwargs)
 
-    monkeypatch.setattr(gate_module, "run_episode", stops)
+    monkeypatch.setattr(gate_module, "play_episode", stops)
     context = new_context(
         "sim=native", "nworld=2", "gate.batch.seeds=3", "gate.acceptance.xy_err=1e-6"
     )

@@ -51,7 +51,7 @@ def planned(robot: str) -> SimpleNamespace:
 
     context = recording_context(robot, "nworld=2", disturb=drop)
     sim = make_simulation(context.model, context.cfg, 2, backend=Backend.native)
-    context.run(sim, context.cfg.reset)
+    context.play(sim, context.cfg.reset)
     sim.close()
     (rec,) = context.recordings
     return rec
@@ -173,10 +173,10 @@ def test_mjwarp_fills_the_box(robot: str, controller: str, device: str) -> None:
     context = RecordingContext(cfg=cfg)
     nworld, reset = (1, NOMINAL) if cpu else (64, cfg.reset)
     sim = make_simulation(context.model, cfg, nworld, backend=Backend.mjwarp, device=device)
-    episode = context.run(sim, reset)
+    episode = context.play(sim, reset)
     for failed in episode.result.failed.tolist():
         assert failed == 0, RULES.describe(failed)
-    assert episode.captured == (not cpu)
+    assert episode.timing.captured == (not cpu)
     sizes = cfg.robot.placements["box"]
     assert int(sim.peak_contacts.max()) <= sizes.nconmax
     assert int(sim.peak_constraints.max()) <= sizes.njmax

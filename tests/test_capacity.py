@@ -27,7 +27,6 @@ from mjstack.envs.buffers import (
     require_physics,
 )
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import start_worlds
 from mjstack.episodes.workloads import Workload, play_task
 from mjstack.errors import FaultError, MjstackError, Unreachable
 from mjstack.gates import capacity as capacity_module
@@ -54,7 +53,7 @@ def peaks(rows: int = 100, contacts: int = 20, nworld: int = 4, **other: object)
 
 
 def start(sim: Simulation, context: GateContext) -> None:
-    start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+    context.start(sim, context.cfg.reset)
 
 
 # What the simulations keep
@@ -264,9 +263,8 @@ def first_steps(stage: Callable[[str], GateContext]) -> Iterator[Callable[[Batch
         sim = make_simulation(
             context.model, context.cfg, 2, backend=Backend.mjwarp, device="cpu", sizes=sizes
         )
-        env, controller = start_worlds(
-            sim, context.index, context.cfg, context.cfg.reset, context.planner
-        )
+        env = context.start(sim, context.cfg.reset)
+        controller = context.driver(env)
         for _ in range(3):
             env.step(controller.command())
         found = read_peaks(sim)

@@ -30,7 +30,7 @@ from mjstack.datasets import DatasetWriter, Feature, read_dataset
 from mjstack.datasets.shard import Shard
 from mjstack.envs import build_env, demonstration_config
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import Episode, run_episode
+from mjstack.episodes.observers import CommandRecorder
 from mjstack.errors import ConfigError
 from mjstack.jobs import collection
 from mjstack.jobs.collect import collect_folder, run_collect_job
@@ -62,14 +62,16 @@ def report_of(folder: Path) -> dict:
     return json.loads((folder / "report.json").read_text())
 
 
-def gate_episode(cfg: Config) -> Episode:
-    """What the gates' own loop makes of the same worlds."""
+def gate_episode(cfg: Config) -> SimpleNamespace:
+    """The same worlds as a gate plays them: result and commands."""
     context = GateContext(cfg=cfg)
     sim = make_simulation(
         context.model, cfg, cfg.nworld, backend=Backend.native, fields=required_fields(cfg.reset)
     )
     try:
-        return run_episode(sim, context.index, cfg, context.planner, cfg.reset, keep_commands=True)
+        commands = CommandRecorder()
+        episode = context.play(sim, cfg.reset, [commands])
+        return SimpleNamespace(result=episode.result, commands=commands.recorded)
     finally:
         sim.close()
 
@@ -758,7 +760,7 @@ def test_the_buffer_bounds_the_worlds() -> None:
 
 def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     values = torch.randn(5, 7, 4)
-    steps = cast(StepRecorder, SimpleNamespace(values=values, starts={"a": 3, "b": 1}))
+    steps = cast(StepRecorder, SimpleNamespace(values=values, layout={"a": 3, "b": 1}))
     none = np.zeros(7, dtype=np.int32)
     played = Played(seed=0, worlds=range(7), steps=steps, failed=none, retries=none, seconds=0.0)
     for size in (1, 2 * 5 * 4 * 4, 10**6):  # one world, two and all at once

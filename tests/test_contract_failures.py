@@ -6,15 +6,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
 from comparison import assert_same_run
 from environments import brisk
 
+from mjstack.drivers.driver import Controller
+from mjstack.envs import Env
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import run_episode, start_worlds
+from mjstack.episodes.observers import Episode, Hook, play_episode
 from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import run_capacity
 from mjstack.gates.throughput import run_throughput
@@ -56,9 +59,7 @@ def test_native(
             sim.qvel[3, context.index.cube_qvel[1]] = math.nan
             sim.step_count[5] -= 1
 
-    episode = run_episode(
-        sim, context.index, context.cfg, context.planner, context.cfg.reset, on_step=hook
-    )
+    episode = context.play(sim, context.cfg.reset, [Hook(hook)])
     found = rules(episode.result.failed)
     assert found[0] == found[4] == set()
     assert found[1] == {"STACKED"}
@@ -78,9 +79,7 @@ def test_mjwarp(stage: Callable[..., GateContext], make_sim: Callable[..., Simul
         if step == context.phase_start("above_blue"):
             sim.qvel[2, context.index.cube_qvel[1]] = math.nan
 
-    episode = run_episode(
-        sim, context.index, context.cfg, context.planner, context.cfg.reset, on_step=hook
-    )
+    episode = context.play(sim, context.cfg.reset, [Hook(hook)])
     found = rules(episode.result.failed)
     assert found[0] == set()
     assert found[1] == {"STACKED"}
@@ -94,7 +93,7 @@ def test_nan_leaves_the_other_worlds_alone(
     final = []
     for poison in (False, True):
         sim = make_sim(backend, 3)
-        start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+        context.start(sim, context.cfg.reset)
         for step in range(6):
             if poison and step == 2:
                 sim.qvel[1, context.index.cube_qvel[0]] = math.nan
@@ -123,7 +122,7 @@ def test_overflow_in_exactly_the_crowded_world(
     context = stage("so101")
     # Any world needs up to 144 rows in the first steps, the crowded one 192.
     sim = make_sim("mjwarp", 3, "batch.njmax=160")
-    start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+    context.start(sim, context.cfg.reset)
     sim.forward()
     assert int(sim.overflow.abs().sum()) == 0
     crowd(context, sim, 1)
@@ -183,10 +182,10 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
         *brisk(),
     )
 
-    def broken_episode(*args: object, **kwargs: object) -> object:
-        return run_episode(*args, **kwargs, on_step=teleport(context, 2))
+    def broken_episode(env: Env, driver: Controller, observers: list, **kwargs: Any) -> Episode:
+        return play_episode(env, driver, [*observers, Hook(teleport(context, 2))], **kwargs)
 
-    monkeypatch.setattr(gate_module, "run_episode", broken_episode)
+    monkeypatch.setattr(gate_module, "play_episode", broken_episode)
     (batch,) = run_batch(context)
     assert batch.status is Status.failed
     assert "1 of 4 worlds (2) failed" in batch.reason

@@ -259,9 +259,9 @@ def test_an_episode_of_the_gate_is_captured_and_accepted() -> None:
 
     context = GateContext(cfg=configure("nworld=32", "sim=mjwarp", "graph=require"))
     sim = context.batch_simulation(32)
-    episode = context.run(sim, context.cfg.reset)
+    episode = context.play(sim, context.cfg.reset)
     assert not episode.result.failed.any()
-    assert episode.capture_seconds > 0.0
+    assert episode.timing.capture_seconds > 0.0
 
 
 @wp.kernel

@@ -120,7 +120,7 @@ PATHS: dict[str, list[str] | None] = {
         )
     ],
     "control/tilt.py": ["CarryTilt.wish"],
-    "gates/watch.py": ["FailureMonitor.update", "_of"],
+    "episodes/failures.py": ["FailureMonitor.update", "_of"],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",
         "BatchedIk.grasp_point",

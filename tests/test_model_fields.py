@@ -14,7 +14,6 @@ from comparison import assert_worlds_step_alone
 from mjstack.config import load_config
 from mjstack.config.schema import Backend
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import start_worlds
 from mjstack.errors import RebindError, UnknownName
 from mjstack.sim import BatchSizes, Simulation, make_simulation
 from mjstack.sim.fields import FIELD_NAMES
@@ -90,7 +89,7 @@ def randomise(sim: Simulation, context: GateContext) -> None:
 
 def start(sim: Simulation, context: GateContext) -> None:
     """Home, jittered cubes, and a command that moves every joint."""
-    start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+    context.start(sim, context.cfg.reset)
     sim.ctrl[:, torch.from_numpy(context.index.ctrl)] += 0.05
 
 

@@ -24,7 +24,7 @@ from mjstack.config.schema import Backend, TermCfg
 from mjstack.episodes.batch_record import BatchRecord
 from mjstack.episodes.context import GateContext
 from mjstack.episodes.replay import _sizes_alone
-from mjstack.episodes.rollout import snapshot, start_worlds
+from mjstack.episodes.rollout import snapshot
 from mjstack.jobs.archived_starts import STEM, archive_starts, copy_names
 from mjstack.jobs.replay import _compare
 from mjstack.sim import BatchSizes
@@ -150,9 +150,7 @@ def test_trajectory_holds_the_episode(
 ) -> None:
     context = new_context("sim=native", "gate.acceptance.xy_err=0.0015")
     sim = context.batch_simulation(7)
-    _, controller = start_worlds(
-        sim, context.index, context.cfg, context.cfg.reset, context.planner
-    )
+    controller = context.driver(context.start(sim, context.cfg.reset))
     with np.load(failing[0] / "trajectory.npz") as held:
         assert np.array_equal(held["start_qpos"], snapshot(sim).qpos[4])
         assert not np.array_equal(held["start_qpos"], snapshot(sim).qpos[0])

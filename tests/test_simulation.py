@@ -13,7 +13,6 @@ from comparison import assert_same_run, assert_worlds_step_alone
 from mjstack.config import load_config
 from mjstack.config.schema import Backend
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import start_worlds
 from mjstack.errors import ArgumentError, RebindError, UnsupportedModel
 from mjstack.math import quat_angle
 from mjstack.scene import build_scene, table_top
@@ -67,7 +66,7 @@ def sensing() -> Callable[[str], Simulation]:
 
 def start(sim: Simulation, context: GateContext) -> None:
     """Home, jittered cubes, and a command that moves every joint."""
-    start_worlds(sim, context.index, context.cfg, context.cfg.reset, context.planner)
+    context.start(sim, context.cfg.reset)
     sim.ctrl[:, torch.from_numpy(context.index.ctrl)] += 0.05
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,8 +25,8 @@ from mjstack.episodes import failures as watch_module
 from mjstack.episodes.batch_record import FAILING, BatchRecord
 from mjstack.episodes.context import GateContext
 from mjstack.episodes.failures import FailureMonitor, Sign
+from mjstack.episodes.observers import Episode, Hook, play_episode
 from mjstack.episodes.regions import Region, find_regions, radial_yaw_deg
-from mjstack.episodes.rollout import Episode, run_episode
 from mjstack.episodes.success_record import PICTURE, REGIONS, STEM, clear_success
 from mjstack.gates.success import _tables, _Tally, run_success, success_config
 from mjstack.jobs.gates import check_machine
@@ -372,12 +373,12 @@ class Stop(Exception):
 def test_what_stops_the_second_seed_keeps_the_first(
     hasty: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def stops(*args: object, **kwargs: object) -> Episode:
+    def stops(*args: Any, **kwargs: Any) -> Episode:
         if (tmp_path / "success_seed0.npz").exists():
             raise Stop("the second seed")
-        return run_episode(*args, **kwargs)
+        return play_episode(*args, **kwargs)
 
-    monkeypatch.setattr(gate_module, "run_episode", stops)
+    monkeypatch.setattr(gate_module, "play_episode", stops)
     result = play(hasty("gate.success.seeds=3", "gate.success.rate=0"), tmp_path)
     assert result.status is Status.failed
     assert "0 of 2 episodes succeeded" in result.reason
@@ -456,13 +457,14 @@ def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(
         watch_module, "cubes_in_hand", lambda *_: torch.from_numpy(forces[now.step] > 0.0).all(2)
     )
-    watch.start(env)
+    monkeypatch.setattr(watch_module, "check_class", lambda _: lambda *_: check)
+    watch.start(env, controller)
     for step in range(total):
         now.step = step
         controller.phase.copy_(torch.from_numpy(phase[step]))
         sim.qpos.copy_(torch.from_numpy(qpos[step]))
         sim.overflow.copy_(torch.from_numpy(overflow[step]))
-        watch.update(env, controller, check)
+        watch.update()
 
     found = [
         tuple(row) for row in torch.stack((watch.sign, watch.phase, watch.step), dim=1).tolist()
@@ -527,7 +529,7 @@ def test_signs_in_real_episodes(new_context: Callable[..., GateContext]) -> None
 
     watch = FailureMonitor(context.cfg)
     sim = context.batch_simulation(6)
-    episode = context.run(sim, context.cfg.reset, watch=watch, on_step=interfere)
+    episode = context.play(sim, context.cfg.reset, [watch, Hook(interfere)])
     failed = episode.result.failed.tolist()
     retries = episode.retries.tolist()
     sim.close()
@@ -572,11 +574,12 @@ def test_each_cube_of_the_box_has_its_own_release(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(
         watch_module, "cubes_in_hand", lambda *_: torch.ones(5, 2, dtype=torch.bool)
     )
-    watch.start(env)
+    monkeypatch.setattr(watch_module, "check_class", lambda _: lambda *_: check)
+    watch.start(env, controller)
     for step in range(len(placed)):
         now.step = step
         controller.phase.fill_(step // 2)
-        watch.update(env, controller, check)
+        watch.update()
     signs = [Sign(sign) for sign in watch.sign.tolist()]
     assert signs == [Sign.NONE, Sign.MISSED, Sign.LEFT, Sign.MISSED, Sign.LEFT]
     assert [names[number] for number in watch.phase[1:].tolist()] == [
@@ -661,12 +664,12 @@ def test_steps_with_the_tracker_are_one_graph(
     context = base.with_config(success_config(base.cfg))
     sim = context.batch_simulation(64)
     watch = FailureMonitor(context.cfg)
-    episode = context.run(sim, context.cfg.reset, watch=watch)
+    episode = context.play(sim, context.cfg.reset, [watch])
     assert episode.captured
     failed = episode.result.failed != 0
     assert int(failed.sum()) <= 3
     assert not bool(((watch.sign != 0) & ~failed).sum() > 3)
-    assert int(watch._now) == episode.steps
+    assert int(watch._now) == episode.timing.steps
     sim.close()
     result = play(
         new_context("sim=mjwarp", "sim.device=cuda:0", "nworld=64", robot=robot), tmp_path

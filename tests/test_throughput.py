@@ -20,9 +20,9 @@ from mjstack.bench.power import EnergyMeter
 from mjstack.bench.timing import Timing, capture_problem, steps_that_fit, timed
 from mjstack.config import load_config
 from mjstack.config.schema import GraphMode
-from mjstack.envs import build_env
+from mjstack.envs import Env, build_env
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import State, run_episode
+from mjstack.episodes.rollout import State
 from mjstack.gates.throughput import run_throughput
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation
@@ -191,7 +191,7 @@ def test_bare_steps_play_the_same_trajectory(
     """
     context = new_context("nworld=1", *brisk())
     sim = make_sim("mjwarp", 1)
-    run_episode(sim, context.index, context.cfg, context.planner, context.cfg.reset)
+    context.play(sim, context.cfg.reset)
     final = sim.qpos.clone()
     seconds, problem = sections._play_bare(context, sim)  # type: ignore[arg-type]
     assert seconds > 0.0
@@ -209,13 +209,12 @@ def test_bare_steps_that_lose_worlds_do_not_count(
     """8 rows do not hold two cubes on a table. What bare steps lose is counted once, after them."""
     context = new_context("nworld=1")
     sim = make_sim("mjwarp", 1, "batch.njmax=8")
-    start = sections.start_worlds
+    make = context.driver
 
-    def short(*args: Any) -> Any:
-        env, controller = start(*args)
-        return env, SimpleNamespace(steps=2, command=controller.command)
+    def short(env: Env) -> Any:
+        return SimpleNamespace(steps=2, command=make(env).command)
 
-    monkeypatch.setattr(sections, "start_worlds", short)
+    monkeypatch.setattr(context, "driver", short)
     assert sections._play_bare(context, sim)[1] == "1 worlds overflowed or diverged with bare steps"  # type: ignore[arg-type]
 
 
@@ -297,10 +296,10 @@ def test_broken_episode_does_not_verify_the_task(
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("bad")
 
-    monkeypatch.setattr(sections, "run_episode", broken)
     context = new_context(
         "sim=native", "nworld=1", *SHORT, "gate.throughput.sections=[physics,episode]"
     )
+    monkeypatch.setattr(context, "play", broken)
     result, _ = run_throughput(context)
     assert result.status is Status.failed
     assert "episode: no figure: RuntimeError: bad" in result.reason
@@ -501,7 +500,7 @@ def test_the_meter_sees_an_episodes_replayed_steps(new_context: Callable[..., Ga
         start=lambda: seen.append(int(sim.step_count[0])),
         stop=lambda: seen.append(int(sim.step_count[0])),
     )
-    context.run(sim, context.cfg.reset, meter=energy)
+    context.play(sim, context.cfg.reset, [power.EnergyObserver(energy)])
     assert seen == [20, 6000]  # not the two steps that warm up and are captured
 
 

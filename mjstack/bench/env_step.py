@@ -25,9 +25,9 @@ from typing import Protocol
 import torch
 
 from mjstack.bench.power import EnergyMeter
-from mjstack.bench.timing import WARM_UP, capture_problem, step_graph, steps_that_fit, timed
+from mjstack.bench.timing import WARM_UP, capture_problem, steps_that_fit, timed
 from mjstack.envs import Env
-from mjstack.episodes.rollout import restore, snapshot
+from mjstack.episodes.rollout import restore, snapshot, step_graph
 from mjstack.sim import LOST_PHYSICS
 
 _COST = 4.0  # of a turn over that of its whole steps from the start, when fewer things touch

@@ -22,6 +22,7 @@ from rich.table import Table
 from mjstack.config import load_config
 from mjstack.config.schema import Backend
 from mjstack.episodes.context import GateContext
+from mjstack.episodes.observers import CommandRecorder, Snapshots
 from mjstack.episodes.rollout import restore
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.report.provenance import collect_provenance
@@ -61,12 +62,12 @@ def measure_arrangements(
     sim = context.simulation(cfg.nworld, Backend.mjwarp, device)
     assert isinstance(sim, MjwarpSimulation)
     first = context.phase_start(cfg.gate.throughput.from_phase)
-    episode = context.run(sim, cfg.reset, snapshots=frozenset([first - 1]), keep_commands=True)
-    state = episode.states[first - 1]
-    tape = episode.commands
-    assert tape is not None
+    snapshots = Snapshots([first - 1])
+    recorder = CommandRecorder()
+    context.play(sim, cfg.reset, [snapshots, recorder])
+    state = snapshots.states[first - 1]
+    tape = recorder.recorded.rewind()
     columns = torch.as_tensor(context.index.ctrl, device=sim.device)
-    tape.rewind()
     commands = [tape.command() for _ in range(min(first + steps, tape.steps))][first:]
     bare = sim.bare_step()
     decimation = cfg.timing.decimation

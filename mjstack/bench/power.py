@@ -5,8 +5,12 @@ from __future__ import annotations
 import time
 from typing import Any
 
+from mjstack.drivers.driver import Controller
+from mjstack.envs import Env
+from mjstack.episodes.rollout import Observer
 from mjstack.sim import cuda_uuid
 
+_EAGER = 2  # steps: the warm-up, and the one that is captured
 SHORTEST = 0.5  # s, of a stretch of work on average: the counter moves some ten times a second
 
 
@@ -90,3 +94,27 @@ class EnergyMeter:
             self._nvml = None
             self.reason = f"NVML: {error}"
             return 0.0
+
+
+class EnergyObserver(Observer):
+    """Measures the energy of a rollout's steps from the third on, when all are replayed."""
+
+    def __init__(self, meter: EnergyMeter) -> None:
+        """``meter`` adds it up."""
+        self._meter = meter
+
+    def start(self, env: Env, driver: Controller) -> None:
+        """See `Observer`."""
+        self._sim = env.sim
+
+    def after_step(self, step: int) -> None:
+        """See `Observer`."""
+        if step == _EAGER - 1:
+            self._sim.synchronize()
+            reading = time.perf_counter()
+            self._meter.start()
+            self.aside = time.perf_counter() - reading
+
+    def finish(self) -> None:
+        """See `Observer`."""
+        self._meter.stop()

@@ -14,28 +14,21 @@ import numpy as np
 import torch
 
 from mjstack.bench.env_step import measure_env_step
-from mjstack.bench.power import EnergyMeter
+from mjstack.bench.power import EnergyMeter, EnergyObserver
 from mjstack.bench.timing import (
     WARM_UP,
     Timing,
     capture_problem,
     spread,
-    step_graph,
     steps_that_fit,
     timed,
 )
 from mjstack.config.schema import Backend, GraphMode
 from mjstack.drivers.driver import Recorded
 from mjstack.envs import Env
-from mjstack.episodes.context import GateContext, TimedEpisode
-from mjstack.episodes.rollout import (
-    CLOSED_LOOP,
-    State,
-    restore,
-    run_episode,
-    snapshot,
-    start_worlds,
-)
+from mjstack.episodes.context import GateContext, TimedEpisode, play_to
+from mjstack.episodes.observers import CommandRecorder
+from mjstack.episodes.rollout import CLOSED_LOOP, Observer, State, restore, rollout, step_graph
 from mjstack.errors import name_worlds
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import cubes_in_hand
@@ -207,34 +200,27 @@ def measure_episode(
         turn_began = time.perf_counter()
         # A plan can be evaluated again; what a controller that watches did has to be kept.
         keep = mjwarp and cfg.controller.name == CLOSED_LOOP
-        episode = run_episode(
-            sim, context.index, cfg, context.planner, cfg.reset, meter=meter, keep_commands=keep
-        )
+        commands = CommandRecorder()
+        recorders: list[Observer] = [commands] if keep else []
+        episode = context.play(sim, cfg.reset, [*recorders, EnergyObserver(meter)])
+        took = episode.timing.seconds
         played.append(TimedEpisode.of(episode, sim))
         if mjwarp:
-            seconds, problem = _play_bare(context, cast("MjwarpSimulation", sim), episode.commands)
+            tape = commands.recorded if keep else None
+            seconds, problem = _play_bare(context, cast("MjwarpSimulation", sim), tape)
             section.problem = section.problem or problem
             bare.append(seconds)
-            ratios.append(episode.seconds / seconds)
+            ratios.append(took / seconds)
         if keep:
             # Both record, so that they differ by the controller alone.
-            again = run_episode(
-                sim,
-                context.index,
-                cfg,
-                context.planner,
-                cfg.reset,
-                repeat=episode.commands,
-                keep_commands=True,
-            )
+            again = context.play(sim, cfg.reset, [CommandRecorder()], repeat=commands.recorded)
             lost = int((again.result.failed != 0).sum())
             if lost:
                 section.problem = (
                     section.problem or f"{lost} worlds failed when their commands were repeated"
                 )
-            controlled.append(episode.seconds / again.seconds - 1.0)
-            del again
-        del episode  # with its commands, before the next turn records as many
+            controlled.append(took / again.timing.seconds - 1.0)
+        del commands, recorders  # before the next turn records as many
         estimate = time.perf_counter() - turn_began
         context.tell("episode, repetitions", len(played), watch.repetitions)
     if not played and before is not None:
@@ -339,17 +325,11 @@ def _carry_start(context: GateContext, sim: Simulation) -> State:
     state = context.carry_start
     if state is not None and state.qpos.shape[0] == sim.nworld:
         return state
-    cfg = context.cfg
     t = context.cfg.gate.throughput
     count = min(sim.nworld, t.start_worlds)
     some = context.simulation(count, Backend.native, "cpu")
-    env, controller = start_worlds(some, context.index, cfg, cfg.reset, context.planner)
-    first = context.phase_start(t.from_phase)
-    for step in range(first):
-        env.step(controller.command())
-        context.tell("steps to the start", step + 1, first)
-    state = snapshot(some)
-    env.close()
+    state = play_to(context, some, t.from_phase)
+    some.close()
     return _rows(state, np.arange(sim.nworld) % count)
 
 
@@ -383,18 +363,14 @@ def _play_bare(
         step()
     if sim.device.type == "cuda" and cfg.graph is not GraphMode.off and not step.captured:
         return math.nan, "the bare steps could not be captured"
-    _, controller = start_worlds(sim, context.index, cfg, cfg.reset, context.planner)
-    if recorded is not None:
-        recorded.rewind()
-        controller = recorded
+    env = context.start(sim, cfg.reset)
+    driver = context.driver(env) if recorded is None else recorded.rewind()
 
-    def play() -> None:
-        for _ in range(controller.steps):
-            sim.ctrl.copy_(controller.command())
-            for _ in range(decimation):
-                step()
+    def physics() -> None:
+        for _ in range(decimation):
+            step()
 
-    seconds = timed(sim, play)
+    seconds = rollout(env, driver, physics=physics).seconds
     sim.latch()
     bad = int(_lost(sim).sum())
     if bad:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 
 from mjstack.bench.power import EnergyMeter
 from mjstack.config.schema import GraphMode
-from mjstack.envs.halves import Repeated
 from mjstack.sim import Simulation
 
 WARM_UP = 3  # calls: eager, captured, replayed
@@ -27,12 +26,6 @@ def timed(sim: Simulation, work: Callable[[], object], meter: EnergyMeter | None
     if meter is not None:
         meter.stop()
     return seconds
-
-
-def step_graph(sim: Simulation, n: int, *, kinematics: bool = False) -> Repeated | None:
-    """The graph that ``sim.step(n)`` replays; None on native MuJoCo, which has none."""
-    graph_of = getattr(sim, "graph_of", None)
-    return None if graph_of is None else graph_of(n, kinematics=kinematics)
 
 
 def capture_problem(sim: Simulation, mode: GraphMode, captured: bool) -> str:

@@ -70,9 +70,10 @@ class Recorded:
         self._phases.index_copy_(0, self._next, phase[None].to(torch.int16))
         self._next.add_(1)
 
-    def rewind(self) -> None:
-        """From here on it repeats."""
+    def rewind(self) -> Recorded:
+        """Repeat from the first step on; returns itself."""
         self._next.zero_()
+        return self
 
     def command(self) -> torch.Tensor:
         """Commands of the next step, shape ``(nworld, nu)``."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mjstack.episodes.context import measured_values
-from mjstack.episodes.rollout import Episode
+from mjstack.episodes.observers import Episode
 from mjstack.errors import RunError
 from mjstack.files import write_atomic
 from mjstack.sim import Simulation

@@ -3,18 +3,38 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import mujoco
 import numpy as np
 
 from mjstack.config.schema import Backend, Config
+from mjstack.drivers.driver import Controller, Recorded
 from mjstack.drivers.open_loop import OpenLoopPlanner
-from mjstack.episodes.rollout import NOMINAL, Advance, Episode, Reset, State, StepHook, run_episode
+from mjstack.envs import Env
+from mjstack.episodes.observers import (
+    Episode,
+    Hook,
+    Snapshots,
+    StepHook,
+    WorldRecorder,
+    play_episode,
+)
+from mjstack.episodes.rollout import (
+    NOMINAL,
+    Advance,
+    Observer,
+    Reset,
+    State,
+    make_driver,
+    rollout,
+    snapshot,
+    start_worlds,
+)
 from mjstack.episodes.workloads import size_batch
 from mjstack.managers.reset import required_fields
 from mjstack.report.record import GateResult, Status
@@ -66,15 +86,33 @@ class TimedEpisode:
     def of(cls, episode: Episode, sim: Simulation) -> TimedEpisode:
         """What is kept of an episode once its simulation is gone."""
         failed = np.flatnonzero(episode.result.failed.cpu().numpy()).tolist()
+        timing = episode.timing
         return cls(
             description=sim.description,
             nworld=sim.nworld,
-            seconds=episode.seconds,
-            warm_up_seconds=episode.warm_up_seconds,
-            capture_seconds=episode.capture_seconds,
-            captured=episode.captured,
+            seconds=timing.seconds,
+            warm_up_seconds=timing.warm_up_seconds,
+            capture_seconds=timing.capture_seconds,
+            captured=timing.captured,
             failed=failed,
         )
+
+
+@dataclass(eq=False, kw_only=True, slots=True)
+class NominalRun:
+    """The reference episode.
+
+    Attributes:
+        sim: Its world.
+        episode: The episode.
+        world: Its recording.
+        states: At the ends of the phases that gate *parity* compares, by step.
+    """
+
+    sim: Simulation
+    episode: Episode
+    world: WorldRecorder
+    states: dict[int, State]
 
 
 @dataclass(eq=False)
@@ -104,7 +142,7 @@ class GateContext:
     measured_env: BatchSizes | None = None
     carry_start: State | None = None
     timed_episode: TimedEpisode | None = None
-    shown: Episode | None = None
+    shown: WorldRecorder | None = None
     shown_by: str = ""
     pictures: list[str] = field(default_factory=list)
 
@@ -149,31 +187,67 @@ class GateContext:
         return resolve_backend(self.cfg)
 
     @cached_property
-    def nominal(self) -> tuple[Simulation, Episode]:
-        """One native world's episode from the nominal layout: the reference of baseline
+    def nominal(self) -> NominalRun:
+        """One native world's episode from the nominal starts: the reference of baseline
         and parity.
         """
         sim = make_simulation(self.model, self.cfg, 1, backend=Backend.native)
-        steps = frozenset(self.phase_end(name) for name in self.cfg.gate.parity.states.values())
-        hook = self.on_step if "parity" not in self.cfg.gates else None
-        episode = self.run(sim, NOMINAL, record=True, snapshots=steps, on_step=hook)
-        return sim, episode
+        steps = [self.phase_end(name) for name in self.cfg.gate.parity.states.values()]
+        world = WorldRecorder()
+        snapshots = Snapshots(steps)
+        shown = [] if "parity" in self.cfg.gates else self.viewers
+        episode = self.play(sim, NOMINAL, [*shown, world, snapshots])
+        return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)
 
     def tell(self, what: str, done: int, total: int) -> None:
         """Reports progress, if anyone listens."""
         if self.advance is not None:
             self.advance(what, done, total)
 
-    def run(
-        self, sim: Simulation, reset: Reset, *, seed: int | None = None, **kwargs: Any
-    ) -> Episode:
-        """`run_episode` with this context's scene and planner, under the configured seed or another
-        one.
-        """
+    @property
+    def viewers(self) -> list[Observer]:
+        """Observers of the episode that is shown."""
+        return [] if self.on_step is None else [Hook(self.on_step)]
+
+    def start(
+        self,
+        sim: Simulation,
+        reset: Reset,
+        *,
+        seed: int | None = None,
+        worlds: Sequence[int] | None = None,
+    ) -> Env:
+        """`start_worlds` in this context's scene, under the configured seed or another one."""
         cfg = self.cfg if seed is None else replace(self.cfg, seed=seed)
-        return run_episode(
-            sim, self.index, cfg, self.planner, reset, advance=self.advance, **kwargs
-        )
+        return start_worlds(sim, self.index, cfg, reset, worlds)
+
+    def driver(self, env: Env) -> Controller:
+        """The configured driver, for worlds that have started."""
+        return make_driver(env, self.planner, self.advance)
+
+    def play(
+        self,
+        sim: Simulation,
+        reset: Reset,
+        observers: Sequence[Observer] = (),
+        *,
+        seed: int | None = None,
+        worlds: Sequence[int] | None = None,
+        repeat: Recorded | None = None,
+    ) -> Episode:
+        """Roll out one judged episode.
+
+        Args:
+            sim: The worlds.
+            reset: How they start.
+            observers: Look on.
+            seed: Seed, if not the configured one.
+            worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start_worlds`.
+            repeat: Commands to repeat, instead of the configured driver's.
+        """
+        env = self.start(sim, reset, seed=seed, worlds=worlds)
+        driver = self.driver(env) if repeat is None else repeat.rewind()
+        return play_episode(env, driver, observers, advance=self.advance)
 
     def batch_simulation(self, nworld: int) -> Simulation:
         """Worlds on the backend of the batch."""
@@ -232,6 +306,15 @@ class GateContext:
     def phase_start(self, name: str) -> int:
         """First step of a phase."""
         return next(phase.start for phase in self.planner.phases if phase.name == name)
+
+
+def play_to(context: GateContext, sim: Simulation, phase: str) -> State:
+    """The state of every world as a phase begins, played from the configured starts."""
+    env = context.start(sim, context.cfg.reset)
+    first = context.phase_start(phase)
+    label = f"steps to {phase}"
+    rollout(env, context.driver(env), steps=first, advance=context.advance, label=label)
+    return snapshot(sim)
 
 
 def judge_one(rules: Rules, result: CheckResult) -> tuple[Status, str, dict]:

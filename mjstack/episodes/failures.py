@@ -10,12 +10,13 @@ import torch
 from mjstack.config.schema import Config
 from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
+from mjstack.episodes.rollout import Observer
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import cubes_in_hand
 from mjstack.scene.index import CUBES
 from mjstack.scene.phases import carried_cubes, grasped_cubes
 from mjstack.sim.simulation import LOST_PHYSICS
-from mjstack.tasks.check import EpisodeCheck
+from mjstack.tasks.check import check_class
 
 GONE_FRAMES = 3  # in a row without load on both jaws: less may be a touch in passing
 
@@ -51,7 +52,7 @@ def describe_sign(sign: int, phase: str) -> str:
     return f"{phase}: {Sign(sign).text}" if phase else Sign(sign).text
 
 
-class FailureMonitor:
+class FailureMonitor(Observer):
     """Notes the first sign of failure in every world, and the phase and step in which it was seen.
 
     What counts as a sign:
@@ -86,8 +87,14 @@ class FailureMonitor:
         self._tables = grasped_cubes(specs), carried_cubes(specs)
         self._releases = _releases(self._tables[1])
 
-    def start(self, env: Env) -> None:
-        """Allocates for the environment's worlds."""
+    def start(self, env: Env, driver: Controller) -> None:
+        """Allocate for the environment's worlds."""
+        self._env = env
+        self._driver = driver
+        # For where objects belong: it is not updated.
+        self._check = check_class(env.cfg)(
+            env.cfg, env.index, driver.phases, env.nworld, env.device
+        )
         n = env.nworld
         device = env.device
 
@@ -107,12 +114,13 @@ class FailureMonitor:
         self._placed = torch.zeros_like(self._loaded)
         self._gone = full(0, torch.int32)
 
-    def update(self, env: Env, controller: Controller, check: EpisodeCheck) -> None:
-        """Takes in the end of a step. Fixed shapes, no host read."""
+    def update(self) -> None:
+        """Process the end of a step. Fixed shapes, no host read."""
+        env = self._env
         sim = env.sim
-        phase = controller.phase
+        phase = self._driver.phase
         loaded = cubes_in_hand(env.index, sim)
-        placed = check.placed(sim)
+        placed = self._check.placed(sim)
 
         lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
         entered = phase > self._at

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,16 +15,11 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Backend, Config
+from mjstack.drivers.driver import Controller
+from mjstack.envs import Env
 from mjstack.episodes.context import GateContext, measured_values
-from mjstack.episodes.rollout import (
-    Episode,
-    State,
-    StepHook,
-    Watch,
-    place_worlds,
-    snapshot,
-    start_worlds,
-)
+from mjstack.episodes.observers import Episode, WorldRecorder
+from mjstack.episodes.rollout import Observer, State, snapshot
 from mjstack.files import write_atomic
 from mjstack.managers.reset import required_fields
 from mjstack.math import lowest_corner
@@ -55,6 +51,7 @@ class ReplayedWorld:
 
     Attributes:
         episode: The episode of the one world.
+        recorder: Its positions and phases.
         start: Its state before the first step.
         fields: Model fields that its start wrote, by MuJoCo's name.
         steps: State and task check at step ends, by name, each with steps first.
@@ -64,6 +61,7 @@ class ReplayedWorld:
     """
 
     episode: Episode
+    recorder: WorldRecorder
     start: State
     fields: dict[str, np.ndarray]
     steps: dict[str, np.ndarray]
@@ -100,10 +98,9 @@ def replay_world(
     world: int,
     backend: Backend,
     device: str,
-    on_step: StepHook | None = None,
-    watch: Watch | None = None,
+    observers: Sequence[Observer] = (),
 ) -> ReplayedWorld:
-    """Plays one world as it started in its batch.
+    """Play one world as it started in its batch.
 
     Random numbers depend on the seed, the world's number and the episode, not on the other worlds,
     so it needs no others.
@@ -114,30 +111,22 @@ def replay_world(
         world: The world's number in the batch.
         backend: Native or MJWarp.
         device: ``cpu`` or ``cuda:N``.
-        on_step: Called after each step.
-        watch: Looks on.
+        observers: Look on.
     """
     cfg = replace(context.cfg, seed=seed)
     sim = _alone(context, backend, device)
     try:
-        start_worlds(sim, context.index, cfg, cfg.reset, context.planner, worlds=[world])
-        start = snapshot(sim)
-        fields = {name: field[0].cpu().numpy().copy() for name, field in sim.fields.items()}
-        states: list[State] = []
-
-        def keep(step: int, sim: Simulation) -> None:
-            states.append(snapshot(sim))
-            if on_step is not None:
-                on_step(step, sim)
-
-        episode = context.run(
-            sim, cfg.reset, seed=seed, worlds=[world], on_step=keep, record=True, watch=watch
+        trace = _Trace()
+        recorder = WorldRecorder()
+        episode = context.play(
+            sim, cfg.reset, [trace, *observers, recorder], seed=seed, worlds=[world]
         )
-        steps = _steps(states, episode, cfg, context)
+        steps = _steps(trace.states, recorder, cfg, context)
         return ReplayedWorld(
             episode=episode,
-            start=start,
-            fields=fields,
+            recorder=recorder,
+            start=trace.initial,
+            fields=trace.fields,
             steps=steps,
             findings=_explain(episode, steps, sim, cfg, context),
             description=sim.description,
@@ -147,14 +136,28 @@ def replay_world(
         sim.close()
 
 
+class _Trace(Observer):
+    """Keeps the start and the state at every step end."""
+
+    def start(self, env: Env, driver: Controller) -> None:
+        """See `Observer`."""
+        self._sim = env.sim
+        self.initial = snapshot(env.sim)
+        self.fields = {name: f[0].cpu().numpy().copy() for name, f in env.sim.fields.items()}
+        self.states: list[State] = []
+
+    def after_step(self, step: int) -> None:
+        """See `Observer`."""
+        self.states.append(snapshot(self._sim))
+
+
 def start_of_world(
     context: GateContext, *, seed: int, world: int, backend: Backend, device: str
 ) -> np.ndarray:
     """Positions at which a world starts, shape ``(nq,)``; arguments as of `replay_world`."""
-    cfg = replace(context.cfg, seed=seed)
     sim = _alone(context, backend, device)
     try:
-        place_worlds(sim, context.index, cfg, cfg.reset, worlds=[world])
+        context.start(sim, context.cfg.reset, seed=seed, worlds=[world])
         return sim.qpos[0].cpu().numpy().copy()
     finally:
         sim.close()
@@ -196,7 +199,7 @@ def _sizes_alone(sizes: BatchSizes, nworld: int) -> BatchSizes:
 
 
 def _steps(
-    states: list[State], episode: Episode, cfg: Config, context: GateContext
+    states: list[State], recorder: WorldRecorder, cfg: Config, context: GateContext
 ) -> dict[str, np.ndarray]:
     """State and what the check looks at, at step ends; red is 0 and blue is 1."""
     index = context.index
@@ -213,10 +216,9 @@ def _steps(
     red = pose[:, 0, :3].numpy()
     blue = pose[:, 1, :3].numpy()  # float32, as the check computes
     names = np.array([phase.name for phase in context.planner.phases])
-    assert episode.phase is not None
     return {
         "time_s": np.arange(1, len(states) + 1) * cfg.timing.step_dt,
-        "phase": names[episode.phase],
+        "phase": names[recorder.phase],
         "qpos": qpos,
         "qvel": qvel,
         "ctrl": ctrl,

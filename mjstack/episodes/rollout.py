@@ -1,45 +1,214 @@
-"""One scripted episode over many worlds: the loop that every gate uses."""
+"""The rollout: the only loop over an episode. Whoever needs to know what happens in it observes."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
 
-from mjstack.bench.power import EnergyMeter
-from mjstack.bench.timing import step_graph
 from mjstack.config.schema import Config, TermCfg
-from mjstack.drivers.driver import Controller, OpenLoopDriver, Recorded
+from mjstack.drivers.driver import Controller, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, driven_config
+from mjstack.envs.halves import Eager, Repeated
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
-from mjstack.tasks.check import CheckResult, EpisodeCheck, check_class
 
-_EAGER = 2  # steps: the warm-up, and the one that is captured
-
-StepHook = Callable[[int, Simulation], None]
-Advance = Callable[[str, int, int], None]
-"""Reports progress: what is going on, how much is done, and of how much."""
-
-
-class Watch(Protocol):
-    """Looks on at an episode."""
-
-    def start(self, env: Env) -> None:
-        """Called once, when every world is at its start."""
-
-    def update(self, env: Env, controller: Controller, check: EpisodeCheck) -> None:
-        """Called at the end of every step, inside what is captured: fixed shapes, no host read."""
-
-
-CLOSED_LOOP = "closed_loop"  # the controller that watches; any other name plays a plan
+CLOSED_LOOP = "closed_loop"  # the controller with feedback; any other name plays a plan
 Reset = dict[str, TermCfg]
 NOMINAL: Reset = {"home": TermCfg(func="mjstack.mdp.reset.home")}
+Advance = Callable[[str, int, int], None]
+"""Reports progress: the work in progress, how much is done, and of how much."""
+
+
+class Observer:
+    """Base class of everything that looks on at a rollout. Every method may be left out.
+
+    Attributes:
+        aside: Time spent in `after_step` that is not part of the episode's [s].
+    """
+
+    aside: float = 0.0
+
+    def start(self, env: Env, driver: Controller) -> None:
+        """Prepare for an episode. Called once, when every world is at its start."""
+
+    def update(self) -> None:
+        """Process the end of a step, inside the captured graph: fixed shapes, no host read."""
+
+    def after_step(self, step: int) -> None:
+        """Process the end of a step on the host, after `update`."""
+
+    def finish(self) -> None:
+        """Conclude. Called once when the device has done the last step, the last observer first."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RolloutTiming:
+    """The time of a rollout.
+
+    Attributes:
+        steps: Number of control steps.
+        seconds: Wall time of the steps [s]; where they are captured, of as many replayed ones.
+        warm_up_seconds: The eager first call of the captured work [s]; 0 without one.
+        capture_seconds: The capture alone [s]; 0 without one.
+        captured: Whether whole steps were replayed. On Warp's CPU device, where physics alone is
+            captured, they are not.
+    """
+
+    steps: int
+    seconds: float
+    warm_up_seconds: float
+    capture_seconds: float
+    captured: bool
+
+
+def rollout(
+    env: Env,
+    driver: Controller,
+    observers: Sequence[Observer] = (),
+    *,
+    steps: int | None = None,
+    advance: Advance | None = None,
+    label: str = "steps",
+    physics: Callable[[], None] | None = None,
+) -> RolloutTiming:
+    """Drive every world through an episode. On CUDA a step is one captured graph.
+
+    Args:
+        env: The environment, its worlds at their start.
+        driver: Gives the actions.
+        observers: Look on, in this order.
+        steps: Number of control steps; the driver's if None.
+        advance: Told about progress.
+        label: Name of the steps in the progress.
+        physics: Replaces the environment's step: the driver's command goes to the actuators as it
+            is, and this advances the physics by one control step. It is not captured here.
+    """
+    sim = env.sim
+    steps = driver.steps if steps is None else steps
+    for observer in observers:
+        observer.start(env, driver)
+
+    def work() -> None:
+        env.action_manager.take(driver.command())
+        env.advance()
+        for observer in observers:
+            observer.update()
+
+    def bare() -> None:
+        sim.ctrl.copy_(driver.command())
+        cast(Callable[[], None], physics)()
+
+    play = Eager(bare) if physics else env.captured(work, "a step of the episode")
+    # On Warp's CPU device physics alone is captured, once for all episodes.
+    graph: Repeated | None = play
+    if sim.device.type != "cuda" and physics is None:
+        graph = step_graph(sim, env.cfg.timing.decimation, kinematics=True)
+    before = _graph_seconds(graph)
+
+    sim.synchronize()
+    began = time.perf_counter()
+    for step in range(steps):
+        play()
+        for observer in observers:
+            observer.after_step(step)
+        if advance is not None:
+            if step % 10 == 9:
+                sim.synchronize()  # so that the bar shows work done, not work queued
+            advance(label, step + 1, steps)
+    sim.synchronize()
+    seconds = time.perf_counter() - began - sum(observer.aside for observer in observers)
+    for observer in reversed(observers):  # an energy meter, say, before the check computes
+        observer.finish()
+
+    after = _graph_seconds(graph)
+    warm_up, capture = (
+        now if now != then else 0.0 for now, then in zip(after, before, strict=True)
+    )
+    captured = play.captured
+    play.drop()  # its memory, which only the collector would find otherwise
+    seconds -= warm_up + capture
+    if warm_up and steps > 1:  # the first step was it
+        seconds *= steps / (steps - 1)
+    return RolloutTiming(
+        steps=steps,
+        seconds=seconds,
+        warm_up_seconds=warm_up,
+        capture_seconds=capture,
+        captured=captured,
+    )
+
+
+def start_worlds(
+    sim: Simulation,
+    index: SceneIndex,
+    cfg: Config,
+    reset: Reset,
+    worlds: Sequence[int] | None = None,
+) -> Env:
+    """Build the environment of a driven episode and reset every world.
+
+    Args:
+        sim: The worlds.
+        index: Addresses.
+        cfg: The configuration.
+        reset: How worlds differ at the start.
+        worlds: Their numbers, which random numbers depend on: ``[17]`` starts one world as world 17
+            of any batch starts.
+
+    Returns:
+        The environment, whose actions are the driver's commands.
+    """
+    return reset_worlds(
+        Env(sim, index, driven_config(cfg, reset=reset), check_faults=False), cfg.seed, worlds
+    )
+
+
+def reset_worlds(env: Env, seed: int, worlds: Sequence[int] | None = None) -> Env:
+    """Reset the first worlds of an environment under these numbers, and bring everything that
+    derives from their state up to date.
+    """
+    if worlds is not None:
+        env.world[: len(worlds)].copy_(torch.tensor(worlds))
+    env.reset(seed=seed)
+    env.sim.forward()
+    return env
+
+
+def make_driver(env: Env, planner: OpenLoopPlanner, advance: Advance | None = None) -> Controller:
+    """Make the configured driver, for worlds that have started.
+
+    Args:
+        env: The environment, whose action terms are the controller's.
+        planner: Plans the joint trajectories, from where the cubes stand.
+        advance: Told about progress.
+    """
+    sim = env.sim
+    if env.cfg.controller.name == CLOSED_LOOP:
+        # Loads Warp, which a native open-loop run does not need.
+        from mjstack.drivers.closed_loop import ClosedLoopDriver
+
+        return ClosedLoopDriver(env, planner.nominal)
+    cubes = torch.cat([sim.qpos[:, a : a + 2] for a in env.index.cube_qpos], dim=1)
+    progress = None if advance is None else (lambda done: advance("planning", done, sim.nworld))
+    tape = planner.plan(cubes.double().cpu().numpy(), progress).to(sim.device, sim.ctrl.dtype)
+    return OpenLoopDriver(tape, planner.phases, sim.nworld, sim.device)
+
+
+def step_graph(sim: Simulation, n: int, *, kinematics: bool = False) -> Repeated | None:
+    """The graph that ``sim.step(n)`` replays; None on native MuJoCo, which has none."""
+    graph_of = getattr(sim, "graph_of", None)
+    return None if graph_of is None else graph_of(n, kinematics=kinematics)
+
+
+def _graph_seconds(graph: Repeated | None) -> tuple[float, float]:
+    """Warm-up and capture so far [s]."""
+    return (0.0, 0.0) if graph is None else (graph.warm_up_seconds, graph.capture_seconds)
 
 
 @dataclass(slots=True)
@@ -51,241 +220,13 @@ class State:
     ctrl: np.ndarray
 
 
-@dataclass(slots=True)
-class Episode:
-    """What an episode leaves behind.
-
-    Attributes:
-        result: The check of every world.
-        steps: How many.
-        start: Positions of every world before the first one, shape ``(nworld, nq)``, in the
-            backend's precision.
-        waypoint_error: Largest distance from a target that inverse kinematics left [m], shape
-            ``(nworld,)``.
-        retries: Grasps that were tried again, shape ``(nworld,)``.
-        seconds: Wall time of the steps alone [s]; where they are captured, of as many replayed
-            ones.
-        qpos: World 0 at every step end, shape ``(steps, nq)``, if it was recorded.
-        phase: Number of its phase in every step, shape ``(steps,)``, likewise.
-        states: Snapshots of all worlds after the steps that were asked for.
-        warm_up_seconds: The eager first call of what is captured [s]; 0 if it was captured before,
-            or never is.
-        capture_seconds: The capture alone [s], likewise.
-        captured: Whether whole steps were replayed; on Warp's CPU device, where physics alone is,
-            they are not.
-        commands: The commands that were given, if they were recorded.
-    """
-
-    result: CheckResult
-    steps: int
-    start: np.ndarray
-    waypoint_error: np.ndarray
-    retries: np.ndarray
-    seconds: float
-    qpos: np.ndarray | None = None
-    phase: np.ndarray | None = None
-    states: dict[int, State] = field(default_factory=dict)
-    warm_up_seconds: float = 0.0
-    capture_seconds: float = 0.0
-    captured: bool = False
-    commands: Recorded | None = None
-
-
-def start_worlds(
-    sim: Simulation,
-    index: SceneIndex,
-    cfg: Config,
-    reset: Reset,
-    planner: OpenLoopPlanner,
-    advance: Advance | None = None,
-    worlds: Sequence[int] | None = None,
-) -> tuple[Env, Controller]:
-    """Resets every world; the configured controller plans from where its cubes then stand, or looks
-    for itself.
-
-    Args:
-        sim: The worlds.
-        index: Addresses.
-        cfg: The configuration.
-        reset: How worlds differ at the start.
-        planner: Plans the commands.
-        advance: Told about progress.
-        worlds: Their numbers, which random numbers depend on: ``[17]`` starts one world as world 17
-            of any batch starts.
-
-    Returns:
-        The environment that the commands go through, and what gives the commands, which are its
-        actions.
-    """
-    env = place_worlds(sim, index, cfg, reset, worlds)
-    return env, make_driver(env, planner, advance)
-
-
-def place_worlds(
-    sim: Simulation,
-    index: SceneIndex,
-    cfg: Config,
-    reset: Reset,
-    worlds: Sequence[int] | None = None,
-) -> Env:
-    """Resets every world, and no more; see `start_worlds`."""
-    env = Env(
-        sim, index, driven_config(cfg, reset=reset), check_faults=False
-    )  # the check names lost worlds
-    if worlds is not None:
-        env.world.copy_(torch.tensor(worlds))
-    env.reset(seed=cfg.seed)
-    sim.forward()
-    return env
-
-
-def make_driver(env: Env, planner: OpenLoopPlanner, advance: Advance | None = None) -> Controller:
-    """The configured controller, for worlds that have started.
-
-    Args:
-        env: The environment, whose action terms are the controller's.
-        planner: Plans the commands.
-        advance: Told about progress.
-    """
-    sim = env.sim
-    if env.cfg.controller.name == CLOSED_LOOP:
-        from mjstack.drivers.closed_loop import (
-            ClosedLoopDriver,
-        )  # loads Warp, which a planned native run does not need
-
-        return ClosedLoopDriver(env, planner.nominal)
-    cubes = torch.cat([sim.qpos[:, a : a + 2] for a in env.index.cube_qpos], dim=1)
-    progress = None if advance is None else (lambda done: advance("planning", done, sim.nworld))
-    tape = planner.plan(cubes.double().cpu().numpy(), progress).to(sim.device, sim.ctrl.dtype)
-    return OpenLoopDriver(tape, planner.phases, sim.nworld, sim.device)
-
-
-def run_episode(
-    sim: Simulation,
-    index: SceneIndex,
-    cfg: Config,
-    planner: OpenLoopPlanner,
-    reset: Reset,
-    *,
-    record: bool = False,
-    snapshots: frozenset[int] = frozenset(),
-    on_step: StepHook | None = None,
-    advance: Advance | None = None,
-    worlds: Sequence[int] | None = None,
-    meter: EnergyMeter | None = None,
-    keep_commands: bool = False,
-    watch: Watch | None = None,
-    repeat: Recorded | None = None,
-) -> Episode:
-    """Plays the scripted task once in every world and judges it.
-
-    Args:
-        sim: The worlds.
-        index: Addresses.
-        cfg: The configuration.
-        planner: Plans the commands.
-        reset: How worlds differ at the start.
-        record: Keep world 0's qpos at every step end.
-        snapshots: Steps after which the state of all worlds is kept.
-        on_step: Called after each step.
-        advance: Told about progress.
-        worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start_worlds`.
-        meter: Takes in the energy of the steps from the third on, when all are replayed.
-        keep_commands: Record all commands, on the device.
-        watch: Looks on, on the device.
-        repeat: Give these commands instead of the controller's.
-    """
-    env, controller = start_worlds(sim, index, cfg, reset, planner, advance, worlds)
-    steps = controller.steps
-    start = sim.qpos.cpu().numpy().copy()
-    recorded = Recorded(controller, env.action_manager.action_dim) if keep_commands else None
-    if repeat is not None:
-        repeat.rewind()
-        controller = repeat
-    check = check_class(cfg)(cfg, index, planner.phases, sim.nworld, sim.device)
-    if watch is not None:
-        watch.start(env)
-
-    def work() -> None:
-        command = controller.command()
-        if recorded is not None:
-            recorded.append(command, controller.phase)
-        env.action_manager.take(command)
-        env.advance()
-        check.update(sim, controller.phase)
-        if watch is not None:
-            watch.update(env, controller, check)
-
-    play = env.captured(work, "a frame of the episode")
-    # On Warp's CPU device physics alone is captured, once for all episodes.
-    graph = (
-        play
-        if sim.device.type == "cuda"
-        else step_graph(sim, cfg.timing.decimation, kinematics=True)
-    )
-    before = (0.0, 0.0) if graph is None else (graph.warm_up_seconds, graph.capture_seconds)
-    trajectory = np.full((steps, sim.qpos.shape[1]), np.nan) if record else None
-    phase = np.full(steps, -1) if record else None
-    states: dict[int, State] = {}
-    sim.synchronize()
-    began = time.perf_counter()
-    aside = 0.0  # what reading the counter takes
-    for step in range(steps):
-        if meter is not None and step == _EAGER:
-            sim.synchronize()
-            reading = time.perf_counter()
-            meter.start()
-            aside = time.perf_counter() - reading
-        play()
-        if on_step is not None:
-            on_step(step, sim)
-        if trajectory is not None:
-            trajectory[step] = sim.qpos[0].cpu().numpy()
-        if phase is not None:
-            phase[step] = int(controller.phase[0])
-        if step in snapshots:
-            states[step] = snapshot(sim)
-        if advance is not None:
-            if step % 10 == 9:
-                sim.synchronize()  # so that the bar shows work done, not work queued
-            advance("steps", step + 1, steps)
-    sim.synchronize()
-    seconds = time.perf_counter() - began - aside
-    if meter is not None:
-        meter.stop()
-    after = before if graph is None else (graph.warm_up_seconds, graph.capture_seconds)
-    warm_up, capture = (
-        now if now != then else 0.0 for now, then in zip(after, before, strict=True)
-    )
-    captured = play.captured
-    play.drop()  # its memory, which only the collector would find otherwise
-    seconds -= warm_up + capture
-    if warm_up:  # the first step was it
-        seconds *= steps / (steps - 1)
-    return Episode(
-        check.result(sim),
-        steps,
-        start,
-        controller.error.double().cpu().numpy(),
-        controller.retries.cpu().numpy(),
-        seconds,
-        trajectory,
-        phase,
-        states,
-        warm_up,
-        capture,
-        captured,
-        recorded,
-    )
-
-
 def snapshot(sim: Simulation) -> State:
-    """Copies the state of every world to the host."""
+    """Copy the state of every world to the host."""
     return State(*(view.double().cpu().numpy().copy() for view in (sim.qpos, sim.qvel, sim.ctrl)))
 
 
 def restore(sim: Simulation, state: State) -> None:
-    """Puts every world into a kept state, counters cleared, warm starts zero, derived arrays
+    """Put every world into a kept state: counters cleared, warm starts zero, derived arrays
     current.
     """
     sim.reset()

@@ -16,7 +16,7 @@ from mjstack.config.schema import Config
 from mjstack.envs import Env
 from mjstack.episodes.batch_record import BatchRecord
 from mjstack.episodes.failures import FailureMonitor, Sign
-from mjstack.episodes.rollout import Episode
+from mjstack.episodes.observers import Episode
 from mjstack.mdp.geometry import pose_w
 from mjstack.sim import Simulation
 from mjstack.tasks.check import Rules

@@ -85,7 +85,7 @@ def play_task(context: GateContext, reset: Reset, sizes: BatchSizes | None) -> W
     """Plays the scripted task once in worlds of exactly these sizes."""
 
     def play(sim: Simulation) -> np.ndarray:
-        return context.run(sim, reset).result.failed.cpu().numpy()
+        return context.play(sim, reset).result.failed.cpu().numpy()
 
     return _play(context, reset, sizes, play)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjstack.episodes.batch_record import FAILING, BatchRecord, write_failing
 from mjstack.episodes.context import GateContext, TimedEpisode, play_seeds
-from mjstack.episodes.rollout import Episode
+from mjstack.episodes.observers import Episode, Snapshots
 from mjstack.errors import name_worlds
 from mjstack.math import wilson_interval
 from mjstack.report.markdown import format_percent
@@ -53,7 +53,7 @@ class _Tally:
         """Takes in one seed."""
         self.seeds += 1
         self.worlds += sim.nworld
-        self.seconds += episode.seconds
+        self.seconds += episode.timing.seconds
         self.steps += int(sim.step_count.sum())
         self.failed += [
             self._name(record.seed, world) for world in np.flatnonzero(record.failed).tolist()
@@ -122,11 +122,10 @@ def _play(context: GateContext, sim: Simulation, seed: int, tally: _Tally) -> Ba
     """One seed's episode in every world."""
     cfg = context.cfg
     last = context.phase_start(cfg.gate.throughput.from_phase) - 1
-    snapshots = frozenset(
-        [last] if seed == cfg.seed else []
-    )  # throughput goes on from the first seed
-    episode = context.run(sim, cfg.reset, seed=seed, snapshots=snapshots)
-    context.carry_start = episode.states.get(last, context.carry_start)
+    # Throughput goes on from the first seed.
+    snapshots = Snapshots([last] if seed == cfg.seed else [])
+    episode = context.play(sim, cfg.reset, [snapshots], seed=seed)
+    context.carry_start = snapshots.states.get(last, context.carry_start)
     if seed == cfg.seed:
         context.timed_episode = TimedEpisode.of(episode, sim)
     record = BatchRecord.take(seed, sim, episode)

@@ -10,6 +10,7 @@ import torch
 from mjstack.config.schema import Config
 from mjstack.config.validate import PARITY_FIELDS
 from mjstack.episodes.context import GateContext, judge_one
+from mjstack.episodes.observers import WorldRecorder
 from mjstack.episodes.rollout import NOMINAL, State, restore
 from mjstack.math import quat_angle
 from mjstack.report.record import GateResult, Status
@@ -19,7 +20,8 @@ from mjstack.sim import Simulation, describe_overflow
 def run_parity(context: GateContext) -> list[GateResult]:
     """Compares steps from equal states, the whole task, and the options each backend holds."""
     cfg = context.cfg
-    native, reference = context.nominal
+    reference = context.nominal
+    native = reference.sim
     mjwarp = context.parity_simulation()
     problems: list[str] = []
     details: list[str] = []
@@ -45,7 +47,8 @@ def run_parity(context: GateContext) -> list[GateResult]:
         if not equal:
             problems.append(line)
 
-    episode = context.run(mjwarp, NOMINAL, record=True, on_step=context.on_step)
+    world = WorldRecorder()
+    episode = context.play(mjwarp, NOMINAL, [*context.viewers, world])
     status, reason, judged = judge_one(context.check.rules, episode.result)
     if status is Status.failed:
         problems.append(reason)
@@ -59,12 +62,10 @@ def run_parity(context: GateContext) -> list[GateResult]:
     metrics["peak_constraint_rows"] = int(mjwarp.peak_constraints[0])
     bits = getattr(mjwarp, "solver_limits", None)
     metrics["solver_limit_hit"] = bool(bits is not None and int(bits[0]))
-    metrics["episode_s"] = episode.seconds
-    assert episode.qpos is not None
-    assert reference.qpos is not None
+    metrics["episode_s"] = episode.timing.seconds
     for cube, address in zip(("red", "blue"), context.index.cube_qpos, strict=True):
-        ours = episode.qpos[-1, address : address + 7]
-        theirs = reference.qpos[-1, address : address + 7]
+        ours = world.qpos[-1, address : address + 7]
+        theirs = reference.world.qpos[-1, address : address + 7]
         distance = float(np.linalg.norm(ours[:3] - theirs[:3]))
         angle = math.degrees(
             float(quat_angle(torch.from_numpy(ours[3:]), torch.from_numpy(theirs[3:])))
@@ -81,7 +82,7 @@ def run_parity(context: GateContext) -> list[GateResult]:
     thresholds["final.rotation_deg"] = cfg.gate.parity.cube_rotation_deg
     headline = context.check.headline(judged)
     context.say(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
-    context.shown = episode
+    context.shown = world
     context.shown_by = "parity world"
     mjwarp.close()
     summary = "; ".join(problems) or (

@@ -13,12 +13,13 @@ import numpy as np
 
 from mjstack.config.schema import Config
 from mjstack.config.validate import places_cubes, reads_starts_file
+from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
 from mjstack.episodes.batch_record import FAILING, write_failing
 from mjstack.episodes.context import GateContext, play_seeds
 from mjstack.episodes.failures import FailureMonitor, describe_sign
 from mjstack.episodes.regions import Region, find_regions
-from mjstack.episodes.rollout import CLOSED_LOOP
+from mjstack.episodes.rollout import CLOSED_LOOP, Observer
 from mjstack.episodes.success_record import (
     BOTH,
     PICTURE,
@@ -54,25 +55,21 @@ def success_config(cfg: Config) -> Config:
     return replace(cfg, reset=reset, controller=replace(cfg.controller, name=CLOSED_LOOP))
 
 
-class _Watch(FailureMonitor):
-    """Keeps how worlds start, too, and writes it down."""
+class _Starts(Observer):
+    """Keeps how worlds start, and writes it down."""
 
-    def __init__(self, cfg: Config, path: Path | None) -> None:
-        """``path`` is the layout's file; None writes none."""
-        super().__init__(cfg)
+    def __init__(self, path: Path | None) -> None:
+        """``path`` of the starts file; None writes none."""
         self._path = path
         self.problem = ""
 
-    def start(self, env: Env) -> None:
-        """See `Watch`."""
-        super().start(env)
+    def start(self, env: Env, driver: Controller) -> None:
+        """See `Observer`."""
         self.places = start_places(env)
         if self._path is not None:
             try:
                 write_starts(env, self._path)
-            except (
-                MjstackError
-            ) as error:  # such as a full disk: the episodes are played all the same
+            except MjstackError as error:  # a full disk, say: the episodes are played all the same
                 log.error("no %s: %s", self._path, error)
                 self.problem = f"{self._path.name} could not be written: {error}"
 
@@ -191,12 +188,13 @@ def _play(
         path = context.folder / starts_name(seed)
         if cfg.starts is not None and path.resolve() == Path(cfg.starts).resolve():
             path = None  # the worlds start from this very file
-    watch = _Watch(cfg, path)
-    episode = context.run(sim, cfg.reset, seed=seed, watch=watch)
-    if watch.problem:
-        details.append(f"seed {seed}: {watch.problem}")
-    record = SuccessRecord.take(seed, sim, cfg, episode, watch.places, watch)
-    tally.add(record, episode.seconds, float(episode.waypoint_error.max()))
+    starts = _Starts(path)
+    monitor = FailureMonitor(cfg)
+    episode = context.play(sim, cfg.reset, [starts, monitor], seed=seed)
+    if starts.problem:
+        details.append(f"seed {seed}: {starts.problem}")
+    record = SuccessRecord.take(seed, sim, cfg, episode, starts.places, monitor)
+    tally.add(record, episode.timing.seconds, float(episode.waypoint_error.max()))
     return record
 
 

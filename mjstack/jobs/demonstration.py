@@ -11,9 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from mjstack.drivers.driver import Controller
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import make_driver
+from mjstack.episodes.observers import play_episode
+from mjstack.episodes.rollout import Observer, reset_worlds
 from mjstack.sim import Simulation
 
 STATE = "observation.state"
@@ -31,7 +33,7 @@ def column_widths(env: Env) -> dict[str, int]:
     return {STATE: n, **groups, ACTION: n, REWARD: 1}
 
 
-class StepRecorder:
+class StepRecorder(Observer):
     """All steps of all worlds in one block on the device. Fixed shapes, no host read: a captured
     graph may hold it.
 
@@ -43,32 +45,35 @@ class StepRecorder:
         layout: How many numbers of each kind there are, in order.
     """
 
-    def __init__(self, env: Env, values: torch.Tensor) -> None:
+    def __init__(self, values: torch.Tensor) -> None:
         """Takes the block, which is written from its first step on."""
         self.values = values
+
+    def start(self, env: Env, driver: Controller) -> None:
+        """See `Observer`."""
         self.layout = column_widths(env)
         self._env = env
         self._robot = env.index.on(env.device, env.sim.qpos.dtype)
-        self._seen = torch.zeros(
-            (env.nworld, self.layout[STATE] + sum(env.observation_manager.group_dims.values()))
-        )
-        self._seen = self._seen.to(env.device)
+        seen = self.layout[STATE] + sum(env.observation_manager.group_dims.values())
+        self._seen = torch.zeros((env.nworld, seen), device=env.device)
         self._next = torch.zeros(1, dtype=torch.int64, device=env.device)
+        self._observe()
 
-    def before(self) -> None:
-        """Takes in the state that the next action is for."""
-        groups = self._env.observation_manager.groups.values()
-        torch.cat(
-            [self._robot.qpos.read(self._env.sim.qpos).float(), *groups], dim=1, out=self._seen
-        )
-
-    def after(self) -> None:
-        """Takes in the action that was made and its reward, and goes on to the next step."""
+    def update(self) -> None:
+        """See `Observer`."""
         env = self._env
         command = self._robot.ctrl.read(env.sim.ctrl).float()
         step = torch.cat((self._seen, command, env.reward_manager.reward[:, None]), dim=1)
         self.values.index_copy_(0, self._next, step[None])
         self._next.add_(1)
+        self._observe()
+
+    def _observe(self) -> None:
+        """Keep the state that the next action is for."""
+        groups = self._env.observation_manager.groups.values()
+        torch.cat(
+            [self._robot.qpos.read(self._env.sim.qpos).float(), *groups], dim=1, out=self._seen
+        )
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -137,38 +142,22 @@ def play_demonstrations(
         worlds: Their numbers, which random numbers depend on.
     """
     began = time.perf_counter()
-    cfg = replace(context.cfg, seed=seed)
-    env = Env(
-        sim, context.index, demonstration_config(cfg), check_faults=False
-    )  # the check names lost worlds
-    env.world[: len(worlds)].copy_(torch.tensor(worlds))
-    env.reset(seed=seed)
-    sim.forward()
-    controller = make_driver(env, context.planner, context.advance)
-    check = context.check(cfg, context.index, context.planner.phases, sim.nworld, sim.device)
-    recorder = StepRecorder(env, values)
-
-    def work() -> None:
-        command = controller.command()
-        recorder.before()
-        env.action_manager.take(command)
-        env.advance()
-        check.update(sim, controller.phase)
-        recorder.after()
-
-    play = env.captured(work, "a step of a demonstration")
-    for step in range(controller.steps):
-        play()
-        if step % 10 == 9:
-            sim.synchronize()  # so that the bar shows work done, not work queued
-        context.tell(f"steps of seed {seed}", step + 1, controller.steps)
-    sim.synchronize()
-    play.drop()
+    cfg = demonstration_config(replace(context.cfg, seed=seed))
+    env = Env(sim, context.index, cfg, check_faults=False)  # the check names lost worlds
+    reset_worlds(env, seed, worlds)
+    recorder = StepRecorder(values)
+    episode = play_episode(
+        env,
+        context.driver(env),
+        [recorder],
+        advance=context.advance,
+        label=f"steps of seed {seed}",
+    )
     return Played(
         seed=seed,
         worlds=worlds,
         steps=recorder,
-        failed=check.result(sim).failed.cpu().numpy()[: len(worlds)],
-        retries=controller.retries.cpu().numpy()[: len(worlds)],
+        failed=episode.result.failed.cpu().numpy()[: len(worlds)],
+        retries=episode.retries[: len(worlds)],
         seconds=time.perf_counter() - began,
     )

@@ -248,15 +248,14 @@ def _replay(
     recorded.
     """
     first = number == 0
-    watch = FailureMonitor(plan.cfg) if plan.gate == "success" else None
+    monitor = FailureMonitor(plan.cfg) if plan.gate == "success" else None
     done = replay_world(
         context,
         seed=plan.seed,
         world=plan.world,
         backend=backend,
         device=device,
-        on_step=context.on_step if first else None,
-        watch=watch,
+        observers=[*(context.viewers if first else []), *([] if monitor is None else [monitor])],
     )
     status, reason, metrics = judge_one(context.check.rules, done.episode.result)
     reason = reason or f"succeeded, {context.check.headline(metrics)}"
@@ -265,10 +264,10 @@ def _replay(
     if not kept:
         status = Status.failed
     if first:
-        context.shown = done.episode
+        context.shown = done.recorder
         context.shown_by = f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
     told = [str(finding) for finding in done.findings] + (
-        [] if watch is None else [_first_sign(watch, done, context)]
+        [] if monitor is None else [_first_sign(monitor, done, context)]
     )
     for line in told:
         context.say(escape(f"  {line}"))
@@ -298,12 +297,12 @@ def _replay(
     ]
 
 
-def _first_sign(watch: FailureMonitor, done: ReplayedWorld, context: GateContext) -> str:
+def _first_sign(monitor: FailureMonitor, done: ReplayedWorld, context: GateContext) -> str:
     """What the success gate would say of where the world went wrong."""
-    sign = int(watch.sign[0])
-    step = int(watch.step[0])
+    sign = int(monitor.sign[0])
+    step = int(monitor.step[0])
     retries = int(done.episode.retries[0])
-    name = context.planner.phases[int(watch.phase[0])].name if sign else ""
+    name = context.planner.phases[int(monitor.phase[0])].name if sign else ""
     when = f", seen in step {step}" if sign else ""
     return (
         f"first sign of failure: {describe_sign(sign, name) if sign else 'none'}{when}; grasps"

@@ -21,7 +21,7 @@ from rich.table import Table
 
 from mjstack.config.schema import Config
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import StepHook
+from mjstack.episodes.observers import StepHook
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import STATUS_COLOR, JobResult
@@ -167,7 +167,7 @@ def _draw(context: GateContext, report: Report, folder: Path, console: Console) 
     """
     episode = context.shown
     cfg = context.cfg
-    if episode is None or episode.qpos is None:
+    if episode is None:
         return
     cubes = np.stack([episode.qpos[:, a : a + 3] for a in context.index.cube_qpos], axis=1)
     title = f"{cfg.robot.title}, {cfg.task.name}: {context.shown_by}"

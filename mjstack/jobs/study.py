@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
-from mjstack.episodes.context import GateContext
-from mjstack.episodes.rollout import State, restore, snapshot, start_worlds
+from mjstack.episodes.context import GateContext, play_to
+from mjstack.episodes.rollout import State, restore
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.gates import check_machine
@@ -112,15 +112,8 @@ def run_study_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
 def _prepare(context: GateContext, job: StudyJobCfg) -> _Base:
     """The configured solver's worlds, played up to where they hold the cube."""
     cfg = context.cfg
-    advance = context.advance
     sim = _simulation(context)
-    env, controller = start_worlds(sim, context.index, cfg, cfg.reset, context.planner, advance)
-    first = context.phase_start(cfg.gate.throughput.from_phase)
-    for step in range(first):
-        env.step(controller.command())
-        if advance is not None:
-            advance("steps to the cube in hand", step + 1, first)
-    state = snapshot(sim)
+    state = play_to(context, sim, cfg.gate.throughput.from_phase)
     restore(sim, state)
     _play(sim, cfg, _WARM_CALLS)
     seconds = _play(sim, cfg, 1)
@@ -168,7 +161,7 @@ def _measure(context: GateContext, job: StudyJobCfg, base: _Base, row: StudyRow)
     advance = context.advance
     sim = _simulation(context)
     try:
-        result = context.run(sim, cfg.reset).result
+        result = context.play(sim, cfg.reset).result
         failed = result.failed.cpu().numpy()
         row.worlds = sim.nworld
         row.succeeded = int((failed == 0).sum())

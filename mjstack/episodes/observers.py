@@ -1,0 +1,172 @@
+"""Observers of a rollout, and the judged episode that most of them look on at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjstack.drivers.driver import Controller, Recorded
+from mjstack.envs import Env
+from mjstack.episodes.rollout import Advance, Observer, RolloutTiming, State, rollout, snapshot
+from mjstack.sim import Simulation
+from mjstack.tasks.check import CheckResult, check_class
+
+StepHook = Callable[[int, Simulation], None]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Episode:
+    """A judged episode of every world.
+
+    Attributes:
+        result: The check of every world.
+        start: Positions before the first step, shape ``(nworld, nq)``, in the backend's precision.
+        waypoint_error: Largest distance from a target that inverse kinematics left [m], shape
+            ``(nworld,)``.
+        retries: Grasps that were tried again, shape ``(nworld,)``.
+        timing: The rollout's.
+    """
+
+    result: CheckResult
+    start: np.ndarray
+    waypoint_error: np.ndarray
+    retries: np.ndarray
+    timing: RolloutTiming
+
+
+def play_episode(
+    env: Env,
+    driver: Controller,
+    observers: Sequence[Observer] = (),
+    *,
+    advance: Advance | None = None,
+    label: str = "steps",
+) -> Episode:
+    """Roll out one whole episode, judged by the task's check.
+
+    Args:
+        env: The environment, its worlds at their start.
+        driver: Gives the actions.
+        observers: Look on after the check.
+        advance: Told about progress.
+        label: Name of the steps in the progress.
+    """
+    start = env.sim.qpos.cpu().numpy().copy()
+    judge = Judge()
+    timing = rollout(env, driver, [judge, *observers], advance=advance, label=label)
+    return Episode(
+        result=judge.result,
+        start=start,
+        waypoint_error=driver.error.double().cpu().numpy(),
+        retries=driver.retries.cpu().numpy(),
+        timing=timing,
+    )
+
+
+class Judge(Observer):
+    """Judges every world by the task's check.
+
+    Attributes:
+        result: The check's result, at the end.
+    """
+
+    result: CheckResult
+
+    def start(self, env: Env, driver: Controller) -> None:
+        """See `Observer`."""
+        cfg = env.cfg
+        self._sim = env.sim
+        self._driver = driver
+        self._check = check_class(cfg)(cfg, env.index, driver.phases, env.nworld, env.device)
+
+    def update(self) -> None:
+        """See `Observer`."""
+        self._check.update(self._sim, self._driver.phase)
+
+    def finish(self) -> None:
+        """See `Observer`."""
+        self.result = self._check.result(self._sim)
+
+
+class WorldRecorder(Observer):
+    """Records world 0.
+
+    Attributes:
+        qpos: Positions at every step end, shape ``(steps, nq)``; NaN in steps not made.
+        phase: Number of the phase in every step, shape ``(steps,)``; -1 in steps not made.
+    """
+
+    qpos: np.ndarray
+    phase: np.ndarray
+
+    def start(self, env: Env, driver: Controller) -> None:
+        """See `Observer`."""
+        self._sim = env.sim
+        self._driver = driver
+        self.qpos = np.full((driver.steps, env.sim.qpos.shape[1]), np.nan)
+        self.phase = np.full(driver.steps, -1)
+
+    def after_step(self, step: int) -> None:
+        """See `Observer`."""
+        self.qpos[step] = self._sim.qpos[0].cpu().numpy()
+        self.phase[step] = int(self._driver.phase[0])
+
+
+class Snapshots(Observer):
+    """Keeps the state of all worlds after some steps.
+
+    Attributes:
+        states: By step.
+    """
+
+    def __init__(self, steps: Collection[int]) -> None:
+        """``steps`` after which the state is kept."""
+        self._steps = frozenset(steps)
+        self.states: dict[int, State] = {}
+
+    def start(self, env: Env, driver: Controller) -> None:
+        """See `Observer`."""
+        self._sim = env.sim
+
+    def after_step(self, step: int) -> None:
+        """See `Observer`."""
+        if step in self._steps:
+            self.states[step] = snapshot(self._sim)
+
+
+class CommandRecorder(Observer):
+    """Records the commands of all worlds, on the device.
+
+    Attributes:
+        recorded: A driver that repeats them.
+    """
+
+    recorded: Recorded
+
+    def start(self, env: Env, driver: Controller) -> None:
+        """See `Observer`."""
+        self._env = env
+        self._driver = driver
+        self.recorded = Recorded(driver, env.action_manager.action_dim)
+
+    def update(self) -> None:
+        """See `Observer`."""
+        self.recorded.append(self._env.action_manager.action, self._driver.phase)
+
+
+class Hook(Observer):
+    """Calls a function after every step, on the host."""
+
+    def __init__(self, function: StepHook) -> None:
+        """``function`` gets the step's number and the simulation."""
+        self._function = function
+
+    def start(self, env: Env, driver: Controller) -> None:
+        """See `Observer`."""
+        self._sim = env.sim
+
+    def after_step(self, step: int) -> None:
+        """See `Observer`."""
+        self._function(step, self._sim)
