@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from environments import brisk
-from pretended import episodes_of, pairs, pretended
+from stubs import episodes_of, pairs, pretended
 
 from mjstack.cli import run
 from mjstack.config import load_config
@@ -680,7 +680,7 @@ from functools import partial
 from mjstack.cli import run
 from mjstack.datasets.shard import Shard
 from mjstack.jobs import collection
-from pretended import pretended
+from stubs import pretended
 
 collection.play_demonstrations = pretended(lambda seed, world: world == 1, noise=True)
 collection.DatasetWriter = partial(collection.DatasetWriter, file_mb=1)

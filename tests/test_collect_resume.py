@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from environments import configure
-from pretended import episodes_of, pairs, pretended
+from stubs import episodes_of, pairs, pretended
 
 from mjstack.cli import run
 from mjstack.config.fingerprint import config_content
