@@ -10,7 +10,7 @@ import mjstack.conf
 import pytest
 
 from mjstack.config import load_config
-from mjstack.config.schema import Backend, Config, ModelSource
+from mjstack.config.schema import Backend, Config, RobotSource
 from mjstack.errors import MjstackError
 from mjstack.jobs.gates import check_machine
 
@@ -68,7 +68,7 @@ def test_every_group_has_an_init_so_that_it_ships() -> None:
 def test_defaults(so101_cfg: Config) -> None:
     cfg = so101_cfg
     assert cfg.robot.name == "so101"
-    assert cfg.model.source is ModelSource.builtin
+    assert cfg.model.source is RobotSource.builtin
     assert cfg.sim.backend is Backend.auto
     assert cfg.nworld == 256
     assert cfg.seed == 0

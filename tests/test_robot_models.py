@@ -278,7 +278,7 @@ def upstream_grasp_point(robot: str, model: mujoco.MjModel, data: mujoco.MjData)
     return (data.body("gripper_left").xpos + data.body("gripper_right").xpos) / 2
 
 
-def test_same_grasp_point_centre(pair: Pair) -> None:
+def test_same_grasp_point(pair: Pair) -> None:
     """200 random configurations; the largest distance between the two centres is at most 1 um."""
     robot, ours, theirs = pair
     rng = np.random.default_rng(20240817)

@@ -20,15 +20,17 @@ CONTENT = "sha256:"  # in front of what stands for a file
 
 
 def config_content(cfg: Config) -> dict[str, Any]:
-    """The whole configuration in JSON's types, with the SHA-256 of each starts file in place of its
-    path.
+    """The whole configuration in JSON's types, with the SHA-256 of the robot's and of each starts
+    file in place of its path.
 
     Raises:
-        ConfigError: A starts file cannot be read.
+        ConfigError: One of these files cannot be read.
     """
     config = cast(
         dict[str, Any], OmegaConf.to_container(OmegaConf.structured(cfg), enum_to_str=True)
     )
+    if cfg.robot.file is not None:
+        config["robot"]["file"] = _content("robot.file", cfg.robot.file)
     for name, term in cfg.reset.items():
         path = term.params.get("path")
         params = config["reset"][name]["params"]

@@ -13,7 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mjstack.config.explain import CompositionError, explain
-from mjstack.config.overrides import check_overrides
+from mjstack.config.overrides import check_overrides, parse
+from mjstack.config.robot_file import complete_robot
 from mjstack.config.schema import JOB_SCHEMAS, Config
 from mjstack.config.session import CONFIG_NAME, own_hydra
 from mjstack.config.terms import type_terms
@@ -36,7 +37,16 @@ def load_config(overrides: Sequence[str] = ()) -> Config:
     Raises:
         MjstackError: An override does not fit; the message says which and what would.
     """
-    return to_config(compose_overrides(overrides))
+    return to_config(compose_overrides(overrides), search_folders(overrides))
+
+
+def search_folders(overrides: Sequence[str]) -> list[Path]:
+    """Folders that overrides add to the search path."""
+    parsed = [parse(override) for override in overrides if "hydra.searchpath" in override]
+    entries = [entry for override in parsed for entry in cast(list, override.value())]
+    return [
+        Path(entry.removeprefix("file://")) for entry in entries if not entry.startswith("pkg:")
+    ]
 
 
 def compose_overrides(overrides: Sequence[str]) -> DictConfig:
@@ -67,13 +77,19 @@ def load_saved(path: Path) -> Config:
     return to_config(cast(DictConfig, merged))
 
 
-def to_config(cfg: DictConfig) -> Config:
-    """Turns a composed configuration into dataclasses and checks their values."""
+def to_config(cfg: DictConfig, folders: Sequence[Path] = ()) -> Config:
+    """Turns a composed configuration into dataclasses and checks their values.
+
+    Args:
+        cfg: The composition.
+        folders: Folders of the search path, which may hold ``robot.file``.
+    """
     try:
         config = cast(Config, OmegaConf.to_object(cfg))
     except (OmegaConfBaseException, AttributeError, TypeError) as error:
         raise explain(error) from error
     type_terms(config)
+    complete_robot(config.robot, folders)
     validate(config)
     return config
 

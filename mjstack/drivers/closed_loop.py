@@ -126,7 +126,8 @@ class ClosedLoopDriver:
         self._command = zeros(len(cfg.robot.home))
         self._yaw = zeros(3)
         self._roll = zeros()
-        self._roll_column, self._roll_sign = self._find_roll()
+        aligns = cfg.controller.align > 0.0
+        self._roll_column, self._roll_sign = self._find_roll() if aligns else (0, 1.0)
 
     def command(self) -> torch.Tensor:
         """Commands of the next step, shape ``(nworld, nu)``, float32. The controller's own memory:
@@ -249,7 +250,7 @@ class ClosedLoopDriver:
         from above.
         """
         names = [*self._cfg.robot.arm_joints, *self._cfg.robot.gripper_joints]
-        column = names.index(self._cfg.robot.roll_joint)
+        column = names.index(str(self._cfg.robot.roll_joint))
         command = self._nominal[:1].expand(self._env.nworld, -1).clone()
         before = self._ik.directions(command)[0][0].double().cpu()
         command[:, column] += 0.1

@@ -20,6 +20,7 @@ from mjstack.kinematics.ik_kernels import (
     grasp_point_kernel,
     solve_kernel,
 )
+from mjstack.kinematics.joints import approach_body, joint_limits
 from mjstack.scene.index import find
 from mjstack.sim.streams import torch_stream_scope
 
@@ -126,7 +127,7 @@ class BatchedIk:
         moved = [robot.arm_joints.index(name) for name in robot.ik_joints]
         low = np.full(len(names), -np.inf, dtype=np.float32)
         high = np.full(len(names), np.inf, dtype=np.float32)
-        low[moved], high[moved] = _limits(model, robot.ik_joints)
+        low[moved], high[moved] = _round_inwards(*joint_limits(model, robot.ik_joints))
         home = np.array(robot.home, dtype=np.float32)
         for name, angle in robot.locked.items():
             home[names.index(name)] = angle
@@ -333,24 +334,14 @@ class BatchedIk:
         buffer.copy_(values)
 
 
-def _limits(model: mujoco.MjModel, names: list[str]) -> np.ndarray:
-    """Narrower of joint and actuator range [rad, m], shape ``(2, n)``, float32, rounded inwards."""
-    low = np.full(len(names), -np.inf)
-    high = np.full(len(names), np.inf)
-    for k, name in enumerate(names):
-        joint = find(model, "joint", name)
-        actuator = find(model, "actuator", name)
-        for limited, span in (
-            (model.jnt_limited[joint], model.jnt_range[joint]),
-            (model.actuator_ctrllimited[actuator], model.actuator_ctrlrange[actuator]),
-        ):
-            if limited:
-                low[k] = max(low[k], span[0])
-                high[k] = min(high[k], span[1])
-    out = np.stack([low, high]).astype(np.float32)
-    out[0] = np.where(out[0] < low, np.nextafter(out[0], np.float32(np.inf)), out[0])
-    out[1] = np.where(out[1] > high, np.nextafter(out[1], np.float32(-np.inf)), out[1])
-    return out
+def _round_inwards(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Limits as float32 that are not outside of the given ones."""
+    low32 = low.astype(np.float32)
+    high32 = high.astype(np.float32)
+    return (
+        np.where(low32 < low, np.nextafter(low32, np.float32(np.inf)), low32),
+        np.where(high32 > high, np.nextafter(high32, np.float32(-np.inf)), high32),
+    )
 
 
 def _build_chain(
@@ -435,14 +426,14 @@ def _read_approach(
     """
     first = max((i for i, b in enumerate(trunk) if commanded & set(_joints(model, b))), default=0)
     rigid = trunk[first:]
-    body = find(model, "body", robot.approach_body)
+    body = approach_body(model, robot)
     if body not in rigid:
         names = ", ".join(model.body(b).name for b in rigid) or "none"
         expected = (
             "a body that carries both grasp_point sites and that every joint before them moves:"
             f" {names}"
         )
-        raise ConfigError("robot.approach_body", robot.approach_body, expected)
+        raise ConfigError("robot.approach_body", model.body(body).name, expected)
     turn = np.empty(4)
     back = end[1].copy()  # from the last body of the trunk to this one, against the way
     for b in reversed(rigid[rigid.index(body) + 1 :]):

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import RobotCfg
-from mjstack.errors import MjstackError
+from mjstack.kinematics.joints import approach_body, joint_limits
 from mjstack.scene.index import find
 
 _DAMPING = 1e-3  # [m/rad] of the steps towards a point
@@ -62,7 +62,6 @@ class PointReach:
 
         Raises:
             UnknownName: The model lacks a joint or site of the robot.
-            MjstackError: One of the ik joints is not a hinge.
         """
         data = mujoco.MjData(model)
         n_arm = len(robot.arm_joints)
@@ -81,25 +80,15 @@ class PointReach:
             (find(model, "joint", name) for name in robot.ik_joints),
             key=lambda j: int(model.jnt_bodyid[j]),
         )
-        for j in joints:
-            if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
-                raise MjstackError(
-                    f"joint '{model.joint(j).name}' is no hinge, expected one of each of"
-                    " robot.ik_joints."
-                )
+        self._slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
         self._home = np.array([command[model.joint(j).name] for j in joints])
         self._anchors = data.xanchor[joints].copy()
         self._axes = data.xaxis[joints].copy()
         sites = [find(model, "site", name) for name in robot.grasp_sites]
         self._tip = data.site_xpos[sites].mean(axis=0)
-        self._pointing = data.body(robot.approach_body).xmat.reshape(3, 3) @ robot.approach_axis
-        span = model.jnt_range[joints].copy()
-        actuators = [find(model, "actuator", model.joint(j).name) for j in joints]
-        for k, a in enumerate(actuators):
-            if model.actuator_ctrllimited[a]:
-                low, high = model.actuator_ctrlrange[a]
-                span[k] = max(span[k, 0], low), min(span[k, 1], high)
-        self._low, self._high = span.T
+        turned = data.xmat[approach_body(model, robot)].reshape(3, 3)
+        self._pointing = turned @ robot.approach_axis
+        self._low, self._high = joint_limits(model, [model.joint(j).name for j in joints])
 
     def solve(self, points: np.ndarray, iterations: int = 60) -> Reached:
         """Goes as near to each point as it can, from a few starts.
@@ -150,11 +139,11 @@ class PointReach:
         """Home, turned towards the points where the first joint stands upright, the other joints
         bent by ``off``.
         """
-        q = np.tile(self._home + off, (len(points), 1))
+        q = np.tile(self._home + np.where(self._slides, 0.0, off), (len(points), 1))
         axis = self._axes[0]
         anchor = self._anchors[0]
         q[:, 0] = self._home[0]
-        if abs(axis[2]) > 0.99:
+        if abs(axis[2]) > 0.99 and not self._slides[0]:
             ahead = points - anchor
             arm = self._tip - anchor
             turn = np.arctan2(ahead[:, 1], ahead[:, 0]) - np.arctan2(arm[1], arm[0])
@@ -175,6 +164,7 @@ class PointReach:
             far = np.linalg.norm(error, axis=1)
             if pointing:
                 turning = np.cross(self._world_axes, direction[:, None]).swapaxes(1, 2)
+                turning[..., self._slides] = 0.0
                 jacobian = np.concatenate((jacobian, pointing * turning), axis=1)
                 error = np.concatenate((error, pointing * ([0.0, 0.0, -1.0] - direction)), axis=1)
             else:
@@ -220,7 +210,8 @@ class PointReach:
     def _forward(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Jacobian ``(n, 3, joints)``, grasp point and pointing direction, both ``(n, 3)``.
 
-        A product of exponentials: each joint turns what follows it about its axis at home.
+        A product of exponentials: each joint moves the links after it about, or along, its axis at
+        home.
         """
         n, joints = q.shape
         rotation = np.tile(np.eye(3), (n, 1, 1))
@@ -230,12 +221,16 @@ class PointReach:
         for k, (axis, anchor) in enumerate(zip(self._axes, self._anchors, strict=True)):
             axes[:, k] = rotation @ axis
             anchors[:, k] = rotation @ anchor + shift
+            if self._slides[k]:
+                shift = shift + axes[:, k] * (q[:, k] - self._home[k])[:, None]
+                continue
             turn = _rotations(axis, q[:, k] - self._home[k])
             shift = shift + np.einsum("nij,nj->ni", rotation, anchor - turn @ anchor)
             rotation = rotation @ turn
         tip = rotation @ self._tip + shift
         self._world_axes = axes
-        return np.cross(axes, tip[:, None] - anchors).swapaxes(1, 2), tip, rotation @ self._pointing
+        columns = np.where(self._slides[:, None], axes, np.cross(axes, tip[:, None] - anchors))
+        return columns.swapaxes(1, 2), tip, rotation @ self._pointing
 
     def _tilt(self, q: np.ndarray) -> np.ndarray:
         return np.arccos(np.clip(-self._forward(q)[2][:, 2], -1.0, 1.0))

@@ -1,45 +1,61 @@
-"""Robot descriptions as MjSpec: our own mesh-free MJCF, or MuJoCo Menagerie's model."""
+"""Robot descriptions as MjSpec: any MJCF file, mjstack's own mesh-free ones, or Menagerie's."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from mjstack.config.schema import ModelCfg, ModelSource, RobotCfg
-from mjstack.errors import SourceError
+from mjstack.config.schema import ModelCfg, RobotCfg, RobotSource
+from mjstack.errors import ConfigError, SourceError, UnknownName
 
 BUILTIN = Path(__file__).parent
+_MENAGERIE_FIX = "Set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie, or use model=builtin."
+
+_CONTACT = ("contype", "conaffinity", "condim", "friction", "solref", "solimp", "priority")
+_GEOM_DEFAULTS = (
+    *("type", "density", "mass", "gap", "margin", "solmix", "group", "material", "rgba"),
+    *_CONTACT,
+)
 
 
 def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
-    """Loads a robot and makes it ready for the task.
+    """Load a robot and make it ready for the task.
 
     Args:
         robot: The robot's profile.
         model: Where its description comes from.
 
     Returns:
-        A spec with the robot's two grasp_point sites and, where the profile says so, the arm's
-        raised force limit.
+        A spec with the robot's two grasp sites, servos named after their joints and, where the
+        profile has one, the arm's force limit. It has no keyframes.
 
     Raises:
         SourceError: The description cannot be found or read.
+        UnknownName: It lacks a joint, body or site of the profile.
+        ConfigError: A joint has no range or no servo.
     """
-    path = builtin_path(robot) if model.source is ModelSource.builtin else menagerie_path(robot)
+    menagerie = model.source is RobotSource.menagerie
+    path = _menagerie_path(robot) if menagerie else _file_path(robot)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, FileNotFoundError) as error:
-        raise SourceError(
-            f"{path} cannot be read: {str(error).splitlines()[0]}. Use model=builtin."
-        ) from error
-    if model.source is ModelSource.menagerie:
-        if robot.replace_collision:
-            _replace_collision(spec, robot)
-        _add_grasp_sites(spec, robot)
-    for key in list(spec.keys):  # a robot's keyframes have no place for the scene's cubes
+        fix = "Use model=builtin." if menagerie else "Correct the file (robot.file)."
+        raise SourceError(f"{path} cannot be read: {str(error).splitlines()[0]}. {fix}") from error
+    if menagerie and robot.replace_collision:
+        _replace_collision(spec, robot)
+    for name in robot.jaw_bodies:
+        _require("body", name, spec.bodies)
+    _add_grasp_sites(spec, robot)
+    for name in (*robot.arm_joints, *robot.gripper_joints):
+        _prepare_joint(spec, name)
+    fresh = mujoco.MjSpec().default.geom
+    for field in _GEOM_DEFAULTS:  # the file's own would count for the scene's geoms too
+        setattr(spec.default.geom, field, getattr(fresh, field))
+    for key in list(spec.keys):  # keyframes of the robot alone do not fit a scene's state
         spec.delete(key)
     if robot.arm_force_limit is not None:
         for name in robot.arm_joints:
@@ -47,17 +63,26 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     return spec
 
 
-def builtin_path(robot: RobotCfg) -> Path:
-    """The MJCF file that ships with mjstack; it opens in MuJoCo's viewer as it is."""
-    return BUILTIN / f"{robot.name}.xml"
+def _file_path(robot: RobotCfg) -> Path:
+    """The file that the profile names, or mjstack's own."""
+    if robot.file is not None:
+        return Path(robot.file)
+    path = BUILTIN / f"{robot.name}.xml"
+    if not path.is_file():
+        raise ConfigError("robot.file", "null", f"the MJCF file of robot {robot.name}")
+    return path
 
 
-def menagerie_path(robot: RobotCfg) -> Path:
-    """The file in MuJoCo Menagerie: below ``MENAGERIE_ROOT`` if that is set, else fetched and
-    cached by its package.
+def _menagerie_path(robot: RobotCfg) -> Path:
+    """The file in MuJoCo Menagerie: below ``MENAGERIE_ROOT`` if that is set, else from the cache of
+    its package.
     """
-    root = os.environ.get("MENAGERIE_ROOT")
-    if root:
+    if not (robot.menagerie_name and robot.menagerie_file):
+        expected = "the robot's folder and file in MuJoCo Menagerie"
+        raise ConfigError(
+            "robot.menagerie_name", robot.menagerie_name, expected, "Use model=builtin"
+        )
+    if root := os.environ.get("MENAGERIE_ROOT"):
         path = Path(root) / robot.menagerie_name / robot.menagerie_file
         if not path.is_file():
             raise SourceError(
@@ -73,44 +98,63 @@ def menagerie_path(robot: RobotCfg) -> Path:
     except (mujoco_menagerie.MenagerieError, OSError) as error:
         raise SourceError(
             f"model=menagerie: {robot.menagerie_name} is neither cached nor can it be fetched"
-            f" ({type(error).__name__}). Set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie, or"
-            " use model=builtin."
+            f" ({type(error).__name__}). {_MENAGERIE_FIX}"
         ) from error
 
 
 def _replace_collision(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
-    """Puts the built-in robot's collision geoms in place of the file's own."""
-    for geom in list(spec.geoms):
-        if geom.contype or geom.conaffinity:
-            geom.contype = geom.conaffinity = 0
-    ours = mujoco.MjSpec.from_file(str(builtin_path(robot))).compile()
+    """Put the collision geoms of mjstack's own file in place of the loaded ones."""
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
+    ours = mujoco.MjSpec.from_file(str(_file_path(robot))).compile()
+    fields = ("type", "pos", "quat", "size", *_CONTACT)
     for i in range(ours.ngeom):
-        if not (ours.geom_contype[i] or ours.geom_conaffinity[i]):
-            continue
-        spec.body(ours.body(ours.geom_bodyid[i]).name).add_geom(
-            name=ours.geom(i).name,
-            type=ours.geom_type[i],
-            pos=ours.geom_pos[i],
-            quat=ours.geom_quat[i],
-            size=ours.geom_size[i],
-            contype=ours.geom_contype[i],
-            conaffinity=ours.geom_conaffinity[i],
-            condim=ours.geom_condim[i],
-            friction=ours.geom_friction[i],
-            solref=ours.geom_solref[i],
-            solimp=ours.geom_solimp[i],
-            priority=ours.geom_priority[i],
-            group=3,
-        )
+        if ours.geom_contype[i] or ours.geom_conaffinity[i]:
+            values = {field: getattr(ours, f"geom_{field}")[i] for field in fields}
+            body = spec.body(ours.body(ours.geom_bodyid[i]).name)
+            body.add_geom(name=ours.geom(i).name, group=3, **values)
 
 
 def _add_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
+    """Add the grasp sites that the file lacks, each at the mean of its geoms or bodies."""
     for site in robot.grasp_sites:
-        if site in robot.grasp_geoms:
-            geoms = [spec.geom(name) for name in robot.grasp_geoms[site]]
-            body = geoms[0].parent
-            pos = np.mean([geom.pos for geom in geoms], axis=0)
-        else:
-            body = spec.body(robot.grasp_bodies[site])
-            pos = np.zeros(3)
-        body.add_site(name=site, pos=pos, group=4)
+        if spec.site(site) is not None:
+            continue
+        if site not in robot.grasp_parts:
+            _require("grasp site", site, spec.sites)
+        parts = robot.grasp_parts[site]
+        if spec.body(parts[0]) is not None:
+            spec.body(parts[0]).add_site(name=site, group=4)
+            continue
+        for name in parts:
+            _require("geom", name, spec.geoms)
+        geoms = [spec.geom(name) for name in parts]
+        geoms[0].parent.add_site(name=site, pos=np.mean([g.pos for g in geoms], axis=0), group=4)
+
+
+def _prepare_joint(spec: mujoco.MjSpec, name: str) -> None:
+    """Name a joint's servo after it, and let it take targets in the joint's range unless it has its
+    own.
+    """
+    _require("joint", name, spec.joints)
+    low, high = spec.joint(name).range
+    if not low < high:
+        raise ConfigError(f"range of joint {name}", [low, high], "a range in the robot's file")
+    servos = [a for a in spec.actuators if a.target == name]
+    if (
+        len(servos) != 1
+        or servos[0].biasprm[1] != -servos[0].gainprm[0]
+        or not servos[0].gainprm[0]
+    ):
+        found = ", ".join(a.name for a in servos) or "none"
+        raise ConfigError(f"actuators of joint {name}", found, "one <position> in the robot's file")
+    servo = servos[0]
+    servo.name = name
+    if not servo.ctrlrange[0] < servo.ctrlrange[1]:
+        servo.inheritrange = 1.0
+
+
+def _require(kind: str, name: str, available: Iterable) -> None:
+    names = [item.name for item in available if item.name]
+    if name not in names:
+        raise UnknownName(kind, name, names)

@@ -32,7 +32,7 @@ from mjstack.config.schema.physics import (
     SolverCfg,
     TimingCfg,
 )
-from mjstack.config.schema.robot import ModelCfg, ModelSource, PlacementsCfg, RobotCfg
+from mjstack.config.schema.robot import ModelCfg, PlacementsCfg, RobotCfg, RobotSource
 from mjstack.config.schema.root import Config
 from mjstack.config.schema.scene import BoxCfg, SceneCfg
 from mjstack.config.schema.task import ControllerCfg, PhaseCfg, TaskCfg
@@ -62,7 +62,6 @@ __all__ = [
     "GraphMode",
     "JobCfg",
     "ModelCfg",
-    "ModelSource",
     "ObservationGroupCfg",
     "ObservationTermCfg",
     "ParityCfg",
@@ -71,6 +70,7 @@ __all__ = [
     "ReachabilityJobCfg",
     "RewardTermCfg",
     "RobotCfg",
+    "RobotSource",
     "ScalingJobCfg",
     "SceneCfg",
     "SimCfg",

@@ -8,8 +8,8 @@ from enum import Enum
 from omegaconf import MISSING
 
 
-class ModelSource(Enum):
-    """Where the robot description comes from."""
+class RobotSource(Enum):
+    """Where the robot's MJCF file comes from."""
 
     builtin = "builtin"
     menagerie = "menagerie"
@@ -17,9 +17,11 @@ class ModelSource(Enum):
 
 @dataclass(kw_only=True, slots=True)
 class ModelCfg:
-    """Source of the robot description."""
+    """Source of the robot's MJCF file."""
 
-    source: ModelSource = MISSING
+    source: RobotSource = MISSING
+    """``builtin``: ``robot.file``, or mjstack's own file of the robot. ``menagerie``: MuJoCo
+    Menagerie's."""
 
 
 @dataclass(kw_only=True, slots=True)
@@ -49,36 +51,68 @@ class PlacementsCfg:
 
 @dataclass(kw_only=True, slots=True)
 class RobotCfg:
-    """An arm: names of its parts and the commands of the task.
+    """An arm with a gripper: names in its MJCF file, and joint targets of its tasks.
 
-    ``home`` is where the scripted task starts; ``start`` is clear of the table, for environments.
-    ``finger_room`` is what the open jaws need around a cube.
+    Every joint named here has a position servo, and a range. Joint values are rad, or m for slides.
     """
 
     name: str = MISSING
-    title: str = MISSING
-    menagerie_name: str = MISSING
-    menagerie_file: str = MISSING
-    arm_joints: list[str] = MISSING
-    gripper_joints: list[str] = MISSING
-    home: list[float] = MISSING
-    start: list[float] = MISSING
-    gripper_open: list[float] = MISSING
-    gripper_closed: list[float] = MISSING
-    ik_joints: list[str] = MISSING
-    locked: dict[str, float] = MISSING
-    arm_force_limit: float | None = None
-    grasp_sites: list[str] = MISSING
-    grasp_geoms: dict[str, list[str]] = field(default_factory=dict)
-    grasp_bodies: dict[str, str] = field(default_factory=dict)
-    approach_body: str = MISSING
-    approach_axis: list[float] = MISSING
-    jaw_bodies: list[str] = MISSING
+    """The robot's name."""
+    title: str = ""
+    """The name in tables and reports. Empty: ``name``."""
+    file: str | None = None
+    """An MJCF file: an absolute path, or one relative to the YAML that names it, or to the working
+    folder. null: mjstack's own file of the robot."""
+    menagerie_name: str = ""
+    """The robot's folder in MuJoCo Menagerie, for ``model=menagerie``."""
+    menagerie_file: str = ""
+    """Its file there."""
     replace_collision: bool = False
-    roll_joint: str = MISSING
-    posture_gain: float = MISSING
-    approach_gain: float = MISSING
-    align: float = MISSING
-    approach_height: float = MISSING
-    finger_room: float = MISSING
-    placements: dict[str, PlacementsCfg] = MISSING
+    """Whether ``model=menagerie`` gets the collision geoms of mjstack's own file."""
+
+    arm_joints: list[str] = MISSING
+    """Joints of the arm, from the base on."""
+    gripper_joints: list[str] = MISSING
+    """Joints of the gripper."""
+    jaw_bodies: list[str] = MISSING
+    """Bodies that touch a grasped object. A sensor measures the force of each on each object."""
+    grasp_sites: list[str] = MISSING
+    """Two sites, one on each jaw. Their midpoint is the grasp point."""
+    grasp_parts: dict[str, list[str]] = field(default_factory=dict)
+    """Where a grasp site goes that the file lacks: the mean of these geoms or bodies of one jaw."""
+    home: list[float] = MISSING
+    """Joint values at which the scripted task begins [rad, m]."""
+    start: list[float] = field(default_factory=list)
+    """Joint values at which environments begin, clear of the table [rad, m]. Empty: ``home``."""
+    gripper_open: list[float] = MISSING
+    """Joint targets of the open gripper [rad, m]."""
+    gripper_closed: list[float] = MISSING
+    """Joint targets of the gripper around an object [rad, m]."""
+    arm_force_limit: float | None = None
+    """Largest force of the arm's servos [N m, N]. null: the file's own."""
+
+    locked: dict[str, float] = field(default_factory=dict)
+    """Arm joints that inverse kinematics holds, with their values [rad, m]."""
+    ik_joints: list[str] = field(default_factory=list)
+    """Arm joints that inverse kinematics moves. Empty: all that are not locked."""
+    approach_body: str = ""
+    """Body with the approach axis: the last that carries both jaws. Empty: the body of the last arm
+    joint."""
+    approach_axis: list[float] = field(default_factory=lambda: [0.0, 0.0, -1.0])
+    """Direction from the wrist towards the grasped object, in that body's frame."""
+    roll_joint: str | None = None
+    """Arm joint that turns the gripper about the approach axis. null: there is none, and no yaw
+    alignment."""
+    posture_gain: float = 0.0
+    """Closed loop: share per iteration of the way to the nominal joint values, in the null
+    space."""
+    approach_gain: float = 0.0
+    """Closed loop: turn per iteration of the approach axis towards the desired one [rad]."""
+    yaw_alignment: float = 0.0
+    """Closed loop: how far the jaws turn to an object's nearest face, from 0 to 1."""
+    approach_height: float = 0.1
+    """Height above an object at which a grasp begins [m]."""
+    finger_room: float = 0.01
+    """Free room around an object for the open jaws [m]."""
+    placements: dict[str, PlacementsCfg] = field(default_factory=dict)
+    """Where the objects of each scene stand for this robot."""

@@ -29,7 +29,7 @@ def check_robot(cfg: Config) -> None:
     for key, names in (
         ("robot.ik_joints", robot.ik_joints),
         ("robot.locked", list(robot.locked)),
-        ("robot.roll_joint", [robot.roll_joint]),
+        ("robot.roll_joint", [robot.roll_joint] if robot.roll_joint else []),
     ):
         for name in names:
             if name not in robot.arm_joints:
@@ -39,6 +39,10 @@ def check_robot(cfg: Config) -> None:
             "robot.locked", list(robot.locked), "joints that robot.ik_joints does not move"
         )
     length("robot.locked", list(robot.locked.values()), len(robot.locked))
+    if robot.yaw_alignment > 0.0 and robot.roll_joint is None:
+        raise ConfigError(
+            "robot.roll_joint", "null", "an arm joint", "Or set robot.yaw_alignment=0"
+        )
     if robot.arm_force_limit is not None:
         positive("robot.arm_force_limit", robot.arm_force_limit, "N m")
     positive("robot.approach_height", robot.approach_height, "m")

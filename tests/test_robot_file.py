@@ -1,0 +1,189 @@
+"""A robot from anybody's MJCF file: where it is found, what follows from it, what is refused, and
+kinematics of an arm with a slide against MuJoCo's.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjstack import load_config
+from mjstack.config.fingerprint import config_content
+from mjstack.config.schema import Config
+from mjstack.drivers.open_loop import OpenLoopPlanner
+from mjstack.errors import ConfigError, MjstackError, SourceError, UnknownName
+from mjstack.kinematics.reach import PointReach
+from mjstack.robots import robot_spec
+from mjstack.scene import build_model
+
+SCARA = Path(__file__).parents[1] / "examples" / "scara"
+MJCF = (SCARA / "scara.xml").read_text()
+
+
+@cache
+def scara() -> Config:
+    return load_config([f"hydra.searchpath=[file://{SCARA}/conf]", "robot=scara"])
+
+
+def changed(tmp_path: Path, old: str, new: str) -> Config:
+    """The SCARA with a part of its file replaced."""
+    assert old in MJCF
+    file = tmp_path / "arm.xml"
+    file.write_text(MJCF.replace(old, new))
+    return replace(scara(), robot=replace(scara().robot, file=str(file)))
+
+
+def test_the_file_is_relative_to_the_yaml_that_names_it() -> None:
+    assert scara().robot.file == str(SCARA / "scara.xml")
+
+
+def test_the_file_can_be_absolute_or_relative_to_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copy(SCARA / "scara.xml", tmp_path / "arm.xml")
+    monkeypatch.chdir(tmp_path)
+    search = f"hydra.searchpath=[file://{SCARA}/conf]"
+    for file in ("arm.xml", tmp_path / "arm.xml"):
+        cfg = load_config([search, "robot=scara", f"robot.file={file}"])
+        assert cfg.robot.file == str(tmp_path / "arm.xml")
+        # A configuration counts by what its files hold, not by where they are.
+        assert config_content(cfg) == config_content(scara())
+
+
+def test_a_profile_without_start_title_and_ik_joints_gets_them() -> None:
+    robot = scara().robot
+    assert robot.start == robot.home
+    assert robot.ik_joints == ["shoulder", "elbow", "lift"]
+    assert load_config(["robot.title=''"]).robot.title == "so101"
+
+
+@pytest.mark.parametrize("file", ["arm.xml", "/no/folder/arm.xml"])
+def test_a_missing_file_is_refused(file: str) -> None:
+    with pytest.raises(ConfigError, match=f"robot.file={file}: expected an MJCF file") as caught:
+        load_config([f"robot.file={file}"])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_robot_without_a_file_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"robot\.file=null: expected the MJCF file of robot mine"
+    ):
+        build_model(load_config(["robot.name=mine"]))
+
+
+def test_menagerie_without_its_names_is_refused() -> None:
+    cfg = load_config(["model=menagerie", "robot.menagerie_name=''"])
+    with pytest.raises(ConfigError, match=r"robot\.menagerie_name=: expected"):
+        build_model(cfg)
+
+
+BROKEN = [
+    ("<mujoco model", "<mujoko model", SourceError, "arm.xml cannot be read: "),
+    ('joint name="elbow"', 'joint name="ellbow"', UnknownName, "Did you mean 'ellbow'"),
+    ('site name="left_grasp"', 'site name="left"', UnknownName, "grasp site 'left_grasp'"),
+    ('body name="left_finger"', 'body name="thumb"', UnknownName, "body 'left_finger'"),
+    (' range="0.1 2.6"', "", ConfigError, "range of joint elbow=.*: expected a range"),
+    (
+        '<position name="elbow" joint="elbow" kp="500" kv="20" forcerange="-40 40"/>',
+        '<motor name="elbow" joint="elbow"/>',
+        ConfigError,
+        "actuators of joint elbow=elbow: expected one <position>",
+    ),
+    (
+        '<position name="elbow" joint="elbow" kp="500" kv="20" forcerange="-40 40"/>',
+        "",
+        ConfigError,
+        "actuators of joint elbow=none: expected one <position>",
+    ),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "error", "message"), BROKEN)
+def test_a_file_that_does_not_fit_the_profile_is_refused(
+    old: str, new: str, error: type[MjstackError], message: str, tmp_path: Path
+) -> None:
+    cfg = changed(tmp_path, old, new)
+    with pytest.raises(error, match=message) as caught:
+        robot_spec(cfg.robot, cfg.model)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_a_servo_is_found_by_its_joint_and_limited_as_the_joint_is(tmp_path: Path) -> None:
+    cfg = changed(tmp_path, '<position name="elbow"', '<position name="motor_2" inheritrange="0"')
+    model = build_model(cfg)
+    assert model.actuator("elbow").trnid[0] == model.joint("elbow").id
+    np.testing.assert_allclose(model.actuator("elbow").ctrlrange, [0.1, 2.6])
+
+
+def test_the_files_defaults_do_not_reach_the_scene() -> None:
+    """The SCARA's geoms have no mass and no contact by default."""
+    model = build_model(scara())
+    for name in ("floor", "table", "red", "blue"):
+        geom = model.geom(name)
+        assert (geom.contype[0], geom.conaffinity[0], geom.group[0]) == (1, 1, 0)
+        assert geom.matid[0] == -1
+    assert model.body("red").mass[0] == pytest.approx(0.08)
+
+
+def test_grasp_sites_are_added_where_the_file_lacks_them(tmp_path: Path) -> None:
+    """At the mean of geoms, or at a body's origin."""
+    cfg = changed(tmp_path, '<site name="left_grasp" pos="0 0 -0.13"/>', "")
+    parts = {"left_grasp": ["left_pad"]}
+    site = build_model(replace(cfg, robot=replace(cfg.robot, grasp_parts=parts))).site("left_grasp")
+    np.testing.assert_allclose(site.pos, [0.0, 0.006, -0.13])
+    parts = {"left_grasp": ["left_finger"]}
+    site = build_model(replace(cfg, robot=replace(cfg.robot, grasp_parts=parts))).site("left_grasp")
+    np.testing.assert_allclose(site.pos, 0.0)
+
+
+def grasp_point(model: mujoco.MjModel, values: dict[str, float]) -> np.ndarray:
+    """Midpoint of the SCARA's grasp sites [m], by MuJoCo."""
+    data = mujoco.MjData(model)
+    for name, value in values.items():
+        data.joint(name).qpos[0] = value
+    mujoco.mj_kinematics(model, data)
+    return 0.5 * (data.site("left_grasp").xpos + data.site("right_grasp").xpos)
+
+
+def scara_points(n: int) -> np.ndarray:
+    """Points over the table of the SCARA [m], shape ``(n, 3)``."""
+    return np.random.default_rng(0).uniform([0.33, -0.22, 0.04], [0.49, 0.22, 0.24], (n, 3))
+
+
+def test_reach_of_an_arm_with_a_slide_is_mujocos() -> None:
+    cfg = scara()
+    model = build_model(cfg)
+    reach = PointReach(model, cfg.robot, cfg.robot.gripper_open)
+    points = scara_points(30)
+    for found in (reach.solve(points), reach.solve_upright(points, 5e-4)):
+        assert found.distance.max() < 1e-6
+        assert found.tilt.max() < 1e-6  # a SCARA's hand always points down
+        for point, q in zip(points, found.q, strict=True):
+            values = dict(zip(cfg.robot.ik_joints, q, strict=True))
+            assert np.linalg.norm(grasp_point(model, values) - point) < 1e-6
+    # Above the slide's range the point is as far away as it is above.
+    high = reach.solve(np.array([[0.4, 0.0, 0.28 + 0.1]]))
+    assert high.distance[0] == pytest.approx(0.1, abs=1e-4)
+    assert high.q[0, 2] == pytest.approx(0.25, abs=1e-9)
+
+
+def test_mink_plans_an_arm_with_a_slide() -> None:
+    cfg = scara()
+    planner = OpenLoopPlanner(cfg)
+    model = build_model(cfg)
+    names = [*cfg.robot.arm_joints, *cfg.robot.gripper_joints]
+    for point in scara_points(10):
+        command, distance = planner.ik.solve(point, np.array([0.02, 0.02]), planner.ik.home)
+        assert distance < 1e-5
+        values = dict(zip(names, command, strict=True))
+        assert np.linalg.norm(grasp_point(model, values) - point) == pytest.approx(
+            distance, abs=1e-9
+        )
+        assert abs(values["roll"]) < 1e-12
