@@ -22,8 +22,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 import mjstack
 from mjstack.config import Config
@@ -33,8 +31,8 @@ from mjstack.config.load import compose_overrides, to_config
 from mjstack.config.overrides import parse
 from mjstack.config.session import CONFIG_MODULE, CONFIG_NAME, own_hydra
 from mjstack.errors import MjstackError, UnknownName
-from mjstack.report.markdown import escape_cell
 from mjstack.report.record import Status
+from mjstack.report.table import Table
 from mjstack.startup import INTERRUPTED, started
 
 if TYPE_CHECKING:
@@ -241,13 +239,7 @@ def check_writable(folder: Path) -> None:
 def _print_sweep(outcomes: list[JobResult]) -> None:
     """One row per job, also written beside the jobs as summary.md."""
     names = list(dict.fromkeys(gate.name for outcome in outcomes for gate in outcome.gates))
-    table = Table(title=f"sweep of {len(outcomes)} jobs")
-    for column in ("job", "overrides", *names, "status"):
-        table.add_column(column)
-    lines = [
-        f"| job | overrides | {' | '.join(names)} | status |",
-        "| --- " * (len(names) + 3) + "|",
-    ]
+    rows = []
     for number, outcome in enumerate(outcomes):
         by_name = {gate.name: gate for gate in outcome.gates}
         cells = [
@@ -258,12 +250,16 @@ def _print_sweep(outcomes: list[JobResult]) -> None:
             )
             for name in names
         ]
-        row = [str(number), " ".join(outcome.overrides), *cells, outcome.status.value]
-        if len(names) > _WIDE:
-            cells = [cell.partition(":")[0] for cell in cells]
-        table.add_row(*(escape(cell) for cell in (row[0], row[1], *cells, row[-1])))
-        lines.append(f"| {' | '.join(escape_cell(cell) for cell in row)} |")
-    Console().print(table)
+        rows.append([str(number), " ".join(outcome.overrides), *cells, outcome.status.value])
+    title = f"sweep of {len(outcomes)} jobs"
+    table = Table(title=title, header=["job", "overrides", *names, "status"], rows=rows)
+    lines = table.to_markdown()
+    if len(names) > _WIDE:
+        table.rows = [
+            [number, job, *(cell.partition(":")[0] for cell in cells), status]
+            for number, job, *cells, status in rows
+        ]
+    Console().print(table.to_console())
     sweep_folder = os.path.commonpath([str(outcome.folder) for outcome in outcomes])
     if len(outcomes) > 1:
         (Path(sweep_folder) / "summary.md").write_text("\n".join(lines) + "\n")

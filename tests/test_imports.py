@@ -49,7 +49,7 @@ HOMES = {
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),
     "pyarrow": ("datasets/",),
-    "rich": ("jobs/", "cli.py", "bench/", "managers/base.py"),
+    "rich": ("jobs/", "cli.py", "bench/", "report/table.py", "managers/base.py"),
 }
 
 

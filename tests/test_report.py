@@ -11,6 +11,7 @@ import pytest
 
 from mjstack.files import write_atomic
 from mjstack.report.record import GateResult, Report, Status
+from mjstack.report.write import safely_draw, write_report
 
 
 def gate(status: Status, name: str = "g", **metrics: float) -> GateResult:
@@ -62,7 +63,7 @@ def test_numbers_that_are_not_finite_stay_json(tmp_path: Path) -> None:
     bad.thresholds["t"] = math.nan
     report = Report(provenance={"x": math.nan, "versions": {"y": math.inf}}, gates=[bad])
     report.conclude()
-    report.write(tmp_path)
+    write_report(report, tmp_path)
     data = strict_json(tmp_path / "report.json")
     assert data["gates"][0]["metrics"] == {"a": "nan", "b": "inf", "c": "-inf", "d": 0.5}
     assert data["schema"] == 2
@@ -71,7 +72,7 @@ def test_numbers_that_are_not_finite_stay_json(tmp_path: Path) -> None:
 
 
 def test_status_before_the_end_is_interrupted(tmp_path: Path) -> None:
-    Report(provenance={}, gates=[gate(Status.passed)]).write(tmp_path)
+    write_report(Report(provenance={}, gates=[gate(Status.passed)]), tmp_path)
     assert strict_json(tmp_path / "report.json")["status"] == "interrupted"
 
 
@@ -94,9 +95,8 @@ def test_conclude(outcomes: list[Status], expected: Status) -> None:
 
 def test_markdown_has_every_gate_and_skip(tmp_path: Path) -> None:
     skip = GateResult(name="throughput_cuda", status=Status.skipped, reason="no CUDA device")
-    Report(
-        provenance={"device": "cpu"}, gates=[gate(Status.passed, "baseline", xy=0.1), skip]
-    ).write(tmp_path)
+    gates = [gate(Status.passed, "baseline", xy=0.1), skip]
+    write_report(Report(provenance={"device": "cpu"}, gates=gates), tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert "## baseline: pass" in text
     assert "| xy | 0.1 |" in text
@@ -105,10 +105,48 @@ def test_markdown_has_every_gate_and_skip(tmp_path: Path) -> None:
 
 def test_table_cells_survive_a_bar_in_a_reason(tmp_path: Path) -> None:
     bad = GateResult(name="baseline", status=Status.failed, reason="a | b")
-    Report(provenance={}, gates=[bad]).write(tmp_path)
+    write_report(Report(provenance={}, gates=[bad]), tmp_path)
     row = next(
         line
         for line in (tmp_path / "report.md").read_text().splitlines()
         if line.startswith("| baseline")
     )
     assert row.replace("\\|", "").count("|") == 5
+
+
+def test_figures_and_limits_have_a_row_each(tmp_path: Path) -> None:
+    """Repetitions as median and range, differences beside their limits, the rest with its unit."""
+    rate = {"median": 12_000.0, "min": 11_500.0, "max": 12_500.0}
+    metrics = {f"physics.world_steps_per_s.{end}": value for end, value in rate.items()}
+    metrics |= {"lifted.step1.qpos": 2e-7, "lifted.step50.qpos": 5e-4, "lifted.step1.count": 0}
+    metrics |= {"final.red.position_m": 1e-3, "physics.captured": True}
+    result = GateResult(
+        name="parity",
+        status=Status.passed,
+        metrics=metrics,
+        thresholds={"step1.qpos": 1e-6, "step50.qpos": 1e-3, "step1.count": 0, "rate_min": 0.9},
+        notes={"backend": "native"},
+    )
+    write_report(Report(provenance={}, gates=[result]), tmp_path)
+    text = (tmp_path / "report.md").read_text()
+    assert "| physics: world steps | 12,000 /s | 11,500 /s | 12,500 /s |" in text
+    assert "| lifted, step1 | 2e-07 / 1e-06 | 0 / 0 |" in text
+    assert "| lifted, step50 | 0.0005 / 0.001 |  |" in text
+    assert "| final, red: position | 0.001 m |" in text
+    assert "| physics: captured | yes |" in text
+    assert "| backend | native |" in text
+    assert "| rate min | 0.9 |" in text
+    assert "step1.qpos" not in text
+
+
+def test_a_failed_picture_is_a_line_and_leaves_no_part(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+
+    def fail(target: Path, text: str) -> None:
+        target.write_text(text)
+        raise OSError(28, "No space left on device")
+
+    assert safely_draw(path, fail, "part") == "no picture a.png: No space left on device"
+    assert not path.exists()
+    assert safely_draw(path, Path.write_text, "all") == ""
+    assert path.read_text() == "all"

@@ -1,4 +1,4 @@
-"""The scaling job: cases in processes of their own, resumed, with gaps where one fails."""
+"""The scaling job: a process per number of worlds, resumed, with gaps where one fails."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +22,17 @@ from mjstack.config import load_config
 from mjstack.errors import ConfigError
 from mjstack.files import to_csv
 from mjstack.jobs import scaling
-from mjstack.jobs.case import OutOfTime, _row, read_case
-from mjstack.jobs.scaling import case_overrides, scaling_folder
+from mjstack.jobs.scaling import run_overrides, scaling_folder
+from mjstack.jobs.scaling_run import OutOfTime, read_report, read_run
 from mjstack.report.curves import save_scaling_curves
 from mjstack.report.scaling import (
     COLUMNS,
     NOT_RUN,
     PASS,
-    ScalingRow,
+    Row,
     crossover,
     describe_crossover,
+    new_row,
     to_markdown,
 )
 
@@ -63,10 +63,10 @@ def table(folder: Path) -> dict[tuple[str, int], dict[str, str]]:
 
 
 def stamps(folder: Path) -> dict[str, int]:
-    return {path.parent.name: path.stat().st_mtime_ns for path in home(folder).rglob("case.json")}
+    return {path.parent.name: path.stat().st_mtime_ns for path in home(folder).rglob("run.json")}
 
 
-def test_cases_resume_and_leave_table_and_plot(
+def test_runs_resume_and_leave_table_and_plot(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run([*TINY, "sim=native", "job.nworlds=[1]"]) == 0
@@ -93,7 +93,7 @@ def test_cases_resume_and_leave_table_and_plot(
         assert float(row["env_steps_per_s"]) == pytest.approx(
             1e3 * nworld / float(row["ms_per_env_step"])
         )
-        assert row["bare_ratio"] == row["succeeded"] == ""  # native cases play no episode
+        assert row["bare_ratio"] == row["succeeded"] == ""  # native runs play no episode
     for name in (
         "scaling.csv",
         "scaling.md",
@@ -110,7 +110,7 @@ def test_cases_resume_and_leave_table_and_plot(
     assert [path.name for path in folder.iterdir()] == ["outputs"]
 
 
-def test_failing_case_is_a_gap_and_runs_again_if_asked(
+def test_failing_run_is_a_gap_and_runs_again_if_asked(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     args = [
@@ -147,7 +147,7 @@ def test_failing_case_is_a_gap_and_runs_again_if_asked(
     assert after["native-1"] == before["native-1"]
 
 
-def test_out_of_memory_is_said_as_that_and_the_next_case_runs(folder: Path) -> None:
+def test_out_of_memory_is_said_as_that_and_the_next_run_starts(folder: Path) -> None:
     """More worlds than there is memory for, and then one."""
     assert run([*TINY, "sim=native", "job.nworlds=[2000000000,1]"]) == 1
     rows = table(folder)
@@ -186,7 +186,7 @@ def test_out_of_memory_is_said_as_that_and_the_next_case_runs(folder: Path) -> N
         (-11, "", "", "crashed", "killed by signal 11"),
     ],
 )
-def test_how_a_case_ended(
+def test_how_a_run_ended(
     tmp_path: Path, code: int, reason: str, output: str, status: str, says: str
 ) -> None:
     gates = (
@@ -198,46 +198,46 @@ def test_how_a_case_ended(
         json.dumps({"gates": gates, "provenance": {"git_commit": "abc"}})
     )
     (tmp_path / "output.log").write_text(output)
-    row = _row(tmp_path, 8, "mjwarp", code)
-    assert (row.status, row.git_commit) == (status, "abc")
-    assert says in row.reason
-    assert row.world_steps_per_s is None
+    row = read_report(tmp_path, 8, "mjwarp", code)
+    assert (row["status"], row["git_commit"]) == (status, "abc")
+    assert says in row["reason"]
+    assert row["world_steps_per_s"] is None
 
 
-def test_case_without_a_report_says_its_last_line(tmp_path: Path) -> None:
+def test_run_without_a_report_says_its_last_line(tmp_path: Path) -> None:
     (tmp_path / "output.log").write_text("something\nImportError: no such thing\n")
-    row = _row(tmp_path, 8, "native", 1)
-    assert (row.status, row.reason) == ("fail", "ImportError: no such thing")
+    row = read_report(tmp_path, 8, "native", 1)
+    assert (row["status"], row["reason"]) == ("fail", "ImportError: no such thing")
 
 
 @pytest.mark.parametrize("text", [None, "", "{", '{"nworld": 1}', '{"other": 1}'])
-def test_unreadable_case_counts_as_not_run(tmp_path: Path, text: str | None) -> None:
+def test_unreadable_run_counts_as_not_run(tmp_path: Path, text: str | None) -> None:
     if text is not None:
-        (tmp_path / "case.json").write_text(text)
-    row = read_case(tmp_path, 4, "native")
-    assert (row.nworld, row.backend, row.status) == (4, "native", NOT_RUN)
+        (tmp_path / "run.json").write_text(text)
+    row = read_run(tmp_path, 4, "native")
+    assert (row["nworld"], row["backend"], row["status"]) == (4, "native", NOT_RUN)
 
 
 @pytest.fixture
-def pretended(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, str]]:
-    """Cases that take 40 s each on a clock of their own."""
+def simulated(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, str]]:
+    """Runs that take 40 s each, on a simulated clock."""
     ran: list[tuple[int, str]] = []
     clock = [0.0]
 
-    def pretend(
+    def simulate(
         _: Path,
         nworld: int,
         backend: str,
         __: list[str],
         *,
-        case_seconds: float,
-        call_seconds: float,
-    ) -> ScalingRow:
-        clock[0] += min(40.0, call_seconds)
-        if call_seconds < 40.0:
+        run_seconds: float,
+        job_seconds: float,
+    ) -> Row:
+        clock[0] += min(40.0, job_seconds)
+        if job_seconds < 40.0:
             raise OutOfTime("stopped")
         ran.append((nworld, backend))
-        return ScalingRow(
+        return new_row(
             nworld=nworld,
             backend=backend,
             status=PASS,
@@ -245,38 +245,38 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, str]]:
             world_steps_per_s=1.0 * nworld,
         )
 
-    monkeypatch.setattr(scaling, "run_case", pretend)
+    monkeypatch.setattr(scaling, "run_process", simulate)
     monkeypatch.setattr(scaling.time, "monotonic", lambda: clock[0])
     return ran
 
 
-def test_no_case_starts_that_would_not_fit(
-    folder: Path, pretended: list[tuple[int, str]], capsys: pytest.CaptureFixture[str]
+def test_no_run_starts_that_would_not_fit(
+    folder: Path, simulated: list[tuple[int, str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     # 150 s: 40, 40 (two of them tell: no growth), 40; 30 s are too few for the fourth.
     args = [*TINY, "sim=native", "job.nworlds=[1,2,4,8]", "job.max_minutes=2.5"]
     assert run(args) == 1
-    assert [nworld for nworld, _ in pretended] == [1, 2, 4]
+    assert [nworld for nworld, _ in simulated] == [1, 2, 4]
     out = capsys.readouterr().out
     assert (
-        "incomplete: 1 of 4 cases have not run (4/4 native, 8 worlds needs more than the 30 s that"
+        "incomplete: 1 of 4 runs have not run (4/4 native, 8 worlds needs more than the 30 s that"
         " are left)" in out
     )
     assert json.loads((home(folder) / "report.json").read_text())["status"] == "interrupted"
     assert "| 8 | native | - | - |" in (home(folder) / "scaling.md").read_text()
 
 
-def test_a_call_that_is_too_short_still_tries_its_first_case(
-    folder: Path, pretended: list[tuple[int, str]], capsys: pytest.CaptureFixture[str]
+def test_a_call_that_is_too_short_still_tries_its_first_run(
+    folder: Path, simulated: list[tuple[int, str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run([*TINY, "sim=native", "job.nworlds=[1,2]", "job.max_minutes=0.5"]) == 1
-    assert pretended == []
-    assert "incomplete: 2 of 2 cases have not run (stopped)" in capsys.readouterr().out
+    assert simulated == []
+    assert "incomplete: 2 of 2 runs have not run (stopped)" in capsys.readouterr().out
 
 
 def test_failed_plot_takes_nothing_back(
     folder: Path,
-    pretended: list[tuple[int, str]],
+    simulated: list[tuple[int, str]],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -285,13 +285,13 @@ def test_failed_plot_takes_nothing_back(
 
     monkeypatch.setattr(scaling, "save_scaling_curves", fail)
     assert run([*TINY, "sim=native", "job.nworlds=[1]"]) == 0
-    assert "no picture: no fonts" in capsys.readouterr().out
+    assert "no picture scaling.png: no fonts" in capsys.readouterr().out
     assert ("native", 1) in table(folder)
 
 
 def test_full_disk_is_one_line(
     folder: Path,
-    pretended: list[tuple[int, str]],
+    simulated: list[tuple[int, str]],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -315,7 +315,7 @@ def test_full_disk_at_ctrl_c_is_one_line_too(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(scaling, "run_case", stopped)
+    monkeypatch.setattr(scaling, "run_process", stopped)
     monkeypatch.setattr(scaling, "write_atomic", full)
     assert run([*TINY, "sim=native", "job.nworlds=[1]"]) == 130
     err = capsys.readouterr().err
@@ -337,7 +337,7 @@ def alive(marker: str) -> list[str]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="no /proc here")
-def test_ctrl_c_leaves_the_finished_cases_and_no_process(folder: Path) -> None:
+def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
     marker = f"MJSTACK_TEST={folder.name}"
     process = subprocess.Popen(
         [
@@ -357,7 +357,7 @@ def test_ctrl_c_leaves_the_finished_cases_and_no_process(folder: Path) -> None:
     )
     try:
         until = time.monotonic() + 120
-        while not list(folder.glob("outputs/scaling/*/cases/native-3000/report.json")):
+        while not list(folder.glob("outputs/scaling/*/runs/native-3000/report.json")):
             assert process.poll() is None
             assert time.monotonic() < until
             time.sleep(0.1)
@@ -370,14 +370,14 @@ def test_ctrl_c_leaves_the_finished_cases_and_no_process(folder: Path) -> None:
         process.kill()
     assert process.returncode == 130
     assert "Traceback" not in err
-    assert "incomplete: 1 of 2 cases have not run (interrupted)" in out
+    assert "incomplete: 1 of 2 runs have not run (interrupted)" in out
     rows = table(folder)
     assert (rows["native", 1]["status"], rows["native", 3000]["status"]) == ("pass", "not run")
     assert json.loads((home(folder) / "report.json").read_text())["status"] == "interrupted"
     assert alive(marker) == []
 
 
-def test_folder_depends_on_what_a_case_depends_on() -> None:
+def test_folder_depends_on_what_a_run_depends_on() -> None:
     def name(*overrides: str) -> str:
         return str(scaling_folder(load_config(["job=scaling", *overrides])))
 
@@ -422,7 +422,7 @@ def test_folder_depends_on_a_layouts_content(tmp_path: Path) -> None:
         name(tmp_path / "no.csv")
 
 
-def test_cases_get_the_command_line() -> None:
+def test_runs_get_the_command_line() -> None:
     cfg = load_config(["job=scaling", "robot=rebot"])
     given = [
         "job=scaling",
@@ -433,7 +433,7 @@ def test_cases_get_the_command_line() -> None:
         "sim.device=cpu",
         "+reward.x={func: f}",
     ]
-    warp, native = (case_overrides(cfg, given, 4096, backend) for backend in ("mjwarp", "native"))
+    warp, native = (run_overrides(cfg, given, 4096, backend) for backend in ("mjwarp", "native"))
     assert warp[:3] == ["robot=rebot", "sim.device=cpu", "+reward.x={func: f}"]
     assert {
         "job=gates",
@@ -448,7 +448,7 @@ def test_cases_get_the_command_line() -> None:
         "gates=[throughput]",
         "gate.throughput.steps=60",
     } <= set(native)
-    assert "gate.throughput.repetitions=5" in case_overrides(cfg, given, 2048, "mjwarp")
+    assert "gate.throughput.repetitions=5" in run_overrides(cfg, given, 2048, "mjwarp")
     for overrides in (warp, native):
         keys = [override.lstrip("+").partition("=")[0] for override in overrides]
         assert len(keys) == len(set(keys))
@@ -463,14 +463,14 @@ BAD = [
     ["job.backends=[cuda]"],
     ["job.backends=[]"],
     ["job.repetitions=0"],
-    ["job.case_minutes=0"],
+    ["job.run_minutes=0"],
     ["job.max_minutes=-1"],
     ["job.retry=perhaps"],
     ["view=true"],
     ["video=true"],
     ["task=reach"],
-    ["gate.throughput.sections=[physic]"],
-    ["gate.throughput.sections=[]"],
+    ["gate.throughput.measurements=[physic]"],
+    ["gate.throughput.measurements=[]"],
     ["job.backends=[mjwarp]", "sim.device=cuda:77"],
     ["hydra.run.dir=afile/below"],
 ]
@@ -489,11 +489,11 @@ def test_bad_input_is_one_line_and_writes_nothing(
     assert [path.name for path in folder.rglob("*")] == ["afile"]
 
 
-def rows(rates: dict[str, dict[int, float | None]]) -> list[ScalingRow]:
+def rows(rates: dict[str, dict[int, float | None]]) -> list[Row]:
     return [
-        ScalingRow(
-            nworld=n,
-            backend=backend,
+        new_row(
+            n,
+            backend,
             status="fail" if rate is None else PASS,
             world_steps_per_s=rate,
         )
@@ -522,16 +522,16 @@ def test_crossover(
     assert (f"about {at:,.0f} worlds" if at else "do not show") in describe_crossover(both)
 
 
-def test_failed_case_is_a_gap_even_with_figures(
+def test_failed_run_is_a_gap_even_with_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of three cases the middle one measured physics and then failed; its figure would move the
+    """Of three runs the middle one measured physics and then failed; its figure would move the
     crossover.
     """
     both = rows(
         {"mjwarp": {1: 1.0, 10: 99.0, 100: 100.0}, "native": {1: 10.0, 10: 10.0, 100: 10.0}}
     )
-    both[1].status = "fail"
+    both[1]["status"] = "fail"
     assert crossover(both) == pytest.approx(10.0)
     drawn: list[tuple[str, list[float]]] = []
     plot = Axes.plot
@@ -548,7 +548,7 @@ def test_failed_case_is_a_gap_even_with_figures(
 
 
 def test_table_shows_gaps_and_where_rows_come_from() -> None:
-    good = ScalingRow(
+    good = new_row(
         nworld=2048,
         backend="mjwarp",
         status=PASS,
@@ -557,7 +557,7 @@ def test_table_shows_gaps_and_where_rows_come_from() -> None:
         git_commit="a",
         hardware="x",
     )
-    bad = ScalingRow(
+    bad = new_row(
         nworld=4096,
         backend="mjwarp",
         status="out of memory",
@@ -574,5 +574,5 @@ def test_table_shows_gaps_and_where_rows_come_from() -> None:
     assert text.count("- hardware") == 1
     assert [
         row["ms_per_step"]
-        for row in csv.DictReader(to_csv(COLUMNS, map(asdict, [good, bad])).splitlines())
+        for row in csv.DictReader(to_csv(list(COLUMNS), [good, bad]).splitlines())
     ] == ["1.376", ""]

@@ -131,7 +131,7 @@ def test_episode_alternates_with_bare_steps_on_mjwarp(
         "sim.device=cpu",
         "nworld=1",
         *SHORT,
-        "gate.throughput.sections=[episode]",
+        "gate.throughput.measurements=[episode]",
         "gate.throughput.repetitions=1",
     )
     result, _ = run_throughput(context)
@@ -149,7 +149,7 @@ def test_episode_alternates_with_bare_steps_on_mjwarp(
 
 
 def test_warm_up_and_capture_are_apart_on_mjwarp(new_context: Callable[..., GateContext]) -> None:
-    sections_ = "gate.throughput.sections=[physics,env_step]"
+    sections_ = "gate.throughput.measurements=[physics,env_step]"
     result, _ = run_throughput(
         new_context("sim=mjwarp", "sim.device=cpu", "nworld=1", *SHORT, sections_)
     )
@@ -244,7 +244,7 @@ def test_overflow_voids_the_figure(new_context: Callable[..., GateContext], sect
             "sim.device=cpu",
             "nworld=2",
             *SHORT,
-            f"gate.throughput.sections=[{section}]",
+            f"gate.throughput.measurements=[{section}]",
             "gate.throughput.env_steps=20",
             "batch.njmax=40",
         )
@@ -264,7 +264,7 @@ def test_steps_not_made_void_the_figure(
 
     monkeypatch.setattr(NativeSimulation, "step", lazy)
     result, _ = run_throughput(
-        new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.sections=[physics]")
+        new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.measurements=[physics]")
     )
     assert result.status is Status.failed
     assert "physics: no figure: 2 worlds overflowed, diverged or were not stepped" in result.reason
@@ -279,7 +279,9 @@ def test_broken_section_leaves_the_others(
 
     monkeypatch.setattr(sections, "measure_env_step", out_of_memory)
     result, _ = run_throughput(
-        new_context("sim=native", "nworld=1", *SHORT, "gate.throughput.sections=[physics,env_step]")
+        new_context(
+            "sim=native", "nworld=1", *SHORT, "gate.throughput.measurements=[physics,env_step]"
+        )
     )
     assert result.status is Status.failed
     assert (
@@ -297,7 +299,7 @@ def test_broken_episode_does_not_verify_the_task(
         raise RuntimeError("bad")
 
     context = new_context(
-        "sim=native", "nworld=1", *SHORT, "gate.throughput.sections=[physics,episode]"
+        "sim=native", "nworld=1", *SHORT, "gate.throughput.measurements=[physics,episode]"
     )
     monkeypatch.setattr(context, "play", broken)
     result, _ = run_throughput(context)
@@ -344,7 +346,9 @@ def test_start_states_repeat_without_the_batch_gate(
 
 def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., GateContext]) -> None:
     """Red beside the jaws in two of five worlds, then in three of them."""
-    context = new_context("sim=native", "nworld=5", *SHORT, "gate.throughput.sections=[physics]")
+    context = new_context(
+        "sim=native", "nworld=5", *SHORT, "gate.throughput.measurements=[physics]"
+    )
     sim = context.batch_simulation(5)
     state = sections._carry_start(context, sim)
     red = context.index.cube_qpos[0]

@@ -80,9 +80,9 @@ def _measure(context: GateContext, name: str, backend: Backend, device: str) -> 
     facts: dict[str, float] = {"worlds": cfg.nworld, "cpu_count": os.cpu_count() or 1}
     notes: dict[str, str] = {}
     sections: list[Section] = []
-    if {"physics", "episode"} & set(t.sections):
+    if {"physics", "episode"} & set(t.measurements):
         sections += _on_scripted_worlds(context, backend, device, watch, meter, facts, notes)
-    if "env_step" in t.sections:
+    if "env_step" in t.measurements:
         sections.append(
             _guarded(
                 "env_step",
@@ -145,7 +145,7 @@ def _on_scripted_worlds(
 ) -> list[Section]:
     """Sections *physics* and *episode*, on the same worlds."""
     cfg = context.cfg
-    wanted = context.cfg.gate.throughput.sections
+    wanted = context.cfg.gate.throughput.measurements
     gc.collect()  # environments hold on to their worlds in cycles, and a GPU has not room for all
     began = time.perf_counter()
     try:

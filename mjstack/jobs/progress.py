@@ -16,7 +16,6 @@ from rich.progress import (
 )
 
 from mjstack.jobs.result import STATUS_COLOR
-from mjstack.report.markdown import headline
 from mjstack.report.record import GateResult
 
 
@@ -84,7 +83,7 @@ class ProgressBar:
         color = STATUS_COLOR[result.status]
         self.say(
             f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s):"
-            f" {escape(headline(result))}"
+            f" {escape(result.reason or 'ok')}"
         )
 
     def _drop(self) -> None:

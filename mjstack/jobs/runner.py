@@ -17,7 +17,6 @@ import numpy as np
 from omegaconf import OmegaConf
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from mjstack.config.schema import Config
 from mjstack.episodes.context import GateContext
@@ -25,10 +24,11 @@ from mjstack.episodes.observers import StepHook
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import STATUS_COLOR, JobResult
-from mjstack.report.markdown import headline
-from mjstack.report.picture import require_video, save_pictures, save_video
+from mjstack.report.markdown import summarize
+from mjstack.report.picture import require_video, save_scene, save_trajectories, save_video
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Report, Status
+from mjstack.report.write import safely_draw, write_report
 from mjstack.sim import Simulation, cuda_driver, cuda_name
 
 log = logging.getLogger(__name__)
@@ -80,7 +80,7 @@ def run_reported(
             f"[bold]{cfg.robot.title}[/], {escape(title)} -> {escape(str(folder))}", soft_wrap=True
         )
         report = Report(provenance=run_provenance(cfg, context))
-        report.write(folder)
+        write_report(report, folder)
         with ProgressBar(console) as bar:
             context.say = bar.say
             context.advance = bar.advance
@@ -88,15 +88,15 @@ def run_reported(
             work(context, bar, lambda result: _record(report, result, folder, bar))
         report.conclude()
         outcome.status = report.status
-        report.write(folder)
+        write_report(report, folder)
         _draw(context, report, folder, console)
         report.pictures += context.pictures
-        report.write(folder)
+        write_report(report, folder)
     except KeyboardInterrupt:
         outcome.status = Status.interrupted
         if report is not None:
             report.status = Status.interrupted
-            report.write(folder)
+            write_report(report, folder)
         kept = (
             "the finished gates are in the report"
             if report is not None
@@ -113,7 +113,7 @@ def run_reported(
         outcome.status = _mark_failed(report)
         with contextlib.suppress(OSError):
             if report is not None:
-                report.write(folder)
+                write_report(report, folder)
         log.error("%s", error)
         Console(stderr=True, soft_wrap=True).print(f"mjstack: {escape(str(error))}")
     if report is not None:
@@ -130,7 +130,7 @@ def _mark_failed(report: Report | None) -> Status:
 
 def _record(report: Report, result: GateResult, folder: Path, bar: ProgressBar) -> None:
     report.gates.append(result)
-    report.write(folder)
+    write_report(report, folder)
     bar.finish(result)
 
 
@@ -171,18 +171,22 @@ def _draw(context: GateContext, report: Report, folder: Path, console: Console) 
         return
     cubes = np.stack([episode.qpos[:, a : a + 3] for a in context.index.cube_qpos], axis=1)
     title = f"{cfg.robot.title}, {cfg.task.name}: {context.shown_by}"
-    try:
-        report.pictures = save_pictures(
-            folder, context.visual_model, episode.qpos[-1], cubes, cfg.scene.cube_half, title
-        )
-        if cfg.video:
-            save_video(
-                folder / "episode.mp4", context.visual_model, episode.qpos, cfg.timing.step_dt
-            )
-            console.print(f"video: {folder}/episode.mp4", soft_wrap=True)
-    except Exception as error:  # drawing must not take back what the gates found
-        log.exception("drawing failed")
-        console.print(f"no picture: {escape(str(error) or type(error).__name__)}", soft_wrap=True)
+    model = context.visual_model
+    half = cfg.scene.cube_half
+    drawn: dict[str, tuple[Callable[..., object], tuple]] = {
+        "scene.png": (save_scene, (model, episode.qpos[-1], cubes[-1], half, title)),
+        "trajectories.png": (save_trajectories, (cubes, half, title)),
+    }
+    if cfg.video:
+        drawn["episode.mp4"] = (save_video, (model, episode.qpos, cfg.timing.step_dt))
+    for name, (draw, args) in drawn.items():
+        problem = safely_draw(folder / name, draw, *args)
+        if problem:
+            console.print(escape(problem), soft_wrap=True)
+        elif name.endswith(".png"):
+            report.pictures.append(name)
+        else:
+            console.print(f"video: {folder}/{name}", soft_wrap=True)
 
 
 def _viewer(context: GateContext) -> StepHook:
@@ -208,20 +212,8 @@ def _viewer(context: GateContext) -> StepHook:
 
 
 def _print_summary(console: Console, report: Report, folder: Path) -> None:
-    table = Table()
-    table.add_column("gate")
-    table.add_column("status")
-    table.add_column("s", justify="right")
-    table.add_column("what it says", overflow="fold")
-    for gate in report.gates:
-        color = STATUS_COLOR[gate.status]
-        table.add_row(
-            gate.name,
-            f"[{color}]{gate.status.value}[/]",
-            f"{gate.seconds:.1f}",
-            escape(headline(gate)),
-        )
-    console.print(table)
+    colors = {status.value: color for status, color in STATUS_COLOR.items()}
+    console.print(summarize(report).to_console(colors))
     console.print(f"report: {escape(str(folder))}/report.md", soft_wrap=True)
     for gate in report.gates:
         if gate.status is Status.skipped:

@@ -1,13 +1,12 @@
-"""A dataset of demonstrations as tables: what is in it, how good the expert was, and how to load
-it.
-"""
+"""A dataset of demonstrations as tables: its content, the expert's success, and how to load it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from mjstack.report.markdown import escape_cell, format_value
+from mjstack.report.markdown import format_value
+from mjstack.report.table import Table, to_document
 
 LOADING = """\
 import json
@@ -26,7 +25,7 @@ for name in ("observation.state", "action"):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ColumnRange:
-    """What one number of the steps ranges over.
+    """Range of one number of the steps.
 
     Attributes:
         name: Feature and number, such as ``action shoulder_pan.pos``.
@@ -50,27 +49,26 @@ def to_markdown(
 
     Args:
         title: Robot and task.
-        facts: What there is to say of the whole dataset.
-        ranges: Of the joints and their commands.
+        facts: Facts on the whole dataset.
+        ranges: Of the joints and their targets.
         folder: Where the dataset is.
     """
-    lines = [f"# {title}", "", "| what | value |", "| --- | ---: |"]
-    lines += [f"| {name} | {escape_cell(format_value(value))} |" for name, value in facts.items()]
-    lines += [
-        "",
-        "| number | unit | smallest | mean | largest |",
-        "| --- | --- | ---: | ---: | ---: |",
-    ]
-    lines += [
-        f"| {row.name} | {row.unit} | {row.low:.4f} | {row.mean:.4f} | {row.high:.4f} |"
-        for row in ranges
-    ]
-    lines += [
-        "",
+    known = [[name, format_value(value)] for name, value in facts.items()]
+    tables = [Table(title="", header=["fact", "value"], rows=known), Table.of("", _COLUMNS, ranges)]
+    loading = [
         "With pyarrow alone:",
         "",
         "```python",
         LOADING.format(folder=folder).rstrip("\n"),
         "```",
     ]
-    return "\n".join(lines) + "\n"
+    return to_document(title, tables) + "\n" + "\n".join(loading) + "\n"
+
+
+_COLUMNS: dict[str, Callable[[ColumnRange], str]] = {
+    "number": lambda row: row.name,
+    "unit": lambda row: row.unit,
+    "smallest": lambda row: f"{row.low:.4f}",
+    "mean": lambda row: f"{row.mean:.4f}",
+    "largest": lambda row: f"{row.high:.4f}",
+}

@@ -8,66 +8,65 @@ from pathlib import Path
 
 import matplotlib
 
-from mjstack.report.scaling import PASS, ScalingRow, crossover
+from mjstack.report.scaling import PASS, Row, crossover
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-COLORS = {"mjwarp": "#2a7d2e", "native": "#2457c7"}
-LABELS = {"mjwarp": "MJWarp", "native": "native MuJoCo"}
+# By backend: colour, label, and height at which failed runs are marked (share of the axis).
+_BACKENDS = {"mjwarp": ("#2a7d2e", "MJWarp", 0.02), "native": ("#2457c7", "native MuJoCo", 0.06)}
 _SERIES = (
     ("world_steps_per_s", "-", "o", "physics"),
     ("env_steps_per_s", "--", "s", "env.step"),
 )
 
 
-def save_scaling_curves(
-    path: Path, rows: Sequence[ScalingRow], decimation: int, title: str
-) -> None:
-    """Draws both panels.
+def save_scaling_curves(path: Path, rows: Sequence[Row], decimation: int, title: str) -> None:
+    """Draw both panels.
 
     Args:
         path: The picture.
-        rows: The table. A case that did not pass interrupts its curves, whatever it has measured,
+        rows: The table. A run that did not pass interrupts its curves, whatever it has measured,
             and a cross marks it.
         decimation: Physics steps in an environment step: both are drawn as world-steps/s.
         title: What is shown.
     """
     figure, (rate, cost) = plt.subplots(1, 2, figsize=(12, 4.8), layout="constrained")
-    for backend, color in COLORS.items():
-        mine = sorted((row for row in rows if row.backend == backend), key=lambda row: row.nworld)
-        if not mine:
-            continue
-        worlds = [row.nworld for row in mine]
-        for name, line, marker, what in _SERIES:
+    for backend, (color, label, height) in _BACKENDS.items():
+        mine = sorted(
+            (row for row in rows if row["backend"] == backend), key=lambda row: row["nworld"]
+        )
+        worlds = [row["nworld"] for row in mine]
+        # A curve per series
+        for name, line, marker, series in _SERIES:
             factor = decimation if name == "env_steps_per_s" else 1
             values = [
-                factor * _number(getattr(row, name)) if row.status == PASS else math.nan
+                factor * row[name] if row["status"] == PASS and row[name] else math.nan
                 for row in mine
             ]
             if all(math.isnan(value) for value in values):
                 continue
-            label = f"{LABELS[backend]}, {what}"
-            rate.plot(worlds, values, line, marker=marker, markersize=4, color=color, label=label)
-            steps = [1e3 * n / value for n, value in zip(worlds, values, strict=True)]
-            cost.plot(worlds, steps, line, marker=marker, markersize=4, color=color, label=label)
-        failed = [row.nworld for row in mine if row.status != PASS]
+            steps_ms = [1e3 * n / value for n, value in zip(worlds, values, strict=True)]
+            for axes, curve in ((rate, values), (cost, steps_ms)):
+                text = f"{label}, {series}"
+                axes.plot(worlds, curve, line, marker=marker, markersize=4, color=color, label=text)
+        # Runs without a figure
+        failed = [row["nworld"] for row in mine if row["status"] != PASS]
         for axes in (rate, cost):
-            bottom = [0.02 if backend == "mjwarp" else 0.06] * len(failed)
-            axes.plot(failed, bottom, "x", color=color, transform=axes.get_xaxis_transform())
+            marks = [height] * len(failed)
+            axes.plot(failed, marks, "x", color=color, transform=axes.get_xaxis_transform())
+    # Axes
     at = crossover(rows)
-    for axes, name, goes in (
-        (rate, "world-steps/s", "up"),
-        (cost, "ms per physics step of all worlds", "down"),
+    ticks = sorted({row["nworld"] for row in rows})
+    for axes, name, grid in (
+        (rate, "world-steps/s", "both"),
+        (cost, "ms per physics step of all worlds", "major"),
     ):
-        axes.set(xscale="log", yscale="log", xlabel="worlds", ylabel=name, title=f"{name}")
+        axes.set(yscale="log", xlabel="worlds", ylabel=name, title=name)
         axes.set_xscale("log", base=2)
-        axes.set_xticks(
-            sorted({row.nworld for row in rows}),
-            [f"{n:,}" for n in sorted({row.nworld for row in rows})],
-        )
+        axes.set_xticks(ticks, [f"{n:,}" for n in ticks])
         axes.tick_params(axis="x", rotation=45)
-        axes.grid(alpha=0.3, which="both" if goes == "up" else "major")
+        axes.grid(alpha=0.3, which=grid)
         if at is not None:
             axes.axvline(at, color="0.4", linestyle=":", label=f"crossover, {at:,.0f} worlds")
         if axes.get_legend_handles_labels()[0]:
@@ -75,7 +74,3 @@ def save_scaling_curves(
     figure.suptitle(f"{title} (x: no figure)")
     figure.savefig(path, dpi=100)
     plt.close(figure)
-
-
-def _number(value: float | None) -> float:
-    return float(value) if isinstance(value, float | int) else math.nan

@@ -5,46 +5,61 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from mjstack.report.record import GateResult, Report, Status, Table
+from mjstack.report.record import GateResult, Report, Status
+from mjstack.report.table import Table
+
+# Units by the end of a metric's name; the first that fits counts.
+_UNITS = {
+    "_m_per_s": "m/s",
+    "_per_s": "/s",
+    "_mib": "MiB",
+    "_deg": "deg",
+    "_mb": "MB",
+    "_rad": "rad",
+    "_m": "m",
+    "_s": "s",
+    "_w": "W",
+    "_j": "J",
+    "_n": "N",
+}
+_SPREAD = ("median", "min", "max")
 
 
 def to_markdown(report: Report) -> str:
-    """Summary table, pictures, then every gate with thresholds and metrics."""
-    lines = [f"# mjstack run: {report.status.value}", ""]
-    lines += ["| gate | status | seconds | what it says |", "| --- | --- | ---: | --- |"]
-    lines += [
-        f"| {g.name} | {g.status.value} | {g.seconds:.1f} | {escape_cell(g.reason)} |"
-        for g in report.gates
-    ]
+    """Summary table, pictures, then every gate with its figures, and the provenance."""
+    lines = [f"# mjstack run: {report.status.value}", "", *summarize(report).to_markdown()]
     for picture in report.pictures:
         lines += ["", f"![{picture}]({picture})"]
     for gate in report.gates:
-        lines += ["", f"## {gate.name}: {gate.status.value}", ""]
-        if gate.reason:
-            lines += [gate.reason, ""]
-        lines += _table("metric", gate.metrics) + _table("threshold", gate.thresholds)
-        lines += _table("note", gate.notes)
-        lines += [f"- {line}" for line in gate.details]
-        for table in gate.tables:
-            lines += ["", f"### {table.title}", "", *_rows(table)]
-    lines += ["", "## Provenance", "", "| what | value |", "| --- | --- |"]
-    for key, value in report.provenance.items():
-        text = (
-            ", ".join(f"{k} {v}" for k, v in value.items())
-            if isinstance(value, dict)
-            else format_value(value)
-        )
-        lines.append(f"| {key} | {text} |")
+        lines += ["", f"## {gate.name}: {gate.status.value}"]
+        lines += ["", gate.reason] if gate.reason else []
+        for table in [*gate.tables, *_tables(gate)]:
+            lines += ["", f"### {table.title}", "", *table.to_markdown()]
+        lines += ["", *(f"- {line}" for line in gate.details)] if gate.details else []
+    rows = [[key, _words(value)] for key, value in report.provenance.items()]
+    table = Table(title="Provenance", header=["fact", "value"], rows=rows)
+    lines += ["", f"## {table.title}", "", *table.to_markdown()]
     skipped = [gate for gate in report.gates if gate.status is Status.skipped]
     if skipped:
         lines += ["", "Skipped:", ""] + [f"- {gate.name}: {gate.reason}" for gate in skipped]
     return "\n".join(lines) + "\n"
 
 
+def summarize(report: Report) -> Table:
+    """A row per gate: its status, wall time, and result in a line."""
+    rows = [
+        [gate.name, gate.status.value, f"{gate.seconds:.1f}", gate.reason or "ok"]
+        for gate in report.gates
+    ]
+    return Table(title="", header=["gate", "status", "seconds", "result"], rows=rows)
+
+
 def format_value(value: object) -> str:
-    """A number with as many digits as a reader needs."""
+    """A number with as many digits as a reader needs; other values as they are."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
+        return f"{value:,.0f}" if 1e4 <= abs(value) < math.inf else f"{value:.4g}"
     return "" if value is None else str(value)
 
 
@@ -56,27 +71,85 @@ def format_percent(rate: float, unit: str = " %") -> str:
     return text.rstrip("0").rstrip(".") + unit
 
 
-def escape_cell(text: str) -> str:
-    """Text as a cell of a Markdown table."""
-    return text.replace("|", "\\|").replace("\n", " ")
+def _tables(gate: GateResult) -> list[Table]:
+    """The gate's numbers, every one once.
+
+    Repeated figures have their median and range in a row. A metric ``STATE.NAME`` whose threshold
+    is called ``NAME`` stands beside that limit, in a row per state. The rest is name and value.
+    """
+    metrics = dict(gate.metrics)
+    thresholds = dict(gate.thresholds)
+    tables = []
+    repeated = [name[:-7] for name in metrics if name.endswith(".median")]
+    if repeated:
+        rows = []
+        for name in repeated:
+            spread = [metrics.pop(f"{name}.{end}") for end in _SPREAD]
+            rows.append([_label(name), *(_with_unit(name, value) for value in spread)])
+        header = ["figure", "median", "smallest", "largest"]
+        tables.append(Table(title="Figures", header=header, rows=rows))
+
+    limited = _with_limits(metrics, thresholds)
+    if limited.rows:
+        tables.append(limited)
+    rest: dict[str, Mapping[str, object]] = {
+        "measured": metrics,
+        "required": thresholds,
+        "note": gate.notes,
+    }
+    for name, values in rest.items():
+        if values:
+            rows = [[_label(key), _with_unit(key, value)] for key, value in values.items()]
+            tables.append(Table(title=name.capitalize(), header=[name, "value"], rows=rows))
+    return tables
 
 
-def headline(gate: GateResult) -> str:
-    """One line about a gate, for the terminal."""
-    return gate.reason or "ok"
+def _with_limits(metrics: dict[str, float], thresholds: dict[str, float]) -> Table:
+    """Metrics per state beside their limits, taken out of both mappings."""
+    cells: dict[str, dict[str, str]] = {}
+    used = set()
+    for name in list(metrics):
+        state, _, quantity = name.partition(".")
+        limit = thresholds.get(quantity)
+        if limit is None:
+            continue
+        used.add(quantity)
+        group, _, column = quantity.rpartition(".")
+        row = cells.setdefault(", ".join(_label(part) for part in (state, group) if part), {})
+        row[column] = f"{format_value(float(metrics.pop(name)))} / {format_value(float(limit))}"
+    for quantity in used:
+        del thresholds[quantity]
+    columns = list(dict.fromkeys(column for row in cells.values() for column in row))
+    return Table(
+        title="Found / allowed",
+        header=["state", *columns],
+        rows=[[name, *(row.get(c, "") for c in columns)] for name, row in cells.items()],
+    )
 
 
-def _rows(table: Table) -> list[str]:
-    """A table as Markdown: its first column is text, the others are numbers."""
-    rule = ["---", *["---:"] * (len(table.header) - 1)]
-    return [
-        f"| {' | '.join(escape_cell(cell) for cell in row)} |"
-        for row in (table.header, rule, *table.rows)
-    ]
+def _ending(name: str) -> str:
+    """The end of a name that tells its unit; empty where there is none."""
+    return next((end for end in _UNITS if name.endswith(end)), "")
 
 
-def _table(title: str, values: Mapping[str, object]) -> list[str]:
-    if not values:
-        return []
-    rows = [f"| {name} | {escape_cell(format_value(value))} |" for name, value in values.items()]
-    return [f"| {title} | value |", "| --- | ---: |", *rows, ""]
+def _label(name: str) -> str:
+    """A metric's name in words, without its unit.
+
+    ``final.red.position_m`` is "final, red: position".
+    """
+    *groups, last = name.removesuffix(_ending(name)).replace("_", " ").split(".")
+    return f"{', '.join(groups)}: {last}" if groups else last
+
+
+def _with_unit(name: str, value: object) -> str:
+    """A value with the unit that its name ends on."""
+    end = _ending(name)
+    number = isinstance(value, float | int) and not isinstance(value, bool)
+    return f"{format_value(value)} {_UNITS[end]}" if end and number else format_value(value)
+
+
+def _words(value: object) -> str:
+    """A value of the provenance; versions become a list."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {item}" for name, item in value.items())
+    return format_value(value)

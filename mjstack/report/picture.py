@@ -64,37 +64,27 @@ class SceneCamera:
         self._renderer.close()
 
 
-def save_pictures(
-    folder: Path,
-    model: mujoco.MjModel,
-    qpos: np.ndarray,
-    cubes: np.ndarray,
-    half: float,
-    title: str,
-) -> list[str]:
-    """Writes scene.png and trajectories.png.
+def save_scene(
+    path: Path, model: mujoco.MjModel, qpos: np.ndarray, cubes: np.ndarray, half: float, title: str
+) -> None:
+    """Draw a state; on a machine without OpenGL in lines.
 
     Args:
-        folder: Where.
+        path: The picture.
         model: The scene with visuals.
-        qpos: Final state, shape ``(nq,)``.
-        cubes: Positions of red and blue over the episode [m], shape ``(frames, 2, 3)``.
+        qpos: The state, shape ``(nq,)``.
+        cubes: Positions of red and blue [m], shape ``(2, 3)``.
         half: Half a cube's edge [m].
         title: What is shown.
-
-    Returns:
-        File names.
     """
     try:
         camera = SceneCamera(model)
-        image = camera.draw(qpos)
-        camera.close()
-        plt.imsave(folder / "scene.png", image)
     except MjstackError as error:
         log.warning("%s The final scene is plotted instead.", error)
-        _plot_scene(folder / "scene.png", model, qpos, cubes[-1], half, title)
-    _plot_trajectories(folder / "trajectories.png", cubes, half, title)
-    return ["scene.png", "trajectories.png"]
+        _plot_scene(path, model, qpos, cubes, half, title)
+        return
+    plt.imsave(path, camera.draw(qpos))
+    camera.close()
 
 
 def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, step_dt: float) -> None:
@@ -103,7 +93,7 @@ def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, step_dt: flo
     Args:
         path: The file.
         model: The scene with visuals.
-        qpos: States at frame ends, shape ``(frames, nq)``.
+        qpos: States at the ends of steps, shape ``(steps, nq)``.
         step_dt: Time between them [s].
 
     Raises:
@@ -131,7 +121,15 @@ def require_video() -> Callable[..., Any]:
     return imageio_ffmpeg.write_frames
 
 
-def _plot_trajectories(path: Path, cubes: np.ndarray, half: float, title: str) -> None:
+def save_trajectories(path: Path, cubes: np.ndarray, half: float, title: str) -> None:
+    """Plot the cubes' way.
+
+    Args:
+        path: The picture.
+        cubes: Positions of red and blue over the episode [m], shape ``(steps, 2, 3)``.
+        half: Half a cube's edge [m].
+        title: What is shown.
+    """
     figure, (side, above, height) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
     for cube, (name, color) in enumerate(CUBE_COLORS.items()):
         mm = 1e3 * cubes[:, cube]
@@ -156,7 +154,7 @@ def _plot_trajectories(path: Path, cubes: np.ndarray, half: float, title: str) -
         aspect="equal",
     )
     above.set(xlabel="y [mm]", ylabel="x [mm]", title="from above", aspect="equal")
-    height.set(xlabel="frame", ylabel="z [mm]", title="height of the centre")
+    height.set(xlabel="control step", ylabel="z [mm]", title="height of the centre")
     for axes in (side, above, height):
         axes.grid(alpha=0.3)
         axes.margins(0.1)

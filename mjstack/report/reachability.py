@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+
+from mjstack.report.table import Table, to_document
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -133,39 +135,39 @@ def to_npz(found: ReachMap) -> bytes:
 
 def to_markdown(found: ReachMap, notes: Sequence[str], picture: str = "") -> str:
     """Both tables and the picture."""
-    lines = [
-        f"# {found.title}",
-        "",
-        "| cube | place | configured | largest square | largest rectangle | tilt at most |",
-    ]
-    lines += ["| --- | --- | --- | ---: | ---: | ---: |"]
-    for region in found.regions:
-        place = f"({region.place[0]:.3f}, {region.place[1]:.3f})"
-        result = "reached" if region.reached else "NOT reached"
-        configured = f"{region.configured[0]:.3f} x {region.configured[1]:.3f}, {result}"
-        largest = f"{region.largest[0]:.3f} x {region.largest[1]:.3f}"
-        tilt = f"{np.degrees(region.tilt):.0f}°" if np.isfinite(region.tilt) else ""
-        lines.append(
-            f"| {region.name} | {place} | {configured} | {region.square:.3f} | {largest} | {tilt} |"
-        )
-    lines += [
-        "",
-        "| level | above the cube's centre | gripper | reached | tilt |",
-        "| --- | ---: | --- | ---: | ---: |",
-    ]
-    for level in found.levels:
-        tilt = (
-            f"{np.degrees(np.nanmin(level.tilt)):.0f}° to {np.degrees(np.nanmax(level.tilt)):.0f}°"
-            if level.reached.any()
-            else ""
-        )
-        share = f"{100.0 * level.reached.mean():.1f} %"
-        lines.append(
-            f"| {level.name} | {level.height:.3f} m | {level.gripper} | {share} | {tilt} |"
-        )
-    if picture:
-        lines += ["", f"![{picture}]({picture})"]
-    return "\n".join([*lines, "", *(f"- {note}" for note in notes)]) + "\n"
+    tables = [Table.of("", _REGION, found.regions), Table.of("", _LEVEL, found.levels)]
+    return to_document(found.title, tables, notes, picture)
+
+
+def _configured(region: CubeRegion) -> str:
+    x, y = region.configured
+    return f"{x:.3f} x {y:.3f}, {'reached' if region.reached else 'NOT reached'}"
+
+
+def _tilts(level: ReachLevel) -> str:
+    if not level.reached.any():
+        return ""
+    low, high = (np.degrees(end(level.tilt)) for end in (np.nanmin, np.nanmax))
+    return f"{low:.0f}° to {high:.0f}°"
+
+
+_REGION: dict[str, Callable[[CubeRegion], str]] = {
+    "cube": lambda region: region.name,
+    "place": lambda region: f"({region.place[0]:.3f}, {region.place[1]:.3f})",
+    "configured": _configured,
+    "largest square": lambda region: f"{region.square:.3f}",
+    "largest rectangle": lambda region: f"{region.largest[0]:.3f} x {region.largest[1]:.3f}",
+    "tilt at most": lambda region: (
+        f"{np.degrees(region.tilt):.0f}°" if np.isfinite(region.tilt) else ""
+    ),
+}
+_LEVEL: dict[str, Callable[[ReachLevel], str]] = {
+    "level": lambda level: level.name,
+    "above the cube's centre": lambda level: f"{level.height:.3f} m",
+    "gripper": lambda level: level.gripper,
+    "reached": lambda level: f"{100.0 * level.reached.mean():.1f} %",
+    "tilt": _tilts,
+}
 
 
 def save_map(path: Path, found: ReachMap) -> None:

@@ -1,155 +1,137 @@
-"""The scaling table: one row per backend and number of worlds, as CSV and as text."""
+"""The scaling table: a row per backend and number of worlds, as CSV and as text."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any
 
-from mjstack.report.markdown import escape_cell
+from mjstack.report.table import Table, to_document
 
 PASS = "pass"
 NOT_RUN = "not run"
 
+Row = dict[str, Any]
+"""One run of the job by the names of `COLUMNS`; a figure that was not measured, or is void, is
+None."""
 
-@dataclass(kw_only=True, slots=True)
-class ScalingRow:
-    """What one case found. A figure that was not measured, or that is void, is None.
-
-    Attributes:
-        nworld: Number of worlds.
-        backend: ``mjwarp`` or ``native``.
-        status: pass, fail, out of memory, timeout, crashed, or not run.
-        reason: Why, in one line; empty for a pass.
-        succeeded: Worlds whose episode succeeded.
-        ms_per_step: One batched physics step under a held command [ms], median; ``_min`` and
-            ``_max`` as well.
-        world_steps_per_s: The same as physics steps of all worlds per second.
-        ms_per_env_step: ``env.step`` with all managers [ms], median.
-        env_steps_per_s: The same as control intervals of all worlds per second.
-        managers_over_physics: What the managers add to physics in ``env.step``, as a fraction of
-            it.
-        managers_alone_over_physics: The time of the managers alone, likewise.
-        episode_s: The validated episode [s], median.
-        bare_ratio: That over bare steps of the same commands.
-        gpu_memory_arrays_mib: GPU memory that arrays hold [MiB], most of all sections.
-        gpu_memory_whole_gpu_mib: GPU memory that is taken on the whole GPU [MiB], likewise.
-        gpu_power_mean_w: Mean power during the episodes' steps alone [W].
-        process_peak_mib: Host memory [MiB]; of native cases.
-        build_s: Building the worlds, compilation included [s].
-        warm_up_s: An episode's first step, which runs eagerly [s].
-        capture_s: Capturing an episode's graph, its warm-up not included [s].
-        seconds: The whole case, start of its process included [s].
-        hardware: Backend and hardware.
-        git_commit: Which mjstack.
-    """
-
-    nworld: int
-    backend: str
-    status: str = NOT_RUN
-    reason: str = ""
-    succeeded: float | None = None
-    ms_per_step: float | None = None
-    ms_per_step_min: float | None = None
-    ms_per_step_max: float | None = None
-    world_steps_per_s: float | None = None
-    world_steps_per_s_min: float | None = None
-    world_steps_per_s_max: float | None = None
-    ms_per_env_step: float | None = None
-    env_steps_per_s: float | None = None
-    env_steps_per_s_min: float | None = None
-    env_steps_per_s_max: float | None = None
-    managers_over_physics: float | None = None
-    managers_alone_over_physics: float | None = None
-    episode_s: float | None = None
-    bare_ratio: float | None = None
-    gpu_memory_arrays_mib: float | None = None
-    gpu_memory_whole_gpu_mib: float | None = None
-    gpu_power_mean_w: float | None = None
-    process_peak_mib: float | None = None
-    build_s: float | None = None
-    warm_up_s: float | None = None
-    capture_s: float | None = None
-    seconds: float | None = None
-    hardware: str = ""
-    git_commit: str = ""
+_MEASUREMENTS = ("physics", "episode", "env_step")
+COLUMNS: dict[str, tuple[str, ...]] = {
+    "nworld": (),
+    "backend": (),
+    "status": (),  # pass, fail, out of memory, timeout, crashed, or not run
+    "reason": (),  # in one line; empty for a pass
+    "succeeded": ("succeeded",),  # worlds, in the batch gate
+    # One physics step of all worlds under a held joint target.
+    "ms_per_step": ("physics.ms_per_batched_step.median",),
+    "ms_per_step_min": ("physics.ms_per_batched_step.min",),
+    "ms_per_step_max": ("physics.ms_per_batched_step.max",),
+    "world_steps_per_s": ("physics.world_steps_per_s.median",),
+    "world_steps_per_s_min": ("physics.world_steps_per_s.min",),
+    "world_steps_per_s_max": ("physics.world_steps_per_s.max",),
+    # `env.step` with all managers.
+    "ms_per_env_step": ("env_step.ms_per_env_step.median",),
+    "env_steps_per_s": ("env_step.env_steps_per_s.median",),
+    "env_steps_per_s_min": ("env_step.env_steps_per_s.min",),
+    "env_steps_per_s_max": ("env_step.env_steps_per_s.max",),
+    "managers_over_physics": ("env_step.managers_over_physics.median",),
+    "managers_alone_over_physics": ("env_step.managers_alone_over_physics.median",),
+    # The validated episode; bare_ratio is its time over that of bare steps.
+    "episode_s": ("episode.seconds.median",),
+    "bare_ratio": ("episode.bare_ratio.median",),
+    # The most of all measurements.
+    "gpu_memory_arrays_mib": tuple(f"{name}.gpu_memory_arrays_mib" for name in _MEASUREMENTS),
+    "gpu_memory_whole_gpu_mib": tuple(f"{name}.gpu_memory_whole_gpu_mib" for name in _MEASUREMENTS),
+    "gpu_power_mean_w": ("episode.gpu_power_mean_w",),
+    "process_peak_mib": ("process_peak_mib",),  # host memory
+    "build_s": ("build_and_compile_s",),
+    "warm_up_s": ("episode.warm_up_s",),  # an episode's first step, which runs eagerly
+    "capture_s": ("episode.capture_s",),
+    "seconds": (),  # the whole run, start of its process included
+    "hardware": (),
+    "git_commit": (),
+}
+"""Columns of scaling.csv, each with the metrics of a run's gates that it takes; the largest of
+several."""
 
 
-COLUMNS = tuple(field.name for field in fields(ScalingRow))
+def new_row(nworld: int, backend: str, **values: Any) -> Row:
+    """A row that has not run, with some values."""
+    empty = dict.fromkeys(COLUMNS) | {"status": NOT_RUN, "reason": ""}
+    return empty | {"nworld": nworld, "backend": backend} | values
 
 
-def to_markdown(
-    rows: Sequence[ScalingRow], title: str, notes: Sequence[str], picture: str = ""
-) -> str:
-    """The table for people, what it says about the crossover, and where its rows come from."""
-    lines = [f"# {title}", ""]
-    lines += [
-        "| " + " | ".join(name for name, _ in _COLUMNS) + " |",
-        "| ---: | --- " + "| ---: " * (len(_COLUMNS) - 3) + "| --- |",
-    ]
-    for row in rows:
-        lines.append("| " + " | ".join(escape_cell(show(row)) for _, show in _COLUMNS) + " |")
-    if picture:
-        lines += ["", f"![{title}]({picture})"]
-    lines += ["", describe_crossover(rows), ""]
-    lines += [f"- {note}" for note in notes]
-    for name, values in (
-        ("hardware", {row.hardware for row in rows}),
-        ("commit", {row.git_commit for row in rows}),
-    ):
-        lines += [f"- {name}: {value}" for value in sorted(values - {""})]
-    return "\n".join(lines) + "\n"
+def take_figures(metrics: Mapping[str, float]) -> Row:
+    """The columns that come from metrics; None where none of theirs is there."""
+    return {
+        column: max((metrics[name] for name in names if name in metrics), default=None)
+        for column, names in COLUMNS.items()
+        if names
+    }
 
 
-def crossover(rows: Sequence[ScalingRow]) -> float | None:
-    """Number of worlds from which MJWarp makes more world-steps/s than native MuJoCo; None where
-    the rows do not show it.
+def to_markdown(rows: Sequence[Row], title: str, notes: Sequence[str], picture: str = "") -> str:
+    """The table for people, the crossover, and where the rows come from."""
+    lines = [describe_crossover(rows), *notes]
+    for name in ("hardware", "git_commit"):
+        values = sorted({row[name] for row in rows if row[name]})
+        lines += [f"{name.removeprefix('git_')}: {value}" for value in values]
+    return to_document(title, [Table.of("", _SHOWN, rows)], lines, picture)
 
-    Interpolated between the two numbers of worlds that bracket it, straight in logarithms. Cases
-    that failed do not count.
+
+def crossover(rows: Sequence[Row]) -> float | None:
+    """Number of worlds from which MJWarp makes more world-steps/s than native MuJoCo.
+
+    Interpolated between the two numbers of worlds that bracket it, straight in logarithms. Runs
+    that failed do not count. None where the rows do not show it.
     """
     rates = {
-        (row.backend, row.nworld): float(row.world_steps_per_s)
+        (row["backend"], row["nworld"]): row["world_steps_per_s"]
         for row in rows
-        if row.status == PASS and isinstance(row.world_steps_per_s, float)
+        if row["status"] == PASS and row["world_steps_per_s"] is not None
     }
     both = sorted({n for _, n in rates if ("mjwarp", n) in rates and ("native", n) in rates})
-    gap = [math.log(rates["mjwarp", n] / rates["native", n]) for n in both]
-    for (n0, g0), (n1, g1) in zip(
-        zip(both, gap, strict=True), list(zip(both, gap, strict=True))[1:], strict=False
-    ):
-        if g0 <= 0.0 < g1:
-            return math.exp(math.log(n0) + (math.log(n1) - math.log(n0)) * -g0 / (g1 - g0))
+    points = [(n, math.log(rates["mjwarp", n] / rates["native", n])) for n in both]
+    for (n0, gap0), (n1, gap1) in pairwise(points):
+        if gap0 <= 0.0 < gap1:
+            return math.exp(math.log(n0) + (math.log(n1) - math.log(n0)) * -gap0 / (gap1 - gap0))
     return None
 
 
-def describe_crossover(rows: Sequence[ScalingRow]) -> str:
+def describe_crossover(rows: Sequence[Row]) -> str:
     """The crossover in a sentence."""
     at = crossover(rows)
     if at is None:
-        return "Crossover: the cases that passed do not show MJWarp passing native MuJoCo."
+        return "Crossover: the runs that passed do not show MJWarp passing native MuJoCo."
     return (
         f"Crossover: from about {at:,.0f} worlds on MJWarp makes more physics steps than native"
         " MuJoCo on all cores."
     )
 
 
-def _number(value: float | None, form: str = ",.0f") -> str:
-    return format(value, form) if isinstance(value, float | int) else "-"
+def _figure(column: str, form: str = ",.0f") -> Callable[[Row], str]:
+    """How a figure is shown; "-" where there is none."""
+
+    def show(row: Row) -> str:
+        value = row[column]
+        return format(value, form) if isinstance(value, float | int) else "-"
+
+    return show
 
 
-_COLUMNS = (
-    ("worlds", lambda r: f"{r.nworld:,}"),
-    ("backend", lambda r: r.backend),
-    ("succeeded", lambda r: _number(r.succeeded)),
-    ("ms per step", lambda r: _number(r.ms_per_step, ".4g")),
-    ("world-steps/s", lambda r: _number(r.world_steps_per_s)),
-    ("env-steps/s", lambda r: _number(r.env_steps_per_s)),
-    ("managers", lambda r: _number(r.managers_over_physics, "+.1%")),
-    ("managers alone", lambda r: _number(r.managers_alone_over_physics, ".1%")),
-    ("episode, s", lambda r: _number(r.episode_s, ".3g")),
-    ("over bare steps", lambda r: _number(r.bare_ratio, ".3f")),
-    ("GPU memory, MiB", lambda r: _number(r.gpu_memory_whole_gpu_mib)),
-    ("capture, s", lambda r: _number(r.capture_s, ".2f")),
-    ("status", lambda r: f"{r.status}: {r.reason}" if r.reason else r.status),
-)
+_SHOWN: dict[str, Callable[[Row], str]] = {
+    "worlds": _figure("nworld"),
+    "backend": lambda row: row["backend"],
+    "succeeded": _figure("succeeded"),
+    "ms per step": _figure("ms_per_step", ".4g"),
+    "world-steps/s": _figure("world_steps_per_s"),
+    "env-steps/s": _figure("env_steps_per_s"),
+    "managers": _figure("managers_over_physics", "+.1%"),
+    "managers alone": _figure("managers_alone_over_physics", ".1%"),
+    "episode, s": _figure("episode_s", ".3g"),
+    "over bare steps": _figure("bare_ratio", ".3f"),
+    "GPU memory, MiB": _figure("gpu_memory_whole_gpu_mib"),
+    "capture, s": _figure("capture_s", ".2f"),
+    "status": lambda row: f"{row['status']}: {row['reason']}" if row["reason"] else row["status"],
+}

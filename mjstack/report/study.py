@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
-from mjstack.report.markdown import escape_cell
+from mjstack.report.markdown import format_value
+from mjstack.report.table import Table, to_document
 
 
 @dataclass(kw_only=True, slots=True)
@@ -62,43 +63,22 @@ def to_markdown(
     rows: Sequence[StudyRow], title: str, notes: Sequence[str], picture: str = ""
 ) -> str:
     """The columns that a reader compares."""
-    head = (
-        "variant",
-        "changes",
-        "ms per step",
-        "ratio to base",
-        "succeeded",
-        "iteration limit",
-        "line-search limit",
-        "notes",
-    )
-    lines = [
-        f"# {title}",
-        "",
-        f"| {' | '.join(head)} |",
-        "| --- | --- | ---: | ---: | ---: | ---: | ---: | --- |",
-    ]
-    for row in rows:
-        ratio = (
-            ""
-            if row.ratio is None
-            else f"{row.ratio:.2f} ({row.ratio_min:.2f} to {row.ratio_max:.2f})"
-        )
-        cells = (
-            row.variant,
-            row.changes,
-            "" if row.ms_per_batched_step is None else f"{row.ms_per_batched_step:.3g}",
-            ratio,
-            "" if row.succeeded is None else f"{row.succeeded} of {row.worlds}",
-            _count(row.iteration_limit_worlds),
-            _count(row.line_search_limit_worlds),
-            "; ".join(text for text in (row.broken_rules, row.reason) if text),
-        )
-        lines.append(f"| {' | '.join(escape_cell(cell) for cell in cells)} |")
-    if picture:
-        lines += ["", f"![{picture}]({picture})"]
-    return "\n".join([*lines, "", *(f"- {note}" for note in notes)]) + "\n"
+    return to_document(title, [Table.of("", _SHOWN, rows)], notes, picture)
 
 
-def _count(value: int | None) -> str:
-    return "" if value is None else str(value)
+def _ratio(row: StudyRow) -> str:
+    if row.ratio is None:
+        return ""
+    return f"{row.ratio:.2f} ({row.ratio_min:.2f} to {row.ratio_max:.2f})"
+
+
+_SHOWN: dict[str, Callable[[StudyRow], str]] = {
+    "variant": lambda row: row.variant,
+    "changes": lambda row: row.changes,
+    "ms per step": lambda row: format_value(row.ms_per_batched_step),
+    "ratio to base": _ratio,
+    "succeeded": lambda row: "" if row.succeeded is None else f"{row.succeeded} of {row.worlds}",
+    "iteration limit": lambda row: format_value(row.iteration_limit_worlds),
+    "line-search limit": lambda row: format_value(row.line_search_limit_worlds),
+    "notes": lambda row: "; ".join(text for text in (row.broken_rules, row.reason) if text),
+}

@@ -92,7 +92,7 @@ class BatchGateCfg:
 class ThroughputCfg:
     """How throughput is measured."""
 
-    sections: list[str] = MISSING
+    measurements: list[str] = MISSING
     repetitions: int = MISSING
     steps: int = MISSING
     env_steps: int = MISSING

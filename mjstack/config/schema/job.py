@@ -17,12 +17,12 @@ class JobCfg:
 
 @dataclass(kw_only=True, slots=True)
 class ScalingJobCfg(JobCfg):
-    """Throughput over numbers of worlds, each in a process of its own.
+    """Throughput over numbers of worlds, each in a process.
 
     ``backends`` null: native, and MJWarp where there is CUDA, as far as ``sim`` allows. Above
-    ``large`` worlds a case makes ``repetitions_large`` repetitions. ``case_minutes`` ends a case
-    that hangs; ``max_minutes`` ends a call, and the next one goes on. ``retry``: cases that failed
-    run again.
+    ``large`` worlds a run makes ``repetitions_large`` repetitions. ``run_minutes`` ends a run
+    that hangs; ``max_minutes`` ends a call, and the next one goes on. ``retry``: runs that failed
+    are repeated.
     """
 
     nworlds: list[int] = MISSING
@@ -32,7 +32,7 @@ class ScalingJobCfg(JobCfg):
     repetitions_large: int = MISSING
     native_steps: int = MISSING
     native_env_steps: int = MISSING
-    case_minutes: float = MISSING
+    run_minutes: float = MISSING
     max_minutes: float | None = None
     retry: bool = MISSING
 

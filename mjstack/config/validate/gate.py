@@ -17,7 +17,7 @@ from mjstack.config.validate.term import places_cubes, reads_starts_file
 from mjstack.config.validate.values import length, positive, positive_int
 from mjstack.errors import ConfigError, UnknownName
 
-SECTIONS = ("physics", "episode", "env_step")
+MEASUREMENTS = ("physics", "episode", "env_step")
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 BOX_ROLES = (
     "approach",
@@ -139,13 +139,13 @@ def _throughput(t: ThroughputCfg) -> None:
         positive_int(f"gate.throughput.{name}", getattr(t, name))
     for name in ("max_seconds", "cpu_max_seconds"):
         positive(f"gate.throughput.{name}", getattr(t, name), "s")
-    if not t.sections:
+    if not t.measurements:
         raise ConfigError(
-            "gate.throughput.sections", "[]", f"at least one of {', '.join(SECTIONS)}"
+            "gate.throughput.measurements", "[]", f"at least one of {', '.join(MEASUREMENTS)}"
         )
-    for name in t.sections:
-        if name not in SECTIONS:
-            raise UnknownName("gate.throughput.sections: section", name, SECTIONS)
+    for name in t.measurements:
+        if name not in MEASUREMENTS:
+            raise UnknownName("gate.throughput.measurements: section", name, MEASUREMENTS)
 
 
 def check_success(cfg: Config) -> None:

@@ -42,7 +42,7 @@ def _scaling(job: ScalingJobCfg) -> None:
         )
     for key in ("repetitions", "large", "repetitions_large", "native_steps", "native_env_steps"):
         positive_int(f"job.{key}", getattr(job, key))
-    positive("job.case_minutes", job.case_minutes, "min")
+    positive("job.run_minutes", job.run_minutes, "min")
     if job.max_minutes is not None:
         positive("job.max_minutes", job.max_minutes, "min")
 
