@@ -2,8 +2,8 @@
 codes.
 
 Hydra exits with 1 on its own configuration errors, ignores what the main function returns, and
-makes the run folder before calling it. So every job is composed and checked here first, and Hydra
-only runs what has passed.
+makes the run folder before calling it. So every job is composed, checked and built here, once, and
+Hydra runs what was composed.
 """
 
 from __future__ import annotations
@@ -12,39 +12,46 @@ import os
 import shutil
 import sys
 import tempfile
+from argparse import ArgumentError, Namespace
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import hydra
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import get_args_parser, run_and_report
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 import mjstack
 from mjstack.config import Config
-from mjstack.config.explain import CompositionError
 from mjstack.config.help import help_text
-from mjstack.config.load import compose_overrides, to_config
-from mjstack.config.overrides import parse
-from mjstack.config.session import CONFIG_MODULE, CONFIG_NAME, own_hydra
-from mjstack.errors import MjstackError, UnknownName
+from mjstack.config.load import compose, explained, split_search_path, to_config
+from mjstack.config.overrides import check_overrides, parse
+from mjstack.config.session import (
+    CONFIG_NAME,
+    PROVIDER,
+    hydra_session,
+    search_path,
+)
+from mjstack.errors import CompositionError, MjstackError, UnknownName
 from mjstack.report.record import Status
 from mjstack.report.table import Table
 from mjstack.startup import INTERRUPTED, started
 
 if TYPE_CHECKING:
-    from mjstack.jobs import JobResult
+    from mjstack.jobs import CheckedJob, JobResult
 
-_OTHER_CONFIG = {"--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp"}
-_HELP = {"--help", "-h"}
-_SWEEP = {"-m", "--multirun"}
-_VALUED = {"--cfg", "-c", "--package", "-p"}
-_OTHER_FLAGS = {"--resolve", "--run", "-r"}
+_OTHER_CONFIG = {"--config-name", "-cn", "--config-path", "-cp"}
 _WIDE = 3  # gates; with more of them a sweep's table has only their status
-_FLAGS_WITHOUT_RUN = {"--hydra-help", "--info", "-i", "--shell-completion", "-sc"}
+
+_checked: dict[tuple[str, ...], CheckedJob] = {}  # by their overrides, until Hydra runs them
+_results: list[JobResult] = []  # of the jobs that ran in this process
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -55,52 +62,90 @@ def main(argv: Sequence[str] | None = None) -> None:
 def run(args: list[str]) -> int:
     """Runs a command line and returns its exit status."""
     errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
-    if any(arg.partition("=")[0] in _HELP for arg in args):
-        _print_help()
-        return 0
-    if "--version" in args:
-        print(f"mjstack {mjstack.__version__}")
-        return 0
-    if _FLAGS_WITHOUT_RUN & set(args) or any(
-        a.startswith(("--info", "--hydra-help")) for a in args
-    ):
-        return _run_hydra(args, [])
-    sweep = bool(_SWEEP & set(args))
-    dry = any(a in ("--cfg", "-c") or a.startswith("--cfg=") for a in args)
+    _checked.clear()
+    _results.clear()
     try:
-        overrides = _overrides(args)
-        jobs = [
-            [o for o in job if not _is_hydra(o)]
-            for job in (_expand(overrides) if sweep else [overrides])
-        ]
-        configs = [to_config(compose_overrides(own)) for own in jobs]
-        from mjstack.jobs import (
-            check_job,
-            job_folder,
-        )  # loads torch and Warp, which what is misspelt need not wait for
-
-        if not dry:
-            for config, own in zip(configs, jobs, strict=True):
-                check_job(config, own)
-        folder = None if sweep or dry else job_folder(configs[0])
-        if folder is not None and not any(o.startswith("hydra.run.dir=") for o in overrides):
-            args = [*args, f"hydra.run.dir={folder}"]
-            overrides = [*overrides, f"hydra.run.dir={folder}"]
-        if not dry:
-            check_writable(_output_folder(overrides, sweep))
+        if "--version" in args:
+            print(f"mjstack {mjstack.__version__}")
+            return 0
+        flags = _parse(args)
+        entries, overrides = split_search_path(flags.overrides)
+        folders = [] if flags.config_dir is None else [flags.config_dir]
+        with search_path([*folders, *entries]):
+            return _dispatch(flags, overrides)
     except MjstackError as error:
         errors.print(f"mjstack: {error}")
         return error.exit_code
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 1
     except KeyboardInterrupt:
-        return INTERRUPTED
-    outcomes: list[JobResult] = []
-    try:
-        status = _run_hydra(args, outcomes)
-    except KeyboardInterrupt:
-        status = INTERRUPTED
-    if sweep and outcomes:
-        _print_sweep(outcomes)
-    return max([status, *(outcome.exit_code for outcome in outcomes)])
+        return max([INTERRUPTED, *(result.exit_code for result in _results)])
+
+
+def _dispatch(flags: Namespace, overrides: list[str]) -> int:
+    """Does what the flags ask for, on the current search path."""
+    if flags.help:
+        _print_help()
+        return 0
+    with hydra_session() as hydra:
+        if flags.hydra_help:
+            hydra.hydra_help(CONFIG_NAME, args_parser=get_args_parser(), args=flags)
+        elif flags.info is not None:
+            hydra.show_info(flags.info, CONFIG_NAME, overrides)
+        elif flags.shell_completion:
+            run_and_report(lambda: hydra.shell_completion(CONFIG_NAME, overrides))
+        elif flags.cfg:
+            _show(hydra, flags, overrides)
+        elif flags.multirun:
+            return _sweep(hydra, overrides)
+        else:
+            return _run_one(hydra, overrides)
+    return 0
+
+
+def _show(hydra: Hydra, flags: Namespace, overrides: list[str]) -> None:
+    """Checks the values of a configuration and prints it."""
+    if flags.multirun:
+        raise CompositionError("--cfg shows one configuration, and -m makes several. Leave -m out.")
+    check_overrides(_own(overrides))
+    to_config(compose(hydra, overrides))
+    run_and_report(
+        lambda: hydra.show_cfg(CONFIG_NAME, overrides, flags.cfg, flags.package, flags.resolve)
+    )
+
+
+def _run_one(hydra: Hydra, overrides: list[str]) -> int:
+    """Composes, checks and runs one job."""
+    check_overrides(_own(overrides))
+    cfg = compose(hydra, overrides)
+    checked = _check(cfg, overrides)
+    if checked.folder is not None and not any(o.startswith("hydra.run.dir=") for o in overrides):
+        cfg.hydra.run.dir = str(checked.folder)
+    check_writable(_folder(cfg, "run"))
+    run_and_report(lambda: hydra.run(CONFIG_NAME, run_job, overrides))
+    return max(result.exit_code for result in _results)
+
+
+def _sweep(hydra: Hydra, overrides: list[str]) -> int:
+    """Composes and checks every job of a sweep, then runs them.
+
+    Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
+    """
+    jobs = _expand(overrides)
+    for job in jobs:
+        check_overrides(job)
+    overrides = [*overrides, "hydra.mode=MULTIRUN"]
+    master = compose(hydra, overrides, RunMode.MULTIRUN)
+    for job in jobs:
+        with explained(job):
+            cfg = hydra.config_loader.load_sweep_config(master, job)
+        _check(cfg, job)
+    check_writable(_folder(master, "sweep"))
+    returned = run_and_report(lambda: hydra.multirun(CONFIG_NAME, run_job, overrides))
+    batches = returned if isinstance(returned, list) else []  # a launcher's own processes return
+    results = _results or [job.return_value for batch in batches for job in batch]
+    _print_sweep(results)
+    return max(result.exit_code for result in results)
 
 
 def _print_help() -> None:
@@ -113,110 +158,101 @@ def _print_help() -> None:
         )  # Python writes there once more at its end
 
 
-def _run_hydra(args: list[str], outcomes: list[JobResult]) -> int:
-    """Hands the command line to Hydra; each job adds its outcome."""
-    from mjstack.jobs import run_job
-
-    def job(cfg: DictConfig) -> None:
-        started()
-        folder = Path(HydraConfig.get().runtime.output_dir)
-        outcome = run_job(to_config(cfg), folder, overrides=list(HydraConfig.get().overrides.task))
-        outcomes.append(outcome)
-        if outcome.status is Status.interrupted:
-            raise KeyboardInterrupt
-
-    argv = sys.argv
-    sys.argv = [argv[0], *args]
-    try:
-        hydra.main(
-            version_base="1.3", config_path=f"pkg://{CONFIG_MODULE}", config_name=CONFIG_NAME
-        )(job)()
-    except SystemExit as stop:
-        return stop.code if isinstance(stop.code, int) else 1
-    finally:
-        sys.argv = argv
-    return 0
+def run_job(cfg: DictConfig) -> JobResult:
+    """Runs a job in the folder that Hydra made. A launcher may call it in another process, where
+    nothing has been checked yet.
+    """
+    started()
+    own = HydraConfig.get()
+    overrides = list(own.overrides.task)
+    sources = [s for s in own.runtime.config_sources if s.provider == PROVIDER]
+    with search_path([f"{source.schema}://{source.path}" for source in sources]):
+        checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
+        result = checked.run(Path(own.runtime.output_dir), overrides)
+    _results.append(result)
+    if result.status is Status.interrupted:
+        raise KeyboardInterrupt
+    return result
 
 
-def _overrides(args: list[str]) -> list[str]:
-    """The key=value arguments; Hydra's own flags and their values are left out."""
-    flags = {*_HELP, "--version", *_FLAGS_WITHOUT_RUN, *_SWEEP, *_VALUED, *_OTHER_FLAGS}
-    out = []
-    skip = False
+def _check(cfg: DictConfig, overrides: list[str]) -> CheckedJob:
+    """Types and checks a composed job, and keeps what that built for its run."""
+    from mjstack.jobs import (
+        check_job,
+    )  # loads torch and Warp, for which a misspelt key need not wait
+
+    own = _own(overrides)
+    checked = check_job(to_config(cfg), own)
+    _checked[tuple(own)] = checked
+    return checked
+
+
+def _parse(args: list[str]) -> Namespace:
+    """Hydra's reading of the flags, or a `CompositionError`."""
+    parser = get_args_parser()
+    parser.exit_on_error = False
+    known = set(parser._option_string_actions)
     for number, arg in enumerate(args):
-        if skip:
-            skip = False
-        elif arg.partition("=")[0] in _OTHER_CONFIG:
+        name = arg.partition("=")[0]
+        if name in _OTHER_CONFIG:
             raise CompositionError(
                 f"argument '{arg}': mjstack runs its own configuration. Change it with key=value"
-                " overrides."
+                " overrides, or add choices with --config-dir DIR."
             )
-        elif arg in _VALUED:
-            skip = True
-        elif arg.startswith("-"):
-            if arg.partition("=")[0] not in flags:
-                override = arg.lstrip("-")
-                key, given, _ = override.partition("=")
-                if key.partition(".")[0] in {field.name for field in fields(Config)}:
-                    follows = args[number + 1 : number + 2]
-                    value = (
-                        follows[0]
-                        if follows and not follows[0].startswith("-") and "=" not in follows[0]
-                        else "VALUE"
-                    )
-                    meant = override if given else f"{key}={value}"
-                    raise CompositionError(
-                        f"flag '{arg}' does not exist. Write {meant}, an override without dashes."
-                    )
-                raise UnknownName("flag", arg, flags)
-        elif "=" not in arg and not arg.startswith("~"):
+        if arg.startswith("-") and name not in known:
+            raise _unknown_flag(arg, args[number + 1 : number + 2], known)
+    try:
+        flags = parser.parse_intermixed_args(args)
+    except ArgumentError as error:
+        raise CompositionError(f"{error}.") from error
+    for arg in flags.overrides:
+        if "=" not in arg and not arg.startswith("~") and not flags.help:
             raise CompositionError(
                 f"argument '{arg}' is not an override. Write key=value, such as nworld=64."
             )
-        else:
-            out.append(arg)
-    return out
+    return flags
 
 
-def _expand(overrides: list[str]) -> list[list[str]]:
-    """The jobs of a sweep, as Hydra's basic sweeper makes them."""
-    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+def _unknown_flag(arg: str, follows: list[str], known: set[str]) -> MjstackError:
+    override = arg.lstrip("-")
+    key, given, _ = override.partition("=")
+    if key.partition(".")[0] not in {field.name for field in fields(Config)}:
+        return UnknownName("flag", arg, known)
+    usable = follows and not follows[0].startswith("-") and "=" not in follows[0]
+    meant = override if given else f"{key}={follows[0] if usable else 'VALUE'}"
+    return CompositionError(
+        f"flag '{arg}' does not exist. Write {meant}, an override without dashes."
+    )
 
-    parsed = [parse(override) for override in overrides]
+
+def _own(overrides: Sequence[str]) -> list[str]:
+    """The overrides that are not Hydra's."""
+    return [o for o in overrides if not o.lstrip("+~").startswith(("hydra.", "hydra/"))]
+
+
+def _expand(overrides: Sequence[str]) -> list[list[str]]:
+    """The jobs of a sweep as Hydra's basic sweeper makes them; none for another sweeper."""
+    if any(o.startswith("hydra/sweeper=") and o != "hydra/sweeper=basic" for o in overrides):
+        return []
+    parsed = [parse(override) for override in _own(overrides)]
     try:
-        return [
-            list(job)
-            for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None)
-            for job in batch
-        ]
+        batches = BasicSweeper.split_arguments(parsed, max_batch_size=None)
     except HydraException as error:
         raise CompositionError(
             f"this sweep cannot be expanded: {str(error).splitlines()[0]}. List its values, such as"
             " robot=so101,rebot."
         ) from error
+    return [list(job) for batch in batches for job in batch]
 
 
-def _is_hydra(override: str) -> bool:
-    return override.lstrip("+~").startswith(("hydra.", "hydra/"))
-
-
-def _output_folder(overrides: list[str], sweep: bool) -> Path:
-    """The folder Hydra would make for these arguments, without making it."""
-    from hydra import compose
-
-    with own_hydra():
-        # Hydra's own part is composed alone: the rest of the configuration has been checked by now.
-        try:
-            cfg = compose(
-                CONFIG_NAME,
-                overrides=[o for o in overrides if _is_hydra(o)],
-                return_hydra_config=True,
-            )
-            return Path(cfg.hydra.sweep.dir if sweep else cfg.hydra.run.dir)
-        except Exception as error:
-            raise CompositionError(
-                f"hydra's own settings cannot be used: {str(error).splitlines()[0]}."
-            ) from error
+def _folder(cfg: DictConfig, kind: str) -> Path:
+    """The folder that Hydra will make for ``run`` or ``sweep``."""
+    try:
+        return Path(cfg.hydra[kind].dir)
+    except OmegaConfBaseException as error:
+        raise CompositionError(
+            f"hydra.{kind}.dir cannot be used: {str(error).splitlines()[0]}."
+        ) from error
 
 
 def check_writable(folder: Path) -> None:

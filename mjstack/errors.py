@@ -53,6 +53,12 @@ class ConfigError(MjstackError):
         return ConfigError(key, *self._facts)
 
 
+class CompositionError(MjstackError):
+    """Overrides do not fit the configuration files."""
+
+    exit_code = 2
+
+
 class UnknownName(MjstackError):
     """A name that does not exist, listed with the ones that do."""
 

@@ -9,15 +9,14 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 
-from hydra import compose
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from omegaconf import OmegaConf
 from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
 from mjstack.config.help import list_groups
 from mjstack.config.schema import JOB_SCHEMAS
-from mjstack.config.session import CONFIG_NAME, own_hydra
-from mjstack.errors import MjstackError, UnknownName, suggest
+from mjstack.config.session import compose_raw
+from mjstack.errors import CompositionError, MjstackError, UnknownName, suggest
 
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 _KINDS = {
@@ -34,12 +33,6 @@ _MISFITS = (
     (r"Invalid value '(?P<value>.*)', expected one of \[(?P<kind>.*)\]", "one of {}"),
     (r"Cannot convert '\w+' to (?P<kind>string): '(?P<value>.*)'", "{}"),
 )
-
-
-class CompositionError(MjstackError):
-    """The overrides do not fit the configuration files."""
-
-    exit_code = 2
 
 
 def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
@@ -129,16 +122,12 @@ def _below_null(overrides: Sequence[str]) -> CompositionError | None:
     no box.
     """
     choices = {group.name for group in list_groups()}
-    with own_hydra():
-        try:
-            base = OmegaConf.to_container(
-                compose(
-                    CONFIG_NAME, overrides=[o for o in overrides if o.partition("=")[0] in choices]
-                ),
-                resolve=False,
-            )
-        except (HydraException, OmegaConfBaseException):
-            return None
+    try:
+        base = OmegaConf.to_container(
+            compose_raw([o for o in overrides if o.partition("=")[0] in choices]), resolve=False
+        )
+    except (HydraException, OmegaConfBaseException):
+        return None
     for override in overrides:
         node: object = base
         path: list[str] = []
@@ -162,13 +151,12 @@ def _unknown_key(error: Exception, key: str, overrides: Sequence[str]) -> Mjstac
         f"{match.group(1)}."
     ):  # the key inside a mapping says more than the mapping's
         key = match.group(1)
-    with own_hydra():
-        # The job that was asked for has keys of its own.
-        jobs = [o for o in overrides if re.fullmatch(r"job=\w+", o)]
-        try:
-            base = OmegaConf.to_container(compose(CONFIG_NAME, overrides=jobs), resolve=False)
-        except (HydraException, OmegaConfBaseException):
-            base = OmegaConf.to_container(compose(CONFIG_NAME), resolve=False)
+    # The job that was asked for has keys of its own.
+    jobs = [o for o in overrides if re.fullmatch(r"job=\w+", o)]
+    try:
+        base = OmegaConf.to_container(compose_raw(jobs), resolve=False)
+    except (HydraException, OmegaConfBaseException):
+        base = OmegaConf.to_container(compose_raw([]), resolve=False)
     keys = _flat_keys(base)
     leaf = key.rpartition(".")[2]
     if key.startswith("job."):
@@ -212,11 +200,10 @@ def _unknown_key(error: Exception, key: str, overrides: Sequence[str]) -> Mjstac
 
 def _unknown_deletion(key: str, overrides: Sequence[str]) -> MjstackError:
     """``~key`` of what is not there: what is there, beside it."""
-    with own_hydra():
-        try:
-            base = compose(CONFIG_NAME, overrides=[o for o in overrides if not o.startswith("~")])
-        except (HydraException, OmegaConfBaseException) as error:
-            return explain(error)
+    try:
+        base = compose_raw([o for o in overrides if not o.startswith("~")])
+    except (HydraException, OmegaConfBaseException) as error:
+        return explain(error)
     parent = key.rpartition(".")[0]
     keys = [
         k

@@ -10,6 +10,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
+from mjstack.config.session import list_choices
+
 _CONF = files("mjstack.conf")
 _GROUP = re.compile(r"  - (?P<name>\w+): (?P<default>\[.*\]|\S+) # (?P<words>.+)")
 _KEY = re.compile(r"(?P<name>\w+): (?P<default>\[.*\]|\S+) # (?P<words>.+)")
@@ -43,6 +45,7 @@ _FLAGS = (
         "print a part of it; job=collect --cfg job -p job has the keys of a job",
     ),
     ("-m", "a sweep over comma-separated values"),
+    ("--config-dir DIR", "a folder of your own with more choices, such as DIR/task/push.yaml"),
     ("--hydra-help", "Hydra's own flags"),
     ("--version", "mjstack's version"),
 )
@@ -74,10 +77,16 @@ class Key:
 
 
 def list_groups() -> list[Group]:
-    """The configuration groups, in the order in which they are composed."""
-    return [
-        Group(name, _choices(name, default), words) for name, default, words in _entries(_GROUP)
-    ]
+    """The groups of the whole search path, mjstack's in the order of composition first."""
+    choices = list_choices()
+    known = {name: (default, words) for name, default, words in _entries(_GROUP)}
+    groups = []
+    for name in [*known, *(name for name in choices if name not in known)]:
+        default, words = known.get(name, ("", "added by the search path"))
+        first = [choice for choice in choices[name] if choice == default]
+        rest = [choice for choice in choices[name] if choice != default]
+        groups.append(Group(name, first + rest, words))
+    return groups
 
 
 def list_keys() -> list[Key]:
@@ -123,15 +132,6 @@ def _entries(pattern: re.Pattern[str]) -> Iterator[tuple[str, str, str]]:
     for line in _CONF.joinpath("config.yaml").read_text(encoding="utf-8").splitlines():
         if match := pattern.fullmatch(line):
             yield match["name"], match["default"], match["words"]
-
-
-def _choices(group: str, default: str) -> list[str]:
-    found = sorted(
-        file.name.removesuffix(".yaml")
-        for file in _CONF.joinpath(group).iterdir()
-        if file.name.endswith(".yaml")
-    )
-    return sorted(found, key=lambda name: name != default)
 
 
 def _table(rows: Sequence[tuple[str, str]], width: int) -> list[str]:

@@ -2,34 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
-from hydra import compose
+from hydra._internal.hydra import Hydra
 from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mjstack.config.explain import CompositionError, explain
+from mjstack.config.explain import explain
 from mjstack.config.overrides import check_overrides, parse
 from mjstack.config.robot_file import complete_robot
 from mjstack.config.schema import JOB_SCHEMAS, Config
-from mjstack.config.session import CONFIG_NAME, own_hydra
+from mjstack.config.session import (
+    CONFIG_NAME,
+    config_folders,
+    hydra_session,
+    search_path,
+    without_hydra,
+)
 from mjstack.config.terms import type_terms
+from mjstack.config.trust import check_trusted
 from mjstack.config.validate import validate
+from mjstack.errors import CompositionError
 
 ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
 for _name, _node in JOB_SCHEMAS.items():
     ConfigStore.instance().store(name=f"{_name}_schema", node=_node, provider="mjstack")
 
 
-def load_config(overrides: Sequence[str] = ()) -> Config:
-    """Composes the configuration as the command line does.
+def load_config(
+    overrides: Sequence[str] = (), *, config_dir: str | os.PathLike | None = None
+) -> Config:
+    """Compose the configuration as the command line does.
 
     Args:
         overrides: Command-line overrides, such as ``["robot=rebot", "nworld=64"]``.
+        config_dir: A folder with more choices, such as ``push/conf`` with ``task/push.yaml``. The
+            folder beside it is importable afterwards.
 
     Returns:
         The configuration, complete and validated.
@@ -37,23 +52,43 @@ def load_config(overrides: Sequence[str] = ()) -> Config:
     Raises:
         MjstackError: An override does not fit; the message says which and what would.
     """
-    return to_config(compose_overrides(overrides), search_folders(overrides))
+    entries, own = split_search_path(overrides)
+    with search_path([*([config_dir] if config_dir is not None else []), *entries]):
+        check_overrides(own)
+        with hydra_session() as hydra:
+            return to_config(compose(hydra, own))
 
 
-def search_folders(overrides: Sequence[str]) -> list[Path]:
-    """Folders that overrides add to the search path."""
-    parsed = [parse(override) for override in overrides if "hydra.searchpath" in override]
-    entries = [entry for override in parsed for entry in cast(list, override.value())]
-    return [
-        Path(entry.removeprefix("file://")) for entry in entries if not entry.startswith("pkg:")
-    ]
+def split_search_path(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Entries that overrides of ``hydra.searchpath`` add, and the other overrides."""
+    entries: list[str] = []
+    others = []
+    for override in overrides:
+        if override.lstrip("+").startswith("hydra.searchpath="):
+            value = parse(override).value()
+            if not isinstance(value, list):
+                raise CompositionError(
+                    f"{override}: expected a list, such as 'hydra.searchpath=[file://DIR]'."
+                )
+            entries += map(str, value)
+        else:
+            others.append(override)
+    return entries, others
 
 
-def compose_overrides(overrides: Sequence[str]) -> DictConfig:
-    """Composes without validating values; errors are one line each."""
-    check_overrides(overrides)
-    with own_hydra():
-        return _compose(overrides)
+def compose(hydra: Hydra, overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictConfig:
+    """Compose without validating values; Hydra's part is in it, and errors are one line each."""
+    with explained(overrides):
+        return hydra.compose_config(CONFIG_NAME, list(overrides), run_mode, from_shell=False)
+
+
+@contextmanager
+def explained(overrides: Sequence[str]) -> Iterator[None]:
+    """Turn Hydra's errors about overrides into one line each."""
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
+        raise explain(error, overrides) from error
 
 
 def load_saved(path: Path) -> Config:
@@ -61,7 +96,8 @@ def load_saved(path: Path) -> Config:
     is.
 
     Raises:
-        MjstackError: The file cannot be read, or is no configuration of this version.
+        MjstackError: The file cannot be read, is no configuration of this version, or names
+            functions that are not in the search path.
     """
     try:
         merged = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.load(path))
@@ -74,28 +110,19 @@ def load_saved(path: Path) -> Config:
         ) from error
     if missing:
         raise CompositionError(f"{missing[0]} is missing, expected every key of this version.")
+    check_trusted(cast(DictConfig, merged), path.parent)
     return to_config(cast(DictConfig, merged))
 
 
-def to_config(cfg: DictConfig, folders: Sequence[Path] = ()) -> Config:
-    """Turns a composed configuration into dataclasses and checks their values.
-
-    Args:
-        cfg: The composition.
-        folders: Folders of the search path, which may hold ``robot.file``.
-    """
+def to_config(cfg: DictConfig) -> Config:
+    """Turn a composed configuration into dataclasses and check their values."""
+    if "hydra" in cfg:
+        cfg = without_hydra(cfg)
     try:
         config = cast(Config, OmegaConf.to_object(cfg))
     except (OmegaConfBaseException, AttributeError, TypeError) as error:
         raise explain(error) from error
     type_terms(config)
-    complete_robot(config.robot, folders)
+    complete_robot(config.robot, config_folders())
     validate(config)
     return config
-
-
-def _compose(overrides: Sequence[str]) -> DictConfig:
-    try:
-        return compose(CONFIG_NAME, overrides=list(overrides))
-    except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
-        raise explain(error, overrides) from error

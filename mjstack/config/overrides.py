@@ -10,8 +10,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
-from mjstack.config.explain import TERM_GROUPS, CompositionError
+from mjstack.config.explain import TERM_GROUPS
 from mjstack.config.help import list_groups
+from mjstack.errors import CompositionError
 
 
 def check_overrides(overrides: Sequence[str]) -> None:

@@ -1,29 +1,201 @@
-"""Hydra's side of a composition: where the files are, and a Hydra of its own that leaves somebody
-else's as it was.
+"""Search path of the configuration, and Hydra on it.
+
+Configuration files are found in mjstack, in installed packages that register a configuration module
+under the entry point group ``mjstack.configs``, and in folders that the caller adds. The folder
+beside an added one is importable, so that its YAML can name functions by module.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import copy
+import os
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
 
-from hydra import initialize_config_module
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.object_type import ObjectType
 from hydra.core.singleton import Singleton
+from hydra.types import RunMode
+from hydra.version import setbase
+from omegaconf import DictConfig, open_dict
+
+from mjstack.errors import CompositionError
 
 CONFIG_MODULE = "mjstack.conf"
 CONFIG_NAME = "config"
+ENTRY_POINTS = "mjstack.configs"
+PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
+_FILE = "file://"
+_PACKAGE = "pkg://"
+
+_added: ContextVar[tuple[str, ...]] = ContextVar("search path", default=())
 
 
 @contextmanager
-def own_hydra() -> Iterator[None]:
-    """Composes from mjstack's files, also inside somebody else's Hydra application, whose state
-    comes back afterwards.
+def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
+    """Add folders and packages to the search path of every composition inside.
+
+    Args:
+        entries: Folders, or ``file://...`` and ``pkg://...`` as Hydra writes them.
+
+    Raises:
+        CompositionError: There is no such folder, or it has a file of mjstack's name.
+    """
+    found = [_entry(str(entry)) for entry in entries]
+    token = _added.set(tuple(dict.fromkeys((*_added.get(), *found))))
+    make_importable(found)
+    try:
+        yield
+    finally:
+        _added.reset(token)
+
+
+def search_path_override() -> list[str]:
+    """The override that gives another process the current search path; none where it is bare."""
+    quoted = [entry.replace("\\", "\\\\").replace("'", "\\'") for entry in _added.get()]
+    listed = ",".join(f"'{entry}'" for entry in quoted)
+    return [f"hydra.searchpath=[{listed}]"] if quoted else []
+
+
+def config_folders() -> list[Path]:
+    """Folders of the search path beside mjstack's: added ones, and those of packages."""
+    folders = []
+    for entry in _entries():
+        if entry.startswith(_FILE):
+            folders.append(Path(entry.removeprefix(_FILE)))
+        else:
+            package = find_spec(entry.removeprefix(_PACKAGE))
+            locations = package.submodule_search_locations if package else None
+            folders += map(Path, locations or ())
+    return folders
+
+
+def _entries() -> list[str]:
+    """Entries of registered packages, and added ones."""
+    registered = [f"{_PACKAGE}{point.value}" for point in entry_points(group=ENTRY_POINTS)]
+    return list(dict.fromkeys((*registered, *_added.get())))
+
+
+def make_importable(entries: Sequence[str]) -> None:
+    """Put the folder beside each configuration folder on Python's import path."""
+    for entry in entries:
+        parent = str(Path(entry.removeprefix(_FILE)).parent)
+        if entry.startswith(_FILE) and parent not in sys.path:
+            sys.path.insert(0, parent)
+
+
+def is_trusted(dotted: str) -> bool:
+    """Whether a dotted name is mjstack's, of a registered package, or in the search path.
+
+    A saved run may name any function; only these may be imported on its word.
+    """
+    package = dotted.partition(".")[0]
+    packages = [e.removeprefix(_PACKAGE) for e in _entries() if e.startswith(_PACKAGE)]
+    if package in {"mjstack", *(name.partition(".")[0] for name in packages)}:
+        return True
+    found = find_spec(package)
+    places = [*(found.submodule_search_locations or ()), found.origin or ""] if found else []
+    parents = [folder.parent for folder in config_folders()]
+    return any(Path(place).resolve().parent in parents for place in places if place)
+
+
+@contextmanager
+def hydra_session() -> Iterator[Hydra]:
+    """A Hydra on the current search path, also inside a Hydra application of the caller's, whose
+    state comes back afterwards.
     """
     outer = Singleton.get_state()
     GlobalHydra.instance().clear()
     try:
-        with initialize_config_module(config_module=CONFIG_MODULE, version_base="1.3"):
-            yield
+        setbase("1.3")
+        path = create_config_search_path(f"{_PACKAGE}{CONFIG_MODULE}")
+        path.get_path().pop()  # the schema, which Hydra wants last
+        for entry in _entries():
+            path.append(PROVIDER, entry)
+        path.append("schema", "structured://")
+        hydra = Hydra(task_name="run", config_loader=_Loader(path))
+        GlobalHydra.instance().initialize(hydra)
+        yield hydra
     finally:
         Singleton.set_state(outer)
+
+
+def compose_raw(overrides: Sequence[str]) -> DictConfig:
+    """Compose on the current search path, with Hydra's own errors."""
+    with hydra_session() as hydra:
+        cfg = hydra.compose_config(CONFIG_NAME, list(overrides), RunMode.RUN, from_shell=False)
+    return without_hydra(cfg)
+
+
+def without_hydra(cfg: DictConfig) -> DictConfig:
+    """A composition without Hydra's own part."""
+    own = copy.copy(cfg)
+    with open_dict(own):
+        own.pop("hydra", None)
+    return own
+
+
+def list_choices() -> dict[str, list[str]]:
+    """Names of every group's files in the whole search path, sorted, by group."""
+    with hydra_session() as hydra:
+        loader = hydra.config_loader
+        groups = [group for group in loader.list_groups("") if group != "hydra"]
+        return {g: sorted(loader.get_group_options(g, ObjectType.CONFIG)) for g in groups}
+
+
+class _Loader(ConfigLoaderImpl):
+    """Composes each list of overrides once: Hydra then runs the composition that was checked."""
+
+    def __init__(self, config_search_path: ConfigSearchPath) -> None:
+        super().__init__(config_search_path)
+        self._composed: dict[tuple, DictConfig] = {}
+
+    def load_configuration(
+        self,
+        config_name: str | None,
+        overrides: list[str],
+        run_mode: RunMode,
+        from_shell: bool = True,
+        validate_sweep_overrides: bool = True,
+    ) -> DictConfig:
+        """Compose, or return the composition of an earlier call."""
+        key = (config_name, *overrides, run_mode)
+        if key not in self._composed:
+            self._composed[key] = super().load_configuration(
+                config_name, overrides, run_mode, from_shell, validate_sweep_overrides
+            )
+        return self._composed[key]
+
+
+def _entry(text: str) -> str:
+    """An entry as Hydra writes it, its folder checked and absolute."""
+    if text.startswith(_PACKAGE):
+        package = text.removeprefix(_PACKAGE)
+        if find_spec(package.partition(".")[0]) is None or find_spec(package) is None:
+            raise CompositionError(f"{text}: there is no such package. Install it.")
+        return text
+    folder = Path(text.removeprefix(_FILE)).absolute()
+    if not folder.is_dir():
+        raise CompositionError(
+            f"configuration folder {folder}: there is no such folder, expected one with YAML files"
+            " in folders such as task/. Name an existing one."
+        )
+    own = find_spec(CONFIG_MODULE)
+    for built_in in own.submodule_search_locations or () if own else ():
+        for path in sorted(folder.rglob("*.yaml")):
+            name = path.relative_to(folder)
+            if (Path(built_in) / name).exists():
+                raise CompositionError(
+                    f"{path}: {name} is mjstack's own, expected a name that mjstack does not have."
+                    " Rename the file."
+                )
+    return f"{_FILE}{folder.resolve()}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -25,6 +26,7 @@ def make_env(
     nworld: int | None = None,
     seed: int | None = None,
     device: str | None = None,
+    config_dir: str | os.PathLike | None = None,
 ) -> Env:
     """Builds an environment as the command line would configure it.
 
@@ -34,6 +36,8 @@ def make_env(
             key.
         seed: Seed of every random number.
         device: ``auto``, ``cpu`` or ``cuda:N``.
+        config_dir: A folder with more choices, such as ``push/conf`` with ``task/push.yaml``. The
+            folder beside it is importable afterwards.
 
     Returns:
         The environment, on MJWarp where there is CUDA, else on native MuJoCo (``sim=...`` chooses).
@@ -54,7 +58,10 @@ def make_env(
         )
     given = {"nworld": nworld, "seed": seed, "sim.device": device}
     return build_env(
-        load_config([*overrides, *(f"{k}={v}" for k, v in given.items() if v is not None)])
+        load_config(
+            [*overrides, *(f"{k}={v}" for k, v in given.items() if v is not None)],
+            config_dir=config_dir,
+        )
     )
 
 

@@ -6,13 +6,14 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
 from mjstack.jobs import collect, gates, reachability, replay, scaling, study
 from mjstack.jobs.result import JobResult
 
-__all__ = ["JOBS", "JobResult", "check_job", "job_folder", "run_job"]
+__all__ = ["JOBS", "CheckedJob", "JobResult", "check_job"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,14 +22,16 @@ class Job:
 
     Attributes:
         check: Raises a `MjstackError` for what cannot be done here, before anything is written.
-        run: Does it. Gets the configuration, the run's folder and the command line's overrides.
+            Returns what `run` needs, such as the scene and the plan that it built; None for the
+            configuration.
+        run: Does it. Gets what `check` returned, the run's folder and the command line's overrides.
         keys: Top-level keys and groups that its command line may set; None for all.
         folder: Where it goes if nobody says otherwise, for a job that resumes; None for a folder of
             the hour.
     """
 
-    check: Callable[[Config], None]
-    run: Callable[[Config, Path, list[str]], JobResult]
+    check: Callable[[Config], Any]
+    run: Callable[[Any, Path, list[str]], JobResult]
     keys: tuple[str, ...] | None = None
     folder: Callable[[Config], Path] | None = None
 
@@ -43,7 +46,26 @@ JOBS = {
 }
 
 
-def check_job(cfg: Config, overrides: Sequence[str] = ()) -> None:
+@dataclass(frozen=True, slots=True)
+class CheckedJob:
+    """A job that has passed its checks.
+
+    Attributes:
+        job: Its kind.
+        context: What its check returned.
+        folder: Where it goes if nobody says otherwise, for a job that resumes.
+    """
+
+    job: Job
+    context: Any
+    folder: Path | None
+
+    def run(self, folder: Path, overrides: list[str]) -> JobResult:
+        """Runs it. Ctrl-C is an outcome, not an exception."""
+        return self.job.run(self.context, folder, overrides)
+
+
+def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
     """Raises for what this machine cannot do, before anything is written.
 
     Args:
@@ -56,15 +78,6 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> None:
         if job.keys is not None and re.split(r"[.@/]", key)[0] not in job.keys:
             expected = f"only {', '.join(job.keys[1:])} beside job={cfg.job.name}"
             raise ConfigError(key, value, expected, "Leave it out")
-    job.check(cfg)
-
-
-def job_folder(cfg: Config) -> Path | None:
-    """The folder of a job that resumes, None for others."""
-    find = JOBS[cfg.job.name].folder
-    return None if find is None else find(cfg)
-
-
-def run_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
-    """Runs the job that the configuration names. Ctrl-C is an outcome, not an exception."""
-    return JOBS[cfg.job.name].run(cfg, folder, overrides)
+    context = job.check(cfg)
+    folder = None if job.folder is None else job.folder(cfg)
+    return CheckedJob(job, cfg if context is None else context, folder)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from mjstack.config.session import search_path_override
 from mjstack.errors import MjstackError, is_out_of_memory
 from mjstack.files import write_atomic
 from mjstack.report.scaling import COLUMNS, NOT_RUN, PASS, Row, new_row, take_figures
@@ -69,7 +70,15 @@ def run_process(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "report.json").unlink(missing_ok=True)  # an earlier try's
     target = str(folder).replace("\\", "\\\\").replace("'", "\\'")
-    command = [sys.executable, "-c", _START, *overrides, f"hydra.run.dir='{target}'"]
+    target_override = f"hydra.run.dir='{target}'"
+    command = [
+        sys.executable,
+        "-c",
+        _START,
+        *overrides,
+        *search_path_override(),
+        target_override,
+    ]
     began = time.monotonic()
     with (folder / "output.log").open("w") as log:
         process = subprocess.Popen(

@@ -1,0 +1,131 @@
+"""Configuration from a folder of one's own: on the command line, in a sweep, and in Python."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import mjstack
+from mjstack.cli import run
+from mjstack.config import load_config
+from mjstack.config.load import load_saved
+from mjstack.config.session import is_trusted, search_path, search_path_override
+from mjstack.errors import MjstackError
+
+TASK = """# @package _global_
+defaults:
+  - stack
+  - _self_
+
+task:
+  name: lean
+reward:
+  height:
+    func: lean.height
+    weight: 2.0
+"""
+MODULE = """
+def height(env, *, scale=3.0):
+    return scale * env.sim.qpos[:, 0]
+"""
+
+
+@pytest.fixture
+def lean(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with a task and, beside it, the module of its reward."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    conf = tmp_path / "lean" / "conf"
+    (conf / "task").mkdir(parents=True)
+    (conf / "task" / "lean.yaml").write_text(TASK)
+    (tmp_path / "lean" / "lean.py").write_text(MODULE)
+    yield conf
+    sys.modules.pop("lean", None)
+
+
+def refused(args: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line with which a command line is refused."""
+    assert run(args) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    return line
+
+
+def test_an_environment_of_another_folder(lean: Path) -> None:
+    env = mjstack.make_env(["task=lean"], config_dir=lean, nworld=2, device="cpu")
+    try:
+        assert env.cfg.task.name == "lean"
+        assert "height" in env.reward_manager.names
+    finally:
+        env.close()
+    with pytest.raises(MjstackError, match="'lean' does not exist"):
+        load_config(["task=lean"])
+
+
+def test_the_search_path_is_an_override_too(lean: Path) -> None:
+    cfg = load_config([f"hydra.searchpath=[file://{lean}]", "task=lean"])
+    assert cfg.reward["height"].func == "lean.height"
+    with search_path([lean]):
+        (override,) = search_path_override()
+    assert load_config([override, "task=lean"]).task.name == "lean"
+
+
+def test_help_and_cfg_see_the_folder(lean: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--config-dir", str(lean), "--help"]) == 0
+    assert "stack, box, lean, reach" in " ".join(capsys.readouterr().out.split())
+    assert run([f"--config-dir={lean}", "task=lean", "--cfg", "job", "-p", "task.name"]) == 0
+    assert capsys.readouterr().out == "lean\n"
+    assert "Did you mean 'lean'?" in refused(["-cd", str(lean), "task=lea"], capsys)
+
+
+def test_a_sweep_and_a_replay(
+    lean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--config-dir", str(lean), "-m", "task=stack", "gates=[baseline]"]
+    reward = "+reward.height={func: lean.height, weight: 1.0}"
+    assert run([*flags, reward, "seed=1,2"]) == 0
+    first, _ = sorted(tmp_path.rglob("report.json"))
+    assert json.loads(first.read_text())["status"] == "pass"
+    saved = first.parent / ".hydra" / "config.yaml"
+    with pytest.raises(MjstackError) as caught:
+        load_saved(saved)
+    assert "reward.height.func=lean.height" in str(caught.value)
+    assert f"--config-dir {lean}" in str(caught.value)
+    with search_path([lean]):
+        assert load_saved(saved).reward["height"].func == "lean.height"
+    saved.write_text(saved.read_text().replace("lean.height", "shutil.rmtree"))
+    with search_path([lean]), pytest.raises(MjstackError, match=r"shutil\.rmtree"):
+        load_saved(saved)
+
+
+def test_a_bad_folder_is_refused(lean: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "no such folder" in refused(["--config-dir", "nowhere"], capsys)
+    assert "no such package" in refused(["hydra.searchpath=[pkg://nowhere.conf]"], capsys)
+    assert "expected a list" in refused(["hydra.searchpath=3"], capsys)
+    shutil.copy(lean / "task" / "lean.yaml", lean / "task" / "box.yaml")
+    assert "task/box.yaml is mjstack's own" in refused(["--config-dir", str(lean)], capsys)
+
+
+def test_an_installed_package_registers_its_configuration(lean: Path) -> None:
+    site = lean.parent.parent / "site"
+    (site / "leaning-1.0.dist-info").mkdir(parents=True)
+    (site / "leaning-1.0.dist-info" / "METADATA").write_text("Name: leaning\nVersion: 1.0\n")
+    points = "[mjstack.configs]\nleaning = leaning.conf\n"
+    (site / "leaning-1.0.dist-info" / "entry_points.txt").write_text(points)
+    shutil.copytree(lean, site / "leaning" / "conf")
+    (site / "leaning" / "__init__.py").write_text(MODULE)
+    task = site / "leaning" / "conf" / "task" / "lean.yaml"
+    task.write_text(TASK.replace("lean.height", "leaning.height"))
+    program = (
+        f"import sys; sys.path.insert(0, {str(site)!r}); from mjstack.config import load_config;"
+        "from mjstack.config.session import is_trusted;"
+        "print(load_config(['task=lean']).reward['height'].func, is_trusted('leaning.height'))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.split() == ["leaning.height", "True"], done.stderr
+    assert not is_trusted("leaning.height")
