@@ -6,6 +6,7 @@ Quaternions are (w, x, y, z), the last dimension is the vector's own.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 
@@ -80,18 +81,34 @@ def quat_to_matrix(quat: torch.Tensor) -> torch.Tensor:
     return outer + cross + torch.diag_embed((2.0 * w.square() - 1.0).expand(*w.shape[:-1], 3))
 
 
-def lowest_corner(pos: torch.Tensor, quat: torch.Tensor, half: float) -> torch.Tensor:
-    """Height [m] of the lowest corner of a cube.
+def lowest_point(
+    pos: torch.Tensor, quat: torch.Tensor, shape: str, size: Sequence[float]
+) -> torch.Tensor:
+    """Height [m] of the lowest point of an object.
 
     Args:
         pos: Centre [m], shape ``(..., 3)``.
         quat: Orientation, shape ``(..., 4)``.
-        half: Half the edge length [m].
+        shape: A shape of `ObjectCfg`.
+        size: Its sizes [m].
 
     Returns:
-        World z of the lowest corner, shape ``(...)``.
+        World z of the lowest point, shape ``(...)``.
     """
-    return pos[..., 2] - half * quat_z_row(quat).abs().sum(-1)
+    up = quat_z_row(quat)
+    if shape == "sphere":
+        reach: torch.Tensor | float = size[0]
+    elif shape == "capsule":  # it lies along its x axis
+        reach = size[0] + size[1] * up[..., 0].abs()
+    elif shape == "cylinder":
+        across = torch.linalg.vector_norm(up[..., :2], dim=-1)
+        reach = size[0] * across + size[1] * up[..., 2].abs()
+    elif len(set(size)) == 1:  # a cube
+        reach = size[0] * up.abs().sum(-1)
+    else:
+        x, y, z = up.abs().unbind(-1)
+        reach = size[0] * x + size[1] * y + size[2] * z
+    return pos[..., 2] - reach
 
 
 def not_finite(*parts: torch.Tensor) -> torch.Tensor:

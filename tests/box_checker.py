@@ -89,7 +89,9 @@ def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> Bo
 
     released_at = {}
     for cube, color in enumerate(COLORS):
-        corners, speed = corners_of(rec.pose[:, cube], rec.velocity[:, cube], cfg.scene.cube_half)
+        corners, speed = corners_of(
+            rec.pose[:, cube], rec.velocity[:, cube], cfg.scene.objects["red"].half_height
+        )
         x = corners[..., 0]
         y = corners[..., 1]
         z = corners[..., 2]
@@ -160,7 +162,7 @@ def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> Bo
         if rest_until(still, steps - 1) < rules.window:
             out.failed.add("INSIDE")
 
-        slot = np.array(getattr(cfg.scene, f"{color}_slot"))
+        slot = np.array(cfg.scene.places[f"{color}_slot"].xy)
         out.values |= {
             f"slot_err_{color}_m": float(np.linalg.norm(rec.pose[-1, cube, :2] - slot)),
             f"grasp_steps_{color}": grasp,

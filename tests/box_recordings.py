@@ -22,13 +22,11 @@ from mjstack.episodes.context import GateContext
 from mjstack.episodes.failures import FailureMonitor
 from mjstack.episodes.observers import Episode
 from mjstack.episodes.rollout import Observer, Reset
-from mjstack.scene import BLUE as BLUE_NAME
-from mjstack.scene import RED as RED_NAME
 from mjstack.sim import Simulation
 from mjstack.tasks.box import BoxCheck
 from mjstack.tasks.check import CheckResult
 
-NAMES = (RED_NAME, BLUE_NAME)
+NAMES = ("red", "blue")
 STATE = ("qpos", "qvel", "sensordata")
 Disturb = Callable[[Env, str], None]
 """Interferes at a step's end, after it was judged and kept; told the phase of the last world."""
@@ -114,8 +112,8 @@ def put_cube(env: Env, cube: int, place: list[float] | np.ndarray) -> None:
     """Puts a cube of the last world somewhere, at rest; the place has its x, y, z [m] and, if it is
     longer, its quaternion.
     """
-    at = env.index.cube_qpos[cube]
-    velocity = env.index.cube_qvel[cube]
+    at = env.index.object_qpos[cube]
+    velocity = env.index.object_qvel[cube]
     env.sim.qpos[-1, at : at + len(place)] = torch.as_tensor(place).to(env.sim.qpos)
     env.sim.qvel[-1, velocity : velocity + 6] = 0.0
 
@@ -157,12 +155,12 @@ class World:
 
     def pose(self, cube: int) -> np.ndarray:
         """A view of a cube's pose, shape ``(steps, 7)``."""
-        at = self.context.index.cube_qpos[cube]
+        at = self.context.index.object_qpos[cube]
         return self.qpos[:, at : at + 7]
 
     def velocity(self, cube: int) -> np.ndarray:
         """A view of its velocity, shape ``(steps, 6)``."""
-        at = self.context.index.cube_qvel[cube]
+        at = self.context.index.object_qvel[cube]
         return self.qvel[:, at : at + 6]
 
     def jaw(self, cube: int, jaw: int) -> np.ndarray:
@@ -186,7 +184,7 @@ class World:
         index = self.context.index
         cubes = (RED, BLUE)
         names = np.array([p.name for p in self.context.planner.phases])
-        ours = [c for a in index.cube_qpos for c in range(a, a + 7)]
+        ours = [c for a in index.object_qpos for c in range(a, a + 7)]
         return BoxRecording(
             phase=names[self.phase],
             pose=np.stack([self.pose(c) for c in cubes], 1),

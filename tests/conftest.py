@@ -138,12 +138,14 @@ def recorded(
             def keep(_: int, sim: Simulation) -> None:
                 pose.append(
                     np.stack(
-                        [sim.qpos[:, a : a + 7].numpy().copy() for a in context.index.cube_qpos], 1
+                        [sim.qpos[:, a : a + 7].numpy().copy() for a in context.index.object_qpos],
+                        1,
                     )
                 )
                 velocity.append(
                     np.stack(
-                        [sim.qvel[:, a : a + 6].numpy().copy() for a in context.index.cube_qvel], 1
+                        [sim.qvel[:, a : a + 6].numpy().copy() for a in context.index.object_qvel],
+                        1,
                     )
                 )
 

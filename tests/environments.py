@@ -92,13 +92,13 @@ def on_shared_sim(backend: str, nworld: int, cfg: Config) -> Env:
     for name, field in sim.fields.items():
         field[:] = torch.from_numpy(getattr(sim.model, name)).to(field)
     sim.reset()
-    return Env(sim, SceneIndex(sim.model, cfg.robot), cfg)
+    return Env(sim, SceneIndex(sim.model, cfg.robot, cfg.scene), cfg)
 
 
 def on_new_sim(backend: str, nworld: int, cfg: Config) -> Env:
     """An environment on a simulation that nobody has used."""
     sim = new_sim(backend, nworld, cfg.robot.name)
-    return Env(sim, SceneIndex(sim.model, cfg.robot), cfg)
+    return Env(sim, SceneIndex(sim.model, cfg.robot, cfg.scene), cfg)
 
 
 def actions(env: Env, steps: int, seed: int = 0) -> list[torch.Tensor]:

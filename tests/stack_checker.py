@@ -80,7 +80,7 @@ def check_world(
     """
     rules = cfg.gate.acceptance
     scene = cfg.scene
-    half = scene.cube_half
+    half = scene.objects["red"].half_height
     top = scene.table_center[2] + scene.table_half[2]
     steps = len(pose)
     span = {p.name: (p.start, p.stop) for p in phases}

@@ -19,12 +19,14 @@ from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
 from mjstack.math import quat_to_matrix
-from mjstack.scene import BLUE, RED, LowestPoint, SceneIndex, build_model
-from mjstack.scene.phases import build_phases
+from mjstack.scene import LowestPoint, SceneIndex, build_model
+from mjstack.scene.phases import build_phases, nominal_xy
 from mjstack.tasks.box import BoxCheck, BoxSuccess
 from mjstack.tasks.box_terms import GraspNext, InBox, Place, ReachNext, ToSlot
 
 X0 = {"so101": 0.305, "rebot": 0.47}
+RED = "red"
+BLUE = "blue"
 TOP = {"so101": 0.024, "rebot": 0.212}
 PARTS = ("floor", "near", "far", "right", "left")
 
@@ -87,8 +89,8 @@ def test_the_scene_is_the_protocols(robot: str) -> None:
 def test_the_motion_is_the_protocols(robot: str) -> None:
     cfg = configured(robot)
     x0 = X0[robot]
-    assert cfg.scene.red_slot == pytest.approx([x0 + 0.055, 0.15])
-    assert cfg.scene.blue_slot == pytest.approx([x0 - 0.030, 0.15])
+    assert cfg.scene.places["red_slot"].xy == pytest.approx([x0 + 0.055, 0.15])
+    assert cfg.scene.places["blue_slot"].xy == pytest.approx([x0 - 0.030, 0.15])
     assert cfg.scene.grasp_offset == {"so101": 0.0, "rebot": 0.006}[robot]
     seconds = [phase.seconds for phase in cfg.controller.phases.values()]
     assert seconds == [1.6, 1.6, 2.2, 2.0, 3.0, 2.4, 1.6, 1.4, 1.4] * 2 + [5.6]
@@ -106,16 +108,16 @@ def test_other_scenes_have_no_box_and_pay_for_no_sensor_of_it(robot: str) -> Non
         model.geom(i).name for i in range(model.ngeom) if model.geom(i).name.startswith("box_")
     ]
     assert model.nsensor == 4
-    assert SceneIndex(model, cfg.robot).support_force == {}
+    assert SceneIndex(model, cfg.robot, cfg.scene).support_force == {}
 
 
 def test_sensors_tell_supports_from_jaws(robot: str) -> None:
     """A cube on the table, in the box and on the other cube; and one in the air."""
     cfg = configured(robot)
     model = build_model(cfg)
-    index = SceneIndex(model, cfg.robot)
+    index = SceneIndex(model, cfg.robot, cfg.scene)
     data = mujoco.MjData(model)
-    top, (red, blue) = TOP[robot], index.cube_qpos
+    top, (red, blue) = TOP[robot], index.object_qpos
 
     def forces() -> list[list[bool]]:
         data.qpos[index.robot_qpos] = cfg.robot.home
@@ -135,7 +137,7 @@ def test_sensors_tell_supports_from_jaws(robot: str) -> None:
 
     assert forces() == [[True, False], [True, False]]
     mujoco.mj_resetData(model, data)
-    data.qpos[red : red + 3] = [*cfg.scene.red_slot, top + 0.006 + 0.022]
+    data.qpos[red : red + 3] = [*cfg.scene.places["red_slot"].xy, top + 0.006 + 0.022]
     data.qpos[blue + 2] += 0.3
     assert forces() == [[True, False], [False, False]]
     mujoco.mj_resetData(model, data)
@@ -148,18 +150,18 @@ def test_sensors_tell_supports_from_jaws(robot: str) -> None:
 
 def test_home_is_the_first_approach_and_clear_of_everything(robot: str) -> None:
     cfg = configured(robot)
-    first = _planner(robot).plan_world(0, np.array([*cfg.scene.red_xy, *cfg.scene.blue_xy]))[0][0]
+    first = _planner(robot).plan_world(0, nominal_xy(cfg.scene))[0][0]
     np.testing.assert_allclose(cfg.robot.home, first, atol=2e-6)
     assert cfg.robot.start == cfg.robot.home == cfg.robot.placements["box"].home
     model = build_model(cfg)
-    index = SceneIndex(model, cfg.robot)
+    index = SceneIndex(model, cfg.robot, cfg.scene)
     data = mujoco.MjData(model)
     data.qpos[index.robot_qpos] = cfg.robot.home
     mujoco.mj_forward(model, data)
     touching = {model.geom(g).name for c in data.contact for g in c.geom}
     assert touching <= {"table", RED, BLUE}
     at = _planner(robot).ik.grasp_point(np.array(cfg.robot.home))
-    assert at == pytest.approx([*cfg.scene.red_xy, TOP[robot] + 0.19], abs=5e-6)
+    assert at == pytest.approx([*cfg.scene.objects["red"].xy, TOP[robot] + 0.19], abs=5e-6)
 
 
 def test_a_home_of_ones_own_counts() -> None:
@@ -172,7 +174,7 @@ def test_random_actions_from_every_start(robot: str, reset: str) -> None:
     env = small_env(f"reset={reset}", robot=robot, nworld=2)
     scene = env.cfg.scene
     spread = {"nominal": (0.0, 0.0), "jitter": (0.002, 0.002), "randomized": scene.random_xy}[reset]
-    for name, place in ((RED, scene.red_xy), (BLUE, scene.blue_xy)):
+    for name, place in ((RED, scene.objects["red"].xy), (BLUE, scene.objects["blue"].xy)):
         address, _ = env.index.object_address(name)
         off = (
             env.sim.qpos[:, address : address + 2] - torch.tensor(place, dtype=torch.float64)
@@ -204,10 +206,8 @@ def put(env: Env, name: str, place: list[float] | np.ndarray, worlds: list[int])
 def rests(env: Env) -> dict[str, list[float]]:
     """Where the cubes rest in the box."""
     scene = env.cfg.scene
-    assert scene.red_slot is not None
-    assert scene.blue_slot is not None
     z = TOP[env.cfg.robot.name] + 0.006 + 0.022
-    return {RED: [*scene.red_slot, z], BLUE: [*scene.blue_slot, z]}
+    return {RED: [*scene.places["red_slot"].xy, z], BLUE: [*scene.places["blue_slot"].xy, z]}
 
 
 def test_terms_know_the_box(robot: str) -> None:
@@ -258,7 +258,12 @@ def test_a_place_counts_off_the_table_whatever_the_boxs_floor() -> None:
     for floor in (0.004, 0.006):
         env = small_env("reset=nominal", f"scene.box.floor={floor}")
         for world, height in enumerate((0.5 * floor - 0.0005, 0.5 * floor + 0.0005, floor)):
-            put(env, RED, [*env.cfg.scene.red_slot, TOP["so101"] + height + 0.022], [world])
+            put(
+                env,
+                RED,
+                [*env.cfg.scene.places["red_slot"].xy, TOP["so101"] + height + 0.022],
+                [world],
+            )
         below, above, resting = Place(env, object=RED, scale=0.1)(env).tolist()
         assert below == 0.0
         assert above == pytest.approx(1.0 - math.tanh((0.5 * floor - 0.0005) / 0.1), abs=1e-6)
@@ -309,7 +314,7 @@ def test_matrix_of_a_quaternion() -> None:
 def test_lowest_point_of_the_jaws(robot: str) -> None:
     cfg = configured(robot)
     model = build_model(cfg)
-    index = SceneIndex(model, cfg.robot)
+    index = SceneIndex(model, cfg.robot, cfg.scene)
     data = mujoco.MjData(model)
     low = index.robot_range[:, 0]
     high = index.robot_range[:, 1]
@@ -389,19 +394,19 @@ def test_lowest_point_of_a_mesh_is_never_too_high() -> None:
 @pytest.mark.parametrize(
     ("overrides", "parts"),
     [
-        (["scene=stack"], ["red_slot", "scene stack", "no box"]),
+        (["scene=stack"], ["red_slot", "object or place"]),
         (["phases=stack"], ["gate.parity.states", "approach_red"]),
         (["~controller.phases.settle_blue"], ["task.check", "settle_blue"]),
         (["scene.box.center=[0.305,0.2]"], ["scene.box.center", "on the table with all its walls"]),
         (["scene.box.height=0.005"], ["scene.box.height=0.005", "0.006 m"]),
-        (["scene.box.wall=-0.006"], ["scene.box.wall=-0.006", "positive"]),
+        (["scene.box.wall=-0.006"], ["scene.box.wall=-0.006", "above 0"]),
         (["scene.box.floor_solref=[-4444,1]"], ["scene.box.floor_solref", "time constant"]),
         (["scene.box.friction=[1,0.005]"], ["scene.box.friction", "3 numbers"]),
-        (["scene.red_slot=[0.46,0.15]"], ["scene.red_slot", "a place in the box"]),
-        (["scene.red_slot=null"], ["red_slot"]),
-        (["scene.blue_xy=[0.35,0.0]"], ["scene.blue_xy", "beside the box"]),
+        (["scene.places.red_slot.xy=[0.46,0.26]"], ["scene.places.red_slot.xy", "off the walls"]),
+        (["scene.places.red_slot.xy=null"], ["red_slot"]),
+        (["scene.objects.blue.xy=[0.35,0.0]"], ["scene.objects.blue.xy", "beside the box"]),
         (["scene.random_xy=[0.1]"], ["scene.random_xy", "2 numbers"]),
-        (["scene.random_xy=[0.1,-0.1]"], ["scene.random_xy", "not negative"]),
+        (["scene.random_xy=[0.1,-0.1]"], ["scene.random_xy", "at least 0"]),
         (["gate.box.window=0"], ["gate.box.window=0", "2000"]),
         (["gate.box.open_fraction=1.2"], ["gate.box.open_fraction=1.2", "up to 1"]),
         (["gate.box.force=0"], ["gate.box.force=0", "positive"]),

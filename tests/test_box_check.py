@@ -45,9 +45,11 @@ def planned(robot: str) -> SimpleNamespace:
             == (context.phase_start("carry_red") + context.phase_start("hold_red")) // 2
         ):
             scene = context.cfg.scene
-            x, y = scene.red_xy
+            x, y = scene.objects["red"].xy
             top = scene.table_center[2] + scene.table_half[2]
-            put_cube(env, RED, [x - 0.08, y, top + scene.cube_half, 1.0, 0.0, 0.0, 0.0])
+            put_cube(
+                env, RED, [x - 0.08, y, top + scene.objects["red"].half_height, 1.0, 0.0, 0.0, 0.0]
+            )
 
     context = recording_context(robot, "nworld=2", disturb=drop)
     sim = make_simulation(context.model, context.cfg, 2, backend=Backend.native)
@@ -67,7 +69,7 @@ def scripted(robot: str) -> SimpleNamespace:
         if phase.startswith("close_") and phase not in taken:
             taken.append(phase)
             cube = RED if phase == "close_red" else BLUE
-            at = env.index.cube_qpos[cube]
+            at = env.index.object_qpos[cube]
             put_cube(env, cube, np.add(env.sim.qpos[-1, at : at + 3].numpy(), [0.0, 0.07, 0.0]))
 
     context = recording_context(
@@ -269,7 +271,9 @@ def _lift_height(by: float) -> Callable[[World, int, str], None]:
         scene = w.context.cfg.scene
         w.pose(cube)[steps, 3:] = [1.0, 0.0, 0.0, 0.0]
         top = scene.table_center[2] + scene.table_half[2]
-        w.pose(cube)[steps, 2] = top + scene.cube_half + w.context.cfg.gate.box.lift_height + by
+        w.pose(cube)[steps, 2] = (
+            top + scene.objects["red"].half_height + w.context.cfg.gate.box.lift_height + by
+        )
         w.support(cube)[steps] = 0.0
 
     return alter
@@ -288,7 +292,7 @@ def _edge(cube: int, w: World, axis: int, by: float) -> float:
     """
     scene = w.context.cfg.scene
     assert scene.box is not None
-    return scene.box.center[axis] + scene.box.half[axis] - scene.cube_half + by
+    return scene.box.center[axis] + scene.box.half[axis] - scene.objects["red"].half_height + by
 
 
 def _over(last: bool, by: float, axis: int) -> Callable[[World, int, str], None]:
@@ -387,7 +391,7 @@ def _at_rest_speed(by: float) -> Callable[[World, int, str], None]:
 def _spin(by: float) -> Callable[[World, int, str], None]:
     def alter(w: World, cube: int, color: str) -> None:
         t = w.context.cfg.gate.box
-        half = w.context.cfg.scene.cube_half
+        half = w.context.cfg.scene.objects["red"].half_height
         spin = (t.rest_speed + by) / (
             math.sqrt(2.0) * half
         )  # about an axis through a face: its corners are sqrt(2) half away
@@ -400,7 +404,7 @@ def _rolling(w: World, cube: int, color: str) -> None:
     """Each part is slow enough; together they move one edge faster than allowed, and the opposite
     one not at all.
     """
-    half = w.context.cfg.scene.cube_half
+    half = w.context.cfg.scene.objects["red"].half_height
     step = w.steps(f"settle_{color}")[-20]
     w.pose(cube)[step, 3:] = [math.cos(0.3), 0.0, 0.0, math.sin(0.3)]
     along = np.array([math.cos(0.6), math.sin(0.6), 0.0])

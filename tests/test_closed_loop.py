@@ -16,7 +16,7 @@ from mjstack.envs import Env, driven_config
 from mjstack.episodes.context import GateContext
 from mjstack.errors import ArgumentError
 from mjstack.managers.reset import required_fields
-from mjstack.scene.phases import anchor_of
+from mjstack.scene.phases import build_targets
 from mjstack.sim import make_simulation
 
 Stage = Callable[[str], GateContext]
@@ -46,7 +46,7 @@ def centre(env: Env) -> torch.Tensor:
 def test_phases_follow_their_times_and_targets(robot: str, stage: Stage) -> None:
     context = stage(robot)
     env, controller = driven(context)
-    red = env.sim.qpos[:, env.index.cube_qpos[0] :][:, :3].clone()
+    red = env.sim.qpos[:, env.index.object_qpos[0] :][:, :3].clone()
     ends = {phase.stop - 1: number for number, phase in enumerate(controller.phases)}
     for step in range(controller.phases[1].stop):
         command = controller.command()
@@ -55,9 +55,9 @@ def test_phases_follow_their_times_and_targets(robot: str, stage: Stage) -> None
         assert controller.phase.tolist() == [phase] * 3
         env.step(command)
         if step in ends:  # commanded to the target; the servos lag by a few millimetres
-            anchor = anchor_of(env.cfg, controller.phases[ends[step]].name)
-            assert anchor is not None
-            wanted = torch.cat((red[:, :2], torch.full((3, 1), anchor.z, dtype=red.dtype)), 1)
+            target = build_targets(env.cfg)[controller.phases[ends[step]].name]
+            assert target is not None
+            wanted = torch.cat((red[:, :2], torch.full((3, 1), target.z, dtype=red.dtype)), 1)
             reached = controller._ik.grasp_point(command).double()
             assert (reached - wanted).norm(dim=1).max() < env.cfg.controller.ik_tolerance
             assert (centre(env) - wanted).norm(dim=1).max() < 0.012
@@ -69,7 +69,7 @@ def test_phases_follow_their_times_and_targets(robot: str, stage: Stage) -> None
 def test_every_world_looks_at_its_own_cube(stage: Stage) -> None:
     """A cube that is moved before the descent is followed; in the other world nothing changes."""
     env, controller = driven(stage("so101"), nworld=2)
-    address = env.index.cube_qpos[0]
+    address = env.index.object_qpos[0]
     for step in range(controller.phases[1].stop):
         if step == controller.phases[0].stop:
             env.sim.qpos[1, address] += 0.02
@@ -85,8 +85,8 @@ def test_jaws_turn_to_a_face(stage: Stage) -> None:
     """
     off = {}
     for align in (0.0, 1.0):
-        env, controller = driven(stage("so101"), f"controller.align={align}", nworld=4)
-        address = env.index.cube_qpos[0]
+        env, controller = driven(stage("so101"), f"controller.yaw_alignment={align}", nworld=4)
+        address = env.index.object_qpos[0]
         yaw = torch.tensor([0.3, -0.6, 1.1, 2.0], dtype=torch.float64)
         env.sim.qpos[:, address + 3] = torch.cos(yaw / 2)
         env.sim.qpos[:, address + 6] = torch.sin(yaw / 2)
@@ -108,8 +108,8 @@ def test_an_empty_grasp_is_tried_once_more_in_time(robot: str, stage: Stage) -> 
     env, controller = driven(stage(robot), nworld=2)
     names = [phase.name for phase in controller.phases]
     grasp = names.index("grasp_red")
-    address = env.index.cube_qpos[0]
-    velocity = env.index.cube_qvel[0]
+    address = env.index.object_qpos[0]
+    velocity = env.index.object_qvel[0]
     place = env.sim.qpos[1, address : address + 7].clone()
     place[0] += 0.03
     visited: list[int] = []
@@ -129,7 +129,7 @@ def test_an_empty_grasp_is_tried_once_more_in_time(robot: str, stage: Stage) -> 
     # rest.
     rest = env.cfg.gate.acceptance.window
     assert visited[-rest:] == [len(names) - 1] * rest
-    red, blue = (env.sim.qpos[:, a : a + 3] for a in env.index.cube_qpos)
+    red, blue = (env.sim.qpos[:, a : a + 3] for a in env.index.object_qpos)
     apart = red - blue
     assert (apart[:, :2].norm(dim=1) < env.cfg.gate.acceptance.xy_err).all()
     assert ((apart[:, 2] > 0.035) & (apart[:, 2] < 0.055)).all()
@@ -142,7 +142,7 @@ def test_a_cube_arrives_as_it_stood() -> None:
     """
     env = make_env(["task=stack", "action=joint_absolute", "sim=native"], nworld=2)
     env.reset(seed=0)
-    red, blue = env.index.cube_qpos
+    red, blue = env.index.object_qpos
     for world, (near, far) in enumerate([(red, blue), (blue, red)]):
         for address, x in ((near, 0.29), (far, 0.375)):
             env.sim.qpos[world, address] = x
@@ -164,29 +164,30 @@ def test_a_cube_arrives_as_it_stood() -> None:
 
 
 def test_tilt_follows_the_phases() -> None:
-    """In the box task red's tilt is kept until blue is looked for; a place without an anchor is
+    """In the box task red's tilt is kept until blue is observed; a place without an anchor is
     where the target was before.
     """
-    phases = load_config(["task=box"]).controller.phases
+    cfg = load_config(["task=box"])
+    phases = cfg.controller.phases
     names = list(phases)
     specs = list(phases.values())
     kept = [name for name, keeps in zip(names, _keeps(specs), strict=True) if keeps]
     roles = ("lift", "carry", "hold", "open", "retreat", "settle")
     assert kept == [f"{role}_{cube}" for cube in ("red", "blue") for role in roles] + ["done"]
-    assert [names[place] for place in _places(specs)] == ["hold_red"] * 6 + ["hold_blue"] * 13
+    assert [names[place] for place in _places(cfg)] == ["hold_red"] * 6 + ["hold_blue"] * 13
     phases["hold_red"].anchor = None
-    assert [names[place] for place in _places(specs)][:7] == ["carry_red"] * 6 + ["hold_blue"]
+    assert [names[place] for place in _places(cfg)][:7] == ["carry_red"] * 6 + ["hold_blue"]
     for spec in specs:
         spec.grasps = None
-    assert [names[place] for place in _places(specs)] == ["retreat_blue"] * 19
+    assert [names[place] for place in _places(cfg)] == ["retreat_blue"] * 19
 
 
 def test_no_retry_without_time(stage: Stage) -> None:
-    env, controller = driven(stage("so101"), "controller.hurry=1.2", nworld=1)
+    env, controller = driven(stage("so101"), "controller.speed_limit=1.2", nworld=1)
     grasp = [phase.name for phase in controller.phases].index("grasp_red")
     for step in range(controller.phases[grasp + 1].start + 5):
         if step == controller.phases[grasp].stop - 1:
-            env.sim.qpos[0, env.index.cube_qpos[0]] += 0.2
+            env.sim.qpos[0, env.index.object_qpos[0]] += 0.2
         env.step(controller.command())
     assert controller.retries.tolist() == [0]
     assert int(controller.phase[0]) == grasp + 1
@@ -236,7 +237,7 @@ def test_a_world_does_not_depend_on_its_neighbours(stage: Stage) -> None:
 
 def test_out_of_reach_is_flagged_in_its_world(stage: Stage) -> None:
     env, controller = driven(stage("so101"), nworld=2)
-    env.sim.qpos[1, env.index.cube_qpos[0]] = 0.9
+    env.sim.qpos[1, env.index.object_qpos[0]] = 0.9
     for _ in range(controller.phases[0].stop):
         env.step(controller.command())
     assert controller.unreachable.tolist() == [False, True]

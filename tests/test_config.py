@@ -150,11 +150,12 @@ def test_task_figures_of_each_robot(robot: str) -> None:
     ):
         assert getattr(cfg.robot, key) == want[key], key
     assert (cfg.scene.table_center, cfg.scene.table_half) == want["table"]
-    assert (cfg.scene.red_xy, cfg.scene.blue_xy) == want["cubes"]
+    assert (cfg.scene.objects["red"].xy, cfg.scene.objects["blue"].xy) == want["cubes"]
     layout = cfg.robot.placements["stack"]
     assert (layout.nconmax, layout.njmax) == want["sizes"]
-    assert (cfg.scene.cube_half, cfg.scene.cube_mass) == (0.022, 0.08)
-    assert cfg.scene.cube_friction == [1.2, 0.005, 0.0005]
+    for cube in cfg.scene.objects.values():
+        assert (cube.shape, cube.size, cube.mass) == ("box", [0.022] * 3, 0.08)
+        assert cube.friction == [1.2, 0.005, 0.0005]
     assert cfg.scene.table_friction == [1.0, 0.005, 0.0005]
 
 
@@ -216,10 +217,10 @@ BAD = [
     (["sim.device=gpu"], "auto, cpu or cuda:N"),
     (["graph=sometimes"], "graph"),
     (["view=perhaps"], "view"),
-    (["scene.red_xy=[0.9,0.0]"], "on the table"),
-    (["scene.red_xy=[0.33]"], "2 numbers"),
-    (["scene.red_xy=[0.33,0.06]"], "touch"),
-    (["scene.cube_mass=0"], "scene.cube_mass"),
+    (["scene.objects.red.xy=[0.9,0.0]"], "on the table"),
+    (["scene.objects.red.xy=[0.33]"], "2 numbers"),
+    (["scene.objects.red.xy=[0.33,0.06]"], "clear of blue"),
+    (["scene.objects.red.mass=0"], "scene.objects.red.mass"),
     (["task.episode_steps=0"], "task.episode_steps=0"),
     (["reward.lift.wait=1"], "wait"),
     (["solver.tolerance=0"], "solver.tolerance"),
@@ -234,8 +235,8 @@ BAD = [
     (["controller.phases.release.anchor=green"], "anchor"),
     (["controller.knots=2"], "controller.knots=2"),
     (
-        ["controller=closed_loop", "controller.phases.above_blue.look=false"],
-        "above_blue.look=false",
+        ["controller=closed_loop", "controller.phases.above_blue.observe=false"],
+        "above_blue.observe=false",
     ),
     (["controller.phases.lift_red.retry=above_red"], "lift_red.grasps"),
     (["controller.phases.grasp_red.retry=lift_red"], "this phase or one before it"),

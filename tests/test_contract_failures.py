@@ -32,7 +32,7 @@ def teleport(context: GateContext, world: int) -> Callable[[int, Simulation], No
 
     def hook(step: int, sim: Simulation) -> None:
         if step == released:
-            sim.qpos[world, context.index.cube_qpos[0]] += 0.08
+            sim.qpos[world, context.index.object_qpos[0]] += 0.08
 
     return hook
 
@@ -56,7 +56,7 @@ def test_native(
         sim.qpos[2] = kept["qpos"]
         sim.qvel[2] = kept["qvel"]
         if step == 300:
-            sim.qvel[3, context.index.cube_qvel[1]] = math.nan
+            sim.qvel[3, context.index.object_qvel[1]] = math.nan
             sim.step_count[5] -= 1
 
     episode = context.play(sim, context.cfg.reset, [Hook(hook)])
@@ -77,7 +77,7 @@ def test_mjwarp(stage: Callable[..., GateContext], make_sim: Callable[..., Simul
     def hook(step: int, sim: Simulation) -> None:
         push(step, sim)
         if step == context.phase_start("above_blue"):
-            sim.qvel[2, context.index.cube_qvel[1]] = math.nan
+            sim.qvel[2, context.index.object_qvel[1]] = math.nan
 
     episode = context.play(sim, context.cfg.reset, [Hook(hook)])
     found = rules(episode.result.failed)
@@ -96,7 +96,7 @@ def test_nan_leaves_the_other_worlds_alone(
         context.start(sim, context.cfg.reset)
         for step in range(6):
             if poison and step == 2:
-                sim.qvel[1, context.index.cube_qvel[0]] = math.nan
+                sim.qvel[1, context.index.object_qvel[0]] = math.nan
             sim.step(10)
         final.append((sim.qpos.clone(), sim.qvel.clone()))
         assert bool(torch.isfinite(torch.cat((sim.qpos[1], sim.qvel[1]))).all()) is not poison
@@ -110,7 +110,7 @@ def crowd(context: GateContext, sim: Simulation, world: int) -> None:
     """
     grasp_point = sim.site_xpos[world, context.index.grasp_sites].mean(0)
     top = context.cfg.scene.table_center[2] + context.cfg.scene.table_half[2]
-    red, blue = context.index.cube_qpos
+    red, blue = context.index.object_qpos
     sim.qpos[world, red : red + 3] = grasp_point.to(sim.qpos.dtype)
     sim.qpos[world, blue : blue + 2] = grasp_point[:2].to(sim.qpos.dtype) + 0.01
     sim.qpos[world, blue + 2] = top + 0.015

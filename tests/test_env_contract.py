@@ -584,24 +584,24 @@ def assert_ends(env: Env, term: str, worlds: list[int]) -> None:
 
 
 def test_end_by_a_cube_beside_the_table(ended: Env) -> None:
-    red, blue = ended.index.cube_qpos
+    red, blue = ended.index.object_qpos
     center = ended.cfg.scene.table_center
     half = ended.cfg.scene.table_half
     ended.sim.qpos[1, blue + 1] = center[1] + half[1] + 0.002
-    assert_ends(ended, "cube_off_table", [1])
+    assert_ends(ended, "object_off_table", [1])
     ended.sim.qpos[1, blue + 1] = center[1] + half[1] - 0.002  # on its edge, but on it
-    assert_ends(ended, "cube_off_table", [])
+    assert_ends(ended, "object_off_table", [])
     ended.sim.qpos[2, red] = center[0] - half[0] - 0.002
-    assert_ends(ended, "cube_off_table", [2])
+    assert_ends(ended, "object_off_table", [2])
 
 
 def test_end_by_a_cube_below_the_table(ended: Env) -> None:
-    red, _ = ended.index.cube_qpos
+    red, _ = ended.index.object_qpos
     top = ended.cfg.scene.table_center[2] + ended.cfg.scene.table_half[2]
     ended.sim.qpos[0, red + 2] = (
         top - ended.cfg.scene.table_half[2] * 2 - 0.03
     )  # under the table top
-    assert_ends(ended, "cube_off_table", [0])
+    assert_ends(ended, "object_off_table", [0])
 
 
 def test_end_by_a_joint_beyond_its_range(ended: Env) -> None:
@@ -613,7 +613,7 @@ def test_end_by_a_joint_beyond_its_range(ended: Env) -> None:
 
 
 def test_end_by_nan(ended: Env) -> None:
-    ended.sim.qvel[1, ended.index.cube_qvel[0]] = math.nan
+    ended.sim.qvel[1, ended.index.object_qvel[0]] = math.nan
     assert_ends(ended, "non_finite", [1])
 
 
@@ -637,7 +637,7 @@ def test_what_happened_outweighs_the_clock(backend: str) -> None:
     env = on_shared_sim(backend, 3, randomized("stack", "so101", steps=2))
     env.reset(seed=0)
     env.step(hold(env))
-    env.sim.qpos[1, env.index.cube_qpos[0] + 1] += 1.0
+    env.sim.qpos[1, env.index.object_qpos[0] + 1] += 1.0
     _, _, terminated, truncated, _ = env.step(hold(env))
     assert terminated.tolist() == [False, True, False]
     assert truncated.tolist() == [True, False, True]
@@ -658,7 +658,7 @@ def test_statistics_are_those_of_the_episodes_that_ended(backend: str) -> None:
     lengths = []
     for t, move in enumerate(moves):
         if t == 5:
-            env.sim.qpos[0, env.index.cube_qpos[0] + 1] += 1.0
+            env.sim.qpos[0, env.index.object_qpos[0] + 1] += 1.0
         _, reward, terminated, truncated, _ = env.step(move)
         totals += reward.cpu()
         for k in (terminated | truncated).nonzero()[:, 0].tolist():
@@ -674,7 +674,7 @@ def test_statistics_are_those_of_the_episodes_that_ended(backend: str) -> None:
     assert len(parts) == len(cfg.reward)
     assert sum(parts) == pytest.approx(read["return"], rel=1e-5)
     assert read["termination/time_out"] == pytest.approx(5 / 6)
-    assert read["termination/cube_off_table"] == pytest.approx(1 / 6)
+    assert read["termination/object_off_table"] == pytest.approx(1 / 6)
     assert read["success"] == 0.0
     assert env.read_statistics() == {"episodes": 0.0}
 

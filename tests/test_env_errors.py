@@ -491,7 +491,7 @@ def test_reset_term_without_its_fields(cfg: Config) -> None:
 
     env = on_shared_sim("native", 3, cfg)
     bare = make_simulation(env.sim.model, cfg, 3, backend=Backend.native)
-    cfg.reset["mass"] = TermCfg(func="mjstack.mdp.reset.CubeMass", params={"scale": [0.9, 1.1]})
+    cfg.reset["mass"] = TermCfg(func="mjstack.mdp.reset.ObjectMass", params={"scale": [0.9, 1.1]})
     fails(TermError, lambda: Env(bare, env.index, cfg), "reset.mass", "body_mass", "fields=")
 
 

@@ -116,7 +116,7 @@ def test_drawn_friction_is_that_of_the_contact(robot: str) -> None:
     for w in range(env.nworld):
         model.geom_friction[:] = env.sim.fields["geom_friction"][w].numpy()
         data.qpos[:] = env.sim.qpos[w].numpy()
-        red = env.index.cube_qpos[0]
+        red = env.index.object_qpos[0]
         # One cube in the jaws, the other one on the table.
         data.qpos[red : red + 3] = (
             0.5 * env.sim.site_xpos[w, env.index.grasp_sites].sum(0)

@@ -48,7 +48,7 @@ def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
     steps = 20
     only_time_out = [
         "~termination.success",
-        "~termination.cube_off_table",
+        "~termination.object_off_table",
         "~termination.joint_limit",
     ]
     common = ["task=reach", *only_time_out, f"termination.time_out.params.steps={steps}"]

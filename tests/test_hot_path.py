@@ -53,7 +53,7 @@ PATHS: dict[str, list[str] | None] = {
         "success",
         "non_finite",
         "overflow",
-        "CubeOffTable.__call__",
+        "ObjectOffTable.__call__",
         "JointLimit.__call__",
     ],
     "mdp/action.py": [
@@ -67,10 +67,10 @@ PATHS: dict[str, list[str] | None] = {
             f"{name}.__call__"
             for name in (
                 "JointNoise",
-                "JitterCubes",
-                "RandomizeCubes",
-                "CubeMass",
-                "CubeFriction",
+                "JitterObjects",
+                "RandomizeObjects",
+                "ObjectMass",
+                "ObjectFriction",
                 "ActuatorGains",
             )
         ),
@@ -78,7 +78,7 @@ PATHS: dict[str, list[str] | None] = {
     "mdp/variation.py": [
         *(
             f"{name}.{n}"
-            for name in ("CubeMasses", "SlidingFriction", "ServoGains")
+            for name in ("ObjectMasses", "SlidingFriction", "ServoGains")
             for n in ("read", "write")
         ),
         *(f"_Elements.{n}" for n in ("read", "write", "scale")),
@@ -116,7 +116,15 @@ PATHS: dict[str, list[str] | None] = {
     "control/scripted.py": [
         *(
             f"ClosedLoopDriver.{n}"
-            for n in ("command", "_advance", "_aim", "_judge_grasp", "_look", "_turn")
+            for n in (
+                "command",
+                "_advance",
+                "_aim",
+                "_judge_grasp",
+                "_observe",
+                "_last_seen",
+                "_turn",
+            )
         )
     ],
     "control/tilt.py": ["CarryTilt.wish"],

@@ -62,8 +62,8 @@ def make_fields(stage: Stage) -> Make:
 
 def cube(context: GateContext) -> tuple[int, int, int]:
     """First cube: its body, and where its position and velocity begin."""
-    q = int(context.index.cube_qpos[0])
-    v = int(context.index.cube_qvel[0])
+    q = int(context.index.object_qpos[0])
+    v = int(context.index.object_qvel[0])
     return int(context.model.dof_bodyid[v]), q, v
 
 

@@ -12,6 +12,7 @@ import pytest
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes.context import GateContext
 from mjstack.errors import Unreachable
+from mjstack.scene.phases import nominal_xy
 
 Stage = Callable[[str], GateContext]
 
@@ -32,18 +33,18 @@ TOP = {"so101": 0.024, "rebot": 0.212}
 
 
 def nominal(context: GateContext) -> np.ndarray:
-    return np.array([*context.cfg.scene.red_xy, *context.cfg.scene.blue_xy])
+    return nominal_xy(context.cfg.scene)
 
 
 def layouts(context: GateContext) -> np.ndarray:
-    shifts = np.random.default_rng(3).uniform(-0.004, 0.004, (3, 4))
+    shifts = np.random.default_rng(3).uniform(-0.004, 0.004, (3, 2, 2))
     shifts[0] = 0.0
     return nominal(context) + shifts
 
 
 def target(robot: str, phase: str, xy: np.ndarray) -> np.ndarray:
     anchor, heights, offset, _ = PHASES[phase]
-    place = xy[:2] if anchor == "red" else xy[2:]
+    place = xy[0] if anchor == "red" else xy[1]
     return np.array([*place, TOP[robot] + 0.022 + heights * APPROACH[robot] + offset])
 
 
@@ -175,7 +176,7 @@ def test_gripper_ramps(robot: str, stage: Stage, tapes: Callable[[str], JointTra
 def test_unreachable_target_names_world_phase_and_distance(robot: str, stage: Stage) -> None:
     context = stage(robot)
     xy = np.stack([nominal(context)] * 2)
-    xy[1, :2] = [1.5, 0.0]
+    xy[1, 0] = [1.5, 0.0]
     with pytest.raises(Unreachable, match="world 1, phase above_red") as caught:
         context.planner.plan(xy)
     assert caught.value.world == 1

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from mjstack.config.schema import Config
-from mjstack.drivers import planner as planner_module
+from mjstack.drivers import open_loop as planner_module
 from mjstack.drivers import planning_pool
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.drivers.planning_pool import Plan
 from mjstack.episodes.context import GateContext
 from mjstack.errors import Unreachable, WorkerLost
+from mjstack.scene.phases import nominal_xy
 
 Stage = Callable[[str], GateContext]
 Workers = list[planning_pool._Worker]
@@ -63,10 +64,8 @@ class PatientPlanner(OpenLoopPlanner):
 
 
 def layouts(context: GateContext, nworld: int) -> np.ndarray:
-    scene = context.cfg.scene
-    return np.array([*scene.red_xy, *scene.blue_xy]) + np.random.default_rng(7).uniform(
-        -0.002, 0.002, (nworld, 4)
-    )
+    shifts = np.random.default_rng(7).uniform(-0.002, 0.002, (nworld, 4))
+    return nominal_xy(context.cfg.scene) + shifts.reshape(nworld, 2, 2)
 
 
 def test_plans_are_those_of_one_process(robot: str, stage: Stage, workers: Workers) -> None:

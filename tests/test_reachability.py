@@ -36,9 +36,11 @@ def points_over(cfg: Config, n: int, seed: int = 0) -> np.ndarray:
     """Random points over the cubes' regions, from the table up to where cubes are carried."""
     rng = np.random.default_rng(seed)
     scene = cfg.scene
-    places = np.array([scene.red_xy, scene.blue_xy])[rng.integers(2, size=n)]
+    places = np.array([scene.objects["red"].xy, scene.objects["blue"].xy])[rng.integers(2, size=n)]
     xy = places + rng.uniform(-1, 1, (n, 2)) * scene.random_xy
-    return np.column_stack((xy, table_top(scene) + scene.cube_half + rng.uniform(0.0, 0.15, n)))
+    return np.column_stack(
+        (xy, table_top(scene) + scene.objects["red"].half_height + rng.uniform(0.0, 0.15, n))
+    )
 
 
 def grasp_point(ik: GraspIk, cfg: Config, q: np.ndarray, gripper: list[float]) -> np.ndarray:
@@ -169,19 +171,19 @@ def test_finger_room_is_what_the_open_jaws_need(stage: Stage, robot: str) -> Non
     scene = cfg.scene
     data = mujoco.MjData(model)
     blue = index.geoms["blue"][0]
-    distance = 2.0 * math.sqrt(2.0) * scene.cube_half + cfg.robot.finger_room
+    distance = 2.0 * math.sqrt(2.0) * scene.objects["red"].half_height + cfg.robot.finger_room
     ik = GraspIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
-    z = table_top(scene) + scene.cube_half
+    z = table_top(scene) + scene.objects["red"].half_height
 
     def touched(
         command: np.ndarray, at: np.ndarray, away: float, yaw: float, apart: float
     ) -> set[str]:
         data.qpos[:] = model.qpos0
         data.qpos[index.robot_qpos] = command
-        data.qpos[index.cube_qpos[0] : index.cube_qpos[0] + 3] = 5.0, 5.0, 5.0
+        data.qpos[index.object_qpos[0] : index.object_qpos[0] + 3] = 5.0, 5.0, 5.0
         beside = at[:2] + apart * np.array([math.cos(away), math.sin(away)])
         pose = [*beside, z, math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)]
-        data.qpos[index.cube_qpos[1] : index.cube_qpos[1] + 7] = pose
+        data.qpos[index.object_qpos[1] : index.object_qpos[1] + 7] = pose
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         pairs = [set(pair) for pair in data.contact.geom[: data.ncon].tolist()]
@@ -190,7 +192,9 @@ def test_finger_room_is_what_the_open_jaws_need(stage: Stage, robot: str) -> Non
 
     closer = blocked = False
     for corner in ((-1, -1), (0, 0), (1, 1)):
-        at = np.array([*(np.array(scene.red_xy) + np.array(corner) * scene.random_xy), z])
+        at = np.array(
+            [*(np.array(scene.objects["red"].xy) + np.array(corner) * scene.random_xy), z]
+        )
         command, left = ik.solve(at, np.array(cfg.robot.gripper_open), ik.home)
         assert left < 5e-4
         for away in np.arange(0.0, 2.0 * math.pi, math.radians(10.0)):
@@ -229,9 +233,9 @@ def with_wall(
 @pytest.mark.parametrize("euler", [0.0, 0.6])
 def test_nothing_starts_in_a_wall(robot: str, euler: float) -> None:
     cfg = configure("reset=randomized", robot=robot)
-    red_x, red_y = cfg.scene.red_xy
+    red_x, red_y = cfg.scene.objects["red"].xy
     model = with_wall(cfg, (red_x, red_y + 0.06), (0.05, 0.003), euler)
-    index = SceneIndex(model, cfg.robot)
+    index = SceneIndex(model, cfg.robot, cfg.scene)
     wall = model.geom("box_wall").id
     placement = Placement(cfg, model, index, region=(0.05, 0.05), gap=0.01, pose=cfg.robot.start)
     draws = (
@@ -247,10 +251,10 @@ def test_nothing_starts_in_a_wall(robot: str, euler: float) -> None:
     data = mujoco.MjData(model)
     nearest = math.inf
     for number, (dx, dy) in enumerate(offsets[:, 0].tolist()):
-        data.qpos[index.cube_qpos[0] : index.cube_qpos[0] + 2] = red_x + dx, red_y + dy
+        data.qpos[index.object_qpos[0] : index.object_qpos[0] + 2] = red_x + dx, red_y + dy
         yaw = 0.1 * number
-        data.qpos[index.cube_qpos[0] + 2] = model.qpos0[index.cube_qpos[0] + 2]
-        data.qpos[index.cube_qpos[0] + 3 : index.cube_qpos[0] + 7] = (
+        data.qpos[index.object_qpos[0] + 2] = model.qpos0[index.object_qpos[0] + 2]
+        data.qpos[index.object_qpos[0] + 3 : index.object_qpos[0] + 7] = (
             math.cos(0.5 * yaw),
             0.0,
             0.0,
@@ -271,7 +275,7 @@ def touches_arm(
     """Whether red, at a place, touches the arm."""
     data = mujoco.MjData(model)
     data.qpos[index.robot_qpos] = command
-    red, blue = index.cube_qpos
+    red, blue = index.object_qpos
     data.qpos[blue : blue + 3] = 5.0, 5.0, 5.0
     data.qpos[red : red + 2] = xy
     data.qpos[red + 3 : red + 7] = math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)
@@ -284,10 +288,12 @@ def touches_arm(
 
 def test_nothing_starts_at_the_arm_wherever_noise_puts_it() -> None:
     """Around the jaws of a SO-101 that has come down to the table."""
-    cfg = configure("reset=randomized", "scene.red_xy=[0.26,-0.03]", "scene.blue_xy=[0.42,0.05]")
+    cfg = configure(
+        "reset=randomized", "scene.objects.red.xy=[0.26,-0.03]", "scene.objects.blue.xy=[0.42,0.05]"
+    )
     model = build_model(cfg)
     noise = 0.02
-    index = SceneIndex(model, cfg.robot)
+    index = SceneIndex(model, cfg.robot, cfg.scene)
     pose = np.array(cfg.robot.start)
     pose[1] += 0.15  # the shoulder, so that the jaws are among the cubes
     placement = Placement(
@@ -300,7 +306,7 @@ def test_nothing_starts_at_the_arm_wherever_noise_puts_it() -> None:
     free = placement._choose(draws)[1].numpy()
     assert 0.1 < free.mean() < 0.9
     hit = np.zeros(600, dtype=bool)
-    for k, place in enumerate(places * 0.07 + cfg.scene.red_xy):
+    for k, place in enumerate(places * 0.07 + cfg.scene.objects["red"].xy):
         for _ in range(8):
             command = pose.copy()
             command[: index.n_arm] += noise * rng.choice([-1.0, 1.0], index.n_arm)
@@ -319,13 +325,13 @@ def test_all_of_the_region_is_drawn_from(robot: str, stage: Stage) -> None:
         placement = Placement(
             cfg,
             model,
-            SceneIndex(model, cfg.robot),
+            SceneIndex(model, cfg.robot, cfg.scene),
             region=region,
             gap=gap,
             pose=cfg.robot.start,
             noise=0.02,
         )
-        placement._apart = 0.0  # the other cube aside
+        placement._apart = [[0.0] * 2] * 2  # the other cube aside
         grid = torch.linspace(-1.0, 1.0, 41, dtype=torch.float64)
         places = torch.cartesian_prod(grid, grid)
         for cube in (0, 1):
@@ -336,11 +342,13 @@ def test_all_of_the_region_is_drawn_from(robot: str, stage: Stage) -> None:
 
 def test_a_wall_that_leaves_no_room_is_said() -> None:
     cfg = configure("reset=randomized")
-    model = with_wall(cfg, (cfg.scene.red_xy[0], cfg.scene.red_xy[1]), (0.1, 0.1))
+    model = with_wall(
+        cfg, (cfg.scene.objects["red"].xy[0], cfg.scene.objects["red"].xy[1]), (0.1, 0.1)
+    )
     placement = Placement(
         cfg,
         model,
-        SceneIndex(model, cfg.robot),
+        SceneIndex(model, cfg.robot, cfg.scene),
         region=(0.05, 0.05),
         gap=0.01,
         pose=cfg.robot.start,
@@ -352,14 +360,14 @@ def test_a_wall_that_leaves_no_room_is_said() -> None:
 def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
     """Red's first free candidate alone would leave blue no place in some worlds."""
     overrides = [
-        "scene.red_xy=[0.29,-0.13]",
-        "scene.blue_xy=[0.37,-0.13]",
+        "scene.objects.red.xy=[0.29,-0.13]",
+        "scene.objects.blue.xy=[0.37,-0.13]",
         "scene.random_xy=[0.03,0.03]",
     ]
     cfg = configure("reset=randomized", *overrides)
     cfg.reset["cubes"].params["gap"] = 0.04
     model = build_model(cfg)
-    index = SceneIndex(model, cfg.robot)
+    index = SceneIndex(model, cfg.robot, cfg.scene)
     placement = Placement(cfg, model, index, region=(0.03, 0.03), gap=0.04, pose=cfg.robot.start)
     placement.require_room("xy", [0.03, 0.03], 16)
     draws = (
@@ -370,7 +378,9 @@ def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
         - 1.0
     )
     offsets, free = placement._choose(draws)
-    places = offsets + torch.tensor([cfg.scene.red_xy, cfg.scene.blue_xy], dtype=torch.float64)
+    places = offsets + torch.tensor(
+        [cfg.scene.objects["red"].xy, cfg.scene.objects["blue"].xy], dtype=torch.float64
+    )
     apart = torch.linalg.vector_norm(places[:, 0] - places[:, 1], dim=1)
     assert free.all()
     assert float(apart.min()) >= 2.0 * math.sqrt(2.0) * 0.022 + 0.04
@@ -386,9 +396,9 @@ def level(cfg: Config, reached: Callable[[np.ndarray, np.ndarray], np.ndarray]) 
 
 def test_regions_stay_inside_what_is_reached() -> None:
     cfg = mjstack.load_config(["job=reachability", "job.step=0.005", "job.margin=0.01"])
-    x0, y0 = cfg.scene.red_xy
+    x0, y0 = cfg.scene.objects["red"].xy
     half_plane = level(cfg, lambda x, y: (x <= x0 + 0.08) & (y >= y0 - 0.09))
-    region = find_region(cfg, [half_plane], "red", [x0, y0])
+    region = find_region(cfg, [half_plane], "red")
     # From the last point that is reached, a step short of the first that is not: a margin less.
     assert region.square == pytest.approx(0.07, abs=0.005)
     assert 0.0 <= 0.07 - region.largest[0] <= 0.005
@@ -396,33 +406,33 @@ def test_regions_stay_inside_what_is_reached() -> None:
     assert region.reached
     assert region.tilt == pytest.approx(0.3)
     near = level(cfg, lambda x, y: x <= x0 + 0.055)
-    assert not find_region(cfg, [half_plane, near], "red", [x0, y0]).reached
-    island = find_region(cfg, [level(cfg, lambda x, y: x < x0 - 0.05)], "red", [x0, y0])
+    assert not find_region(cfg, [half_plane, near], "red").reached
+    island = find_region(cfg, [level(cfg, lambda x, y: x < x0 - 0.05)], "red")
     assert (island.square, island.largest, island.reached) == (0.0, (0.0, 0.0), False)
     assert math.isnan(island.tilt)
-    everywhere = find_region(cfg, [level(cfg, lambda x, y: x < 9.0)], "red", [x0, y0])
+    everywhere = find_region(cfg, [level(cfg, lambda x, y: x < 9.0)], "red")
     scene = cfg.scene
     for k in (0, 1):  # the table's edge ends it, for a cube of any yaw
         edge = (
             scene.table_half[k]
             - abs((x0, y0)[k] - scene.table_center[k])
-            - math.sqrt(2.0) * scene.cube_half
+            - math.sqrt(2.0) * scene.objects["red"].half_height
         )
         assert 0.0 <= edge - everywhere.largest[k] <= 0.001
 
 
 def test_levels_are_the_controllers(robot: str) -> None:
     cfg = mjstack.load_config([f"robot={robot}", "job=reachability"])
-    h = cfg.robot.approach_height
+    h = cfg.robot.approach_height + 0.022
     levels = find_levels(cfg)
     assert levels == {
-        "grasp": (pytest.approx(0.0), "open"),
+        "grasp": (pytest.approx(0.022), "open"),
         "approach": (pytest.approx(h), "open"),
         "carry": levels["carry"],
     }
     assert levels["carry"] == (pytest.approx(h + 0.09), "open")
-    cfg = mjstack.load_config(["job=reachability", "controller.phases.lift_red.offset=0.2"])
-    assert find_levels(cfg)["carry"] == (pytest.approx(0.29), "closed")
+    cfg = mjstack.load_config(["job=reachability", "controller.phases.lift_red.offset=[0,0,0.2]"])
+    assert find_levels(cfg)["carry"] == (pytest.approx(0.312), "closed")
 
 
 def test_the_job_leaves_a_map(
@@ -442,7 +452,13 @@ def test_the_job_leaves_a_map(
     reach = PointReach(build_model(cfg), cfg.robot, cfg.robot.gripper_open)
     for row in rows[:: len(rows) // 7]:
         point = np.array(
-            [[float(row["x_m"]), float(row["y_m"]), table_top(cfg.scene) + cfg.scene.cube_half]]
+            [
+                [
+                    float(row["x_m"]),
+                    float(row["y_m"]),
+                    table_top(cfg.scene) + cfg.scene.objects["red"].half_height,
+                ]
+            ]
         )
         distance = float(reach.solve(point).distance[0])
         assert (row["grasp_reached"] == "1") is (distance <= 5e-4)

@@ -164,10 +164,10 @@ def test_trajectory_holds_the_episode(
             "descend_red",
             "done",
         ]
-        red, blue = (held["qpos"][:, a : a + 3] for a in context.index.cube_qpos)
+        red, blue = (held["qpos"][:, a : a + 3] for a in context.index.object_qpos)
         assert held["xy_err_m"] == pytest.approx(np.hypot(*(red - blue)[:, :2].T), abs=1e-6)
         assert held["dz_m"] == pytest.approx((red - blue)[:, 2], abs=1e-6)
-        v = context.index.cube_qvel[0]
+        v = context.index.object_qvel[0]
         speed = np.linalg.norm(held["qvel"][:, v : v + 3], axis=1)
         speed += np.sqrt(3.0) * 0.022 * np.linalg.norm(held["qvel"][:, v + 3 : v + 6], axis=1)
         assert held["cube_speed_m_per_s"][:, 0] == pytest.approx(speed)
@@ -302,7 +302,7 @@ def test_what_is_promised_of_another_end(
     context = new_context("sim=native")
     ours = np.zeros(context.model.nq)
     theirs = ours.copy()
-    theirs[context.index.cube_qpos[1]] = moved
+    theirs[context.index.object_qpos[1]] = moved
     failed = np.array([0, int(bits)], np.int32)
     record = BatchRecord(
         seed=0,

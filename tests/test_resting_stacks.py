@@ -24,16 +24,16 @@ def moving_stacks(*, primitive: bool) -> int:
     """Stacks whose red cube still turns after SECONDS, of NWORLD dropped from half a millimetre."""
     cfg = load_config()
     model = build_model(cfg)
-    index = SceneIndex(model, cfg.robot)
+    index = SceneIndex(model, cfg.robot, cfg.scene)
     sim = make_simulation(model, cfg, NWORLD, backend=Backend.mjwarp, device="cuda:0")
     if not primitive:
         sim._m.opt.disableflags &= ~int(mjw.DisableBit.NATIVECCD)
     generator = torch.Generator().manual_seed(7)
     draw = (2.0 * torch.rand((NWORLD, 4), generator=generator) - 1.0).to(sim.device)
     sim.reset()
-    half = cfg.scene.cube_half
+    half = cfg.scene.objects["red"].half_height
     top = table_top(cfg.scene)
-    red, blue = index.cube_qpos
+    red, blue = index.object_qpos
     spot = torch.tensor([0.42, 0.14], device=sim.device)
     sim.qpos[:, blue : blue + 2] = spot
     sim.qpos[:, blue + 2] = top + half
@@ -42,7 +42,7 @@ def moving_stacks(*, primitive: bool) -> int:
     sim.qpos[:, red + 2] = top + 3.0 * half + 5e-4
     sim.qpos[:, red + 3 : red + 7] = quat_from_yaw(0.25 * math.pi * draw[:, 3])
     sim.ctrl[:] = torch.tensor(cfg.robot.home, device=sim.device)
-    spin = index.cube_qvel[0] + 3
+    spin = index.object_qvel[0] + 3
     fastest = torch.zeros(NWORLD, device=sim.device)
     steps = round(SECONDS / cfg.timing.step_dt)
     for step in range(steps):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mjstack.math import lowest_corner, not_finite, quat_angle, quat_from_yaw, quat_mul, quat_z_row
+from mjstack.math import lowest_point, not_finite, quat_angle, quat_from_yaw, quat_mul, quat_z_row
 from mjstack.rng import philox, uniform
 
 KNOWN = [
@@ -167,5 +167,5 @@ def test_lowest_corner_against_eight_corners(quats: np.ndarray) -> None:
             mujoco.mju_rotVecQuat(corner, np.array(signs), q)
             heights.append(p[2] + corner[2])
         expected.append(min(heights))
-    got = lowest_corner(torch.from_numpy(pos), torch.from_numpy(quats), 0.022)
+    got = lowest_point(torch.from_numpy(pos), torch.from_numpy(quats), "box", [0.022] * 3)
     np.testing.assert_allclose(got.numpy(), expected, atol=1e-14)

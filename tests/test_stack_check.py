@@ -52,7 +52,8 @@ def feed(
     worlds: list[World], rec: SimpleNamespace, dtype: torch.dtype = torch.float64
 ) -> CheckResult:
     """Plays recordings through the check; the state also has one coordinate of an arm."""
-    index = SimpleNamespace(cube_qpos=[1, 8], cube_qvel=[1, 7])
+    addresses = {"red": (1, 1), "blue": (8, 7)}
+    index = SimpleNamespace(object_address=addresses.__getitem__)
     n = len(worlds)
     check = StackCheck(rec.cfg, index, rec.phases, n, torch.device("cpu"))
     phase_at = torch.tensor([i for i, p in enumerate(rec.phases) for _ in range(p.start, p.stop)])
@@ -146,19 +147,19 @@ def blue_sunk_into_the_table(w: World) -> None:
 
 @CASES.case("SUPPORTED")
 def both_off_the_table_edge(w: World) -> None:
-    reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.cube_half
+    reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.objects["red"].half_height
     w.pose[w.window, :, 1] = w.rec.cfg.scene.table_center[1] + reach + HAIR
 
 
 @CASES.case()
 def both_at_the_table_edge(w: World) -> None:
-    reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.cube_half
+    reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.objects["red"].half_height
     w.pose[w.window, :, 1] = w.rec.cfg.scene.table_center[1] + reach - HAIR
 
 
 @CASES.case("SUPPORTED")
 def both_off_the_far_edge(w: World) -> None:
-    reach = w.rec.cfg.scene.table_half[0] - w.rec.cfg.scene.cube_half
+    reach = w.rec.cfg.scene.table_half[0] - w.rec.cfg.scene.objects["red"].half_height
     w.pose[w.window, :, 0] = w.rec.cfg.scene.table_center[0] - reach - HAIR
 
 

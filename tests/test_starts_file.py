@@ -61,7 +61,7 @@ def write_rows(path: Path, rows: Rows) -> Path:
 
 def plain_rows(cfg: Config, n: int = N) -> Rows:
     """Worlds with the cubes near their places, as a person would write them."""
-    (red_x, red_y), (blue_x, blue_y) = cfg.scene.red_xy, cfg.scene.blue_xy
+    (red_x, red_y), (blue_x, blue_y) = cfg.scene.objects["red"].xy, cfg.scene.objects["blue"].xy
     return [
         {
             "world": str(w),
@@ -153,7 +153,7 @@ def test_absent_columns_leave_the_models_own(backend: str, robot: str, tmp_path:
     assert (env.sim.qpos[:, env.index.robot_qpos.tolist()] == start).all()
     assert (env.sim.ctrl[:, env.index.ctrl.tolist()] == start).all()
     for w in range(N):  # the world's own row, in whatever order they stand
-        assert float(env.sim.qpos[w, env.index.cube_qpos[0] + 1]) == pytest.approx(
+        assert float(env.sim.qpos[w, env.index.object_qpos[0] + 1]) == pytest.approx(
             float(rows[w]["red_y_m"]), rel=1e-6
         )
     backwards = started(
@@ -230,7 +230,7 @@ def test_writing_is_refused_where_worlds_have_moved_on(tmp_path: Path) -> None:
     env.reset(seed=0)
     with pytest.raises(ArgumentError, match=r"path: .*no/worlds\.csv.*folder"):
         write_starts(env, tmp_path / "no" / "worlds.csv")
-    env.sim.qpos[1, env.index.cube_qpos[0] + 2] += 0.1
+    env.sim.qpos[1, env.index.object_qpos[0] + 2] += 0.1
     with pytest.raises(ArgumentError, match="red of world 1 off the table"):
         write_starts(env, tmp_path / "worlds.csv")
     env.reset(seed=0)

@@ -42,8 +42,9 @@ def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
     generator = torch.Generator().manual_seed(0)
     most = 0
     touched = False
-    index = SceneIndex(ours.model, configure(robot=robot).robot)
-    red = index.cube_qpos[0]
+    cfg = configure(robot=robot)
+    index = SceneIndex(ours.model, cfg.robot, cfg.scene)
+    red = index.object_qpos[0]
     for step in range(40):
         command = low + (high - low) * torch.rand((3, len(low)), generator=generator)
         between = ours.site_xpos[:, index.grasp_sites].mean(1)
@@ -92,14 +93,15 @@ def test_branches_count_and_sense_what_one_after_the_other_does(robot: str) -> N
     ours = worlds(robot, "cuda:0")
     plain = worlds(robot, "cuda:0")
     plain.arrange(Arrangement(own_stages=False))
-    index = SceneIndex(ours.model, configure(robot=robot).robot)
+    cfg = configure(robot=robot)
+    index = SceneIndex(ours.model, cfg.robot, cfg.scene)
     home = torch.tensor(configure(robot=robot).robot.start, device="cuda:0")
     for sim in (ours, plain):
         sim.qpos[:, torch.as_tensor(index.robot_qpos, device="cuda:0")] = home
         sim.ctrl[:, torch.as_tensor(index.ctrl, device="cuda:0")] = home
         sim.step(50, kinematics=True)
     between = plain.site_xpos[:, index.grasp_sites].mean(1)
-    red = index.cube_qpos[0]
+    red = index.object_qpos[0]
     plain.qpos[:, red : red + 3] = between
     for n in (1, 1, 2, 3, 1, 2):
         ours.qpos[:] = plain.qpos

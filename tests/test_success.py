@@ -120,7 +120,9 @@ def test_small_region_passes(passed: Path) -> None:
     assert "![success.png](success.png)" in (passed / "report.md").read_text()
     scene = load_config().scene
     with np.load(passed / "success_seed0.npz") as held:
-        off = np.abs(held["start_places"][..., :2] - [scene.red_xy, scene.blue_xy])
+        off = np.abs(
+            held["start_places"][..., :2] - [scene.objects["red"].xy, scene.objects["blue"].xy]
+        )
         assert 0.015 < off.max() <= 0.03
         assert (held["sign"] == 0).all()
         assert (held["failed"] == 0).all()
@@ -455,7 +457,7 @@ def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> Non
     controller = SimpleNamespace(phase=torch.zeros(n, dtype=torch.int64))
     check = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.step]))
     monkeypatch.setattr(
-        watch_module, "cubes_in_hand", lambda *_: torch.from_numpy(forces[now.step] > 0.0).all(2)
+        watch_module, "objects_in_hand", lambda *_: torch.from_numpy(forces[now.step] > 0.0).all(2)
     )
     monkeypatch.setattr(watch_module, "check_class", lambda _: lambda *_: check)
     watch.start(env, controller)
@@ -512,7 +514,7 @@ def test_signs_in_real_episodes(new_context: Callable[..., GateContext]) -> None
     """
     base = new_context("sim=native", "nworld=6")
     context = base.with_config(success_config(base.cfg))
-    red, _ = context.index.cube_qpos
+    red, _ = context.index.object_qpos
     at = {name: context.phase_start(name) for name in PHASES}
 
     def interfere(step: int, sim: Simulation) -> None:
@@ -572,7 +574,7 @@ def test_each_cube_of_the_box_has_its_own_release(monkeypatch: pytest.MonkeyPatc
     controller = SimpleNamespace(phase=torch.zeros(5, dtype=torch.int64))
     check = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.step]))
     monkeypatch.setattr(
-        watch_module, "cubes_in_hand", lambda *_: torch.ones(5, 2, dtype=torch.bool)
+        watch_module, "objects_in_hand", lambda *_: torch.ones(5, 2, dtype=torch.bool)
     )
     monkeypatch.setattr(watch_module, "check_class", lambda _: lambda *_: check)
     watch.start(env, controller)
@@ -621,20 +623,20 @@ def test_worst_regions_of_made_up_episodes() -> None:
     turned = (radial_yaw_deg(places[:, 1]) >= 30.0) & (radial_yaw_deg(places[:, 1]) < 45.0)
     succeeded = ~(corner & (rng.random(n) < 0.9)) & ~(turned & (rng.random(n) < 0.5))
     found = find_regions(
-        places, succeeded, cell=0.02, yaw_cell_deg=15.0, episodes=20, cubes=("red", "blue")
+        places, succeeded, cell=0.02, yaw_cell_deg=15.0, episodes=20, objects=("red", "blue")
     )
     assert [region.rate for region in found] == sorted(region.rate for region in found)
     assert all(region.episodes >= 20 for region in found)
-    assert not any(region.cube == "red" and region.x_min_m == 0.4 for region in found)
-    assert (found[0].cube, found[0].x_min_m, found[0].y_min_m) == ("red", 0.34, -0.14)
+    assert not any(region.object == "red" and region.x_min_m == 0.4 for region in found)
+    assert (found[0].object, found[0].x_min_m, found[0].y_min_m) == ("red", 0.34, -0.14)
     assert found[0].where.startswith("red: x 0.340 to 0.360 m, y -0.140 to -0.120 m")
-    alone = [region for region in found if region.cube == "blue" and region.x_min_m is None]
+    alone = [region for region in found if region.object == "blue" and region.x_min_m is None]
     assert (alone[0].yaw_min_deg, alone[0].yaw_max_deg) == (30.0, 45.0)
     assert alone[0].where == "blue: turned 30 to 45 deg"
     assert len(alone) == 6
     assert sum(region.episodes for region in alone) == n
     assert sum(region.succeeded for region in alone) == succeeded.sum()
-    placed = [region for region in found if region.cube == "red" and region.yaw_min_deg is None]
+    placed = [region for region in found if region.object == "red" and region.yaw_min_deg is None]
     assert len(placed) == 6
     whole = next(region for region in placed if (region.x_min_m, region.y_min_m) == (0.34, -0.14))
     assert (whole.episodes, whole.succeeded) == (int(corner.sum()), int((corner & succeeded).sum()))

@@ -32,6 +32,7 @@ from mjstack.mdp import observation as observation_terms
 from mjstack.mdp import reset as reset_terms
 from mjstack.mdp import reward as reward_terms
 from mjstack.mdp import termination as termination_terms
+from mjstack.mdp.geometry import source_xy
 from mjstack.scene import SceneIndex
 from mjstack.tasks.reach import ReachSuccess
 from mjstack.tasks.stack import StackSuccess
@@ -70,7 +71,7 @@ REWARDS = {  # whether it is a fraction, from 0 to 1
 TERMINATIONS = {
     "time_out": {"steps": 3},
     "success": {},
-    "CubeOffTable": {},
+    "ObjectOffTable": {},
     "JointLimit": {"margin": 0.1},
     "non_finite": {},
     "overflow": {},
@@ -78,10 +79,10 @@ TERMINATIONS = {
 RESETS = (
     "home",
     "JointNoise",
-    "JitterCubes",
-    "RandomizeCubes",
-    "CubeMass",
-    "CubeFriction",
+    "JitterObjects",
+    "RandomizeObjects",
+    "ObjectMass",
+    "ObjectFriction",
     "ActuatorGains",
 )
 
@@ -172,7 +173,7 @@ class Reference:
 def test_observation_groups_hold_what_mujoco_says(backend: str, task: str, robot: str) -> None:
     env = on_shared_sim(backend, 3, configure(f"task={task}", robot=robot))
     env.reset(seed=0)
-    for cube in env.index.cube_qvel:
+    for cube in env.index.object_qvel:
         env.sim.qvel[:, cube : cube + 6] += 0.2  # so that no velocity is zero
     moves = actions(env, 6)
     for move in moves:
@@ -213,8 +214,7 @@ def record(env: Env, stage: Stage, steps: int = 600) -> SimpleNamespace:
     """Plays the scripted grasp; per step the state, the returned values and each term's reward."""
     planner = stage(env.cfg.robot.name).planner
     env.reset(seed=0)
-    cubes = torch.cat([env.sim.qpos[:, a : a + 2] for a in env.index.cube_qpos], dim=1)
-    tape = planner.plan(cubes.double().cpu().numpy())
+    tape = planner.plan(source_xy(env).double().cpu().numpy())
     rows: dict[str, list[torch.Tensor]] = {}
     for step in range(steps):
         row = returned(env.step(tape.command(step).float())) | {
@@ -260,8 +260,8 @@ def cubes_of(
     rec: SimpleNamespace, qpos: torch.Tensor, qvel: torch.Tensor
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses and velocities of both cubes, shape ``(..., 2, 7)`` and ``(..., 2, 6)``."""
-    pose = [qpos[..., a : a + 7] for a in rec.index.cube_qpos]
-    velocity = [qvel[..., a : a + 6] for a in rec.index.cube_qvel]
+    pose = [qpos[..., a : a + 7] for a in rec.index.object_qpos]
+    velocity = [qvel[..., a : a + 6] for a in rec.index.object_qvel]
     return torch.stack(pose, -2).numpy(), torch.stack(velocity, -2).numpy()
 
 
@@ -277,7 +277,7 @@ def test_rewards_of_a_scripted_episode(
         for i, name in enumerate(names)
     }
     pose, _ = cubes_of(rec, rec.qpos, rec.qvel)
-    half = cfg.scene.cube_half
+    half = cfg.scene.objects["red"].half_height
     top = table_top(cfg)
     low = np.array([[lowest_corner(p[RED], half) - top for p in step] for step in pose])
     red = pose[..., RED, :3]
@@ -437,7 +437,7 @@ def rested(
     """
     t = cfg.gate.acceptance
     scene = cfg.scene
-    half = scene.cube_half
+    half = scene.objects["red"].half_height
     top = table_top(cfg)
     red = pose[:, RED]
     blue = pose[:, BLUE]
@@ -659,7 +659,7 @@ def test_stack_success_is_rules_four_and_five(
         pose, velocity = cubes_of(rec, q, v)
         if alter is not None:
             alter(pose, velocity, fingers)
-        for i, (a, b) in enumerate(zip(rec.index.cube_qpos, rec.index.cube_qvel, strict=True)):
+        for i, (a, b) in enumerate(zip(rec.index.object_qpos, rec.index.object_qvel, strict=True)):
             q[:, a : a + 7] = torch.from_numpy(pose[:, i])
             v[:, b : b + 6] = torch.from_numpy(velocity[:, i])
         q[:, gripper] = torch.from_numpy(closed + fingers * (opened - closed))
@@ -722,7 +722,7 @@ def test_reaching_ends_the_episode_after_ten_steps_in_a_row(backend: str) -> Non
     interruption.
     """
     cfg = configure("task=reach", "reset=nominal")
-    cfg.termination.pop("cube_off_table")
+    cfg.termination.pop("object_off_table")
     env = on_shared_sim(backend, 3, cfg)
     env.reset(seed=0)
     q, v = env.index.objects["red"]
@@ -762,11 +762,11 @@ def test_joint_limit_at_its_threshold(robot: str) -> None:
                 assert term(env).tolist() == [False, out, False]
 
 
-def test_cube_off_table_at_its_threshold(robot: str) -> None:
+def test_object_off_table_at_its_threshold(robot: str) -> None:
     env = on_shared_sim("native", 3, configure(robot=robot))
-    term = termination_terms.CubeOffTable(env)
+    term = termination_terms.ObjectOffTable(env)
     scene = env.cfg.scene
-    for a in env.index.cube_qpos:
+    for a in env.index.object_qpos:
         for axis in (0, 1):
             for sign in (-1, 1):
                 for by, out in ((-0.001, False), (0.001, True)):
@@ -792,7 +792,7 @@ class Bench:
         self.nworld = nworld
         self.seed = cfg.seed
         self.sim = new_sim(backend, nworld, cfg.robot.name)
-        self.index = SceneIndex(self.sim.model, cfg.robot)
+        self.index = SceneIndex(self.sim.model, cfg.robot, cfg.scene)
         self.device = self.sim.device
         self.world = torch.arange(nworld, device=self.device)
         self.episode, self.episode_step = torch.zeros_like(self.world), torch.zeros_like(self.world)
@@ -928,7 +928,7 @@ def test_overrides_change_exactly_what_they_name() -> None:
     env.reset()
     env.step(torch.zeros(2, 4))
     # Lift is worth three instead of two per second.
-    env.sim.qpos[:, env.index.cube_qpos[0] + 2] += 0.2
+    env.sim.qpos[:, env.index.object_qpos[0] + 2] += 0.2
     env.step(torch.zeros(2, 4))
     column = env.reward_manager.values[:, 1]
     torch.testing.assert_close(column, torch.full_like(column, 3.0 * env.cfg.timing.step_dt))
@@ -972,10 +972,10 @@ def test_cubes_start_on_the_table_and_touch_nothing_else(robot: str, reset: str)
     for k in range(1 if reset == "nominal" else MANY):
         data.qpos[:] = env.sim.qpos[k]
         mujoco.mj_forward(m, data)
-        for a in env.index.cube_qpos:
-            at = corners(data.qpos[a : a + 7], scene.cube_half)
+        for a in env.index.object_qpos:
+            at = corners(data.qpos[a : a + 7], scene.objects["red"].half_height)
             assert at[:, 2].min() == pytest.approx(table_top(env.cfg), abs=1e-9)
-            assert np.ptp(at[:, 2]) == pytest.approx(2.0 * scene.cube_half)
+            assert np.ptp(at[:, 2]) == pytest.approx(2.0 * scene.objects["red"].half_height)
             assert (np.abs(at[:, :2] - scene.table_center[:2]) <= scene.table_half[:2]).all()
         touching = {tuple(sorted(contact.geom)) for contact in data.contact}
         assert {pair for pair in touching if set(pair) & {*cubes}} <= {
@@ -999,7 +999,7 @@ def test_home_jitter_and_noise_stay_within_their_widths(robot: str) -> None:
 
     jitter = start_of(configure("reset=jitter", robot=robot))
     assert torch.equal(jitter.sim.qpos[:, columns], nominal.sim.qpos[:, columns])
-    for a in jitter.index.cube_qpos:
+    for a in jitter.index.object_qpos:
         off = jitter.sim.qpos[:, a : a + 3] - qpos0[a : a + 3]
         yaw = 2.0 * torch.atan2(jitter.sim.qpos[:, a + 6], jitter.sim.qpos[:, a + 3])
         for values, width in ((off[:, 0], 0.002), (off[:, 1], 0.002), (yaw, 0.05)):
@@ -1024,7 +1024,7 @@ def test_home_jitter_and_noise_stay_within_their_widths(robot: str) -> None:
         assert len(torch.unique(off[:, j])) > MANY // 3, (
             j
         )  # home may lie on a limit, as the SO-101's does not
-    for a in noisy.index.cube_qpos:
+    for a in noisy.index.object_qpos:
         off = noisy.sim.qpos[:, a : a + 2] - qpos0[a : a + 2]
         yaw = 2.0 * torch.atan2(noisy.sim.qpos[:, a + 6], noisy.sim.qpos[:, a + 3])
         half = torch.tensor(noisy.cfg.scene.random_xy, dtype=torch.float64)
@@ -1049,7 +1049,7 @@ def test_masses_friction_and_gains_are_drawn_anew_from_the_models_own(robot: str
         fields = {name: field.clone() for name, field in env.sim.fields.items()}
         ratio = {name: field / torch.from_numpy(getattr(m, name)) for name, field in fields.items()}
         mass = ratio["body_mass"][:, bodies]
-        dofs = [[v + i for i in range(6)] for v in index.cube_qvel]
+        dofs = [[v + i for i in range(6)] for v in index.object_qvel]
         for other in (
             ratio["body_inertia"][:, bodies],
             ratio["body_subtreemass"][:, bodies, None],

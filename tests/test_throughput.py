@@ -333,9 +333,9 @@ def test_start_states_repeat_without_the_batch_gate(
     assert state.qpos.shape[0] == 5
     assert np.array_equal(state.qpos[[0, 1, 0]], state.qpos[2:])
     assert not np.array_equal(state.qpos[0], state.qpos[1])
-    red = context.index.cube_qpos[0]
+    red = context.index.object_qpos[0]
     gripper = context.index.robot_qpos[-1]
-    assert np.abs(state.qpos[:, red] - context.cfg.scene.red_xy[0]).max() < 0.03
+    assert np.abs(state.qpos[:, red] - context.cfg.scene.objects["red"].xy[0]).max() < 0.03
     assert (
         state.qpos[:, gripper].max() < context.cfg.robot.gripper_open[0] - 0.1
     )  # closed on the cube
@@ -351,7 +351,7 @@ def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., GateC
     )
     sim = context.batch_simulation(5)
     state = sections._carry_start(context, sim)
-    red = context.index.cube_qpos[0]
+    red = context.index.object_qpos[0]
     state.qpos[[1, 4], red + 1] -= 0.1
     context.carry_start = state
     result, _ = run_throughput(context)

@@ -31,8 +31,8 @@ from mjstack.episodes.observers import CommandRecorder
 from mjstack.episodes.rollout import CLOSED_LOOP, Observer, State, restore, rollout, step_graph
 from mjstack.errors import name_worlds
 from mjstack.math import not_finite
-from mjstack.mdp.geometry import cubes_in_hand
-from mjstack.scene.phases import carried_cubes
+from mjstack.mdp.geometry import objects_in_hand
+from mjstack.scene.phases import carried_objects
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Simulation, device_memory
 
 if TYPE_CHECKING:
@@ -334,14 +334,14 @@ def _carry_start(context: GateContext, sim: Simulation) -> State:
 
 
 def _in_hand(context: GateContext, sim: Simulation) -> int | None:
-    """Number of worlds in which both jaws press on the cube of the measured phase; None if it
+    """Number of worlds in which both jaws press on the object of the measured phase; None if it
     carries none.
     """
     phases = context.cfg.controller.phases
-    cube = carried_cubes(list(phases.values()))[
+    number = carried_objects(context.cfg)[
         list(phases).index(context.cfg.gate.throughput.from_phase)
     ]
-    return None if cube < 0 else int(cubes_in_hand(context.index, sim)[:, cube].sum())
+    return None if number < 0 else int(objects_in_hand(context.index, sim)[:, number].sum())
 
 
 def _rows(state: State, rows: np.ndarray) -> State:

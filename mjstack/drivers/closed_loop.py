@@ -1,4 +1,4 @@
-"""The scripted controller: every world goes through its phases by itself, watches its cubes, and
+"""The closed-loop driver: every world goes through its phases by itself, observes its objects, and
 needs no host.
 """
 
@@ -16,9 +16,8 @@ from mjstack.envs import Env
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.base import EnvView
-from mjstack.mdp.geometry import cubes_in_hand, pose_w, robot
-from mjstack.scene.index import CUBES
-from mjstack.scene.phases import FIXED, anchor_of, build_phases, grasped_cubes
+from mjstack.mdp.geometry import objects_in_hand, place_xy, pose_w, robot
+from mjstack.scene.phases import build_phases, build_targets, grasped_objects, source_names
 
 _QUARTER = 0.5 * math.pi
 _STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
@@ -27,16 +26,17 @@ _DONE = 1e-3  # steps: a phase is over this much before its last step would be
 
 
 class ClosedLoopDriver:
-    """Phase, time and targets of every world as tensors; targets from where its cubes are; batched
-    inverse kinematics.
+    """Phase, time and targets of every world as tensors; targets from where its objects are;
+    batched inverse kinematics.
 
     A phase moves the grasp point by smoothstep from the last phase's target to its own. Where it
-    says ``look``, the cube's place is measured when it begins. A grasp without load on both jaws at
-    its end is tried again, from the phase ``retry``, once for each cube and if the rest can be done
-    in time: such a world then goes faster than the others, at most ``controller.hurry`` times.
+    says ``observe``, its anchor is measured when it begins. A grasp without load on both jaws at
+    its end is tried again, from the phase ``retry``, once for each object and if the rest can be
+    done in time: such a world then goes faster than the others, at most ``controller.speed_limit``
+    times.
 
     Where the robot has an ``approach_gain``, the gripper leans at the grasp as it must where the
-    cube is let go (`CarryTilt`).
+    object is let go (`CarryTilt`).
 
     A world that the environment has reset starts over by itself.
 
@@ -61,8 +61,7 @@ class ClosedLoopDriver:
                 keep close to, shape ``(phases, nu)``.
 
         Raises:
-            MjstackError: The scene lacks a phase's anchor, the environment takes other actions, or
-                worlds have moved on.
+            MjstackError: The environment takes other actions, or worlds have moved on.
         """
         cfg = env.cfg
         device = env.device
@@ -115,18 +114,20 @@ class ClosedLoopDriver:
         self.retries = zeros(dtype=torch.int32)
         self.error = zeros()
         self.unreachable = zeros(dtype=torch.bool)
-        self._tried = zeros(len(CUBES), dtype=torch.bool)  # whose grasp has been tried again
+        self._tried = zeros(
+            len(cfg.scene.objects), dtype=torch.bool
+        )  # whose grasp has been tried again
         self._again = zeros(dtype=torch.bool)  # the phase was entered to try a grasp once more
-        self._seen = zeros(3, 2)  # x and y of red, of blue, and of a fixed place
+        self._seen = zeros(len(source_names(cfg.scene)), 2)  # x and y of objects and places
         self._from = zeros(3)
         self._to = zeros(3)
         n_grip = len(cfg.robot.gripper_joints)
         self._grip_from = zeros(n_grip)
         self._grip_to = zeros(n_grip)
         self._command = zeros(len(cfg.robot.home))
-        self._yaw = zeros(3)
+        self._yaw = zeros(len(source_names(cfg.scene)))
         self._roll = zeros()
-        aligns = cfg.controller.align > 0.0
+        aligns = cfg.controller.yaw_alignment > 0.0
         self._roll_column, self._roll_sign = self._find_roll() if aligns else (0, 1.0)
 
     def command(self) -> torch.Tensor:
@@ -148,7 +149,7 @@ class ClosedLoopDriver:
         posture = self._nominal.index_select(0, self.phase)
         start = torch.where(fresh[:, None], posture, self._command)
         start[:, self._n_arm :] = grip
-        if self._cfg.controller.align > 0.0:
+        if self._cfg.controller.yaw_alignment > 0.0:
             self._turn(start, fresh)
         approach = None
         if self._tilt is not None:
@@ -184,7 +185,7 @@ class ClosedLoopDriver:
             buffer.masked_fill_(fresh, 0)
         self._tried.masked_fill_(fresh[:, None], False)
 
-        self._look(entering, fresh)
+        self._observe(entering, fresh)
         rows = entering[:, None]
         to = torch.where(self._holds.index_select(0, phase)[:, None], self._to, self._aim(phase))
         self._from.copy_(torch.where(rows, torch.where(fresh[:, None], to, self._to), self._from))
@@ -194,35 +195,47 @@ class ClosedLoopDriver:
         self._grip_to.copy_(torch.where(rows, self._grip.index_select(0, phase), self._grip_to))
 
     def _aim(self, phase: torch.Tensor) -> torch.Tensor:
-        """Target of each world's phase, from where its cubes were last seen [m], shape ``(nworld,
+        """Target of each world's phase, from where its anchor was last seen [m], shape ``(nworld,
         3)``.
         """
         table = self._target.index_select(0, phase)
-        source = self._source.index_select(0, phase)
-        seen = self._seen.gather(1, source[:, None, None].expand(-1, 1, 2))[:, 0]
-        return torch.cat((table[:, :2] + seen, table[:, 2:]), dim=1)
+        seen = self._last_seen(self._source, phase)
+        offset = table[:, :2]
+        if self._turns:
+            away = self._last_seen(self._toward, phase) - seen
+            angle = torch.atan2(away[:, 1], away[:, 0])
+            angle = angle * self._has_toward.index_select(0, phase)
+            along, left = offset.unbind(1)
+            cos = torch.cos(angle)
+            sin = torch.sin(angle)
+            offset = torch.stack((along * cos - left * sin, along * sin + left * cos), dim=1)
+        return torch.cat((offset + seen, table[:, 2:]), dim=1)
+
+    def _last_seen(self, sources: torch.Tensor, phase: torch.Tensor) -> torch.Tensor:
+        source = sources.index_select(0, phase)
+        return self._seen.gather(1, source[:, None, None].expand(-1, 1, 2))[:, 0]
 
     def _judge_grasp(self, over: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Worlds that try their grasp again, ``(nworld,)`` bool, and how fast they go on,
         ``(nworld,)``.
         """
-        held = cubes_in_hand(self._env.index, self._env.sim)
+        held = objects_in_hand(self._env.index, self._env.sim)
         grasps = self._grasps.index_select(0, self.phase)
-        cube = grasps.clamp(min=0)[:, None]
-        empty = over & (grasps >= 0) & ~held.gather(1, cube)[:, 0]
+        number = grasps.clamp(min=0)[:, None]
+        empty = over & (grasps >= 0) & ~held.gather(1, number)[:, 0]
         again = self._retry_to.index_select(0, self.phase)
         time_left = (self.steps - self._rest - self._env.episode_step).clamp(min=1)
         rate = (self._needed.index_select(0, again) / time_left).clamp(min=1.0)
-        first = ~self._tried.gather(1, cube)[:, 0] & self._can_retry.index_select(0, self.phase)
-        retry = empty & first & (rate <= self._hurry)
-        self._tried |= retry[:, None] & (grasps[:, None] == self._cubes)
+        first = ~self._tried.gather(1, number)[:, 0] & self._can_retry.index_select(0, self.phase)
+        retry = empty & first & (rate <= self._speed_limit)
+        self._tried |= retry[:, None] & (grasps[:, None] == self._numbers)
         return retry, rate
 
     def _turn(self, command: torch.Tensor, fresh: torch.Tensor) -> None:
-        """Rolls the open jaws towards a face of the cube that a phase looks at, by a little per
+        """Rolls the open jaws towards a face of the object that a phase observes, by a little per
         step.
 
-        A cube looks the same every quarter turn. A roll about the approach axis turns the closing
+        A box has a face every quarter turn. A roll about the approach axis turns the closing
         axis less in the horizontal plane than about the axis, the more the gripper is tilted.
         """
         self._roll.masked_fill_(fresh, 0.0)
@@ -241,7 +254,9 @@ class ClosedLoopDriver:
         )
         cost = (wanted - _STAY * self._roll).abs()
         wanted = torch.where(cost[0] <= cost[1], wanted[0], wanted[1])
-        step = (self._cfg.controller.align * wanted - self._roll).clamp(-_ROLL_STEP, _ROLL_STEP)
+        step = (self._cfg.controller.yaw_alignment * wanted - self._roll).clamp(
+            -_ROLL_STEP, _ROLL_STEP
+        )
         self._roll += step * self._aligns.index_select(0, self.phase)
         command[:, self._roll_column] = column + self._roll
 
@@ -257,25 +272,29 @@ class ClosedLoopDriver:
         after = self._ik.directions(command)[0][0].double().cpu()
         return column, math.copysign(1.0, float(before[0] * after[1] - before[1] * after[0]))
 
-    def _look(self, entering: torch.Tensor, fresh: torch.Tensor) -> None:
-        """Measures the cubes that the phases which begin ask for; all of them where an episode
+    def _observe(self, entering: torch.Tensor, fresh: torch.Tensor) -> None:
+        """Measures the objects that the phases which begin observe; everything where an episode
         begins.
         """
-        wanted = self._looks.index_select(0, self.phase)
-        for number, name in enumerate(CUBES):
-            now = fresh | entering & (wanted == number)
+        wanted = self._observes.index_select(0, self.phase)
+        objects = self._cfg.scene.objects
+        for number, name in enumerate(objects):
+            now = fresh | entering & wanted[:, number]
             seen = self._seen[:, number]
             pose = pose_w(self._env, name).float()
             seen.copy_(torch.where(now[:, None], pose[:, :2], seen))
             w, x, y, z = pose[:, 3:].unbind(1)
             yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
             self._yaw[:, number] = torch.where(now, yaw, self._yaw[:, number])
+        for number, name in enumerate(self._cfg.scene.places, start=len(objects)):
+            self._seen[:, number] = place_xy(self._env, name).float()
 
     def _build_tables(self, cfg: Config, device: torch.device) -> None:
         """What each phase says, as tensors."""
         names = list(cfg.controller.phases)
         specs = list(cfg.controller.phases.values())
-        anchors = [anchor_of(cfg, name) for name in names]
+        targets = list(build_targets(cfg).values())
+        sources = source_names(cfg.scene)
         grips = {"open": cfg.robot.gripper_open, "closed": cfg.robot.gripper_closed}
         steps = [phase.stop - phase.start for phase in self.phases]
 
@@ -283,28 +302,32 @@ class ClosedLoopDriver:
             return torch.tensor(values, dtype=dtype, device=device)
 
         self._length = table(steps)
-        self._target = table([[*a.xy, a.z] if a else [0.0] * 3 for a in anchors])
-        self._source = table([FIXED if a is None else a.source for a in anchors], torch.int64)
-        self._holds = table([a is None for a in anchors], torch.bool)
+        self._target = table([[*t.offset, t.z] if t else [0.0] * 3 for t in targets])
+        self._source = table([t.source if t else 0 for t in targets], torch.int64)
+        self._toward = table([max(t.toward, 0) if t else 0 for t in targets], torch.int64)
+        self._has_toward = table([float(t is not None and t.toward >= 0) for t in targets])
+        self._turns = any(spec.toward is not None for spec in specs)
+        self._holds = table([t is None for t in targets], torch.bool)
         self._grip = table([grips[spec.gripper] for spec in specs])
-        looks = [
-            -1 if a is None or not spec.look else a.source
-            for a, spec in zip(anchors, specs, strict=True)
+        observes = [
+            [spec.observe and name in (spec.anchor, spec.toward) for name in sources]
+            for spec in specs
         ]
-        self._looks = table(looks, torch.int64)
-        self._aligns = table(
-            [look >= 0 and spec.gripper == "open" for look, spec in zip(looks, specs, strict=True)],
-            torch.bool,
-        )
-        self._grasps = table(grasped_cubes(specs), torch.int64)
-        self._cubes = torch.arange(len(CUBES), device=device)
+        self._observes = table(observes, torch.bool)
+        aligns = [
+            spec.observe and spec.gripper == "open" and spec.anchor in cfg.scene.objects
+            for spec in specs
+        ]
+        self._aligns = table(aligns, torch.bool)
+        self._grasps = table(grasped_objects(cfg), torch.int64)
+        self._numbers = torch.arange(len(cfg.scene.objects), device=device)
         self._can_retry = table([spec.retry is not None for spec in specs], torch.bool)
         self._retry_to = table(
             [names.index(spec.retry) if spec.retry else 0 for spec in specs], torch.int64
         )
         # From the start of a phase to that of the last one, where the arm rests.
         self._needed = table([self.phases[-1].start - phase.start for phase in self.phases])
-        self._hurry = cfg.controller.hurry
+        self._speed_limit = cfg.controller.speed_limit
         window = cfg.gate.acceptance.window if cfg.scene.box is None else cfg.gate.box.window
         self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)
 

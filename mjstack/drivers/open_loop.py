@@ -13,7 +13,13 @@ from mjstack.config.schema import Config
 from mjstack.drivers.planning_pool import PARALLEL_FROM, WORLDS_PER_PROCESS, Plan, plan_in_parallel
 from mjstack.errors import Unreachable
 from mjstack.kinematics.mink_ik import GraspIk
-from mjstack.scene.phases import FIXED, anchor_of, build_phases
+from mjstack.scene.phases import (
+    build_phases,
+    build_targets,
+    carried_objects,
+    nominal_xy,
+    target_xy,
+)
 from mjstack.sim.native import available_cores
 
 
@@ -75,7 +81,7 @@ class JointTrajectory:
 
 
 class OpenLoopPlanner:
-    """Plans command tapes for cubes at given places, with mink."""
+    """Plans joint trajectories for objects and places at given positions, with mink."""
 
     def __init__(
         self, cfg: Config, *, parallel_from: int = PARALLEL_FROM, processes: int | None = None
@@ -105,16 +111,18 @@ class OpenLoopPlanner:
         self._weights, self._segments = self._step_weights()
         self._seed: np.ndarray | None = None
         self._last: tuple[np.ndarray, JointTrajectory] | None = None
-        nominal = np.array([[*cfg.scene.red_xy, *cfg.scene.blue_xy]])
-        self._seed = self.plan_world(0, nominal[0])[0]
+        self._phase_targets = build_targets(cfg)
+        self._carried = carried_objects(cfg)
+        self._seed = self.plan_world(0, nominal_xy(cfg.scene))[0]
 
     def plan(
-        self, cubes_xy: np.ndarray, progress: Callable[[int], None] | None = None
+        self, sources_xy: np.ndarray, progress: Callable[[int], None] | None = None
     ) -> JointTrajectory:
-        """Plans one tape per world; worlds whose cubes stand alike share the work.
+        """Plans one trajectory per world; worlds that start alike share the work.
 
         Args:
-            cubes_xy: Red x, y and blue x, y at the start [m], shape ``(nworld, 4)``.
+            sources_xy: Position of each object and place at the start [m], shape ``(nworld,
+                sources, 2)``; see `source_names`.
             progress: Called with the number of worlds done.
 
         Raises:
@@ -122,21 +130,21 @@ class OpenLoopPlanner:
                 the distance.
             WorkerLost: A process that helps has ended.
         """
-        if self._last is not None and np.array_equal(self._last[0], cubes_xy):
+        if self._last is not None and np.array_equal(self._last[0], sources_xy):
             return self._last[1]  # the gates of one run play the same batch
-        nworld = cubes_xy.shape[0]
+        nworld = sources_xy.shape[0]
         knots = np.full(
             (nworld, len(self.phases) * len(self._nodes), len(self._cfg.robot.home)), np.nan
         )
         error = np.full(nworld, np.nan)
         first: dict[bytes, int] = {}
         twin = np.array(
-            [first.setdefault(xy.tobytes(), world) for world, xy in enumerate(cubes_xy)],
+            [first.setdefault(xy.tobytes(), world) for world, xy in enumerate(sources_xy)],
             dtype=np.intp,
         )
         alike = np.bincount(twin, minlength=nworld)
         done = 0
-        with closing(self._plans(list(first.values()), cubes_xy)) as plans:
+        with closing(self._plans(list(first.values()), sources_xy)) as plans:
             for world, *plan in plans:
                 knots[world], error[world] = plan
                 done += int(alike[world])
@@ -147,7 +155,7 @@ class OpenLoopPlanner:
             error = error[twin]
         tape = JointTrajectory(knots, self._weights, self._segments, error)
         if nworld > 1:
-            self._last = (cubes_xy.copy(), tape)
+            self._last = (sources_xy.copy(), tape)
         return tape
 
     @property
@@ -156,13 +164,14 @@ class OpenLoopPlanner:
         assert self._seed is not None
         return self._seed[len(self._nodes) - 1 :: len(self._nodes)]
 
-    def path_error(self, cubes_xy: np.ndarray) -> float:
-        """Largest distance [m] of the grasp point from its straight path at any step, for one
-        layout ``(4,)``.
+    def path_error(self) -> float:
+        """Largest distance [m] of the grasp point from its straight path at any step of the nominal
+        plan.
         """
-        tape = self.plan(cubes_xy[None])
+        nominal = nominal_xy(self._cfg.scene)
+        tape = self.plan(nominal[None])
         worst = 0.0
-        for phase, (start, end, _, _) in zip(self.phases, self._targets(cubes_xy), strict=True):
+        for phase, (start, end, _, _) in zip(self.phases, self._targets(nominal), strict=True):
             for step in range(phase.start, phase.stop):
                 s = _smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
                 at = self.ik.grasp_point(tape.command(step)[0].numpy())
@@ -174,7 +183,7 @@ class OpenLoopPlanner:
 
         Args:
             world: Its number, for the error.
-            xy: Red x, y and blue x, y at the start [m], shape ``(4,)``.
+            xy: Position of each object and place at the start [m], shape ``(sources, 2)``.
 
         Returns:
             Commands at the knots, shape ``(n, nu)``, and the largest distance [m] from a target at
@@ -206,35 +215,38 @@ class OpenLoopPlanner:
                 knots[k] = command
         return knots, worst
 
-    def _plans(self, worlds: list[int], cubes_xy: np.ndarray) -> Generator[Plan]:
+    def _plans(self, worlds: list[int], sources_xy: np.ndarray) -> Generator[Plan]:
         """The plans of some worlds, one after the other here, or shared out where there are many;
         then in any order.
         """
         if len(worlds) >= self._parallel_from:
             processes = self._processes or min(available_cores(), len(worlds) // WORLDS_PER_PROCESS)
             if processes > 1:
-                yield from plan_in_parallel(self._cfg, self.plan_world, worlds, cubes_xy, processes)
+                yield from plan_in_parallel(
+                    self._cfg, self.plan_world, worlds, sources_xy, processes
+                )
                 return
         for world in worlds:
-            yield world, *self.plan_world(world, cubes_xy[world])
+            yield world, *self.plan_world(world, sources_xy[world])
 
     def _targets(
         self, xy: np.ndarray
     ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
         """Start and end of the grasp point and of the gripper command, per phase."""
         robot = self._cfg.robot
-        sources = (xy[:2], xy[2:])
+        where = xy.copy()  # of each object after the phases so far
+        held = -1
         grips = {"open": np.array(robot.gripper_open), "closed": np.array(robot.gripper_closed)}
         out: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-        for name, cfg in self._cfg.controller.phases.items():
+        for (name, cfg), carried in zip(
+            self._cfg.controller.phases.items(), self._carried, strict=True
+        ):
+            if held >= 0 and carried < 0:  # let go where the last target was
+                where[held] = out[-1][1][:2]
+            held = carried
             grip = grips[cfg.gripper]
-            anchor = anchor_of(self._cfg, name)
-            if anchor is None:
-                end = out[-1][1]
-            else:
-                end = np.array(
-                    [*(anchor.xy if anchor.source == FIXED else sources[anchor.source]), anchor.z]
-                )
+            target = self._phase_targets[name]
+            end = out[-1][1] if target is None else np.array([*target_xy(target, where), target.z])
             # The first phase's target stands from the first step; only the gripper moves from home.
             start = out[-1][1] if out else end
             grip0 = out[-1][3] if out else np.array(robot.home[len(robot.arm_joints) :])

@@ -34,7 +34,7 @@ def plan_in_parallel(
     cfg: Config,
     plan_world: Callable[[int, np.ndarray], tuple[np.ndarray, float]],
     worlds: Sequence[int],
-    cubes_xy: np.ndarray,
+    sources_xy: np.ndarray,
     processes: int,
 ) -> Generator[Plan]:
     """Plans worlds here and in worker processes, which are gone when this has ended, in whatever
@@ -48,7 +48,8 @@ def plan_in_parallel(
         cfg: From which a worker builds the planner.
         plan_world: Plans one world here.
         worlds: Their numbers, ascending.
-        cubes_xy: Red x, y and blue x, y of every world at the start [m], shape ``(nworld, 4)``.
+        sources_xy: Position of each object and place of every world at the start [m], shape
+            ``(nworld, sources, 2)``.
         processes: How many plan, this one among them.
 
     Yields:
@@ -78,11 +79,11 @@ def plan_in_parallel(
                     queue.clear()
                 else:
                     yield from answer
-                worker.give(queue, cubes_xy)
+                worker.give(queue, sources_xy)
             if queue:
                 world = queue.popleft()
                 try:
-                    plan = plan_world(world, cubes_xy[world])
+                    plan = plan_world(world, sources_xy[world])
                 except Unreachable as error:
                     failures.append(error)
                     queue.clear()
@@ -142,11 +143,11 @@ class _Worker:
         self._started = True
         return answer
 
-    def give(self, queue: deque[int], cubes_xy: np.ndarray) -> None:
+    def give(self, queue: deque[int], sources_xy: np.ndarray) -> None:
         """Takes chunks out of the queue until the worker has enough."""
         while queue and self.pending < _AHEAD:
             worlds = [queue.popleft() for _ in range(min(_CHUNK, len(queue)))]
-            self._send((worlds, cubes_xy[worlds]))
+            self._send((worlds, sources_xy[worlds]))
             self.pending += 1
 
     def kill(self) -> None:

@@ -26,13 +26,13 @@ def serve(socket: Connection) -> None:
 
 
 def _plan(
-    planner: OpenLoopPlanner, worlds: list[int], cubes_xy: np.ndarray
+    planner: OpenLoopPlanner, worlds: list[int], sources_xy: np.ndarray
 ) -> list[Plan] | Unreachable:
     """The plans of some worlds; or why the first of them that has none has none."""
     try:
         return [
             (world, *planner.plan_world(world, xy))
-            for world, xy in zip(worlds, cubes_xy, strict=True)
+            for world, xy in zip(worlds, sources_xy, strict=True)
         ]
     except Unreachable as error:
         return error

@@ -1,4 +1,4 @@
-"""How the gripper is to lean, so that a cube arrives as it stood."""
+"""How the gripper is to lean, so that an object arrives as it stood."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mjstack.config.schema import Config, PhaseCfg
 from mjstack.errors import ConfigError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.scene.index import find
-from mjstack.scene.phases import carried_cubes
+from mjstack.scene.phases import carried_objects
 
 
 class CarryTilt:
@@ -60,7 +60,7 @@ class CarryTilt:
         specs = list(c.phases.values())
         self._keeps = torch.tensor(_keeps(specs), device=device)
         self._grasps = torch.tensor([spec.grasps is not None for spec in specs], device=device)
-        self.place = torch.tensor(_places(specs), device=device)
+        self.place = torch.tensor(_places(cfg), device=device)
         self._there = nominal.new_zeros((ik.nworld, nominal.shape[1]))
         self._kept = nominal.new_zeros((ik.nworld, 3))
         self._kept_turn = nominal.new_zeros(ik.nworld)
@@ -116,17 +116,18 @@ def _keeps(specs: Sequence[PhaseCfg]) -> list[bool]:
     out = []
     kept = False
     for spec in specs:
-        kept = kept and not (spec.look and spec.gripper == "open")
+        kept = kept and not (spec.observe and spec.gripper == "open")
         out.append(kept and spec.grasps is None)
         kept = kept or spec.grasps is not None
     return out
 
 
-def _places(specs: Sequence[PhaseCfg]) -> list[int]:
+def _places(cfg: Config) -> list[int]:
     """For each phase the one at whose target the next cube, or the held one, is let go; after all
     of them, the last.
     """
-    carries = [cube >= 0 for cube in carried_cubes(specs)]
+    specs = list(cfg.controller.phases.values())
+    carries = [number >= 0 for number in carried_objects(cfg)]
     ends = [k for k, held in enumerate(carries) if held and not any(carries[k + 1 : k + 2])] or [
         len(carries) - 1
     ]

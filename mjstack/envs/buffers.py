@@ -252,7 +252,7 @@ def probe_env_sizes(
             model, cfg, worlds, backend=backend, device=device, fields=fields, sizes=sizes
         )
         env = Env(
-            sim, SceneIndex(model, cfg.robot), cfg, check_faults=False
+            sim, SceneIndex(model, cfg.robot, cfg.scene), cfg, check_faults=False
         )  # a lack of room is what it looks for
         try:
             env.reset(seed=cfg.seed)

@@ -109,7 +109,7 @@ def build_env(
         fields=required_fields(cfg.reset),
         sizes=sizes,
     )
-    return Env(sim, SceneIndex(model, cfg.robot), cfg)
+    return Env(sim, SceneIndex(model, cfg.robot, cfg.scene), cfg)
 
 
 def driven_config(cfg: Config, **changes: object) -> Config:

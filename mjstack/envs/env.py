@@ -97,6 +97,7 @@ class Env:
         self.world = torch.arange(sim.nworld, device=sim.device)
         self.episode = torch.full_like(self.world, -1)
         self.episode_step = torch.zeros_like(self.world)
+        self.given_places: dict[str, torch.Tensor] = {}
         self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
         self._everyone = torch.ones_like(self.success)
         self._steps = self._version = 0

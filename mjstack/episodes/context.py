@@ -169,7 +169,7 @@ class GateContext:
     @cached_property
     def index(self) -> SceneIndex:
         """Addresses in the model."""
-        return SceneIndex(self.model, self.cfg.robot)
+        return SceneIndex(self.model, self.cfg.robot, self.cfg.scene)
 
     @cached_property
     def check(self) -> type[EpisodeCheck]:

@@ -12,9 +12,8 @@ from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
 from mjstack.episodes.rollout import Observer
 from mjstack.math import not_finite
-from mjstack.mdp.geometry import cubes_in_hand
-from mjstack.scene.index import CUBES
-from mjstack.scene.phases import carried_cubes, grasped_cubes
+from mjstack.mdp.geometry import objects_in_hand
+from mjstack.scene.phases import carried_objects, grasped_objects
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.tasks.check import check_class
 
@@ -83,9 +82,8 @@ class FailureMonitor(Observer):
 
     def __init__(self, cfg: Config) -> None:
         """Reads the phases."""
-        specs = list(cfg.controller.phases.values())
-        self._tables = grasped_cubes(specs), carried_cubes(specs)
-        self._releases = _releases(self._tables[1])
+        self._tables = grasped_objects(cfg), carried_objects(cfg)
+        self._releases = _releases(self._tables[1], len(cfg.scene.objects))
 
     def start(self, env: Env, driver: Controller) -> None:
         """Allocate for the environment's worlds."""
@@ -110,7 +108,7 @@ class FailureMonitor(Observer):
         self._now = full(0, size=1)
         self._at = full(0)
         self._release = torch.tensor(self._releases, device=device)
-        self._loaded = torch.zeros((n, len(CUBES)), dtype=torch.bool, device=device)
+        self._loaded = torch.zeros((n, len(self._releases)), dtype=torch.bool, device=device)
         self._placed = torch.zeros_like(self._loaded)
         self._gone = full(0, torch.int32)
 
@@ -119,7 +117,7 @@ class FailureMonitor(Observer):
         env = self._env
         sim = env.sim
         phase = self._driver.phase
-        loaded = cubes_in_hand(env.index, sim)
+        loaded = objects_in_hand(env.index, sim)
         placed = self._check.placed(sim)
 
         lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
@@ -158,9 +156,9 @@ def _of(table: torch.Tensor, cube: torch.Tensor) -> torch.Tensor:
     return table.gather(1, cube.clamp(min=0)[:, None])[:, 0]
 
 
-def _releases(carried: Sequence[int]) -> list[int]:
+def _releases(carried: Sequence[int], objects: int) -> list[int]:
     """Number of the phase in which each cube is let go for good; one that never comes for a cube
     that is not carried.
     """
     last = {cube: number for number, cube in enumerate(carried)}
-    return [last[cube] + 1 if cube in last else len(carried) for cube in range(len(CUBES))]
+    return [last[cube] + 1 if cube in last else len(carried) for cube in range(objects)]

@@ -1,5 +1,5 @@
-"""Where an episode started against how it ended: success rates over cells of the cubes' start
-places.
+"""Where an episode started against how it ended: success rates over cells of the objects'
+starts.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ _EDGE = 1e-9  # cells: a place this close below a cell's edge is on it
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Region:
-    """Episodes whose cube started in one cell. What a cell does not restrict is None.
+    """Episodes whose object started in one cell. What a cell does not restrict is None.
 
     Attributes:
-        cube: ``red`` or ``blue``.
+        object: Its name.
         x_min_m: Least x of its centre [m], and so on.
-        yaw_min_deg: Least angle [deg] from the direction base to cube to a face's normal, of 0 to
+        yaw_min_deg: Least angle [deg] from the direction base to object to a face's normal, of 0 to
             90, and so on.
         episodes: How many.
         succeeded: How many of them succeeded.
         rate: Their share, and its 95 % interval.
     """
 
-    cube: str
+    object: str
     x_min_m: float | None
     x_max_m: float | None
     y_min_m: float | None
@@ -52,11 +52,11 @@ class Region:
             )
         if self.yaw_min_deg is not None:
             parts.append(f"turned {self.yaw_min_deg:g} to {self.yaw_max_deg:g} deg")
-        return f"{self.cube}: {', '.join(parts)}"
+        return f"{self.object}: {', '.join(parts)}"
 
 
 def radial_yaw_deg(places: np.ndarray) -> np.ndarray:
-    """Angle of a cube relative to the direction in which the base, at the origin, sees it [deg],
+    """Angle of an object relative to the direction in which the base, at the origin, sees it [deg],
     from 0 to 90.
 
     Args:
@@ -73,26 +73,26 @@ def find_regions(
     cell: float,
     yaw_cell_deg: float,
     episodes: int,
-    cubes: Sequence[str],
+    objects: Sequence[str],
 ) -> list[Region]:
-    """Cells of each cube's place, of its direction, and of both, that have enough episodes; the
-    lowest rate first.
+    """Cells of each object's position, of its direction, and of both, that have enough episodes;
+    the lowest rate first.
 
     Args:
-        places: x and y [m] and rotation about z [rad] of each cube at the start, shape ``(n, cubes,
-            3)``.
+        places: x and y [m] and rotation about z [rad] of each object at the start, shape ``(n,
+            objects, 3)``.
         succeeded: Whether each episode was, shape ``(n,)``, bool.
         cell: Width of a cell in x and y [m]; cells begin at multiples of it.
         yaw_cell_deg: Width in direction [deg]; the last one ends at 90.
         episodes: Least number of episodes.
-        cubes: Names of the cubes.
+        objects: Names of the objects.
     """
 
     def edge(number: int) -> float:
         return round(number * cell, 9)
 
     out = []
-    for number, cube in enumerate(cubes):
+    for number, name in enumerate(objects):
         mine = places[:, number]
         at = np.floor(mine[:, :2] / cell + _EDGE).astype(np.int64)
         turn = np.floor(radial_yaw_deg(mine) / yaw_cell_deg + _EDGE).astype(np.int64)[:, None]
@@ -119,7 +119,7 @@ def find_regions(
                 )
                 out.append(
                     Region(
-                        cube=cube,
+                        object=name,
                         x_min_m=edge(i) if placed else None,
                         x_max_m=edge(i + 1) if placed else None,
                         y_min_m=edge(j) if placed else None,

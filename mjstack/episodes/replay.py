@@ -5,7 +5,6 @@ found and wanted.
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from mjstack.episodes.observers import Episode, WorldRecorder
 from mjstack.episodes.rollout import Observer, State, snapshot
 from mjstack.files import write_atomic
 from mjstack.managers.reset import required_fields
-from mjstack.math import lowest_corner
+from mjstack.math import lowest_point
 from mjstack.scene import table_top
 from mjstack.sim import Simulation, describe_overflow, make_simulation, resolve_sizes
 from mjstack.sim.sizes import BatchSizes
@@ -206,13 +205,18 @@ def _steps(
     qpos, qvel, ctrl = (
         np.concatenate([getattr(s, name) for s in states]) for name in ("qpos", "qvel", "ctrl")
     )
-    pose = torch.from_numpy(np.stack([qpos[:, a : a + 7] for a in index.cube_qpos], 1)).float()
-    velocity = np.stack([qvel[:, a : a + 6] for a in index.cube_qvel], 1)
-    half = cfg.scene.cube_half
-    low = lowest_corner(pose[..., :3], pose[..., 3:], half).numpy() - np.float32(
-        table_top(cfg.scene)
-    )
-    spin = math.sqrt(3.0) * half * np.linalg.norm(velocity[..., 3:], axis=-1)
+    pose = torch.from_numpy(np.stack([qpos[:, a : a + 7] for a in index.object_qpos], 1)).float()
+    velocity = np.stack([qvel[:, a : a + 6] for a in index.object_qvel], 1)
+    objects = list(cfg.scene.free.values())
+    low = np.stack(
+        [
+            lowest_point(pose[:, k, :3], pose[:, k, 3:], thing.shape, thing.size).numpy()
+            for k, thing in enumerate(objects)
+        ],
+        axis=1,
+    ) - np.float32(table_top(cfg.scene))
+    radii = np.array([thing.radius for thing in objects])
+    spin = radii * np.linalg.norm(velocity[..., 3:], axis=-1)
     red = pose[:, 0, :3].numpy()
     blue = pose[:, 1, :3].numpy()  # float32, as the check computes
     names = np.array([phase.name for phase in context.planner.phases])

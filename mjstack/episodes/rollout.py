@@ -15,6 +15,7 @@ from mjstack.drivers.driver import Controller, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, driven_config
 from mjstack.envs.halves import Eager, Repeated
+from mjstack.mdp.geometry import source_xy
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
 
@@ -185,7 +186,7 @@ def make_driver(env: Env, planner: OpenLoopPlanner, advance: Advance | None = No
 
     Args:
         env: The environment, whose action terms are the controller's.
-        planner: Plans the joint trajectories, from where the cubes stand.
+        planner: Plans the joint trajectories, from where objects and places are.
         advance: Told about progress.
     """
     sim = env.sim
@@ -194,9 +195,9 @@ def make_driver(env: Env, planner: OpenLoopPlanner, advance: Advance | None = No
         from mjstack.drivers.closed_loop import ClosedLoopDriver
 
         return ClosedLoopDriver(env, planner.nominal)
-    cubes = torch.cat([sim.qpos[:, a : a + 2] for a in env.index.cube_qpos], dim=1)
     progress = None if advance is None else (lambda done: advance("planning", done, sim.nworld))
-    tape = planner.plan(cubes.double().cpu().numpy(), progress).to(sim.device, sim.ctrl.dtype)
+    sources = source_xy(env).double().cpu().numpy()
+    tape = planner.plan(sources, progress).to(sim.device, sim.ctrl.dtype)
     return OpenLoopDriver(tape, planner.phases, sim.nworld, sim.device)
 
 

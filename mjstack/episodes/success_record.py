@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,11 +31,11 @@ BOTH = (  # the failing episodes, where the batch gate has a table of its own
 
 
 def start_places(env: Env) -> np.ndarray:
-    """Where cubes stand, red first: x and y [m] and rotation about z [rad], on the host, shape
-    ``(nworld, 2, 3)``.
+    """Where objects stand: x and y [m] and rotation about z [rad], on the host, shape ``(nworld,
+    objects, 3)``.
     """
     poses = [pose_w(env, name).double().cpu().numpy() for name in env.index.objects]
-    # Cubes stand flat at a start, so that all of a rotation is about z.
+    # Objects stand flat at a start, so that all of a rotation is about z.
     return np.stack(
         [np.column_stack((p[:, :2], 2.0 * np.arctan2(p[:, 6], p[:, 3]))) for p in poses], axis=1
     )
@@ -46,7 +47,7 @@ class SuccessRecord:
 
     Attributes:
         batch: Results, what was measured, and positions at the start and at the end.
-        places: Of the cubes at the start; see `start_places`.
+        places: Of the objects at the start; see `start_places`.
         retries: Grasps that were tried again, shape ``(nworld,)``.
         unreachable: Whether a target was out of reach, shape ``(nworld,)``, bool.
         sign: Number of the first `Sign` of failure, shape ``(nworld,)``.
@@ -126,11 +127,9 @@ class SuccessRecord:
             )
         return out.getvalue().splitlines()
 
-    def header(self) -> str:
-        """The table's first line."""
-        places = [
-            f"{cube}_{part}" for cube in ("red", "blue") for part in ("x_m", "y_m", "yaw_rad")
-        ]
+    def header(self, objects: Iterable[str]) -> str:
+        """The table's first line, for the names of the objects."""
+        places = [f"{name}_{part}" for name in objects for part in ("x_m", "y_m", "yaw_rad")]
         names = [
             "seed",
             "world",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from mjstack.episodes.context import GateContext, judge_one
 from mjstack.report.record import GateResult
 
@@ -21,9 +19,7 @@ def run_baseline(context: GateContext) -> list[GateResult]:
     metrics["episode_s"] = timing.seconds
     metrics["world_steps_per_s"] = timing.steps * cfg.timing.decimation / timing.seconds
     metrics["waypoint_error_m"] = float(episode.waypoint_error.max())
-    metrics["path_error_m"] = context.planner.path_error(
-        np.array([*cfg.scene.red_xy, *cfg.scene.blue_xy])
-    )
+    metrics["path_error_m"] = context.planner.path_error()
     metrics["peak_contacts"] = int(sim.peak_contacts[0])
     metrics["peak_constraint_rows"] = int(sim.peak_constraints[0])
     context.shown = nominal.world

@@ -63,7 +63,7 @@ def run_parity(context: GateContext) -> list[GateResult]:
     bits = getattr(mjwarp, "solver_limits", None)
     metrics["solver_limit_hit"] = bool(bits is not None and int(bits[0]))
     metrics["episode_s"] = episode.timing.seconds
-    for cube, address in zip(("red", "blue"), context.index.cube_qpos, strict=True):
+    for cube, (address, _) in context.index.objects.items():
         ours = world.qpos[-1, address : address + 7]
         theirs = reference.world.qpos[-1, address : address + 7]
         distance = float(np.linalg.norm(ours[:3] - theirs[:3]))

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mjstack.config.schema import Config
-from mjstack.config.validate import places_cubes, reads_starts_file
+from mjstack.config.validate import places_objects, reads_starts_file
 from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
 from mjstack.episodes.batch_record import FAILING, write_failing
@@ -40,7 +40,6 @@ from mjstack.tasks.check import Rules
 
 log = logging.getLogger(__name__)
 
-CUBES = ("red", "blue")
 _NAMED = 100  # episodes a line in report.md; the table of failing ones has all
 
 
@@ -50,7 +49,7 @@ def success_config(cfg: Config) -> Config:
     reset = dict(cfg.reset if reads_starts_file(cfg.reset) else t.reset)
     if t.region is not None:
         for name, term in reset.items():
-            if places_cubes(term):
+            if places_objects(term):
                 reset[name] = replace(term, params=term.params | {"xy": list(t.region)})
     return replace(cfg, reset=reset, controller=replace(cfg.controller, name=CLOSED_LOOP))
 
@@ -212,7 +211,12 @@ def _keep(context: GateContext, record: SuccessRecord, tally: _Tally, details: l
     try:
         record.write(folder, tally.phases)
         if tally.rows:
-            write_failing(folder, record.header(), tally.rows, _failing_name(context.cfg))
+            write_failing(
+                folder,
+                record.header(context.cfg.scene.free),
+                tally.rows,
+                _failing_name(context.cfg),
+            )
     except OSError as error:
         log.exception("the record of seed %d was not written", record.batch.seed)
         details.append(
@@ -243,7 +247,7 @@ def _judge(
         cell=t.cell,
         yaw_cell_deg=t.yaw_cell_deg,
         episodes=t.cell_episodes,
-        cubes=CUBES,
+        objects=list(cfg.scene.free),
     )
     metrics: dict[str, float] = {
         "worlds": cfg.nworld,
@@ -327,9 +331,9 @@ def _describe_start(cfg: Config) -> str:
     regions = [
         term.params["xy"]
         for term in cfg.reset.values()
-        if places_cubes(term) and "xy" in term.params
+        if places_objects(term) and "xy" in term.params
     ]
-    where = "".join(f", cubes within {x:g} x {y:g} m of their places" for x, y in regions)
+    where = "".join(f", objects within {x:g} x {y:g} m of their places" for x, y in regions)
     return f"gate.success.reset ({', '.join(cfg.reset)}{where})"
 
 
@@ -352,7 +356,12 @@ def _save(
             folder / REGIONS, to_csv([f.name for f in fields(Region)], map(asdict, regions))
         ),
         PICTURE: lambda: save_places(
-            folder / PICTURE, places, succeeded, table, f"{context.cfg.robot.title}: {title}", CUBES
+            folder / PICTURE,
+            places,
+            succeeded,
+            table,
+            f"{context.cfg.robot.title}: {title}",
+            {name: thing.color for name, thing in scene.free.items()},
         ),
     }
     lost = []

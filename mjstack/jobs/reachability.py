@@ -1,5 +1,5 @@
 """Job *reachability*: what the arm reaches on the table, at which tilt, and how far from their
-places the cubes may stand.
+positions the objects may stand.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, run_reported
 from mjstack.kinematics.reach import PointReach
 from mjstack.report.reachability import (
-    CubeRegion,
+    ObjectRegion,
     ReachLevel,
     ReachMap,
     save_map,
@@ -31,8 +31,8 @@ from mjstack.report.reachability import (
     to_npz,
 )
 from mjstack.report.record import GateResult, Status
-from mjstack.scene import BLUE, RED, table_top
-from mjstack.scene.phases import cube_targets
+from mjstack.scene import table_top
+from mjstack.scene.phases import object_targets
 from mjstack.sim import resolve_backend
 
 log = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> Job
 
     Returns:
         How it ended: a pass if the region of ``reset=randomized`` is reached with the margin,
-        around both cubes' places.
+        around every object's position.
     """
 
     def work(context: GateContext, bar: ProgressBar, record: Record) -> None:
@@ -93,10 +93,7 @@ def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> Job
             _write(context, folder, levels, [])
             record(_level_result(levels[-1], time.perf_counter() - began))
         began = time.perf_counter()
-        regions = [
-            find_region(cfg, levels, RED, cfg.scene.red_xy),
-            find_region(cfg, levels, BLUE, cfg.scene.blue_xy),
-        ]
+        regions = [find_region(cfg, levels, name) for name in cfg.scene.free]
         _write(context, folder, levels, regions)
         for region in regions:
             record(_region_result(cfg, region, time.perf_counter() - began))
@@ -106,25 +103,26 @@ def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> Job
 
 
 def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
-    """Heights above a cube's centre [m] at which the task needs the grasp point, and the gripper's
+    """Heights above the table [m] at which the task needs the grasp point, and the gripper's
     command there.
 
-    ``approach`` is the controller's first target over a cube, ``grasp`` its lowest, and ``carry``
+    ``approach`` is the controller's first target at an object, ``grasp`` its lowest, and ``carry``
     its highest.
     """
-    red, blue = cube_targets(cfg)
-    if not red + blue:
+    targets = [target for found in object_targets(cfg).values() for target in found]
+    if not targets:
         raise ConfigError(
-            "controller.phases", list(cfg.controller.phases), "a phase with a cube as its anchor"
+            "controller.phases", list(cfg.controller.phases), "a phase with an object as its anchor"
         )
-    low, high = (end(red + blue, key=lambda target: target.height) for end in (min, max))
-    first = (red + blue)[0]
+    low, high = (end(targets, key=lambda target: target.target.z) for end in (min, max))
+    first = targets[0]
+    top = table_top(cfg.scene)
     # The jaws close where they grasp, but come there open, which reaches less far where one jaw
     # stays.
     return {
-        "grasp": (low.height, "open"),
-        "approach": (first.height, first.gripper),
-        "carry": (high.height, high.gripper),
+        "grasp": (low.target.z - top, "open"),
+        "approach": (first.target.z - top, first.gripper),
+        "carry": (high.target.z - top, high.gripper),
     }
 
 
@@ -150,7 +148,7 @@ def map_level(
     reach = PointReach(context.model, cfg.robot, command)
     tolerance = cfg.controller.ik_tolerance
     x, y = axes(cfg)
-    level = table_top(cfg.scene) + cfg.scene.cube_half + height
+    level = table_top(cfg.scene) + height
     points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), level)], axis=-1).reshape(
         -1, 3
     )
@@ -172,14 +170,16 @@ def map_level(
     )
 
 
-def find_region(cfg: Config, levels: list[ReachLevel], cube: str, place: list[float]) -> CubeRegion:
-    """The largest regions around a place that are reached at every level, with the margin, and stay
-    on the table.
+def find_region(cfg: Config, levels: list[ReachLevel], name: str) -> ObjectRegion:
+    """The largest regions around an object's position that are reached at every level, with the
+    margin, and stay on the table.
 
     Between two points of the map the worse one counts.
     """
     job = cast(ReachabilityJobCfg, cfg.job)
     scene = cfg.scene
+    thing = scene.objects[name]
+    place = thing.xy
     x, y = axes(cfg)
     blocked = ~np.logical_and.reduce([level.reached for level in levels])
     rows, columns = np.nonzero(blocked)
@@ -196,9 +196,7 @@ def find_region(cfg: Config, levels: list[ReachLevel], cube: str, place: list[fl
         return min(edge[1], beside.min(initial=math.inf)) if half_x <= edge[0] else -1.0
 
     room = [
-        scene.table_half[k]
-        - math.sqrt(2.0) * scene.cube_half
-        - abs(place[k] - scene.table_center[k])
+        scene.table_half[k] - thing.footprint - abs(place[k] - scene.table_center[k])
         for k in (0, 1)
     ]
     square = 0.0
@@ -214,8 +212,8 @@ def find_region(cfg: Config, levels: list[ReachLevel], cube: str, place: list[fl
             largest = float(half_x), half_y
     wide, deep = scene.random_xy
     inside = np.ix_(np.abs(y - place[1]) <= deep + 1e-9, np.abs(x - place[0]) <= wide + 1e-9)
-    return CubeRegion(
-        name=cube,
+    return ObjectRegion(
+        name=name,
         place=(place[0], place[1]),
         configured=(wide, deep),
         square=float(square),
@@ -232,12 +230,12 @@ def _map_edge(axis: np.ndarray, at: float) -> float:
 def _level_result(level: ReachLevel, seconds: float) -> GateResult:
     share = float(level.reached.mean())
     metrics: dict[str, float] = {
-        "height_above_cube_center_m": level.height,
+        "height_above_table_m": level.height,
         "points": level.reached.size,
         "reached_fraction": share,
     }
     reason = (
-        f"{level.height:.3f} m above a cube's centre, {level.gripper}: {100.0 * share:.1f} % of the"
+        f"{level.height:.3f} m above the table, {level.gripper}: {100.0 * share:.1f} % of the"
         " table reached"
     )
     if share:
@@ -249,7 +247,7 @@ def _level_result(level: ReachLevel, seconds: float) -> GateResult:
     )
 
 
-def _region_result(cfg: Config, region: CubeRegion, seconds: float) -> GateResult:
+def _region_result(cfg: Config, region: ObjectRegion, seconds: float) -> GateResult:
     margin = cast(ReachabilityJobCfg, cfg.job).margin
     reason = (
         f"scene.random_xy {region.configured[0]:g} x {region.configured[1]:g} m is"
@@ -277,7 +275,7 @@ def _region_result(cfg: Config, region: CubeRegion, seconds: float) -> GateResul
     )
 
 
-def _map(context: GateContext, levels: list[ReachLevel], regions: list[CubeRegion]) -> ReachMap:
+def _map(context: GateContext, levels: list[ReachLevel], regions: list[ObjectRegion]) -> ReachMap:
     cfg = context.cfg
     x, y = axes(cfg)
     return ReachMap(
@@ -287,6 +285,7 @@ def _map(context: GateContext, levels: list[ReachLevel], regions: list[CubeRegio
         table=(cfg.scene.table_center[:2], cfg.scene.table_half[:2]),
         levels=levels,
         regions=regions,
+        colors={name: thing.color for name, thing in cfg.scene.free.items()},
     )
 
 
@@ -294,7 +293,7 @@ def _write(
     context: GateContext,
     folder: Path,
     levels: list[ReachLevel],
-    regions: list[CubeRegion],
+    regions: list[ObjectRegion],
     picture: str = "",
 ) -> None:
     """The tables, as far as they are known."""
@@ -303,9 +302,9 @@ def _write(
     robot = context.cfg.robot
     notes = [
         (
-            "Half-widths in m, around the place. A region counts as reached if it still is with"
+            "Half-widths in m, around the position. A region counts as reached if it still is with"
             f" {1e3 * job.margin:g} mm more all round, at every level; points are"
-            f" {1e3 * job.step:g} mm apart. Regions keep cubes of any yaw on the table."
+            f" {1e3 * job.step:g} mm apart. Regions keep objects of any yaw on the table."
         ),
         (
             f"Reached: inverse kinematics of {', '.join(robot.ik_joints)} brings the grasp point"
@@ -325,7 +324,7 @@ def _write(
 
 
 def _draw(
-    context: GateContext, folder: Path, levels: list[ReachLevel], regions: list[CubeRegion]
+    context: GateContext, folder: Path, levels: list[ReachLevel], regions: list[ObjectRegion]
 ) -> None:
     """The picture. Its failure takes nothing back."""
     try:

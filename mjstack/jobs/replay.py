@@ -342,7 +342,8 @@ def _compare(
     if same and exact:
         return True, "as recorded, and it ends bit for bit where it did"
     apart = max(
-        float(np.linalg.norm(ours[a : a + 3] - theirs[a : a + 3])) for a in context.index.cube_qpos
+        float(np.linalg.norm(ours[a : a + 3] - theirs[a : a + 3]))
+        for a in context.index.object_qpos
     )
     ends = (
         "it ends bit for bit where it did"

@@ -169,13 +169,13 @@ def _draw(context: GateContext, report: Report, folder: Path, console: Console) 
     cfg = context.cfg
     if episode is None:
         return
-    cubes = np.stack([episode.qpos[:, a : a + 3] for a in context.index.cube_qpos], axis=1)
+    objects = {name: (thing.half, thing.color) for name, thing in cfg.scene.free.items()}
+    positions = np.stack([episode.qpos[:, a : a + 3] for a in context.index.object_qpos], axis=1)
     title = f"{cfg.robot.title}, {cfg.task.name}: {context.shown_by}"
     model = context.visual_model
-    half = cfg.scene.cube_half
     drawn: dict[str, tuple[Callable[..., object], tuple]] = {
-        "scene.png": (save_scene, (model, episode.qpos[-1], cubes[-1], half, title)),
-        "trajectories.png": (save_trajectories, (cubes, half, title)),
+        "scene.png": (save_scene, (model, episode.qpos[-1], positions[-1], objects, title)),
+        "trajectories.png": (save_trajectories, (positions, objects, title)),
     }
     if cfg.video:
         drawn["episode.mp4"] = (save_video, (model, episode.qpos, cfg.timing.step_dt))

@@ -42,6 +42,8 @@ class EnvView(Protocol):
         action: The policy's last action, shape ``(nworld, action_dim)``.
         previous_action: The one before.
         success: Whether the task is achieved, shape ``(nworld,)``, bool.
+        given_places: Positions [m] of places that a file of starts gives instead of the draw, by
+            name, shape ``(rows, 2)``; world w has row w.
     """
 
     sim: Simulation
@@ -54,6 +56,7 @@ class EnvView(Protocol):
     world: torch.Tensor
     episode: torch.Tensor
     episode_step: torch.Tensor
+    given_places: dict[str, torch.Tensor]
 
     @property
     def action(self) -> torch.Tensor:
@@ -123,6 +126,25 @@ def random_uniform(
         seed=env.seed, world=env.world, episode=env.episode, step=step, stream=stream, size=size
     )
     return low + 0.5 * (high - low) * (draw.to(env.sim.qpos.dtype) + 1.0)
+
+
+def episode_draw(
+    env: EnvView, name: str, size: int, low: float = -1.0, high: float = 1.0
+) -> torch.Tensor:
+    """Random numbers of every world that stay the same all episode: every term that names them sees
+    the same, and the next episode has others.
+
+    Args:
+        env: The environment.
+        name: Whose numbers they are, such as ``goal``.
+        size: Numbers per world.
+        low: Smallest value.
+        high: Upper bound.
+
+    Returns:
+        Shape ``(nworld, size)``, in the type of the simulation's floats.
+    """
+    return random_uniform(env, f"episode.{name}", size, low, high)
 
 
 def resolve_func(label: str, path: str) -> Callable[..., Any]:

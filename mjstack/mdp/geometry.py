@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import torch
 
-from mjstack.errors import ParameterError
-from mjstack.managers.base import EnvView, shared
-from mjstack.math import lowest_corner
+from mjstack.errors import ParameterError, UnknownName
+from mjstack.managers.base import EnvView, episode_draw, shared
+from mjstack.math import lowest_point
 from mjstack.scene import table_top
-from mjstack.scene.index import CUBES, RobotTensors, SceneIndex
+from mjstack.scene.index import RobotTensors, SceneIndex
 from mjstack.sim.simulation import Simulation
 
 
@@ -65,39 +65,76 @@ def pose_w(env: EnvView, name: str) -> torch.Tensor:
     """Position [m] and quaternion (wxyz) of an object, from qpos, which is never stale, shape
     ``(nworld, 7)``.
     """
+    if name in env.index.fixed:
+        return env.index.constant(env.index.fixed[name], env.sim.qpos).expand(env.nworld, -1)
     address, _ = env.index.object_address(name)
     return env.sim.qpos[:, address : address + 7]
 
 
 def above_table(env: EnvView, name: str) -> torch.Tensor:
-    """Height of a cube's lowest corner above the table [m], shape ``(nworld,)``. Not to be written
-    into.
+    """Height of an object's lowest point above the table [m], shape ``(nworld,)``. Not to be
+    written into.
     """
 
     def compute() -> torch.Tensor:
         pose = pose_w(env, name)
-        return lowest_corner(pose[:, :3], pose[:, 3:], env.cfg.scene.cube_half) - table_top(
-            env.cfg.scene
-        )
+        thing = env.cfg.scene.objects[name]
+        low = lowest_point(pose[:, :3], pose[:, 3:], thing.shape, thing.size)
+        return low - table_top(env.cfg.scene)
 
     return shared((id(env), above_table, name), compute)
+
+
+def place_xy(env: EnvView, name: str) -> torch.Tensor:
+    """Position of a place [m], drawn anew in each episode if it has ``random_xy``, shape ``(nworld,
+    2)``. Not to be written into.
+
+    Raises:
+        UnknownName: The scene has no such place.
+    """
+    places = env.cfg.scene.places
+    if name not in places:
+        raise UnknownName("place", name, places)
+    if name in env.given_places:
+        return env.given_places[name].index_select(0, env.world)
+    place = places[name]
+    if not any(place.random_xy):
+        return env.index.constant(place.xy, env.sim.qpos).expand(env.nworld, -1)
+
+    def compute() -> torch.Tensor:
+        dx, dy = episode_draw(env, name, 2).unbind(1)
+        wide, deep = place.random_xy
+        return torch.stack((place.xy[0] + wide * dx, place.xy[1] + deep * dy), dim=1)
+
+    return shared((id(env), place_xy, name), compute)
+
+
+def source_xy(env: EnvView) -> torch.Tensor:
+    """Position of every object, then of every place, in the scene's order [m], shape ``(nworld,
+    sources, 2)``.
+    """
+    objects = [pose_w(env, name)[:, :2] for name in env.cfg.scene.objects]
+    places = [place_xy(env, name) for name in env.cfg.scene.places]
+    return torch.stack([*objects, *places], dim=1)
 
 
 def jaw_forces(env: EnvView, name: str) -> torch.Tensor:
     """Size of the contact force [N] of each jaw on an object, at the last physics step, shape
     ``(nworld, 2)``.
     """
-    env.index.object_address(name)
     return _jaw_forces(env.index, env.sim, name)
 
 
-def cubes_in_hand(index: SceneIndex, sim: Simulation) -> torch.Tensor:
-    """Whether both jaws press on each cube, at the last physics step, shape ``(nworld,
-    2)``, bool.
+def objects_in_hand(index: SceneIndex, sim: Simulation) -> torch.Tensor:
+    """Whether all jaws press on each object of the scene, at the last physics step, shape
+    ``(nworld, objects)``, bool.
     """
-    return torch.stack([(_jaw_forces(index, sim, name) > LOADED).all(1) for name in CUBES], dim=1)
+    held = [(_jaw_forces(index, sim, name) > LOADED).all(1) for name in index.bodies]
+    return torch.stack(held, dim=1)
 
 
 def _jaw_forces(index: SceneIndex, sim: Simulation, name: str) -> torch.Tensor:
+    if name not in index.jaw_force:
+        raise UnknownName("object", name, index.jaw_force)
     parts = [sim.sensordata[:, a : a + 3] for a in index.jaw_force[name]]
     return torch.linalg.vector_norm(torch.stack(parts, dim=1), dim=2)

@@ -10,9 +10,11 @@ from mjstack.mdp.geometry import (
     jaw_forces,
     joint_positions,
     joint_velocities,
+    place_xy,
     pose_w,
     robot,
 )
+from mjstack.scene import table_top
 
 
 def joint_pos(env: EnvView) -> torch.Tensor:
@@ -51,6 +53,15 @@ def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> 
 def object_to_object(env: EnvView, *, a: str, b: str) -> torch.Tensor:
     """From one object's centre to another's [m], shape ``(nworld, 3)``."""
     return pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
+
+
+def object_to_place(env: EnvView, *, object: str, place: str) -> torch.Tensor:
+    """From an object's centre to where it is when it stands at a place on the table [m], shape
+    ``(nworld, 3)``.
+    """
+    at = pose_w(env, object)[:, :3]
+    height = table_top(env.cfg.scene) + env.cfg.scene.objects[object].half_height
+    return torch.cat((place_xy(env, place) - at[:, :2], height - at[:, 2:]), dim=1)
 
 
 def object_pose(env: EnvView, *, object: str) -> torch.Tensor:

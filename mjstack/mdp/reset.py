@@ -18,7 +18,7 @@ from mjstack.mdp.starts.randomization import (
     FRICTION_FIELDS,
     GAIN_FIELDS,
     MASS_FIELDS,
-    CubeMasses,
+    ObjectMasses,
     ServoGains,
     SlidingFriction,
     bounds,
@@ -64,8 +64,8 @@ class JointNoise:
         _write_robot(env, mask, torch.clamp(command, self._low, self._high))
 
 
-class JitterCubes:
-    """Moves each cube a little off the model's own place."""
+class JitterObjects:
+    """Moves each object a little off its nominal position."""
 
     label = "reset.cubes"
 
@@ -91,16 +91,17 @@ class JitterCubes:
         draw = random_uniform(env, self.label, 3 * len(env.index.objects))
         for number, name in enumerate(env.index.objects):
             dx, dy, yaw = draw[:, 3 * number : 3 * number + 3].unbind(1)
-            _write_cube(env, mask, name, self._xy * dx, self._xy * dy, self._yaw * yaw)
+            _write_object(env, mask, name, self._xy * dx, self._xy * dy, self._yaw * yaw)
 
 
-class RandomizeCubes:
-    """Puts each cube anywhere in a region around its place where nothing is in its way.
+class RandomizeObjects:
+    """Puts each object anywhere in a region around its nominal position where nothing is in its
+    way.
 
-    Both cubes stay on the table, apart from each other, and clear of what is fixed to the world and
-    of the arm at its start, joint noise included. Each world draws some candidates and takes the
-    first pair that fits, so that the number of operations is fixed. Regions that the arm does not
-    reach are refused.
+    Objects stay on the table, apart from each other, and clear of what is fixed to the world and of
+    the arm at its start, joint noise included. Each world draws some candidates and takes the first
+    that fit, so that the number of operations is fixed. Regions that the arm does not reach are
+    refused.
     """
 
     label = "reset.cubes"
@@ -121,8 +122,8 @@ class RandomizeCubes:
             env: The environment.
             xy: Half-widths of the region in x and y [m].
             yaw: Half-width of the rotation about z [rad].
-            gap: Free room around a cube, for fingers [m].
-            candidates: Draws per cube and world.
+            gap: Free room around an object, for fingers [m].
+            candidates: Draws per object and world.
             pose: Where the arm is then, ``home`` or ``start``.
 
         Raises:
@@ -157,36 +158,39 @@ class RandomizeCubes:
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes qpos."""
-        draws = random_uniform(env, self.label, 2 * (2 * self._candidates + 1)).view(
-            env.nworld, 2, -1
+        count = len(env.index.objects)
+        draws = random_uniform(env, self.label, count * (2 * self._candidates + 1)).view(
+            env.nworld, count, -1
         )
-        offsets = self._placement.choose(draws[..., 1:].reshape(env.nworld, 2, self._candidates, 2))
+        offsets = self._placement.choose(
+            draws[..., 1:].reshape(env.nworld, count, self._candidates, 2)
+        )
         for number, name in enumerate(env.index.objects):
             dx, dy = offsets[:, number].unbind(1)
-            _write_cube(env, mask, name, dx, dy, self._yaw * draws[:, number, 0])
+            _write_object(env, mask, name, dx, dy, self._yaw * draws[:, number, 0])
 
 
 @uses_fields(*MASS_FIELDS)
-class CubeMass:
-    """Scales each cube's mass and inertia."""
+class ObjectMass:
+    """Scales each object's mass and inertia."""
 
     label = "reset.mass"
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Takes the smallest and largest factor."""
         self._low, self._high = bounds("scale", scale)
-        self._masses = CubeMasses(env)
+        self._masses = ObjectMasses(env)
         self._nominal = self._masses.nominal.to(env.sim.qpos.dtype)
 
     def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
         """Writes the mass fields."""
-        factors = random_uniform(env, self.label, len(env.index.bodies), self._low, self._high)
+        factors = random_uniform(env, self.label, len(env.index.objects), self._low, self._high)
         self._masses.write(mask, self._nominal * factors)
 
 
 @uses_fields(*FRICTION_FIELDS)
-class CubeFriction:
-    """Draws the sliding friction of each cube, and of the grip; see `SlidingFriction`."""
+class ObjectFriction:
+    """Draws the sliding friction of each object, and of the grip; see `SlidingFriction`."""
 
     label = "reset.friction"
 
@@ -233,7 +237,7 @@ def _write_robot(env: EnvView, mask: torch.Tensor, command: torch.Tensor) -> Non
     tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
 
 
-def _write_cube(
+def _write_object(
     env: EnvView,
     mask: torch.Tensor,
     name: str,
@@ -241,7 +245,7 @@ def _write_cube(
     dy: torch.Tensor,
     yaw: torch.Tensor,
 ) -> None:
-    """Moves the masked worlds' cube off the place where the simulation's reset has put it."""
+    """Moves the masked worlds' object off the position where the simulation's reset has put it."""
     view = pose_w(env, name)
     place = view[:, :3] + torch.stack((dx, dy, torch.zeros_like(dx)), dim=1)
     # Float64, because a float32 cosine need not be that of any angle, and a file of layouts has the

@@ -5,7 +5,14 @@ from __future__ import annotations
 import torch
 
 from mjstack.managers.base import EnvView, require_positive
-from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, joint_velocities, pose_w
+from mjstack.mdp.geometry import (
+    above_table,
+    grasp_point,
+    jaw_forces,
+    joint_velocities,
+    place_xy,
+    pose_w,
+)
 
 
 def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> torch.Tensor:
@@ -29,7 +36,7 @@ def grasp(env: EnvView, *, object: str, force: float = 0.05) -> torch.Tensor:
 
 
 def lift(env: EnvView, *, object: str, height: float) -> torch.Tensor:
-    """Height of a cube's lowest corner above the table as a fraction of ``height`` [m], from 0 to
+    """Height of an object's lowest point above the table as a fraction of ``height`` [m], from 0 to
     1.
     """
     require_positive("height", height)
@@ -37,14 +44,22 @@ def lift(env: EnvView, *, object: str, height: float) -> torch.Tensor:
 
 
 def place(env: EnvView, *, a: str, b: str, scale: float) -> torch.Tensor:
-    """Nearness of cube ``a`` to its place on cube ``b``, while it is off the table: ``1 -
+    """Nearness of object ``a`` to its position on object ``b``, while it is off the table: ``1 -
     tanh(distance / scale)``.
     """
     require_positive("scale", scale)
     offset = pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
-    offset[:, 2] += 2.0 * env.cfg.scene.cube_half
+    objects = env.cfg.scene.objects
+    offset[:, 2] += objects[a].half_height + objects[b].half_height
     near = 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
     return near * (above_table(env, a) > 0.005)
+
+
+def near_place(env: EnvView, *, object: str, place: str, scale: float) -> torch.Tensor:
+    """Horizontal nearness of an object to a place: ``1 - tanh(distance / scale)``."""
+    require_positive("scale", scale)
+    away = place_xy(env, place) - pose_w(env, object)[:, :2]
+    return 1.0 - torch.tanh(torch.linalg.vector_norm(away, dim=1) / scale)
 
 
 def success(env: EnvView) -> torch.Tensor:

@@ -26,8 +26,8 @@ def success(env: EnvView) -> torch.Tensor:
     return env.success
 
 
-class CubeOffTable:
-    """When a cube's centre is beside the table or below its top."""
+class ObjectOffTable:
+    """When an object's centre is beside the table or below its top."""
 
     def __init__(self, env: EnvView) -> None:
         """Reads the table's place."""
@@ -38,7 +38,7 @@ class CubeOffTable:
         self._top = table_top(scene)
 
     def __call__(self, env: EnvView) -> torch.Tensor:
-        """True for worlds with a cube off the table, shape ``(nworld,)``."""
+        """True for worlds with an object off the table, shape ``(nworld,)``."""
         off = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
         for name in env.index.objects:
             pos = pose_w(env, name)[:, :3]

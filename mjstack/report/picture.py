@@ -1,10 +1,10 @@
-"""Pictures of a run: the final scene, the cubes' way there, and a video."""
+"""Pictures of a run: the final scene, the objects' way there, and a video."""
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 
 log = logging.getLogger(__name__)
 
-CUBE_COLORS = {"red": "#cc2a24", "blue": "#2457c7"}
+Drawn = tuple[Sequence[float], Sequence[float]]
 
 
 class SceneCamera:
@@ -65,7 +65,12 @@ class SceneCamera:
 
 
 def save_scene(
-    path: Path, model: mujoco.MjModel, qpos: np.ndarray, cubes: np.ndarray, half: float, title: str
+    path: Path,
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    positions: np.ndarray,
+    objects: Mapping[str, Drawn],
+    title: str,
 ) -> None:
     """Draw a state; on a machine without OpenGL in lines.
 
@@ -73,15 +78,15 @@ def save_scene(
         path: The picture.
         model: The scene with visuals.
         qpos: The state, shape ``(nq,)``.
-        cubes: Positions of red and blue [m], shape ``(2, 3)``.
-        half: Half a cube's edge [m].
+        positions: Of each object [m], shape ``(objects, 3)``.
+        objects: Half sizes [m] and color of each object, by name.
         title: What is shown.
     """
     try:
         camera = SceneCamera(model)
     except MjstackError as error:
         log.warning("%s The final scene is plotted instead.", error)
-        _plot_scene(path, model, qpos, cubes, half, title)
+        _plot_scene(path, model, qpos, positions, objects, title)
         return
     plt.imsave(path, camera.draw(qpos))
     camera.close()
@@ -121,26 +126,28 @@ def require_video() -> Callable[..., Any]:
     return imageio_ffmpeg.write_frames
 
 
-def save_trajectories(path: Path, cubes: np.ndarray, half: float, title: str) -> None:
-    """Plot the cubes' way.
+def save_trajectories(
+    path: Path, positions: np.ndarray, objects: Mapping[str, Drawn], title: str
+) -> None:
+    """Plot the objects' way.
 
     Args:
         path: The picture.
-        cubes: Positions of red and blue over the episode [m], shape ``(steps, 2, 3)``.
-        half: Half a cube's edge [m].
+        positions: Of each object over the episode [m], shape ``(steps, objects, 3)``.
+        objects: Half sizes [m] and color of each object, by name.
         title: What is shown.
     """
     figure, (side, above, height) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
-    for cube, (name, color) in enumerate(CUBE_COLORS.items()):
-        mm = 1e3 * cubes[:, cube]
+    for number, (name, (half, color)) in enumerate(objects.items()):
+        mm = 1e3 * positions[:, number]
         for axes, row in ((side, 2), (above, 0)):
             axes.plot(mm[:, 1], mm[:, row], color=color, label=name)
             for at, fill in ((mm[0], False), (mm[-1], True)):
-                corner = (at[1] - 1e3 * half, at[row] - 1e3 * half)
+                corner = (at[1] - 1e3 * half[1], at[row] - 1e3 * half[row])
                 square = plt.Rectangle(
                     corner,
-                    2e3 * half,
-                    2e3 * half,
+                    2e3 * half[1],
+                    2e3 * half[row],
                     color=color,
                     fill=fill,
                     alpha=0.5 if fill else 1.0,
@@ -165,9 +172,14 @@ def save_trajectories(path: Path, cubes: np.ndarray, half: float, title: str) ->
 
 
 def _plot_scene(
-    path: Path, model: mujoco.MjModel, qpos: np.ndarray, cubes: np.ndarray, half: float, title: str
+    path: Path,
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    positions: np.ndarray,
+    objects: Mapping[str, Drawn],
+    title: str,
 ) -> None:
-    """A drawing in lines for machines without OpenGL: arm joints, table and cubes."""
+    """A drawing in lines for machines without OpenGL: arm joints, table and objects."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
@@ -183,8 +195,8 @@ def _plot_scene(
     low = center - size
     extent = 2.0 * size
     axes.bar3d(*low, *extent, color="#b8a894", alpha=0.4)
-    for pos, color in zip(cubes, CUBE_COLORS.values(), strict=True):
-        axes.bar3d(*(pos - half), *([2.0 * half] * 3), color=color)
+    for pos, (half, color) in zip(positions, objects.values(), strict=True):
+        axes.bar3d(*(pos - half), *(2.0 * np.array(half)), color=color)
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
     axes.set_aspect("equal")
     figure.savefig(path, dpi=110)

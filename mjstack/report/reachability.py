@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,6 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.patches import Rectangle
 
-_COLORS = {"red": "#cc2a24", "blue": "#2457c7"}
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ReachLevel:
@@ -27,7 +25,7 @@ class ReachLevel:
 
     Attributes:
         name: Such as ``grasp``.
-        height: Of the points above a cube's centre [m].
+        height: Of the points above the table [m].
         gripper: ``open`` or ``closed``.
         residual: Distance that is left at each point [m], shape ``(ny, nx)``.
         tilt: Smallest tilt of the gripper from vertical [rad], NaN where the point is not reached,
@@ -47,11 +45,11 @@ class ReachLevel:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class CubeRegion:
-    """Where one cube may stand.
+class ObjectRegion:
+    """Where one object may stand.
 
     Attributes:
-        name: The cube.
+        name: The object.
         place: Its nominal x and y [m].
         configured: Half-widths of ``reset=randomized`` [m].
         square: Largest half-width of a square around the place that is reached with the margin [m];
@@ -81,7 +79,8 @@ class ReachMap:
         y: Rows [m], shape ``(ny,)``.
         table: Centre and half size of the table in x and y [m].
         levels: Heights.
-        regions: Where the cubes may stand.
+        regions: Where the objects may stand.
+        colors: Red, green, blue and alpha of each object, by name.
     """
 
     title: str
@@ -89,7 +88,8 @@ class ReachMap:
     y: np.ndarray
     table: tuple[Sequence[float], Sequence[float]]
     levels: Sequence[ReachLevel]
-    regions: Sequence[CubeRegion]
+    regions: Sequence[ObjectRegion]
+    colors: Mapping[str, Sequence[float]]
 
 
 def to_csv(found: ReachMap) -> str:
@@ -125,7 +125,7 @@ def to_npz(found: ReachMap) -> bytes:
         x_m=found.x,
         y_m=found.y,
         level=np.array([level.name for level in found.levels]),
-        height_above_cube_center_m=np.array([level.height for level in found.levels]),
+        height_above_table_m=np.array([level.height for level in found.levels]),
         reached=np.array([level.reached for level in found.levels]),
         residual_m=np.array([level.residual for level in found.levels]),
         tilt_deg=np.degrees([level.tilt for level in found.levels]),
@@ -139,7 +139,7 @@ def to_markdown(found: ReachMap, notes: Sequence[str], picture: str = "") -> str
     return to_document(found.title, tables, notes, picture)
 
 
-def _configured(region: CubeRegion) -> str:
+def _configured(region: ObjectRegion) -> str:
     x, y = region.configured
     return f"{x:.3f} x {y:.3f}, {'reached' if region.reached else 'NOT reached'}"
 
@@ -151,9 +151,9 @@ def _tilts(level: ReachLevel) -> str:
     return f"{low:.0f}° to {high:.0f}°"
 
 
-_REGION: dict[str, Callable[[CubeRegion], str]] = {
-    "cube": lambda region: region.name,
-    "place": lambda region: f"({region.place[0]:.3f}, {region.place[1]:.3f})",
+_REGION: dict[str, Callable[[ObjectRegion], str]] = {
+    "object": lambda region: region.name,
+    "position": lambda region: f"({region.place[0]:.3f}, {region.place[1]:.3f})",
     "configured": _configured,
     "largest square": lambda region: f"{region.square:.3f}",
     "largest rectangle": lambda region: f"{region.largest[0]:.3f} x {region.largest[1]:.3f}",
@@ -163,7 +163,7 @@ _REGION: dict[str, Callable[[CubeRegion], str]] = {
 }
 _LEVEL: dict[str, Callable[[ReachLevel], str]] = {
     "level": lambda level: level.name,
-    "above the cube's centre": lambda level: f"{level.height:.3f} m",
+    "above the table": lambda level: f"{level.height:.3f} m",
     "gripper": lambda level: level.gripper,
     "reached": lambda level: f"{100.0 * level.reached.mean():.1f} %",
     "tilt": _tilts,
@@ -172,7 +172,7 @@ _LEVEL: dict[str, Callable[[ReachLevel], str]] = {
 
 def save_map(path: Path, found: ReachMap) -> None:
     """Draws a panel per level: the tilt as colour, hatched where the arm does not get to, table,
-    cubes and regions.
+    objects and regions.
     """
     width = found.x[-1] - found.x[0]
     panel = 3.6 * max(0.6, width / (found.y[-1] - found.y[0])) + 1.0
@@ -204,7 +204,7 @@ def save_map(path: Path, found: ReachMap) -> None:
         (x, y), (half_x, half_y) = found.table
         axes.add_patch(_box(x, y, half_x, half_y, fill=False, ec="k", lw=1.5))
         for region in found.regions:
-            color = _COLORS[region.name.removesuffix("_cube")]
+            color = found.colors[region.name]
             axes.plot(*region.place, "s", color=color, markersize=7, markeredgecolor="w")
             axes.add_patch(_box(*region.place, *region.configured, fill=False, ec=color, lw=1.8))
             axes.add_patch(
@@ -219,7 +219,7 @@ def save_map(path: Path, found: ReachMap) -> None:
     if image is not None:
         figure.colorbar(image, ax=panels, label="smallest tilt of the gripper from vertical [deg]")
     figure.suptitle(
-        f"{found.title}\nhatched: not reached; squares: cubes; solid: configured region; dotted:"
+        f"{found.title}\nhatched: not reached; squares: objects; solid: configured region; dotted:"
         " largest with margin"
     )
     figure.savefig(path, dpi=100)

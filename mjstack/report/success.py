@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib
@@ -13,8 +13,6 @@ import matplotlib.pyplot as plt
 from matplotlib.collections import PathCollection
 from matplotlib.patches import Rectangle
 
-_COLORS = ("#cc2a24", "#2457c7")
-
 
 def save_places(
     path: Path,
@@ -22,18 +20,18 @@ def save_places(
     succeeded: np.ndarray,
     table: tuple[Sequence[float], Sequence[float]],
     title: str,
-    names: Sequence[str] = ("red", "blue"),
+    colors: Mapping[str, Sequence[float]],
 ) -> None:
-    """Draws every start as two dots, one per cube; a failed one as crosses on its cubes, joined by
-    a line.
+    """Draws every start as a dot per object; a failed one as crosses on its objects, joined by a
+    line.
 
     Args:
         path: The picture.
-        places: x and y [m] of each cube first, shape ``(n, cubes, 2 or more)``.
+        places: x and y [m] of each object first, shape ``(n, objects, 2 or more)``.
         succeeded: Whether each episode was, shape ``(n,)``, bool.
         table: Centre and half size of the table in x and y [m].
         title: What is shown.
-        names: Of the cubes.
+        colors: Red, green, blue and alpha of each object, by name.
     """
     figure, axes = plt.subplots(figsize=(7.5, 6.5), layout="constrained")
     (x, y), (half_x, half_y) = table
@@ -44,7 +42,7 @@ def save_places(
     axes.plot(0.0, 0.0, "k^", markersize=9, label="base")
     size, alpha = (12.0, 0.5) if len(places) <= 2000 else (3.0, 0.25)
     failed = places[~succeeded]
-    for number, (name, color) in enumerate(zip(names, _COLORS, strict=True)):
+    for number, (name, color) in enumerate(colors.items()):
         good = places[succeeded, number]
         axes.scatter(
             good[:, 1],
@@ -57,7 +55,7 @@ def save_places(
         )
     for pair in failed:
         axes.plot(pair[:, 1], pair[:, 0], color="0.3", lw=0.5, alpha=0.6)
-    for number, (name, color) in enumerate(zip(names, _COLORS, strict=True)):
+    for number, (name, color) in enumerate(colors.items()):
         bad = failed[:, number]
         axes.scatter(bad[:, 1], bad[:, 0], s=45.0, marker="x", color="k", lw=2.6)
         axes.scatter(

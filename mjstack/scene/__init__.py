@@ -1,7 +1,7 @@
-"""Scenes: a robot, a table and cubes as one MjModel, and where each name lies in it."""
+"""Scenes: a robot, a table and objects as one MjModel, and where each name lies in it."""
 
-from mjstack.scene.build import BLUE, RED, build_model, build_scene, table_top
+from mjstack.scene.build import build_model, build_scene, table_top
 from mjstack.scene.extent import LowestPoint
 from mjstack.scene.index import SceneIndex
 
-__all__ = ["BLUE", "RED", "LowestPoint", "SceneIndex", "build_model", "build_scene", "table_top"]
+__all__ = ["LowestPoint", "SceneIndex", "build_model", "build_scene", "table_top"]

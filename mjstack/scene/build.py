@@ -1,20 +1,19 @@
-"""Builds a scene around a robot: floor, table, two cubes and perhaps a box, timestep and solver,
-all set before compilation.
+"""Builds a scene around a robot: floor, table, objects and perhaps a box, timestep and solver, all
+set before compilation.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 
 import mujoco
 
-from mjstack.config.schema import BoxCfg, Cone, Config, SceneCfg, SolverCfg, TimingCfg
+from mjstack.config.schema import BoxCfg, Cone, Config, ObjectCfg, SceneCfg, SolverCfg, TimingCfg
 from mjstack.robots import robot_spec
 
-RED = "red"
-BLUE = "blue"
 WORLD = "world"  # MuJoCo's name of the body that never moves
-CUBES_SENSOR = f"{RED}/{BLUE}"
 _CONES = {
     Cone.elliptic: mujoco.mjtCone.mjCONE_ELLIPTIC,
     Cone.pyramidal: mujoco.mjtCone.mjCONE_PYRAMIDAL,
@@ -49,14 +48,14 @@ def build_scene(
 
     Args:
         spec: The robot; it is changed in place.
-        scene: Table and cubes, and perhaps a box.
+        scene: Table and objects, and perhaps a box.
         timing: Physics timestep.
         solver: Solver settings; ``None`` keeps the robot file's own.
-        jaw_bodies: Bodies of the gripper, whose contact force on each cube a sensor measures.
+        jaw_bodies: Bodies of the gripper, whose contact force on each object a sensor measures.
         visuals: Keep geoms that only pictures need.
 
     Returns:
-        The compiled model; its ``qpos0`` has the cubes at their nominal places.
+        The compiled model; its ``qpos0`` has the objects at their nominal positions.
     """
     option = spec.option
     option.timestep = timing.physics_dt
@@ -93,29 +92,16 @@ def build_scene(
     )
     if scene.box is not None:
         _add_box(spec, scene.box, table_top(scene))
-    z = table_top(scene) + scene.cube_half
-    for name, xy, rgba in (
-        (RED, scene.red_xy, [0.80, 0.16, 0.14, 1]),
-        (BLUE, scene.blue_xy, [0.14, 0.34, 0.78, 1]),
-    ):
-        body = world.add_body(name=name, pos=[*xy, z])
-        body.add_freejoint(name=name)
-        body.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=[scene.cube_half] * 3,
-            mass=scene.cube_mass,
-            friction=scene.cube_friction,
-            condim=3,
-            rgba=rgba,
-        )
-    for cube in (RED, BLUE):
+    for name, thing in scene.objects.items():
+        _add_object(world, name, thing, table_top(scene))
+    for name in scene.objects:
         for jaw in jaw_bodies:
-            _add_force_sensor(spec, jaw_sensor(jaw, cube), jaw, cube)
-    if scene.box is not None:
-        for cube in (RED, BLUE):
-            _add_force_sensor(spec, support_sensor(cube), WORLD, cube)
-        _add_force_sensor(spec, CUBES_SENSOR, RED, BLUE)
+            _add_force_sensor(spec, force_sensor(jaw, name), jaw, name)
+    if scene.support_sensors:
+        for name in scene.objects:
+            _add_force_sensor(spec, force_sensor(WORLD, name), WORLD, name)
+        for first, second in itertools.combinations(scene.objects, 2):
+            _add_force_sensor(spec, force_sensor(first, second), first, second)
     if visuals:
         world.add_light(pos=[0.2, -0.6, 1.6], dir=[0.1, 0.4, -1.0], diffuse=[0.6, 0.6, 0.6])
         spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
@@ -127,16 +113,31 @@ def build_scene(
     return spec.compile()
 
 
-def jaw_sensor(jaw: str, cube: str) -> str:
-    """Name of the sensor of the force between a jaw and a cube."""
-    return f"{jaw}/{cube}"
-
-
-def support_sensor(cube: str) -> str:
-    """Name of the sensor of the force between a cube and what is fixed to the world: floor, table
-    and box.
+def force_sensor(first: str, second: str) -> str:
+    """Name of the sensor of the force between two bodies: a jaw or the world, and an object; or two
+    objects in the scene's order.
     """
-    return f"{WORLD}/{cube}"
+    return f"{first}/{second}"
+
+
+def _add_object(world: mujoco.MjsBody, name: str, thing: ObjectCfg, top: float) -> None:
+    """Adds an object that stands on a surface at height top [m]. Its body, joint and geom have its
+    name.
+    """
+    body = world.add_body(name=name, pos=[*thing.xy, top + thing.half_height])
+    if not thing.fixed:
+        body.add_freejoint(name=name)
+    geom = body.add_geom(
+        name=name,
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{thing.shape.upper()}"),
+        size=[*thing.size, 0.0, 0.0][:3],
+        mass=thing.mass,
+        friction=thing.friction,
+        condim=3,
+        rgba=thing.color,
+    )
+    if thing.shape == "capsule":  # MuJoCo's stands along z; this one lies along x
+        geom.quat = [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0]
 
 
 def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:

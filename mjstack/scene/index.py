@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import mujoco
 import numpy as np
 import torch
 
-from mjstack.config.schema import RobotCfg
+from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import UnknownName
-from mjstack.scene.build import BLUE, CUBES_SENSOR, RED, jaw_sensor, support_sensor
-
-CUBES = (RED, BLUE)
+from mjstack.scene.build import WORLD, force_sensor
 
 
 class Columns:
@@ -90,9 +89,6 @@ class SceneIndex:
     """Where each named thing of a scene lies in MuJoCo's arrays.
 
     Attributes:
-        cube_qpos: First qpos address of the red and of the blue cube (7 numbers each: position,
-            quaternion).
-        cube_qvel: First qvel address of the red and of the blue cube (6 numbers each).
         robot_qpos: qpos addresses of the arm's and then the gripper's joints.
         robot_qvel: qvel addresses in the same order.
         robot_range: Joint limits in the same order [rad, m], shape ``(n, 2)``.
@@ -100,16 +96,20 @@ class SceneIndex:
         ctrl_range: Limits of the commands in the same order, shape ``(n, 2)``.
         n_arm: How many of them are the arm's.
         grasp_sites: The two site indices whose midpoint is the grasp point.
-        objects: First qpos and qvel address of every object that moves freely, by name.
-        bodies: Body index of those objects.
-        geoms: Geom indices of those objects.
+        object_qpos: First qpos address of every object that moves, in the scene's order.
+        object_qvel: First qvel address of each of them.
+        objects: First qpos address (7 numbers: position, quaternion) and qvel address (6 numbers)
+            of every object that moves, by name.
+        fixed: Position [m] and quaternion of every object that does not.
+        bodies: Body index of every object.
+        geoms: Geom indices of every object.
         jaw_force: First sensordata address of each jaw's force on an object (3 numbers), by the
             object's name.
-        support_force: Likewise of the world's and the other cube's force on it; only a scene with a
-            box measures them.
+        support_force: First sensordata addresses of the world's force and of each other object's;
+            empty unless ``scene.support_sensors`` is set.
     """
 
-    def __init__(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
+    def __init__(self, model: mujoco.MjModel, robot: RobotCfg, scene: SceneCfg) -> None:
         names = [*robot.arm_joints, *robot.gripper_joints]
         joints = [find(model, "joint", n) for n in names]
         self._robot = robot
@@ -121,27 +121,34 @@ class SceneIndex:
         self.ctrl_range = model.actuator_ctrlrange[self.ctrl].copy()
         self.n_arm = len(robot.arm_joints)
         self.grasp_sites = [find(model, "site", n) for n in robot.grasp_sites]
-        cubes = [find(model, "joint", n) for n in CUBES]
-        self.cube_qpos = [int(model.jnt_qposadr[j]) for j in cubes]
-        self.cube_qvel = [int(model.jnt_dofadr[j]) for j in cubes]
-        self.objects = {
-            n: (q, v) for n, q, v in zip(CUBES, self.cube_qpos, self.cube_qvel, strict=True)
+        free = {name: find(model, "joint", name) for name in scene.free}
+        self.object_qpos = [int(model.jnt_qposadr[j]) for j in free.values()]
+        self.object_qvel = [int(model.jnt_dofadr[j]) for j in free.values()]
+        pairs = zip(self.object_qpos, self.object_qvel, strict=True)
+        self.objects = dict(zip(free, pairs, strict=True))
+        self.bodies = {name: find(model, "body", name) for name in scene.objects}
+        self.fixed = {
+            name: np.concatenate((model.body_pos[body], model.body_quat[body])).tolist()
+            for name, body in self.bodies.items()
+            if name not in self.objects
         }
-        self.bodies = {n: int(model.jnt_bodyid[j]) for n, j in zip(CUBES, cubes, strict=True)}
         self.geoms = {
             n: np.flatnonzero(model.geom_bodyid == body).tolist() for n, body in self.bodies.items()
         }
-        self.jaw_force: dict[str, list[int]] = {}
-        for cube in CUBES:
-            sensors = [find(model, "sensor", jaw_sensor(jaw, cube)) for jaw in robot.jaw_bodies]
-            self.jaw_force[cube] = [int(model.sensor_adr[s]) for s in sensors]
-        self.support_force: dict[str, list[int]] = {}
-        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, CUBES_SENSOR) >= 0:
-            for cube in CUBES:
-                sensors = [
-                    find(model, "sensor", name) for name in (support_sensor(cube), CUBES_SENSOR)
-                ]
-                self.support_force[cube] = [int(model.sensor_adr[s]) for s in sensors]
+        self._constants: dict[tuple, torch.Tensor] = {}
+
+        def sensors(bodies: Iterable[tuple[str, str]]) -> list[int]:
+            return [int(model.sensor_adr[find(model, "sensor", force_sensor(*p))]) for p in bodies]
+
+        others = list(combinations(scene.objects, 2))
+        self.jaw_force = {
+            name: sensors((jaw, name) for jaw in robot.jaw_bodies) for name in scene.objects
+        }
+        self.support_force = {
+            name: sensors([(WORLD, name), *(pair for pair in others if name in pair)])
+            for name in scene.objects
+            if scene.support_sensors
+        }
 
     def on(self, device: torch.device, dtype: torch.dtype) -> RobotTensors:
         """The robot's part on a device. Made once: a captured step may not copy from the host."""
@@ -164,9 +171,18 @@ class SceneIndex:
             self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]
 
+    def constant(self, values: Sequence[float], like: torch.Tensor) -> torch.Tensor:
+        """Numbers in the type and on the device of a tensor, shape ``(n,)``. Copied there once: a
+        captured step may not copy from the host.
+        """
+        key = (tuple(values), like.device, like.dtype)
+        if key not in self._constants:
+            self._constants[key] = torch.tensor(values, dtype=like.dtype, device=like.device)
+        return self._constants[key]
+
     def object_address(self, name: str) -> tuple[int, int]:
-        """First qpos and qvel address of an object; an unknown name is an error that lists the
-        known ones.
+        """First qpos and qvel address of an object that moves; any other name is an error that
+        lists those.
         """
         if name not in self.objects:
             raise UnknownName("object", name, self.objects)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, PlacementsCfg
 
 KEYS = ("nconmax", "njmax", "naconmax", "nccdmax", "naccdmax")
 
@@ -68,13 +68,13 @@ class BatchSizes:
 
 def resolve_sizes(cfg: Config) -> BatchSizes:
     """The configured sizes, with the defaults of this robot and scene where they are null."""
-    placements = cfg.robot.placements[cfg.scene.name]
+    placements = _placements(cfg)
     return apply_configured(cfg, BatchSizes(nconmax=placements.nconmax, njmax=placements.njmax))
 
 
 def resolve_env_sizes(cfg: Config) -> BatchSizes:
     """Likewise with room for random actions, the worst case for contacts."""
-    placements = cfg.robot.placements[cfg.scene.name]
+    placements = _placements(cfg)
     return apply_configured(
         cfg, BatchSizes(nconmax=placements.env_nconmax, njmax=placements.env_njmax)
     )
@@ -84,12 +84,17 @@ def resolve_measuring_sizes(cfg: Config) -> BatchSizes:
     """Room to measure in: the robot's sizes for random actions, or the configured ones where those
     are larger.
     """
-    placements = cfg.robot.placements[cfg.scene.name]
+    placements = _placements(cfg)
     return BatchSizes(
         nconmax=max(placements.env_nconmax, cfg.batch.nconmax or 0),
         njmax=max(placements.env_njmax, cfg.batch.njmax or 0),
         source="room to measure in",
     )
+
+
+def _placements(cfg: Config) -> PlacementsCfg:
+    """Those of the scene; a scene that gives all its own positions needs none."""
+    return cfg.robot.placements.get(cfg.scene.name) or PlacementsCfg()
 
 
 def apply_configured(cfg: Config, sizes: BatchSizes) -> BatchSizes:

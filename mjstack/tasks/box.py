@@ -18,7 +18,7 @@ from mjstack.managers.base import EnvView
 from mjstack.math import not_finite, quat_to_matrix
 from mjstack.mdp.geometry import gripper_opening
 from mjstack.scene import LowestPoint, SceneIndex, table_top
-from mjstack.scene.index import CUBES, Columns
+from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS, Simulation
 from mjstack.tasks.box_report import report_box
@@ -66,16 +66,16 @@ class CubesAndBox:
         """
         scene = cfg.scene
         box = cfg.scene.box
-        if box is None or scene.red_slot is None or scene.blue_slot is None:
+        if box is None:
             raise ConfigError("scene", scene.name, "a scene with a box", "Set scene=box")
         self._t = cfg.gate.box
-        self._half = scene.cube_half
+        self._half = scene.objects[COLORS[0]].size[0]
         self.top = table_top(scene)
         self.rim = self.top + box.height
-        self._qpos = index.cube_qpos
-        self._qvel = index.cube_qvel
-        self._jaws = [index.jaw_force[name] for name in CUBES]
-        self._supports = [index.support_force[name] for name in CUBES]
+        self._qpos = [index.object_address(name)[0] for name in COLORS]
+        self._qvel = [index.object_address(name)[1] for name in COLORS]
+        self._jaws = [index.jaw_force[name] for name in COLORS]
+        self._supports = [index.support_force[name] for name in COLORS]
 
         def constant(values: object) -> torch.Tensor:
             return torch.tensor(values, dtype=torch.float32, device=device)
@@ -83,7 +83,7 @@ class CubesAndBox:
         low = [box.center[i] - box.half[i] for i in (0, 1)]
         high = [box.center[i] + box.half[i] for i in (0, 1)]
         self._low, self._high = constant([*low, self.top + box.floor]), constant([*high, self.rim])
-        self._slots = constant([scene.red_slot, scene.blue_slot])
+        self._slots = constant([scene.places[f"{name}_slot"].xy for name in COLORS])
         self._corners = self._half * constant(list(itertools.product((-1.0, 1.0), repeat=3)))
         self._gripper = Columns(index.robot_qpos[index.n_arm :], device)
         self._closed = constant(cfg.robot.gripper_closed)

@@ -6,12 +6,12 @@ import math
 
 import torch
 
-from mjstack.errors import ParameterError, UnknownName
+from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView, require_positive, shared
 from mjstack.math import quat_to_matrix
 from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, pose_w
-from mjstack.scene import BLUE, RED, table_top
-from mjstack.tasks.box import CubesAndBox
+from mjstack.scene import table_top
+from mjstack.tasks.box import COLORS, CubesAndBox
 
 
 class ToSlot:
@@ -30,13 +30,10 @@ class ToSlot:
         env.index.object_address(object)
         scene = env.cfg.scene
         box = env.cfg.scene.box
-        slots = {RED: env.cfg.scene.red_slot, BLUE: env.cfg.scene.blue_slot}
-        slot = slots.get(object)
-        if object not in slots:
-            raise UnknownName("cube", object, slots)
-        if box is None or slot is None:
+        if box is None:
             raise ParameterError("object", object, "a scene with a box", "Set scene=box")
-        place = [*slot, table_top(scene) + box.floor + scene.cube_half]
+        slot = scene.places[f"{object}_slot"].xy
+        place = [*slot, table_top(scene) + box.floor + scene.objects[object].half_height]
         self._object = object
         self._place = torch.tensor(place, dtype=env.sim.qpos.dtype, device=env.device)
 
@@ -111,7 +108,8 @@ class ReachNext:
     def __call__(self, env: EnvView) -> torch.Tensor:
         """The reward, shape ``(nworld,)``."""
         red, blue = cubes_inside(env, self._cubes).unbind(1)
-        aim = torch.where(red[:, None], pose_w(env, BLUE)[:, :3], pose_w(env, RED)[:, :3])
+        first, second = (pose_w(env, name)[:, :3] for name in COLORS)
+        aim = torch.where(red[:, None], second, first)
         near = 1.0 - torch.tanh(
             torch.linalg.vector_norm(aim - grasp_point(env), dim=1) / self._scale
         )
@@ -141,7 +139,7 @@ class GraspNext:
     def __call__(self, env: EnvView) -> torch.Tensor:
         """The reward, shape ``(nworld,)``."""
         red, blue = cubes_inside(env, self._cubes).unbind(1)
-        holds = [(jaw_forces(env, name) > self._force).all(1) for name in (RED, BLUE)]
+        holds = [(jaw_forces(env, name) > self._force).all(1) for name in COLORS]
         return (torch.where(red, holds[1], holds[0]) | (red & blue)).to(torch.float32)
 
 

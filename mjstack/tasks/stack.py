@@ -14,7 +14,7 @@ import torch
 from mjstack.config.schema import Config
 from mjstack.errors import ParameterError
 from mjstack.managers.base import EnvView
-from mjstack.math import lowest_corner, not_finite, quat_angle
+from mjstack.math import lowest_point, not_finite, quat_angle
 from mjstack.mdp.geometry import gripper_opening
 from mjstack.scene import SceneIndex, table_top
 from mjstack.scene.phases import Phase
@@ -36,6 +36,9 @@ RULES = Rules(
 )
 
 
+COLORS = ("red", "blue")  # the order of every dimension over cubes
+
+
 class CubePair:
     """Both cubes of every world as the rules see them, red first, float32: they read qpos and qvel
     alone, never stale.
@@ -44,13 +47,14 @@ class CubePair:
     def __init__(self, cfg: Config, index: SceneIndex, device: torch.device) -> None:
         """Reads addresses, thresholds and the table's place."""
         self._t = cfg.gate.acceptance
-        self._half = cfg.scene.cube_half
+        self._cubes = [cfg.scene.objects[name] for name in COLORS]
+        half = self._cubes[1].size[0]
         self._top = table_top(cfg.scene)
-        self._qpos = index.cube_qpos
-        self._qvel = index.cube_qvel
+        self._qpos = [index.object_address(name)[0] for name in COLORS]
+        self._qvel = [index.object_address(name)[1] for name in COLORS]
         self._center = torch.tensor(cfg.scene.table_center[:2], dtype=torch.float32, device=device)
         self._room = (
-            torch.tensor(cfg.scene.table_half[:2], dtype=torch.float32, device=device) - self._half
+            torch.tensor(cfg.scene.table_half[:2], dtype=torch.float32, device=device) - half
         )
 
     def pose(self, sim: Simulation) -> torch.Tensor:
@@ -63,11 +67,12 @@ class CubePair:
         linear, angular = torch.linalg.vector_norm(velocity.unflatten(-1, (2, 3)), dim=-1).unbind(
             -1
         )
-        return linear + math.sqrt(3.0) * self._half * angular
+        return linear + self._cubes[0].radius * angular
 
     def clearance(self, pose: torch.Tensor) -> torch.Tensor:
         """Height of each lowest corner above the table [m], shape ``(nworld, 2)``."""
-        return lowest_corner(pose[..., :3], pose[..., 3:], self._half) - self._top
+        cube = self._cubes[0]
+        return lowest_point(pose[..., :3], pose[..., 3:], cube.shape, cube.size) - self._top
 
     def offset(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Horizontal distance of the centres, and height of red above blue [m], each

@@ -36,7 +36,7 @@ def report_stack(
     gap = np.abs(steps["cube_height_m"][window, 1])
     inside = (
         np.abs(blue_xy[window] - scene.table_center[:2])
-        <= np.array(scene.table_half[:2]) - scene.cube_half
+        <= np.array(scene.table_half[:2]) - scene.objects["blue"].size[0]
     ).all(1)
     return {
         "LIFT": (

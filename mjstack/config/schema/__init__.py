@@ -34,7 +34,7 @@ from mjstack.config.schema.physics import (
 )
 from mjstack.config.schema.robot import ModelCfg, PlacementsCfg, RobotCfg, RobotSource
 from mjstack.config.schema.root import Config
-from mjstack.config.schema.scene import BoxCfg, SceneCfg
+from mjstack.config.schema.scene import SHAPES, BoxCfg, ObjectCfg, PlaceCfg, SceneCfg
 from mjstack.config.schema.task import ControllerCfg, PhaseCfg, TaskCfg
 from mjstack.config.schema.term import (
     ActionTermCfg,
@@ -47,6 +47,7 @@ from mjstack.config.schema.term import (
 
 __all__ = [
     "JOB_SCHEMAS",
+    "SHAPES",
     "ActionTermCfg",
     "Backend",
     "BatchCfg",
@@ -62,10 +63,12 @@ __all__ = [
     "GraphMode",
     "JobCfg",
     "ModelCfg",
+    "ObjectCfg",
     "ObservationGroupCfg",
     "ObservationTermCfg",
     "ParityCfg",
     "PhaseCfg",
+    "PlaceCfg",
     "PlacementsCfg",
     "ReachabilityJobCfg",
     "RewardTermCfg",

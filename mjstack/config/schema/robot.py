@@ -7,6 +7,8 @@ from enum import Enum
 
 from omegaconf import MISSING
 
+from mjstack.config.fields import spec
+
 
 class RobotSource(Enum):
     """Where the robot's MJCF file comes from."""
@@ -26,27 +28,32 @@ class ModelCfg:
 
 @dataclass(kw_only=True, slots=True)
 class PlacementsCfg:
-    """Where a scene's objects stand for one robot, and the buffer sizes its contacts need.
+    """Where a scene's objects stand for one robot, and the buffer sizes its contacts need."""
 
-    ``random_xy`` is how far ``reset=randomized`` moves each cube off its place in x and y.
-    ``nconmax`` and ``njmax`` are for the scripted task, ``env_nconmax`` and ``env_njmax`` for
-    random actions. A scene with a box has a ``home`` of its own, clear of it.
-    """
-
-    table_center: list[float] = MISSING
-    table_half: list[float] = MISSING
-    red_xy: list[float] = MISSING
-    blue_xy: list[float] = MISSING
-    random_xy: list[float] = MISSING
-    box_center: list[float] | None = None
-    red_slot: list[float] | None = None
-    blue_slot: list[float] | None = None
-    grasp_offset: float = 0.0
-    home: list[float] | None = None
-    nconmax: int = MISSING
-    njmax: int = MISSING
-    env_nconmax: int = MISSING
-    env_njmax: int = MISSING
+    table_center: list[float] = spec(unit="m", length=3)
+    """Centre of the table."""
+    table_half: list[float] = spec(unit="m", length=3, gt=0.0)
+    """Half sizes of the table."""
+    objects: dict[str, list[float]] = spec(factory=dict, unit="m", length=2)
+    """Nominal x and y of each object."""
+    places: dict[str, list[float]] = spec(factory=dict, unit="m", length=2)
+    """x and y of each place."""
+    random_xy: list[float] = spec(unit="m", length=2, ge=0.0)
+    """How far ``reset=randomized`` moves each object, plus or minus."""
+    box_center: list[float] | None = spec(None, unit="m", length=2)
+    """Centre of the box."""
+    grasp_offset: float = spec(0.0, unit="m")
+    """How far above an object's centre it is held."""
+    home: list[float] | None = spec(None, unit="rad, m")
+    """Home command of a scene in whose way the usual one is."""
+    nconmax: int = spec(128, ge=1)
+    """Contacts per world while a driver does the task."""
+    njmax: int = spec(300, ge=1)
+    """Constraint rows per world while a driver does the task."""
+    env_nconmax: int = spec(128, ge=1)
+    """Contacts per world under random actions."""
+    env_njmax: int = spec(768, ge=1)
+    """Constraint rows per world under random actions."""
 
 
 @dataclass(kw_only=True, slots=True)

@@ -7,7 +7,10 @@ from typing import Any
 
 from omegaconf import MISSING
 
+from mjstack.config.fields import spec
 from mjstack.config.schema.term import TermCfg
+
+LEVELS = ("center", "table", "on_top")
 
 
 @dataclass(kw_only=True, slots=True)
@@ -30,49 +33,64 @@ class TaskCfg:
 
 @dataclass(kw_only=True, slots=True)
 class PhaseCfg:
-    """One phase of the scripted grasp.
-
-    ``anchor`` is one of `mjstack.scene.phases.build_anchors`, such as ``red`` (a cube's centre), or
-    null (the last target holds). The target lies ``h_scale`` approach heights plus ``offset`` above
-    it, and ``scene.grasp_offset`` too where the cube is ``in_hand``.
-
-    The rest is for a controller that watches (``controller=closed_loop``): ``look`` measures the
-    anchor's cube anew when the phase begins, ``grasps`` names the cube that both jaws must press on
-    when it ends, and ``retry`` the phase to go back to if they do not.
-    """
+    """One phase of the scripted motion: where it brings the grasp point, and the gripper."""
 
     anchor: str | None = None
+    """Object or place from which the target counts; null: the last target holds."""
+    level: str = spec("center", choices=LEVELS)
+    """Height of the target: center (of the anchor as it stands; a place is on the table), table
+    (its surface at the anchor), or on_top (centre of the object grasped last, standing on the
+    anchor).
+    """
+    offset: list[float] = spec(factory=lambda: [0.0, 0.0, 0.0], unit="m", length=3)
+    """Added to the target in x, y and z."""
     h_scale: float = 0.0
-    offset: float = 0.0
+    """How many ``robot.approach_height`` higher the target is."""
+    toward: str | None = None
+    """Object or place at which the offset's x axis points, as seen from the anchor; null: world
+    axes.
+    """
     in_hand: bool = False
-    gripper: str = MISSING
-    seconds: float = MISSING
-    look: bool = False
+    """Whether ``scene.grasp_offset`` is added to the height."""
+    gripper: str = spec(choices=("open", "closed"))
+    """open or closed."""
+    seconds: float = spec(unit="s", gt=0.0)
+    """Duration."""
+    observe: bool = False
+    """With controller=closed_loop: measure anchor and ``toward`` anew when the phase begins."""
     grasps: str | None = None
+    """Object on which the jaws must press when the phase ends."""
     retry: str | None = None
+    """With controller=closed_loop: phase to go back to if they do not."""
 
 
 @dataclass(kw_only=True, slots=True)
 class ControllerCfg:
-    """The scripted motion. Its commands go through the action terms of ``action``.
+    """The scripted motion. Its commands go through the action terms of ``action``."""
 
-    ``knots``, ``ik_tolerance`` and ``ik_iterations`` are mink's, which plans. A controller that
-    watches makes ``step_iterations`` of batched inverse kinematics per step; ``posture_gain`` pulls
-    redundant joints to mink's nominal plan and ``approach_gain`` tilts the gripper as the cube's
-    place needs it; ``align`` is the share by which the jaws turn towards a cube's nearest face; a
-    retry may go up to ``hurry`` times as fast, and must be over ``rest_seconds`` before the window
-    of rest.
+    name: str = spec()
+    """open_loop or closed_loop."""
+    action: dict[str, Any] = spec()
+    """Its action terms, by name."""
+    phases: dict[str, PhaseCfg] = spec(factory=dict)
+    """Phases in their order."""
+    knots: int = spec(ge=3)
+    """Inverse-kinematics solutions per phase of a plan."""
+    ik_tolerance: float = spec(unit="m", gt=0.0)
+    """Largest distance of the grasp point from a target."""
+    ik_iterations: int = spec(ge=1)
+    """Iterations per solution of a plan."""
+    step_iterations: int = spec(ge=1)
+    """Iterations of batched inverse kinematics per control step of closed_loop."""
+    posture_gain: float = spec(ge=0.0, le=1.0)
+    """How strongly redundant joints follow the nominal plan per iteration."""
+    approach_gain: float = spec(ge=0.0, le=1.0)
+    """How strongly the gripper takes the approach tilt that the release needs per
+    iteration.
     """
-
-    name: str = MISSING
-    action: dict[str, Any] = MISSING
-    phases: dict[str, PhaseCfg] = MISSING
-    knots: int = MISSING
-    ik_tolerance: float = MISSING
-    ik_iterations: int = MISSING
-    step_iterations: int = MISSING
-    posture_gain: float = MISSING
-    approach_gain: float = MISSING
-    align: float = MISSING
-    hurry: float = MISSING
-    rest_seconds: float = MISSING
+    yaw_alignment: float = spec(ge=0.0, le=1.0)
+    """Share of the turn of the jaws to an object's nearest face."""
+    speed_limit: float = spec(ge=1.0)
+    """How many times as fast a world may go after a retry."""
+    rest_seconds: float = spec(unit="s", ge=0.0)
+    """Time between the last motion and the window of rest after a retry."""

@@ -2,6 +2,6 @@
 
 from mjstack.config.validate.gate import BOX_ROLES, PARITY_FIELDS
 from mjstack.config.validate.root import validate
-from mjstack.config.validate.term import places_cubes, reads_starts_file
+from mjstack.config.validate.term import places_objects, reads_starts_file
 
-__all__ = ["BOX_ROLES", "PARITY_FIELDS", "places_cubes", "reads_starts_file", "validate"]
+__all__ = ["BOX_ROLES", "PARITY_FIELDS", "places_objects", "reads_starts_file", "validate"]

@@ -13,7 +13,7 @@ from mjstack.config.schema import (
     StackCheckCfg,
     ThroughputCfg,
 )
-from mjstack.config.validate.term import places_cubes, reads_starts_file
+from mjstack.config.validate.term import places_objects, reads_starts_file
 from mjstack.config.validate.values import length, positive, positive_int
 from mjstack.errors import ConfigError, UnknownName
 
@@ -181,9 +181,9 @@ def check_success(cfg: Config) -> None:
         raise ConfigError(
             "gate.success.region",
             t.region,
-            "null, because reset=starts_file says where cubes start",
+            "null, because reset=starts_file says where objects start",
         )
-    if not any(places_cubes(term) for term in t.reset.values()):
+    if not any(places_objects(term) for term in t.reset.values()):
         raise ConfigError(
             "gate.success.region",
             t.region,
@@ -191,16 +191,17 @@ def check_success(cfg: Config) -> None:
         )
     scene = cfg.scene
     for axis in (0, 1):
-        # A cube of any yaw is a disc of half its diagonal.
-        room = scene.table_half[axis] - math.sqrt(2.0) * scene.cube_half
+        # An object of any yaw is a disc.
         most = min(
-            room - abs(place[axis] - scene.table_center[axis])
-            for place in (scene.red_xy, scene.blue_xy)
+            scene.table_half[axis]
+            - thing.footprint
+            - abs(thing.xy[axis] - scene.table_center[axis])
+            for thing in scene.free.values()
         )
         if not 0.0 <= t.region[axis] <= most:
             raise ConfigError(
                 "gate.success.region",
                 t.region,
-                f"half-widths that leave both cubes on the table, {'xy'[axis]} from 0 to"
+                f"half-widths that leave every object on the table, {'xy'[axis]} from 0 to"
                 f" {max(most, 0.0):.3f} m",
             )

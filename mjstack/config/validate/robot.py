@@ -10,9 +10,7 @@ from mjstack.errors import ConfigError, UnknownName
 
 
 def check_robot(cfg: Config) -> None:
-    """The robot's lists have its joints' length, its names are its joints', and the scene has a
-    place for it.
-    """
+    """The robot's lists have its joints' length, and its names are its joints'."""
     robot = cfg.robot
     n_arm = len(robot.arm_joints)
     n_grip = len(robot.gripper_joints)
@@ -47,7 +45,3 @@ def check_robot(cfg: Config) -> None:
         positive("robot.arm_force_limit", robot.arm_force_limit, "N m")
     positive("robot.approach_height", robot.approach_height, "m")
     not_negative("robot.finger_room", robot.finger_room, "m")
-    if cfg.scene.name not in robot.placements:
-        raise UnknownName(
-            f"robot.placements of {robot.name}: scene", cfg.scene.name, robot.placements
-        )

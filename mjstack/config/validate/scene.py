@@ -2,70 +2,62 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 
-from mjstack.config.schema import BoxCfg, Config, SceneCfg
-from mjstack.config.validate.values import length, not_negative, positive
+from mjstack.config.schema import SHAPES, BoxCfg, Config, ObjectCfg, SceneCfg
+from mjstack.config.validate.values import length
 from mjstack.errors import ConfigError
+
+_TAKEN = ("world", "floor", "table")
 
 
 def check_scene(cfg: Config) -> None:
-    """Table and cubes, and the box if there is one."""
+    """Table, objects and places, and the box if there is one."""
     scene = cfg.scene
-    for key, size in (
-        ("table_center", 3),
-        ("table_half", 3),
-        ("table_friction", 3),
-        ("cube_friction", 3),
-    ):
-        length(f"scene.{key}", getattr(scene, key), size)
-    positive("scene.cube_half", scene.cube_half, "m")
-    positive("scene.cube_mass", scene.cube_mass, "kg")
-    for key in ("table_half", "table_friction", "cube_friction"):
-        for number in getattr(scene, key):
-            positive(f"scene.{key}", number)
-    for key in ("red_xy", "blue_xy"):
-        value = getattr(scene, key)
-        length(f"scene.{key}", value, 2)
-        for axis in (0, 1):
-            reach = scene.table_half[axis] - scene.cube_half
-            if not abs(value[axis] - scene.table_center[axis]) <= reach:
-                low = scene.table_center[axis] - reach
-                high = scene.table_center[axis] + reach
-                raise ConfigError(
-                    f"scene.{key}",
-                    value,
-                    f"{'xy'[axis]} within [{low:.3f}, {high:.3f}] m, so that the cube is on the"
-                    " table",
-                )
-    length("scene.random_xy", scene.random_xy, 2)
-    for number in scene.random_xy:
-        not_negative("scene.random_xy", number, "m")
-    apart = math.dist(scene.red_xy, scene.blue_xy)
-    if not apart >= 2.0 * math.sqrt(2.0) * scene.cube_half:
-        raise ConfigError(
-            "scene.red_xy",
-            scene.red_xy,
-            f"a cube that does not touch the blue one at {scene.blue_xy}",
-        )
+    for name, thing in scene.objects.items():
+        _object(scene, name, thing)
+    for name, place in scene.places.items():
+        key = f"scene.places.{name}"
+        if name in scene.objects:
+            raise ConfigError(key, name, "a name that no object has")
+        _on_table(scene, f"{key}.xy", place.xy, place.random_xy, "place")
+    for (one, first), (other, second) in itertools.combinations(scene.objects.items(), 2):
+        if not math.dist(first.xy, second.xy) >= first.footprint + second.footprint:
+            raise ConfigError(
+                f"scene.objects.{one}.xy",
+                first.xy,
+                f"a position clear of {other}, which is at {second.xy}",
+            )
     if scene.box is not None:
         _box(scene, scene.box)
 
 
+def _object(scene: SceneCfg, name: str, thing: ObjectCfg) -> None:
+    key = f"scene.objects.{name}"
+    if name in _TAKEN or "/" in name:
+        raise ConfigError(key, name, f"a name other than {', '.join(_TAKEN)}, without a slash")
+    length(f"{key}.size", thing.size, SHAPES[thing.shape])
+    edge = min(thing.size[:2]) if thing.shape == "box" else thing.footprint
+    _on_table(scene, f"{key}.xy", thing.xy, (edge, edge), "object")
+
+
+def _on_table(scene: SceneCfg, key: str, xy: list[float], edge: Sequence[float], what: str) -> None:
+    for axis in (0, 1):
+        reach = scene.table_half[axis] - edge[axis]
+        low = scene.table_center[axis] - reach
+        high = scene.table_center[axis] + reach
+        if not abs(xy[axis] - scene.table_center[axis]) <= reach:
+            raise ConfigError(
+                key,
+                xy,
+                f"{'xy'[axis]} within [{low:.3f}, {high:.3f}] m, so that the {what} is on the"
+                " table",
+            )
+
+
 def _box(scene: SceneCfg, box: BoxCfg) -> None:
-    for key, size in (
-        ("center", 2),
-        ("half", 2),
-        ("friction", 3),
-        ("floor_solref", 2),
-        ("wall_solref", 2),
-    ):
-        length(f"scene.box.{key}", getattr(box, key), size)
-    for name in ("floor", "wall", "height"):
-        positive(f"scene.box.{name}", getattr(box, name), "m")
-    for key in ("half", "friction"):
-        for number in getattr(box, key):
-            positive(f"scene.box.{key}", number)
     if not box.height > box.floor:
         raise ConfigError(
             "scene.box.height", box.height, f"more than the floor's thickness, {box.floor:g} m"
@@ -87,12 +79,11 @@ def _box(scene: SceneCfg, box: BoxCfg) -> None:
             raise ConfigError(
                 "scene.box.center", box.center, "a box that is on the table with all its walls"
             )
-    for key in ("red_xy", "blue_xy"):
-        xy = getattr(scene, key)
-        if not any(abs(xy[i] - box.center[i]) >= outer[i] + scene.cube_half for i in (0, 1)):
-            raise ConfigError(f"scene.{key}", xy, "a cube beside the box")
-    for key in ("red_slot", "blue_slot"):
-        slot = getattr(scene, key)
-        length(f"scene.{key}", slot or [], 2)
-        if not all(abs(slot[i] - box.center[i]) <= box.half[i] - scene.cube_half for i in (0, 1)):
-            raise ConfigError(f"scene.{key}", slot, "a place in the box")
+    for name, thing in scene.objects.items():
+        if not any(abs(thing.xy[i] - box.center[i]) >= outer[i] + thing.size[0] for i in (0, 1)):
+            raise ConfigError(f"scene.objects.{name}.xy", thing.xy, "a position beside the box")
+    for name, place in scene.places.items():
+        if all(abs(place.xy[i] - box.center[i]) < outer[i] for i in (0, 1)) and not all(
+            abs(place.xy[i] - box.center[i]) + place.random_xy[i] < box.half[i] for i in (0, 1)
+        ):
+            raise ConfigError(f"scene.places.{name}.xy", place.xy, "a position off the walls")

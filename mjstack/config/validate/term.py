@@ -12,6 +12,6 @@ def reads_starts_file(reset: Mapping[str, TermCfg]) -> bool:
     return any(term.func.endswith(".FromStartsFile") for term in reset.values())
 
 
-def places_cubes(term: TermCfg) -> bool:
-    """Whether a reset term puts cubes anywhere in a region, its parameter ``xy``."""
-    return term.func.endswith(".RandomizeCubes")
+def places_objects(term: TermCfg) -> bool:
+    """Whether a reset term puts objects anywhere in a region, its parameter ``xy``."""
+    return term.func.endswith(".RandomizeObjects")

@@ -1,18 +1,17 @@
-"""Where cubes can stand: on the table, apart from each other, clear of the arm and of what is
+"""Where objects can stand: on the table, apart from each other, clear of the arm and of what is
 fixed.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 import torch
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, ObjectCfg
 from mjstack.errors import ParameterError
 from mjstack.rng import uniform
 from mjstack.scene import SceneIndex, table_top
@@ -20,16 +19,16 @@ from mjstack.scene import SceneIndex, table_top
 _TRIALS = 20_000  # imaginary worlds that try a region before it is used
 _SHARE = 2_000  # of them at a time
 _FIRST = 3  # candidates that are tried first
-# [m] between a cube and the arm at its start, noise included: it is the arm that moves away
+# [m] between an object and the arm at its start, noise included: it is the arm that moves away
 _ARM_ROOM = 0.001
 
 
 class Placement:
-    """Tests places of both cubes in a region around their nominal ones.
+    """Tests positions of all free objects in a region around their nominal ones.
 
-    Shapes are rounded up: a cube of any yaw is a disc of half its diagonal; a geom of the arm,
-    wherever noise puts it, or of what is fixed to the world, such as a wall of the box, is the box
-    along the axes that holds it. So what passes is free, and some free places are not used.
+    Shapes are rounded up: an object of any yaw is a disc, of half a box's diagonal. A geom of the
+    arm, wherever noise puts it, or of what is fixed to the world, such as a wall of the box, is the
+    box along the axes that holds it. So what passes is free, and some free positions are not used.
     """
 
     def __init__(
@@ -50,48 +49,38 @@ class Placement:
             model: The compiled scene.
             index: Its addresses.
             region: Half-widths of the region in x and y [m].
-            gap: Free room between cubes, and around what is fixed to the world [m], for fingers.
+            gap: Free room between objects, and around what is fixed to the world [m], for fingers.
             pose: Where the robot's joints are [rad, m].
             noise: How far each arm joint may be from there [rad].
         """
         scene = cfg.scene
-        half = scene.cube_half
-        self._radius = math.sqrt(2.0) * half
-        self._apart = 2.0 * self._radius + gap
-        self._half = half
-        self._height = table_top(scene) + half
-        nominal = torch.tensor([scene.red_xy, scene.blue_xy], dtype=torch.float64)
-        center = torch.tensor(scene.table_center[:2]).double()
-        room = torch.tensor(scene.table_half[:2]).double() - self._radius
+        objects = list(scene.free.values())
+        radii = [thing.footprint for thing in objects]
+        self._apart = [[a + b + gap for b in radii] for a in radii]
         data = mujoco.MjData(model)
         data.qpos[index.robot_qpos] = pose
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        obstacles = [
-            self._around(_arm_boxes(cfg, data, index, noise), min(gap, _ARM_ROOM)),
-            self._around(_fixed_boxes(data), gap),
+        arm = _arm_boxes(cfg, data, index, noise)
+        fixed = _fixed_boxes(data)
+
+        rectangles = []
+        top = table_top(scene)
+        for thing in objects:
+            around = np.concatenate(
+                [_around(thing, top, arm, min(gap, _ARM_ROOM)), _around(thing, top, fixed, gap)]
+            )
+            away = np.abs(around[:, :2] - thing.xy) - around[:, 2:4] - region
+            near = np.linalg.norm(np.maximum(away, 0.0), axis=1) < around[:, 4]
+            rectangles.append(torch.from_numpy(around[near]))
+        half = torch.tensor(scene.table_half[:2]).double()
+        self._tensors = [
+            torch.tensor([thing.xy for thing in objects], dtype=torch.float64).reshape(-1, 2),
+            torch.tensor(region).double(),
+            torch.tensor(scene.table_center[:2]).double(),
+            torch.stack([half - radius for radius in radii]) if radii else half[None, :][:0],
+            *rectangles,
         ]
-        around = np.concatenate(obstacles)
-        near = np.zeros(len(around), dtype=bool)
-        for xy in (scene.red_xy, scene.blue_xy):
-            away = np.abs(around[:, :2] - xy) - around[:, 2:4] - region
-            near |= np.linalg.norm(np.maximum(away, 0.0), axis=1) < around[:, 4]
-        rectangles = torch.from_numpy(around[near])
-        self._tensors = [nominal, torch.tensor(region).double(), center, room, rectangles]
-
-    def _around(self, boxes: tuple[np.ndarray, np.ndarray], clear: float) -> np.ndarray:
-        """What a box asks of a cube on the table: to have its centre some distance from a
-        rectangle.
-
-        Returns:
-            Centre and half sizes of the rectangle in x and y, and the distance [m], shape ``(m,
-            5)``, of the boxes that are low enough to matter.
-        """
-        centers, halves = boxes
-        above = np.maximum(np.abs(centers[:, 2] - self._height) - halves[:, 2] - self._half, 0.0)
-        matters = (above < clear) | (above == 0.0)
-        distance = self._radius + np.sqrt(np.maximum(clear**2 - above**2, 0.0))
-        return np.column_stack((centers[:, :2], halves[:, :2], distance))[matters]
 
     def to(self, device: torch.device, dtype: torch.dtype) -> None:
         """Moves the constants to where worlds are placed."""
@@ -101,11 +90,11 @@ class Placement:
         """The first candidates that fit.
 
         Args:
-            draws: Numbers in [-1, 1), shape ``(n, 2, candidates, 2)``: red and blue, x and y.
+            draws: Numbers in [-1, 1), shape ``(n, objects, candidates, 2)``: x and y.
 
         Returns:
-            Offsets from the nominal places [m], shape ``(n, 2, 2)``; 0 for both cubes where nothing
-            fits.
+            Offsets from the nominal positions [m], shape ``(n, objects, 2)``; 0 for all objects
+            where nothing fits.
         """
         return self._choose(draws)[0]
 
@@ -115,12 +104,13 @@ class Placement:
         Raises:
             ParameterError: In some of them no candidate fits.
         """
+        count = len(self._apart)
         world = torch.arange(_TRIALS)
         zero = torch.zeros_like(world)
         draws = uniform(
-            seed=0, world=world, episode=zero, step=zero, stream=0, size=4 * candidates
+            seed=0, world=world, episode=zero, step=zero, stream=0, size=2 * count * candidates
         ).double()
-        draws = draws.view(_TRIALS, 2, candidates, 2)
+        draws = draws.view(_TRIALS, count, candidates, 2)
         hard = draws[
             ~self._choose(draws[:, :, :_FIRST])[1]
         ]  # the first few do for most worlds, which saves time
@@ -129,50 +119,81 @@ class Placement:
             raise ParameterError(
                 name,
                 value,
-                f"a region with a free place for both cubes; {candidates} draws found none in"
+                f"a region with a free position for every object; {candidates} draws found none in"
                 f" {lacking} of {_TRIALS} trials",
-                "Make the region smaller, the gap smaller, or move the cubes (scene.red_xy,"
-                " scene.blue_xy)",
+                "Make the region smaller, the gap smaller, or move the objects"
+                " (scene.objects.NAME.xy)",
             )
 
     def require_all_free(self, name: str, value: object) -> None:
         """Checks the corners of the region, which is small: every draw must fit.
 
         Raises:
-            ParameterError: A cube could leave the table or touch the other.
+            ParameterError: An object could leave the table or touch another one.
         """
         corners = torch.tensor([[x, y] for x in (-1.0, 1.0) for y in (-1.0, 1.0)]).double()
-        pairs = torch.stack([torch.stack((a, b)) for a in corners for b in corners])
-        _, free = self._choose(pairs[:, :, None])
-        if not bool(free.all()):
-            raise ParameterError(
-                name,
-                value,
-                "cubes that stay on the table, apart from each other and clear of the arm",
-            )
+        numbers = range(len(self._apart))
+        for i, j in itertools.combinations_with_replacement(numbers, 2):
+            draws = torch.zeros((16, len(self._apart), 1, 2), dtype=torch.float64)
+            draws[:, i, 0] = corners.repeat_interleave(4, dim=0)
+            draws[:, j, 0] = corners.repeat(4, 1)
+            if not bool(self._choose(draws)[1].all()):
+                raise ParameterError(
+                    name,
+                    value,
+                    "objects that stay on the table, apart from each other and clear of the arm",
+                )
 
     def _choose(self, draws: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        nominal, region, center, room, rectangles = self._tensors
+        """Offsets, and whether all objects fit, ``(n,)``.
+
+        One object after the other takes its first candidate that is free, clear of those before,
+        and leaves each of those after it one that is clear too.
+        """
+        nominal, region, center, room, *rectangles = self._tensors
         offsets = draws * region
         places = nominal[None, :, None] + offsets
-        free = ((places - center).abs() <= room).all(-1)
-        if rectangles.shape[0]:
-            away = (
-                (places[..., None, :] - rectangles[:, :2]).abs() - rectangles[:, 2:4]
-            ).clamp_min(0.0)
-            free &= (away.square().sum(-1) >= rectangles[:, 4].square()).all(-1)
-        x, y = (places[:, 0, :, None] - places[:, 1, None]).unbind(-1)
-        fits = (x.square() + y.square() >= self._apart**2) & free[:, 0, :, None] & free[:, 1, None]
-        first = (
-            fits.flatten(1).to(torch.uint8).argmax(1)
-        )  # red's first candidate that goes with one of blue's
+        free = ((places - center).abs() <= room[:, None]).all(-1)
+        for number, around in enumerate(rectangles):
+            if around.shape[0]:
+                away = (
+                    (places[:, number, :, None, :] - around[:, :2]).abs() - around[:, 2:4]
+                ).clamp_min(0.0)
+                free[:, number] &= (away.square().sum(-1) >= around[:, 4].square()).all(-1)
         rows = torch.arange(draws.shape[0], device=draws.device)
-        candidates = draws.shape[2]
-        red = first // candidates
-        blue = first % candidates
-        both = fits.flatten(1).any(1)
-        chosen = torch.stack((offsets[rows, 0, red], offsets[rows, 1, blue]), dim=1)
-        return torch.where(both[:, None, None], chosen, 0.0), both
+        fits = torch.ones_like(rows, dtype=torch.bool)
+        chosen = []
+        count = len(rectangles)
+        for k in range(count):
+            good = free[:, k]
+            clear = {}
+            for m in range(k + 1, count):
+                x, y = (places[:, k, :, None] - places[:, m, None]).unbind(-1)
+                clear[m] = (x.square() + y.square() >= self._apart[k][m] ** 2) & free[:, m, None]
+                good = good & clear[m].any(2)
+            first = good.to(torch.uint8).argmax(1)
+            fits &= good.any(1)
+            chosen.append(offsets[rows, k, first])
+            for m, table in clear.items():
+                free[:, m] = table[rows, first]
+        return torch.where(fits[:, None, None], torch.stack(chosen, dim=1), 0.0), fits
+
+
+def _around(
+    thing: ObjectCfg, top: float, boxes: tuple[np.ndarray, np.ndarray], clear: float
+) -> np.ndarray:
+    """Distance that boxes ask of an object on the table: of its centre from a rectangle.
+
+    Returns:
+        Centre and half sizes of the rectangle in x and y, and the distance [m], shape ``(m, 5)``,
+        of the boxes that are low enough to matter.
+    """
+    centers, halves = boxes
+    half = thing.half_height
+    above = np.maximum(np.abs(centers[:, 2] - (top + half)) - halves[:, 2] - half, 0.0)
+    matters = (above < clear) | (above == 0.0)
+    distance = thing.footprint + np.sqrt(np.maximum(clear**2 - above**2, 0.0))
+    return np.column_stack((centers[:, :2], halves[:, :2], distance))[matters]
 
 
 def _arm_boxes(

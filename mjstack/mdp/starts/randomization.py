@@ -22,16 +22,16 @@ FRICTION_FIELDS = ("geom_friction",)
 GAIN_FIELDS = ("actuator_gainprm", "actuator_biasprm")
 
 
-class CubeMasses:
-    """Mass of each cube [kg], in the order of ``index.objects``.
+class ObjectMasses:
+    """Mass of each free object [kg], in the order of ``index.objects``.
 
-    A cube is a body of its own on a free joint, so that what the compiler derives from the mass
+    An object is a body of its own on a free joint, so that what the compiler derives from the mass
     scales with it, and need not be computed anew.
     """
 
     def __init__(self, env: EnvView) -> None:
         """Needs `MASS_FIELDS`."""
-        bodies = list(env.index.bodies.values())
+        bodies = [env.index.bodies[name] for name in env.index.objects]
         dofs = [dof + i for _, dof in env.index.objects.values() for i in range(6)]
         self._mass = _Elements(env, "body_mass", bodies)
         self._scaled = [
@@ -42,11 +42,11 @@ class CubeMasses:
         self.nominal = self._mass.nominal
 
     def read(self) -> torch.Tensor:
-        """Shape ``(nworld, cubes)``, in the field's type."""
+        """Shape ``(nworld, objects)``, in the field's type."""
         return self._mass.read()
 
     def write(self, mask: torch.Tensor, mass: torch.Tensor) -> None:
-        """Writes masses ``(nworld, cubes)`` and what follows into the masked worlds."""
+        """Writes masses ``(nworld, objects)`` and what follows into the masked worlds."""
         mass = mass.to(self._mass.dtype)
         factor = mass.double() / self.nominal
         self._mass.write(mask, mass)
@@ -57,11 +57,11 @@ class CubeMasses:
 
 
 class SlidingFriction:
-    """Sliding friction of each cube, and of the grip where the jaws have one of their own.
+    """Sliding friction of each free object, and of the grip where the jaws have one of their own.
 
     MuJoCo takes the larger coefficient of the two geoms in a contact, or that of the geom with the
-    higher priority. So the table, and jaws of the cubes' own priority, get the smallest
-    coefficient, which leaves the cube's in force; jaws of higher priority (SO-101's) have one of
+    higher priority. So the table, and jaws of the objects' own priority, get the smallest
+    coefficient, which leaves the object's in force; jaws of higher priority (SO-101's) have one of
     their own, the same for both.
 
     Attributes:
@@ -71,15 +71,15 @@ class SlidingFriction:
     def __init__(self, env: EnvView, least: float) -> None:
         """Needs `FRICTION_FIELDS`. ``least`` is the smallest coefficient that is ever drawn."""
         model = env.sim.model
-        cubes = list(env.index.geoms.values())
-        priority = model.geom_priority[cubes[0][0]]
+        objects = [env.index.geoms[name] for name in env.index.objects]
+        priority = 0  # of objects
         bodies = [model.body(name).id for name in env.cfg.robot.jaw_bodies]
         jaws = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies]
         above = [g for g in jaws if model.geom_priority[g] > priority]
         level = [model.geom("table").id, *(g for g in jaws if g not in above)]
-        self.names = [*env.index.geoms, *(["grip"] if above else [])]
+        self.names = [*env.index.objects, *(["grip"] if above else [])]
         self._view = env.sim.fields["geom_friction"][..., 0]
-        self._groups = [Columns(geoms, env.device) for geoms in (*cubes, above) if geoms]
+        self._groups = [Columns(geoms, env.device) for geoms in (*objects, above) if geoms]
         self._lowered = Columns(level, env.device)
         self._least = torch.tensor(least, dtype=self._view.dtype, device=env.device)
 
@@ -89,7 +89,7 @@ class SlidingFriction:
 
     def write(self, mask: torch.Tensor, values: torch.Tensor) -> None:
         """Writes coefficients ``(nworld, len(names))`` into the masked worlds, and lowers what the
-        cubes lie on.
+        objects lie on.
         """
         values = values.to(self._view.dtype)
         for number, group in enumerate(self._groups):

@@ -15,18 +15,18 @@ import torch
 from mjstack.errors import ArgumentError, ConfigError, ParameterError
 from mjstack.files import write_atomic
 from mjstack.managers.base import EnvView, uses_fields
-from mjstack.mdp.geometry import joint_positions, named_pose, pose_w, robot
+from mjstack.mdp.geometry import joint_positions, named_pose, place_xy, pose_w, robot
 from mjstack.mdp.starts.randomization import (
     FRICTION_FIELDS,
     GAIN_FIELDS,
     MASS_FIELDS,
-    CubeMasses,
+    ObjectMasses,
     ServoGains,
     SlidingFriction,
     bounds,
 )
 from mjstack.mdp.starts.reach import out_of_reach
-from mjstack.mdp.starts.table import StartsTable, column_names, read_starts_table, short
+from mjstack.mdp.starts.table import StartsTable, column_names, read_starts_table
 
 _ROUNDING = 1e-6  # of a range's ends, which float32 does not hold exactly
 # [m], and of a quaternion: how far from standing on the table a cube may be that stands on it
@@ -38,7 +38,7 @@ class FromStartsFile:
     """World w starts as row w of a file says, at every reset.
 
     Joints without a column are at a pose of the robot's; masses, friction and gains without one are
-    left alone.
+    left alone, and places without columns are drawn.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class FromStartsFile:
             env: The environment.
             path: The file; see `mjstack.mdp.starts.table`.
             pose: Of joints that have no column, ``home`` or ``start``.
-            mass: Smallest and largest mass of a cube, over the model's own.
+            mass: Smallest and largest mass of an object, over the model's own.
             friction: Smallest and largest coefficient. Where the file has any, the table gets the
                 smallest.
             gain: Smallest and largest factor of a servo's gains.
@@ -96,12 +96,13 @@ class FromStartsFile:
             "friction": bounds("friction", friction),
             "gain": bounds("gain", gain),
         }
-        self._masses = CubeMasses(env)
+        self._masses = ObjectMasses(env)
         self._friction = SlidingFriction(env, ranges["friction"][0])
         self._gains = ServoGains(env)
         joints = [*env.cfg.robot.arm_joints, *env.cfg.robot.gripper_joints]
+        objects = list(env.index.objects)
         file = read_starts_table(
-            path, column_names(list(env.index.objects), joints, self._friction.names)
+            path, column_names(objects, joints, self._friction.names, drawn_places(env))
         )
         table = file.columns
         rows = len(next(iter(table.values())))
@@ -113,14 +114,13 @@ class FromStartsFile:
                 f"at least {needed} worlds, it has {rows}",
                 f"Add rows, or set nworld={rows}",
             )
-        cubes = [short(name) for name in env.index.objects]
         nominal = self._masses.nominal.cpu().numpy()
-        for cube, kilograms in zip(cubes, nominal, strict=True):
+        for name, kilograms in zip(objects, nominal, strict=True):
             _check_range(
-                file, f"{cube}_mass_kg", [kilograms * end for end in ranges["mass"]], "mass"
+                file, f"{name}_mass_kg", [kilograms * end for end in ranges["mass"]], "mass"
             )
         for name in self._friction.names:
-            _check_range(file, f"{short(name)}_friction", ranges["friction"], "friction")
+            _check_range(file, f"{name}_friction", ranges["friction"], "friction")
         for name, low, high in zip(joints, *_joint_limits(env), strict=True):
             _check_range(file, f"gain_{name}", ranges["gain"], "gain")
             _check_range(file, f"joint_{name}", (low, high))
@@ -130,11 +130,13 @@ class FromStartsFile:
             command[:, k] = table.get(f"joint_{name}", command[:, k])
         places = np.stack(
             [
-                np.stack([table[f"{cube}_{part}"] for part in ("x_m", "y_m", "yaw_rad")], 1)
-                for cube in cubes
+                np.stack([table[f"{name}_{part}"] for part in ("x_m", "y_m", "yaw_rad")], 1)
+                for name in objects
             ],
             1,
         )
+        for name in drawn_places(env):
+            self._give_place(env, file, name)
         _check_on_table(env, file, places)
         _check_touching(env, file, places, command)
         _check_reach(env, file, places)
@@ -146,8 +148,8 @@ class FromStartsFile:
         self._quats = self._keep(env, np.stack((np.cos(half), zero, zero, np.sin(half)), axis=-1))
         self._given = []
         for held, names in (
-            (self._masses, [f"{cube}_mass_kg" for cube in cubes]),
-            (self._friction, [f"{short(name)}_friction" for name in self._friction.names]),
+            (self._masses, [f"{name}_mass_kg" for name in objects]),
+            (self._friction, [f"{name}_friction" for name in self._friction.names]),
             (self._gains, [f"gain_{name}" for name in joints]),
         ):
             if any(name in table for name in names):
@@ -171,6 +173,19 @@ class FromStartsFile:
         for held, table in self._given:
             values = table.index_select(0, env.world)
             held.write(mask, torch.where(values.isnan(), held.read().double(), values))
+
+    def _give_place(self, env: EnvView, file: StartsTable, name: str) -> None:
+        """Sets a drawn place to what the file has for it."""
+        given = [column for column in _place(name) if column in file.columns]
+        if not given:
+            return
+        if len(given) < 2:
+            raise file.misfit(0, given, "both coordinates of a place", "Add the other column")
+        place = env.cfg.scene.places[name]
+        for column, at, half in zip(given, place.xy, place.random_xy, strict=True):
+            _check_range(file, column, (at - half, at + half))
+        xy = np.stack([file.columns[column] for column in given], axis=1)
+        env.given_places[name] = self._keep(env, xy)
 
     @staticmethod
     def _keep(env: EnvView, values: np.ndarray) -> torch.Tensor:
@@ -205,30 +220,30 @@ def write_starts(env: EnvView, path: str | Path) -> None:
             raise ArgumentError(
                 "env",
                 f"{name} of world {off.argmax()} off the table",
-                "cubes that stand flat on it",
+                "objects that stand flat on it",
             )
-        cube = short(name)
         table |= {
-            f"{cube}_x_m": pose[:, 0],
-            f"{cube}_y_m": pose[:, 1],
-            f"{cube}_yaw_rad": _yaw(pose[:, 3], pose[:, 6]),
+            f"{name}_x_m": pose[:, 0],
+            f"{name}_y_m": pose[:, 1],
+            f"{name}_yaw_rad": _yaw(pose[:, 3], pose[:, 6]),
         }
     at = joint_positions(env).cpu().numpy()
     table |= {f"joint_{name}": at[:, k] for k, name in enumerate(joints)}
     if _varies(env, MASS_FIELDS):
-        masses = CubeMasses(env).read().cpu().numpy()
-        table |= {
-            f"{short(name)}_mass_kg": masses[:, k] for k, name in enumerate(env.index.objects)
-        }
+        masses = ObjectMasses(env).read().cpu().numpy()
+        table |= {f"{name}_mass_kg": masses[:, k] for k, name in enumerate(env.index.objects)}
     if _varies(env, FRICTION_FIELDS):
         friction = SlidingFriction(env, 0.0)
         table |= {
-            f"{short(name)}_friction": v
+            f"{name}_friction": v
             for name, v in zip(friction.names, friction.read().cpu().numpy().T, strict=True)
         }
     if _varies(env, GAIN_FIELDS):
         gains = ServoGains(env).read().cpu().numpy()
         table |= {f"gain_{name}": gains[:, k] for k, name in enumerate(joints)}
+    for name in drawn_places(env):
+        xy = place_xy(env, name).cpu().numpy()
+        table |= {f"{name}_{axis}_m": xy[:, k] for k, axis in enumerate("xy")}
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(table)
@@ -242,6 +257,11 @@ def write_starts(env: EnvView, path: str | Path) -> None:
         raise ArgumentError(
             "path", f"{path} ({error.strerror})", "a file in a folder that can be written"
         ) from error
+
+
+def drawn_places(env: EnvView) -> list[str]:
+    """Names of the places that each episode draws."""
+    return [name for name, place in env.cfg.scene.places.items() if any(place.random_xy)]
 
 
 def _varies(env: EnvView, names: Sequence[str]) -> bool:
@@ -297,15 +317,24 @@ def _check_range(file: StartsTable, name: str, ends: Sequence[float], parameter:
 
 
 def _check_on_table(env: EnvView, file: StartsTable, places: np.ndarray) -> None:
-    """Every corner of every cube is above the table."""
+    """All of every object is above the table."""
     scene = env.cfg.scene
     yaw = places[..., 2]
-    reach = scene.cube_half * (np.abs(np.cos(yaw)) + np.abs(np.sin(yaw)))[..., None]
+    cos = np.abs(np.cos(yaw))
+    sin = np.abs(np.sin(yaw))
+    reach = np.empty((*yaw.shape, 2))
+    for number, thing in enumerate(scene.free.values()):
+        if thing.shape == "box":
+            wide, deep = thing.size[:2]
+            reach[:, number, 0] = wide * cos[:, number] + deep * sin[:, number]
+            reach[:, number, 1] = wide * sin[:, number] + deep * cos[:, number]
+        else:
+            reach[:, number] = thing.footprint
     over = np.abs(places[..., :2] - scene.table_center[:2]) + reach - scene.table_half[:2]
     if over.max() > _ROUNDING:
         world, cube, axis = np.argwhere(over > _ROUNDING)[0]
         name = list(env.index.objects)[cube]
-        room = scene.table_half[axis] - reach[world, cube, 0]
+        room = scene.table_half[axis] - reach[world, cube, axis]
         # Rounded towards the table, so that what is said succeeds.
         low = math.ceil(1e3 * (scene.table_center[axis] - room)) / 1e3
         high = math.floor(1e3 * (scene.table_center[axis] + room)) / 1e3
@@ -322,7 +351,7 @@ def _check_on_table(env: EnvView, file: StartsTable, places: np.ndarray) -> None
 def _check_touching(
     env: EnvView, file: StartsTable, places: np.ndarray, command: np.ndarray
 ) -> None:
-    """No cube touches anything but the table."""
+    """No object touches anything but the table."""
     model = env.sim.model
     index = env.index
     data = mujoco.MjData(model)
@@ -348,26 +377,26 @@ def _check_touching(
                     owner.get(g) or model.geom(g).name or model.body(model.geom_bodyid[g]).name
                     for g in (first, second)
                 ]
-                cubes_there = [name for name in names if name in index.objects]
-                moved = [column for name in cubes_there for column in _place(name)]
+                touching = [name for name in names if name in index.objects]
+                moved = [column for name in touching for column in _place(name)]
                 expected = (
-                    f"cubes that touch nothing but the table; {' and '.join(names)} touch in world"
-                    f" {world}"
+                    f"objects that touch nothing but the table; {' and '.join(names)} touch in"
+                    f" world {world}"
                 )
                 raise file.misfit(
-                    world, moved, expected, "Move them apart" if len(cubes_there) > 1 else "Move it"
+                    world, moved, expected, "Move them apart" if len(touching) > 1 else "Move it"
                 )
 
 
 def _check_reach(env: EnvView, file: StartsTable, places: np.ndarray) -> None:
-    """The arm gets to every cube, above it, and wherever the phases go there."""
-    for cube, name in enumerate(env.index.objects):
-        if found := out_of_reach(env, cube, places[:, cube, :2]):
+    """The arm gets wherever the phases bring it at every object."""
+    for number, name in enumerate(env.index.objects):
+        if found := out_of_reach(env, name, places[:, number, :2]):
             world, what = found
             fix = "Move it closer; job=reachability draws a map"
             raise file.misfit(world, _place(name), f"a place that the arm reaches; {what}", fix)
 
 
 def _place(name: str) -> list[str]:
-    """The columns of a cube's place."""
-    return [f"{short(name)}_{axis}_m" for axis in "xy"]
+    """The columns of an object's position."""
+    return [f"{name}_{axis}_m" for axis in "xy"]

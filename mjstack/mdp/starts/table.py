@@ -1,4 +1,4 @@
-"""A file of layouts: a CSV with a header and one row per world, read and checked cell by cell."""
+"""A file of starts: a CSV with a header and one row per world, read and checked cell by cell."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LONGEST = 40  # characters of a cell in a message
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Names of a layout file's columns for one robot.
+    """Names of a starts file's columns for one robot.
 
     Attributes:
         required: Every file has them.
@@ -30,27 +30,23 @@ class Columns:
     optional: Sequence[str]
 
 
-def column_names(objects: Sequence[str], joints: Sequence[str], friction: Sequence[str]) -> Columns:
+def column_names(
+    objects: Sequence[str], joints: Sequence[str], friction: Sequence[str], places: Sequence[str]
+) -> Columns:
     """The columns, in the order in which they are written.
 
     Args:
-        objects: Names of the cubes, such as ``red``.
+        objects: Names of the free objects, such as ``red``.
         joints: Names of the robot's joints.
-        friction: Whose friction may be given: the cubes, and ``grip`` where the jaws have their
+        friction: Whose friction may be given: the objects, and ``grip`` where the jaws have their
             own.
+        places: Names of the places that are drawn per episode.
     """
-    cubes = [short(name) for name in objects]
-    places = [f"{cube}_{part}" for cube in cubes for part in ("x_m", "y_m", "yaw_rad")]
-    optional = [f"joint_{name}" for name in joints] + [f"{cube}_mass_kg" for cube in cubes]
-    optional += [f"{short(name)}_friction" for name in friction] + [
-        f"gain_{name}" for name in joints
-    ]
-    return Columns(["world", *places], optional)
-
-
-def short(name: str) -> str:
-    """``red`` for ``red``."""
-    return name.removesuffix("_cube")
+    required = [f"{name}_{part}" for name in objects for part in ("x_m", "y_m", "yaw_rad")]
+    optional = [f"joint_{name}" for name in joints] + [f"{name}_mass_kg" for name in objects]
+    optional += [f"{name}_friction" for name in friction] + [f"gain_{name}" for name in joints]
+    optional += [f"{name}_{axis}_m" for name in places for axis in "xy"]
+    return Columns(["world", *required], optional)
 
 
 @dataclass(frozen=True, slots=True)
