@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 from statistics import mean
 
 import pytest
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from mjstack import MjstackError, load_config
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 TRAINS = "runner.learn("
 GUIDES = sorted(
     page.name for page in DOCS.glob("*.md") if "\n```python\n" in page.read_text(encoding="utf-8")
 )
+COMMAND = r"(?:mjstack|python scripts/run\.py) "
 ITERATIONS = 30
 # iterations of 24 steps: by then the episodes that the runner began in their middle have ended
 STARTED = 7
@@ -69,6 +75,46 @@ def test_python_blocks_run(name: str, tmp_path: Path) -> None:
         timeout=600,
     )
     assert run.returncode == 0, f"line numbers are those of docs/{name}\n{run.stdout}\n{run.stderr}"
+
+
+def shown_commands() -> list[dict[str, str]]:
+    """Overrides of every command that the README and the pages show, by key; of a sweep, those of
+    its first job.
+    """
+    commands: list[dict[str, str]] = []
+    for page in (DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))):
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        lines = re.findall(rf"(?m)^\$ {COMMAND}(.*)$", text)
+        for line in [*lines, *re.findall(rf"`{COMMAND}([^`]+)`", text)]:
+            words = shlex.split(line, comments=True)
+            given = [word for word in words if "=" in word or word.startswith("~")]
+            if any("<" in word or "--config-dir" in word for word in words):
+                continue  # a placeholder; a folder that another test has
+            if "-m" in words:
+                parsed = OverridesParser.create().parse_overrides(given)
+                given = list(BasicSweeper.split_arguments(parsed, None)[0][0])
+            commands.append({word.partition("=")[0]: word for word in given})
+    return commands
+
+
+def test_shown_commands_compose() -> None:
+    """Together where no key has two values: a composition takes half a second."""
+    groups: list[list[dict[str, str]]] = []
+    for command in shown_commands():
+        for group in groups:
+            together = {key: word for other in group for key, word in other.items()}
+            if all(together.get(key, word) == word for key, word in command.items()):
+                group.append(command)
+                break
+        else:
+            groups.append([command])
+    assert sum(map(len, groups)) > 50
+    for group in groups:
+        try:
+            load_config(list({word for command in group for word in command.values()}))
+        except MjstackError:  # they do not fit together, or one of them does not fit at all
+            for command in group:
+                load_config(list(command.values()))
 
 
 def train(block: str, folder: Path) -> list[float]:
