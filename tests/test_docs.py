@@ -11,40 +11,18 @@ from pathlib import Path
 from statistics import mean
 
 import pytest
+from doc_blocks import PAGES, ROOT, TRAINS, python_blocks, python_lines, write_files
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from mjstack import MjstackError, load_config
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
-TRAINS = "runner.learn("
-GUIDES = sorted(
-    page.name for page in DOCS.glob("*.md") if "\n```python\n" in page.read_text(encoding="utf-8")
-)
+DOCS = ROOT / "docs"
+GUIDES = [page.name for page in PAGES[1:] if python_blocks(page.read_text(encoding="utf-8"))]
 COMMAND = r"(?:mjstack|python scripts/run\.py) "
 ITERATIONS = 30
 # iterations of 24 steps: by then the episodes that the runner began in their middle have ended
 STARTED = 7
-
-
-def python_lines(markdown: str) -> str:
-    """The ```python blocks, everything else blank: a traceback's line number is the guide's.
-
-    Blocks that train are left out.
-    """
-    lines: list[str] = []
-    begins = 0
-    fence = ""
-    for line in markdown.splitlines():
-        opens = line.startswith("```")
-        lines.append(line if fence == "```python" and not opens else "")
-        if opens:
-            if fence and any(TRAINS in line for line in lines[begins:]):
-                lines[begins:] = [""] * (len(lines) - begins)
-            begins = len(lines)
-            fence = "" if fence else line.rstrip()
-    assert not fence, "a block is not closed"
-    return "\n".join(lines) + "\n"
 
 
 def test_lines_keep_their_numbers() -> None:
@@ -61,8 +39,9 @@ def test_python_blocks_run(name: str, tmp_path: Path) -> None:
     """In a process and a file of their own: Warp reads the source of kernels, so they cannot come
     from a string.
     """
-    program = python_lines((DOCS / name).read_text(encoding="utf-8"))
-    assert program.strip(), f"{name} has no ```python block"
+    text = (DOCS / name).read_text(encoding="utf-8")
+    write_files(text, tmp_path)
+    program = python_lines(text)
     script = tmp_path / f"{Path(name).stem}_blocks.py"
     script.write_text(program, encoding="utf-8")
     env = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
@@ -82,7 +61,7 @@ def shown_commands() -> list[dict[str, str]]:
     its first job.
     """
     commands: list[dict[str, str]] = []
-    for page in (DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))):
+    for page in PAGES:
         text = page.read_text(encoding="utf-8").replace("\\\n", " ")
         lines = re.findall(rf"(?m)^\$ {COMMAND}(.*)$", text)
         for line in [*lines, *re.findall(rf"`{COMMAND}([^`]+)`", text)]:
@@ -111,7 +90,7 @@ def test_shown_commands_compose() -> None:
     assert sum(map(len, groups)) > 50
     for group in groups:
         try:
-            load_config(list({word for command in group for word in command.values()}))
+            load_config(list(dict.fromkeys(w for command in group for w in command.values())))
         except MjstackError:  # they do not fit together, or one of them does not fit at all
             for command in group:
                 load_config(list(command.values()))
@@ -140,7 +119,7 @@ def test_training_block_learns(tmp_path: Path) -> None:
 
     Held against that and not against the first iterations, in which some runs, from other weights,
     have learnt already."""
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "training.md").read_text(), re.S)
+    blocks = python_blocks((DOCS / "training.md").read_text(encoding="utf-8"))
     (block,) = (block for block in blocks if TRAINS in block)
     assert len(block.splitlines()) <= 30
     block, replaced = re.subn(r"(?m)^iterations = \d+$", f"iterations = {ITERATIONS}", block)

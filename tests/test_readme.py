@@ -6,17 +6,19 @@ import re
 from pathlib import Path
 
 import pytest
+from doc_blocks import ROOT, python_blocks, write_files
 
-README = Path(__file__).resolve().parents[1] / "README.md"
+README = ROOT / "README.md"
 
 
 def test_python_blocks_run(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    write_files(README.read_text(), tmp_path)
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.S)
+    monkeypatch.syspath_prepend(tmp_path)
     names: dict[str, object] = {}
-    for block in blocks:  # one after the other: later blocks use what earlier ones defined
+    for block in python_blocks(README.read_text()):  # later ones use names of earlier ones
         exec(block, names)
     assert "'policy': (64, 24)" in capsys.readouterr().out
 
