@@ -1,6 +1,6 @@
 """Measures what the managers cost: ``python scripts/bench_env_step.py task=stack nworld=256``."""
 
-from mjstack.bench.env_step_cli import main
+from mjstack.bench.cli import bench_env_step
 
 if __name__ == "__main__":
-    main()
+    bench_env_step()

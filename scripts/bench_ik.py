@@ -2,7 +2,7 @@
 --iterations 4 8``.
 """
 
-from mjstack.bench.ik_cli import main
+from mjstack.bench.cli import bench_ik
 
 if __name__ == "__main__":
-    main()
+    bench_ik()

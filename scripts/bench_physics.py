@@ -2,7 +2,7 @@
 robot=so101 nworld=2048``.
 """
 
-from mjstack.bench.physics_cli import main
+from mjstack.bench.cli import bench_physics
 
 if __name__ == "__main__":
-    main()
+    bench_physics()

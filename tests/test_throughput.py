@@ -1,11 +1,13 @@
-"""The throughput gate: what its sections measure, and what voids their figures."""
+"""The throughput gate: its measurements, and what voids their figures."""
 
 from __future__ import annotations
 
-import statistics
+import argparse
+import json
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,17 +16,19 @@ import pytest
 import torch
 from environments import brisk
 
-from mjstack.bench import env_step, power, sections
+from mjstack.bench import cli, env_step, episode, physics, power
 from mjstack.bench.env_step import measure_env_step
 from mjstack.bench.power import EnergyMeter
-from mjstack.bench.timing import Timing, capture_problem, steps_that_fit, timed
+from mjstack.bench.timing import Measurement, capture_problem, steps_that_fit, timed
 from mjstack.config import load_config
 from mjstack.config.schema import GraphMode
 from mjstack.envs import Env, build_env
 from mjstack.episodes.context import GateContext
 from mjstack.episodes.rollout import State
+from mjstack.gates import throughput
 from mjstack.gates.throughput import run_throughput
 from mjstack.report.record import GateResult, Status
+from mjstack.report.table import Table
 from mjstack.sim import Simulation
 from mjstack.sim.native import NativeSimulation
 
@@ -39,42 +43,33 @@ SHORT = (
 SPEEDS = ("per_s", "ms_per", "seconds", "ratio", "over_physics", "power")
 
 
-def speeds(result: GateResult, section: str = "") -> list[str]:
+def speeds(result: GateResult, measurement: str = "") -> list[str]:
     """Metrics that say how fast something was."""
     named = [
         name
         for name in result.metrics
-        if name.startswith(section) and any(word in name for word in SPEEDS)
+        if name.startswith(measurement) and any(word in name for word in SPEEDS)
     ]
     return named
 
 
-def test_timing_is_arithmetic() -> None:
-    timing = Timing(nworld=4, steps=5, decimation=10, seconds=[2.0, 0.5, 1.0])
-    assert timing.median == 1.0
-    assert timing.world_steps_per_s == 200.0
-    step = timing.step_metrics()
-    env_rates = timing.env_step_metrics()
-    assert [step[f"ms_per_batched_step.{k}"] for k in ("median", "min", "max")] == [
-        20.0,
-        10.0,
-        40.0,
-    ]
-    assert [step[f"world_steps_per_s.{k}"] for k in ("median", "min", "max")] == [
-        200.0,
-        100.0,
-        400.0,
-    ]
-    assert [env_rates[f"ms_per_env_step.{k}"] for k in ("median", "min", "max")] == [
-        200.0,
-        100.0,
-        400.0,
-    ]
-    assert [env_rates[f"env_steps_per_s.{k}"] for k in ("median", "min", "max")] == [
-        20.0,
-        10.0,
-        40.0,
-    ]
+def test_rates_are_arithmetic() -> None:
+    measured = Measurement(name="m")
+    measured.add_rates([2.0, 0.5, 1.0], 4, 5, decimation=10)
+    measured.add_env_rates([2.0, 0.5, 1.0], 4, 5)
+    metrics = measured.metrics()
+    expected = {
+        "ms_per_batched_step": (20.0, 10.0, 40.0),
+        "world_steps_per_s": (200.0, 100.0, 400.0),
+        "ms_per_env_step": (200.0, 100.0, 400.0),
+        "env_steps_per_s": (20.0, 10.0, 40.0),
+    }
+    for name, values in expected.items():
+        found = tuple(metrics[f"m.{name}.{end}"] for end in ("median", "min", "max"))
+        assert found == values
+    assert measured.median("world_steps_per_s") == 200.0
+    measured.problem = "void"
+    assert measured.metrics() == {}
 
 
 @pytest.mark.parametrize(
@@ -91,31 +86,29 @@ def test_timed_waits_for_the_device_at_both_ends() -> None:
     assert seen == ["wait", "work", "wait"]
 
 
-def test_native_sections(new_context: Callable[..., GateContext]) -> None:
+def test_native_measurements(new_context: Callable[..., GateContext]) -> None:
     result, cuda = run_throughput(new_context("sim=native", "nworld=2", *SHORT))
     assert result.status is Status.passed, result.reason
     assert cuda.status is Status.skipped or torch.cuda.is_available()
     m = result.metrics
     assert (m["worlds"], m["physics.repetitions"], m["physics.steps_per_repetition"]) == (2, 3, 3)
     assert (m["episode.succeeded"], m["episode.repetitions"], m["episode.steps"]) == (2, 3, 300)
-    assert (m["env_step.turns"], m["env_step.steps_per_turn"]) == (3, 2)
-    for section in ("physics", "episode", "env_step"):
+    assert (m["env_step.repetitions"], m["env_step.steps_per_repetition"]) == (3, 2)
+    for name in ("physics", "episode", "env_step"):
         # With three repetitions the median of the rates is the rate of the median.
-        ms = m[f"{section}.ms_per_batched_step.median"]
-        rate = m[f"{section}.world_steps_per_s.median"]
+        ms = m[f"{name}.ms_per_batched_step.median"]
+        rate = m[f"{name}.world_steps_per_s.median"]
         assert rate == pytest.approx(2 * 1e3 / ms)
-        assert (
-            m[f"{section}.ms_per_batched_step.min"] <= ms <= m[f"{section}.ms_per_batched_step.max"]
-        )
+        assert m[f"{name}.ms_per_batched_step.min"] <= ms <= m[f"{name}.ms_per_batched_step.max"]
     assert m["episode.seconds.median"] == pytest.approx(
         3.0 * m["episode.ms_per_batched_step.median"]
     )
     assert m["env_step.managers_over_physics.median"] > 0.0
     assert m["env_step.managers_ms_per_step.median"] < m["env_step.ms_per_env_step.max"]
     assert result.notes["gpu_power_and_memory"] == "not measured: no GPU"
-    for section in ("physics", "episode", "env_step"):
-        assert m[f"{section}.captured"] is False  # native MuJoCo has nothing to capture
-        assert m[f"{section}.warm_up_s"] == m[f"{section}.capture_s"] == 0.0
+    for name in ("physics", "episode", "env_step"):
+        assert m[f"{name}.captured"] is False  # native MuJoCo has nothing to capture
+        assert m[f"{name}.warm_up_s"] == m[f"{name}.capture_s"] == 0.0
     alone = m["env_step.managers_alone_over_physics.median"]
     over = m["env_step.managers_over_physics.median"]
     assert f"managers {100.0 * over:+.1f} % (alone {100.0 * alone:.1f} %)" in result.reason
@@ -149,15 +142,15 @@ def test_episode_alternates_with_bare_steps_on_mjwarp(
 
 
 def test_warm_up_and_capture_are_apart_on_mjwarp(new_context: Callable[..., GateContext]) -> None:
-    sections_ = "gate.throughput.measurements=[physics,env_step]"
+    only = "gate.throughput.measurements=[physics,env_step]"
     result, _ = run_throughput(
-        new_context("sim=mjwarp", "sim.device=cpu", "nworld=1", *SHORT, sections_)
+        new_context("sim=mjwarp", "sim.device=cpu", "nworld=1", *SHORT, only)
     )
     assert result.status is Status.passed, result.reason
     m = result.metrics
-    for section in ("physics", "env_step"):
-        assert m[f"{section}.warm_up_s"] > 0.0
-        assert m[f"{section}.capture_s"] > 0.0
+    for name in ("physics", "env_step"):
+        assert m[f"{name}.warm_up_s"] > 0.0
+        assert m[f"{name}.capture_s"] > 0.0
     assert m["physics.captured"] is True
     assert (m["env_step.captured"], m["env_step.physics_captured"]) == (False, True)
     # The first call of a step was neither timed nor the estimate: eager it takes some 0.15 s.
@@ -193,12 +186,12 @@ def test_bare_steps_play_the_same_trajectory(
     sim = make_sim("mjwarp", 1)
     context.play(sim, context.cfg.reset)
     final = sim.qpos.clone()
-    seconds, problem = sections._play_bare(context, sim)  # type: ignore[arg-type]
+    seconds, problem = episode.play_bare(context, sim)  # type: ignore[arg-type]
     assert seconds > 0.0
     assert problem == ""
     assert torch.equal(sim.qpos, final)
     monkeypatch.setattr(type(sim), "bare_step", lambda _: lambda: None)
-    assert sections._play_bare(context, sim)[1] == "1 worlds did not do the task with bare steps"  # type: ignore[arg-type]
+    assert episode.play_bare(context, sim)[1] == "1 worlds did not do the task with bare steps"  # type: ignore[arg-type]
 
 
 def test_bare_steps_that_lose_worlds_do_not_count(
@@ -215,10 +208,10 @@ def test_bare_steps_that_lose_worlds_do_not_count(
         return SimpleNamespace(steps=2, command=make(env).command)
 
     monkeypatch.setattr(context, "driver", short)
-    assert sections._play_bare(context, sim)[1] == "1 worlds overflowed or diverged with bare steps"  # type: ignore[arg-type]
+    assert episode.play_bare(context, sim)[1] == "1 worlds overflowed or diverged with bare steps"  # type: ignore[arg-type]
 
 
-def test_rejected_episode_voids_every_section(new_context: Callable[..., GateContext]) -> None:
+def test_rejected_episode_voids_every_measurement(new_context: Callable[..., GateContext]) -> None:
     result, _ = run_throughput(
         new_context(
             "sim=native",
@@ -235,8 +228,8 @@ def test_rejected_episode_voids_every_section(new_context: Callable[..., GateCon
     assert result.metrics["episode.succeeded"] == 0
 
 
-@pytest.mark.parametrize("section", ["physics", "env_step"])
-def test_overflow_voids_the_figure(new_context: Callable[..., GateContext], section: str) -> None:
+@pytest.mark.parametrize("name", ["physics", "env_step"])
+def test_overflow_voids_the_figure(new_context: Callable[..., GateContext], name: str) -> None:
     """40 rows hold a start above the table, and neither a grasped cube nor thrashing."""
     result, _ = run_throughput(
         new_context(
@@ -244,13 +237,13 @@ def test_overflow_voids_the_figure(new_context: Callable[..., GateContext], sect
             "sim.device=cpu",
             "nworld=2",
             *SHORT,
-            f"gate.throughput.measurements=[{section}]",
+            f"gate.throughput.measurements=[{name}]",
             "gate.throughput.env_steps=20",
             "batch.njmax=40",
         )
     )
     assert result.status is Status.failed
-    assert f"{section}: no figure: " in result.reason
+    assert f"{name}: no figure: " in result.reason
     assert speeds(result) == []
 
 
@@ -271,13 +264,13 @@ def test_steps_not_made_void_the_figure(
     assert speeds(result) == []
 
 
-def test_broken_section_leaves_the_others(
+def test_broken_measurement_leaves_the_others(
     new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def out_of_memory(*_: object, **__: object) -> None:
         raise MemoryError("Unable to allocate 9 GiB")
 
-    monkeypatch.setattr(sections, "measure_env_step", out_of_memory)
+    monkeypatch.setattr(throughput, "measure_env_step", out_of_memory)
     result, _ = run_throughput(
         new_context(
             "sim=native", "nworld=1", *SHORT, "gate.throughput.measurements=[physics,env_step]"
@@ -320,7 +313,7 @@ def test_no_time_for_an_episode_is_said(new_context: Callable[..., GateContext])
     assert "episode: not measured: an episode would take about" in result.reason
     assert "the task was not verified in this run" in result.reason
     assert result.metrics["physics.steps_per_repetition"] == 1
-    assert result.metrics["env_step.steps_per_turn"] == 1
+    assert result.metrics["env_step.steps_per_repetition"] == 1
     assert speeds(result, "episode") == []
 
 
@@ -329,7 +322,7 @@ def test_start_states_repeat_without_the_batch_gate(
 ) -> None:
     context = new_context("sim=native", "nworld=5", *SHORT, "gate.throughput.start_worlds=2")
     sim = context.batch_simulation(5)
-    state = sections._carry_start(context, sim)
+    state = physics.carry_start(context, sim)
     assert state.qpos.shape[0] == 5
     assert np.array_equal(state.qpos[[0, 1, 0]], state.qpos[2:])
     assert not np.array_equal(state.qpos[0], state.qpos[1])
@@ -341,7 +334,7 @@ def test_start_states_repeat_without_the_batch_gate(
     )  # closed on the cube
     kept = State(state.qpos.copy(), state.qvel, state.ctrl)
     context.carry_start = kept
-    assert sections._carry_start(context, sim) is kept
+    assert physics.carry_start(context, sim) is kept
 
 
 def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., GateContext]) -> None:
@@ -350,7 +343,7 @@ def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., GateC
         "sim=native", "nworld=5", *SHORT, "gate.throughput.measurements=[physics]"
     )
     sim = context.batch_simulation(5)
-    state = sections._carry_start(context, sim)
+    state = physics.carry_start(context, sim)
     red = context.index.object_qpos[0]
     state.qpos[[1, 4], red + 1] -= 0.1
     context.carry_start = state
@@ -404,23 +397,15 @@ def test_the_parts_play_one_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(env_step, "snapshot", keep)
     witness = Witness(env.sim)
-    times = measure_env_step(env, steps=4, turns=3, baseline=witness)
-    assert (
-        len(times.physics_ms)
-        == len(times.managers_ms)
-        == len(times.env_ms)
-        == len(times.baseline_ms)
-        == 3
-    )
-    assert times.overhead == pytest.approx(
-        statistics.median(e / p - 1.0 for e, p in zip(times.env_ms, times.physics_ms, strict=True))
-    )
-    assert times.managers_alone == [
-        m / p for m, p in zip(times.managers_ms, times.physics_ms, strict=True)
-    ]
-    for residual, whole_ms, physics_ms, managers_ms in zip(
-        times.residual_ms, times.env_ms, times.physics_ms, times.managers_ms, strict=True
-    ):
+    times = measure_env_step(env, steps=4, repetitions=3, baseline=witness)
+    figures = times.samples
+    names = ("ms_per_env_step", "physics_ms_per_step", "managers_ms_per_step")
+    repetitions = list(zip(*(figures[name] for name in names), strict=True))
+    assert len(repetitions) == len(figures["baseline_over_physics"]) == 3
+    for number, (whole_ms, physics_ms, managers_ms) in enumerate(repetitions):
+        assert figures["managers_over_physics"][number] == whole_ms / physics_ms - 1.0
+        assert figures["managers_alone_over_physics"][number] == managers_ms / physics_ms
+        residual = figures["residual_ms_per_step"][number]
         assert residual + physics_ms + managers_ms == pytest.approx(whole_ms)
     assert times.problem == ""
     ended = 0
@@ -434,7 +419,7 @@ def test_the_parts_play_one_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
         assert np.array_equal(whole.qpos[same], alone.numpy()[same])
         assert not np.array_equal(whole.qpos[~same], alone.numpy()[~same])
     assert ended > 12  # 16 steps of episodes of 9: every world once at least
-    assert 0 < times.episodes < ended  # the first turn warms up
+    assert 0 < times.facts["episodes_ended"] < ended  # the first repetition warms up
 
 
 class FakeNvml:
@@ -528,6 +513,43 @@ def test_missing_power_says_why(
     assert why in text
 
 
+@pytest.mark.parametrize(
+    "args", [["--steps", "0"], ["--many", "3", "0"], ["--out", "/nowhere/at/all.json"]]
+)
+def test_bad_options_of_a_benchmark_are_one_line(
+    args: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def never(*_: object) -> Any:
+        raise AssertionError("started")
+
+    with pytest.raises(SystemExit) as stopped:
+        cli._main("text", {"steps": (10, "steps"), "many": ([1], "numbers")}, never, args)
+    assert stopped.value.code == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert err.startswith(f"mjstack: {args[0]}=")
+
+
+def test_a_benchmark_prints_its_table_and_keeps_its_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def work(args: argparse.Namespace, progress: Callable[[str], None]) -> tuple[Table, object]:
+        progress("working")
+        table = Table(title="T", header=["steps", "overrides"], rows=[[str(args.steps), "a|b"]])
+        return table, {"overrides": args.overrides, "many": args.many_numbers}
+
+    numbers: dict[str, tuple[int | list[int], str]] = {
+        "steps": (10, "steps"),
+        "many-numbers": ([1, 2], "numbers"),
+    }
+    out = tmp_path / "figures.json"
+    cli._main("text", numbers, work, ["robot=rebot", "--steps", "3", "--out", str(out)])
+    assert "a|b" in capsys.readouterr().out
+    data = json.loads(out.read_text())
+    assert data["results"] == {"overrides": ["robot=rebot"], "many": [1, 2]}
+    assert data["versions"]["mujoco"]
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_episode_costs_hardly_more_than_bare_steps(new_context: Callable[..., GateContext]) -> None:
@@ -544,13 +566,11 @@ def test_episode_costs_hardly_more_than_bare_steps(new_context: Callable[..., Ga
     m = result.metrics
     assert m["episode.succeeded"] == 2048
     assert m["episode.bare_ratio.median"] <= 1.04
-    for section in ("physics", "episode", "env_step"):
-        assert (
-            0.0 < m[f"{section}.gpu_memory_arrays_mib"] <= m[f"{section}.gpu_memory_whole_gpu_mib"]
-        )
-        watts = m.get(f"{section}.gpu_power_mean_w")
-        assert 50.0 < watts < 2000.0 if watts else f"{section}.gpu_power_mean_w" in result.notes
-        assert m[f"{section}.captured"] is True
-        assert m[f"{section}.warm_up_s"] > 0.0
-        assert m[f"{section}.capture_s"] > 0.0
+    for name in ("physics", "episode", "env_step"):
+        assert 0.0 < m[f"{name}.gpu_memory_arrays_mib"] <= m[f"{name}.gpu_memory_whole_gpu_mib"]
+        watts = m.get(f"{name}.gpu_power_mean_w")
+        assert 50.0 < watts < 2000.0 if watts else f"{name}.gpu_power_mean_w" in result.notes
+        assert m[f"{name}.captured"] is True
+        assert m[f"{name}.warm_up_s"] > 0.0
+        assert m[f"{name}.capture_s"] > 0.0
     assert m["env_step.managers_over_physics.median"] < 1.0

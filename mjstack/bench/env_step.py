@@ -1,276 +1,282 @@
-"""What a whole ``env.step`` costs, and its physics and its managers alone: in turns, on one
-trajectory.
+"""The cost of a whole ``env.step``, of its physics and of its managers, interleaved.
 
-A turn plays random actions from one state three times: the whole step, then from the same state the
-physics under the same commands, then the managers without any physics. The next turn goes on where
-the whole step ended. So each ratio is of one turn and one machine's mood. Worlds start at ages
-spread over an episode, so that in every step some of them time out and are reset.
+A repetition plays random actions from one state three times: the whole step, then from the same
+state the physics with the same joint targets, then the managers without any physics. The next
+repetition starts where the whole step ended. So each ratio is of one repetition and one state of
+the machine. Worlds start at ages spread over an episode, so that in every step some of them time
+out and are reset.
 
 The three do not do quite the same work. Physics alone has no resets: a world that ended goes on
-from where it was, under the next episode's commands, and may touch more, and so cost more, than the
-reset one in the whole step. Then env.step's time over that of physics flatters the managers. The
-managers alone work on worlds that stand still, which end for other reasons, and they launch what in
-the whole step may run beside something else. Hence both ratios, and what is left when both parts
-are taken from the whole: where it is far from 0, the turns differed by more than the managers.
+from where it was, with the next episode's joint targets, and may touch more, and so cost more, than
+the reset one in the whole step. Then env.step's time over that of physics flatters the managers.
+The managers alone work on worlds that stand still, which end for other reasons, and they launch
+work that the whole step may run beside other work. Hence both ratios, and the residual when both
+parts are subtracted from the whole: where it is far from 0, the repetitions differed by more than
+the managers.
 """
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol
 
 import torch
 
 from mjstack.bench.power import EnergyMeter
-from mjstack.bench.timing import WARM_UP, capture_problem, steps_that_fit, timed
+from mjstack.bench.timing import (
+    WARM_UP,
+    Measurement,
+    capture_facts,
+    capture_problem,
+    describe_lost,
+    lost_worlds,
+    steps_that_fit,
+    timed,
+)
 from mjstack.envs import Env
-from mjstack.episodes.rollout import restore, snapshot, step_graph
-from mjstack.sim import LOST_PHYSICS
+from mjstack.episodes.rollout import State, restore, snapshot
 
-_COST = 4.0  # of a turn over that of its whole steps from the start, when fewer things touch
+_COST = 4.0  # of a repetition over that of its whole steps from the start, when fewer things touch
 _LOSSES = ("mjstack.mdp.termination.overflow", "mjstack.mdp.termination.non_finite")
 
 
 class Baseline(Protocol):
-    """Something else that plays a turn's physics, to be timed beside it."""
+    """Other code that plays a repetition's physics, to be timed beside it."""
 
     def begin(self) -> None:
-        """Takes the simulation's state as the start."""
+        """Take the simulation's state as the start."""
 
     def record(self) -> None:
-        """Takes the commands and the state before a step."""
+        """Record the joint targets and the state before a step."""
 
     def play(self) -> None:
-        """Plays the steps; this is what is timed."""
+        """Play the steps; this is timed."""
 
     def check(self) -> None:
-        """Raises unless it ended where the simulation did."""
-
-
-@dataclass(kw_only=True, slots=True)
-class EnvStepTimes:
-    """Times of one backend.
-
-    Attributes:
-        backend: Backend and hardware.
-        nworld: Number of worlds.
-        steps: Steps per turn.
-        decimation: Physics steps per step.
-        physics_ms: Per step and turn [ms], the physics steps and the poses after them.
-        managers_ms: Likewise, everything else of a step, on worlds that stand still.
-        env_ms: Likewise, ``env.step``.
-        baseline_ms: Likewise, the baseline; empty without one.
-        episodes: Episodes that ended, and were reset, within the measured turns.
-        warm_up_s: The first step, which runs eagerly [s]; on Warp's CPU device its physics, 0 on
-            native MuJoCo.
-        capture_s: Capturing it [s], likewise.
-        captured: Whether the step and both parts were replayed.
-        problem: Why the times are void; empty where they count.
-    """
-
-    backend: str
-    nworld: int
-    steps: int
-    decimation: int
-    physics_ms: list[float] = field(default_factory=list)
-    managers_ms: list[float] = field(default_factory=list)
-    env_ms: list[float] = field(default_factory=list)
-    baseline_ms: list[float] = field(default_factory=list)
-    episodes: float = 0.0
-    warm_up_s: float = 0.0
-    capture_s: float = 0.0
-    captured: bool = False
-    problem: str = ""
-
-    @property
-    def overheads(self) -> list[float]:
-        """env.step's time over physics', less 1, of every turn."""
-        return [e / p - 1.0 for e, p in zip(self.env_ms, self.physics_ms, strict=True)]
-
-    @property
-    def overhead(self) -> float:
-        """Their median. On a busy machine it need not be the ratio of the medians."""
-        return statistics.median(self.overheads)
-
-    @property
-    def managers_alone(self) -> list[float]:
-        """The managers' own time over physics', of every turn."""
-        return [m / p for m, p in zip(self.managers_ms, self.physics_ms, strict=True)]
-
-    @property
-    def residual_ms(self) -> list[float]:
-        """What of env.step neither part explains [ms per step], of every turn; negative where they
-        run side by side.
-        """
-        return [
-            e - p - m
-            for e, p, m in zip(self.env_ms, self.physics_ms, self.managers_ms, strict=True)
-        ]
-
-    @property
-    def baseline_ratio(self) -> float | None:
-        """Median of the baseline's time over physics': 1 is as fast. None where there was no
-        baseline.
-        """
-        if not self.baseline_ms:
-            return None
-        return statistics.median(
-            r / p for r, p in zip(self.baseline_ms, self.physics_ms, strict=True)
-        )
-
-    def world_steps_per_s(self, milliseconds: list[float]) -> float:
-        """Physics steps of all worlds per second, median."""
-        return 1e3 * self.nworld * self.decimation / statistics.median(milliseconds)
+        """Raise unless it ended where the simulation did."""
 
 
 def measure_env_step(
     env: Env,
     *,
     steps: int,
-    turns: int,
+    repetitions: int,
     max_seconds: float | None = None,
     baseline: Baseline | None = None,
     meter: EnergyMeter | None = None,
     progress: Callable[[int], None] | None = None,
-) -> EnvStepTimes:
-    """Plays random actions, uniform over their whole range, in turns.
+) -> Measurement:
+    """Play random actions, uniform over their whole range, in interleaved repetitions.
 
     Args:
         env: The environment.
-        steps: Steps per turn.
-        turns: Measured turns; one before them warms up.
-        max_seconds: Shortens the turns so that all of them take about this long [s].
+        steps: Control steps per repetition.
+        repetitions: Measured repetitions; one before them warms up.
+        max_seconds: Shortens the repetitions so that all of them take about this long [s].
         baseline: Timed beside the physics.
-        meter: Takes in the energy of the whole steps.
-        progress: Told the turns done.
+        meter: Measures the energy of the whole steps.
+        progress: Gets the number of repetitions done.
+
+    Returns:
+        Samples of the whole step (``ms_per_env_step``), its physics and its managers.
+        ``managers_over_physics`` is the whole's time over that of physics, less 1;
+        ``baseline_over_physics`` is there where a baseline is.
 
     Raises:
         FaultError: Physics was lost.
     """
     sim = env.sim
-    manager = env.action_manager
     decimation = env.cfg.timing.decimation
-    generator = torch.Generator().manual_seed(0)
-    low = manager.low.float().cpu()
-    high = manager.high.float().cpu()
-
-    def random_actions(count: int) -> list[torch.Tensor]:
-        span = (high - low) * torch.rand(
-            (count, env.nworld, manager.action_dim), generator=generator
-        )
-        return list((low + span).to(env.device).unbind())
-
-    env.reset(seed=env.cfg.seed)
-    env.episode_step.copy_(torch.randint(env.max_episode_steps, (env.nworld,), generator=generator))
-    seconds = [timed(sim, partial(env.step, action)) for action in random_actions(WARM_UP)]
-    parts = env.parts()
-    on_cuda = env.device.type == "cuda"
-    if on_cuda:  # a turn may be too short to warm them up
-        for part in (parts.physics, parts.managers):
-            for _ in range(WARM_UP):
-                part()
+    parts = _Parts(env, baseline)
+    step_seconds = parts.warm_up()
     if max_seconds is not None:
-        steps = steps_that_fit(steps, max_seconds, _COST * (turns + 1) * seconds[-1])
-    result = EnvStepTimes(
-        backend=sim.description, nworld=env.nworld, steps=steps, decimation=decimation
-    )
-    graph = env.graph if on_cuda else step_graph(sim, decimation, kinematics=True)
-    if graph is not None:
-        result.warm_up_s = graph.warm_up_seconds
-        result.capture_s = graph.capture_seconds
-    commands = [torch.empty_like(sim.ctrl) for _ in range(steps)]
-    bad = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
+        steps = steps_that_fit(steps, max_seconds, _COST * (repetitions + 1) * step_seconds)
+    graph = env.graph if parts.on_cuda else sim.graph_of(decimation, kinematics=True)
 
-    def whole() -> None:
-        for action, command in zip(actions, commands, strict=True):
-            env.step(action)
-            command.copy_(
-                sim.ctrl
-            )  # one small copy; where a world was reset it is the new episode's
-
-    def physics() -> None:
-        for command in commands:
-            sim.ctrl.copy_(command)
-            parts.physics()
-
-    def managers() -> None:
-        for action in actions:
-            manager.process(action)
-            parts.managers()
-
-    def set_ages(step: torch.Tensor, episode: torch.Tensor) -> None:
-        env.episode_step.copy_(step)
-        env.episode.copy_(episode)
-
-    def per_step(work: Callable[[], None], meter: EnergyMeter | None = None) -> float:
-        return 1e3 * timed(sim, work, meter) / steps
-
+    # The repetitions
+    times: dict[str, list[float]] = {}
+    ended = 0.0
     if meter is not None:
         meter.clear()
     start = snapshot(sim)
-    for turn in range(turns + 1):
-        actions = random_actions(steps)
-        ages = env.episode_step.clone(), env.episode.clone()
+    for repetition in range(repetitions + 1):
+        start, seconds, episodes = parts.play(start, steps, meter if repetition else None)
+        if repetition:  # the first one warms up
+            ended += episodes
+            for part, spent in seconds.items():
+                times.setdefault(part, []).append(spent)
+            if progress is not None:
+                progress(repetition)
+
+    # The result
+    out = Measurement(name="env_step")
+    out.add_env_rates(times["env"], env.nworld, steps)
+    out.add_rates(times["env"], env.nworld, steps, decimation=decimation)
+    env_ms, physics_ms, managers_ms, *others = (
+        [1e3 * s / steps for s in spent] for spent in times.values()
+    )
+    pairs = list(zip(env_ms, physics_ms, managers_ms, strict=True))
+    out.samples |= {
+        "physics_ms_per_step": physics_ms,
+        "managers_ms_per_step": managers_ms,
+        "managers_over_physics": [e / p - 1.0 for e, p, _ in pairs],
+        "managers_alone_over_physics": [m / p for _, p, m in pairs],
+        "residual_ms_per_step": [e - p - m for e, p, m in pairs],
+    }
+    if others:
+        out.samples["baseline_over_physics"] = [
+            b / p for b, p in zip(others[0], physics_ms, strict=True)
+        ]
+    captured = env.graph.captured and parts.captured
+    out.facts = {
+        "steps_per_repetition": steps,
+        "repetitions": repetitions,
+        "episodes_ended": int(ended),
+        "warm_up_s": 0.0 if graph is None else graph.warm_up_seconds,
+        "capture_s": 0.0 if graph is None else graph.capture_seconds,
+        "captured": captured,
+    }
+    out.facts |= capture_facts(sim, decimation)
+    out.add_resources(sim, meter)
+    out.problem = (
+        describe_lost(parts.lost) or parts.problem or capture_problem(sim, env.cfg.graph, captured)
+    )
+    out.headline = (
+        f"{out.median('env_steps_per_s'):,.0f} env-steps/s, managers"
+        f" {100.0 * out.median('managers_over_physics'):+.1f} % (alone"
+        f" {100.0 * out.median('managers_alone_over_physics'):.1f} %)"
+    )
+    return out
+
+
+class _Parts:
+    """Plays the parts of a repetition, each from the same state.
+
+    Attributes:
+        lost: Worlds whose physics was lost or not stepped, shape ``(nworld,)``, bool.
+        problem: The terminations by which physics was lost in the whole steps; empty where none.
+    """
+
+    def __init__(self, env: Env, baseline: Baseline | None) -> None:
+        """Prepare random actions, with a generator that no one else uses."""
+        manager = env.action_manager
+        self._env = env
+        self._baseline = baseline
+        self._generator = torch.Generator().manual_seed(0)
+        self._low = manager.low.float().cpu()
+        self._span = manager.high.float().cpu() - self._low
+        self.on_cuda = env.device.type == "cuda"
+        self.lost = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
+        self.problem = ""
+
+    @property
+    def captured(self) -> bool:
+        """Whether physics and managers were replayed."""
+        return self._halves.physics.captured and self._halves.managers.captured
+
+    def warm_up(self) -> float:
+        """Start worlds at random ages, compile and capture; return the seconds of a step."""
+        env = self._env
+        env.reset(seed=env.cfg.seed)
+        ages = torch.randint(env.max_episode_steps, (env.nworld,), generator=self._generator)
+        env.episode_step.copy_(ages)
+        seconds = [timed(env.sim, partial(env.step, action)) for action in self._actions(WARM_UP)]
+        self._halves = env.parts()
+        if self.on_cuda:  # a repetition may be too short to warm them up
+            for half in (self._halves.physics, self._halves.managers):
+                for _ in range(WARM_UP):
+                    half()
+        return seconds[-1]
+
+    def play(
+        self, start: State, steps: int, meter: EnergyMeter | None
+    ) -> tuple[State, dict[str, float], float]:
+        """Play one repetition.
+
+        Returns:
+            The state after the whole steps; seconds of env, physics, managers and baseline; and
+            the number of episodes that ended.
+        """
+        env = self._env
+        sim = env.sim
+        actions = self._actions(steps)
+        targets = [torch.empty_like(sim.ctrl) for _ in actions]
+        ages = self._ages()
+
+        # The whole step
         restore(sim, start)
         env.read_statistics()
-        env_ms = per_step(whole, meter if turn else None)
+        seconds = {"env": timed(sim, lambda: self._whole(actions, targets), meter)}
         counted = env.read_statistics()
-        losses = [name for name, cfg in env.cfg.termination.items() if cfg.func in _LOSSES]
-        lost = [name for name in losses if counted.get(f"termination/{name}", 0.0) > 0.0]
-        if lost:
-            result.problem = (
-                f"worlds ended by {', '.join(lost)}: raise batch.nconmax or batch.njmax, or act"
+        self._find_losses(counted)
+        end = snapshot(sim)
+        later_ages = self._ages()
+
+        # Physics alone, with the same joint targets
+        restore(sim, start)
+        if self._baseline is not None:
+            baseline = self._play_baseline(self._baseline, targets)
+            restore(sim, start)
+        seconds["physics"] = timed(sim, lambda: self._physics(targets))
+        self.lost |= lost_worlds(sim, steps * env.cfg.timing.decimation)
+
+        # The managers alone
+        restore(sim, start)
+        self._set_ages(*ages)
+        seconds["managers"] = timed(sim, lambda: self._managers(actions))
+        env.raise_faults()
+        self._set_ages(*later_ages)
+        if self._baseline is not None:
+            seconds["baseline"] = baseline
+        return end, seconds, counted["episodes"]
+
+    def _actions(self, count: int) -> list[torch.Tensor]:
+        shape = (count, self._env.nworld, len(self._span))
+        noise = torch.rand(shape, generator=self._generator)
+        return list((self._low + self._span * noise).to(self._env.device).unbind())
+
+    def _whole(self, actions: list[torch.Tensor], targets: list[torch.Tensor]) -> None:
+        for action, target in zip(actions, targets, strict=True):
+            self._env.step(action)
+            # One small copy; where a world was reset it is the new episode's.
+            target.copy_(self._env.sim.ctrl)
+
+    def _physics(self, targets: list[torch.Tensor]) -> None:
+        for target in targets:
+            self._env.sim.ctrl.copy_(target)
+            self._halves.physics()
+
+    def _managers(self, actions: list[torch.Tensor]) -> None:
+        for action in actions:
+            self._env.action_manager.process(action)
+            self._halves.managers()
+
+    def _play_baseline(self, baseline: Baseline, targets: list[torch.Tensor]) -> float:
+        """The baseline's seconds, with the joint targets of this repetition."""
+        sim = self._env.sim
+        baseline.begin()
+        for target in targets:
+            sim.ctrl.copy_(target)
+            baseline.record()
+            sim.step(self._env.cfg.timing.decimation)
+        seconds = timed(sim, baseline.play)
+        baseline.check()
+        return seconds
+
+    def _ages(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self._env.episode_step.clone(), self._env.episode.clone()
+
+    def _set_ages(self, step: torch.Tensor, episode: torch.Tensor) -> None:
+        self._env.episode_step.copy_(step)
+        self._env.episode.copy_(episode)
+
+    def _find_losses(self, counted: dict[str, float]) -> None:
+        terms = self._env.cfg.termination.items()
+        losses = [name for name, term in terms if term.func in _LOSSES]
+        ended = [name for name in losses if counted.get(f"termination/{name}", 0.0) > 0.0]
+        if ended:
+            self.problem = (
+                f"worlds ended by {', '.join(ended)}: raise batch.nconmax or batch.njmax, or act"
                 " more gently"
             )
-        end = snapshot(sim)
-        later_ages = (env.episode_step.clone(), env.episode.clone())
-        restore(sim, start)
-        baseline_ms = (
-            [] if baseline is None else [_play_baseline(env, baseline, commands, per_step)]
-        )
-        restore(sim, start)
-        physics_ms = per_step(physics)
-        bad |= (sim.overflow & LOST_PHYSICS) != 0
-        bad |= ~(torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1))
-        bad |= sim.step_count != steps * decimation
-        restore(sim, start)
-        set_ages(*ages)
-        managers_ms = per_step(managers)
-        env.raise_faults()
-        set_ages(*later_ages)
-        start = end
-        if turn:  # the first one warms up
-            result.env_ms.append(env_ms)
-            result.physics_ms.append(physics_ms)
-            result.managers_ms.append(managers_ms)
-            result.baseline_ms.extend(baseline_ms)
-            result.episodes += counted["episodes"]
-            if progress is not None:
-                progress(turn)
-    result.captured = env.graph.captured and parts.physics.captured and parts.managers.captured
-    result.problem = result.problem or capture_problem(sim, env.cfg.graph, result.captured)
-    if bool(bad.any()):
-        result.problem = (
-            f"{int(bad.sum())} of {env.nworld} worlds overflowed, diverged or were not stepped"
-        )
-    return result
-
-
-def _play_baseline(
-    env: Env,
-    baseline: Baseline,
-    commands: list[torch.Tensor],
-    per_step: Callable[[Callable[[], None]], float],
-) -> float:
-    """The baseline's time [ms per step], on the commands of this turn."""
-    baseline.begin()
-    for command in commands:
-        env.sim.ctrl.copy_(command)
-        baseline.record()
-        env.sim.step(env.cfg.timing.decimation)
-    milliseconds = per_step(baseline.play)
-    baseline.check()
-    return milliseconds

@@ -1,21 +1,104 @@
-"""Wall time of work on a simulation, and what repetitions of it say."""
+"""Wall time of work on a simulation, and the repetitions of a measurement."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
+
+import torch
 
 from mjstack.bench.power import EnergyMeter
 from mjstack.config.schema import GraphMode
-from mjstack.sim import Simulation
+from mjstack.math import not_finite
+from mjstack.sim import LOST_PHYSICS, Simulation, device_memory
 
 WARM_UP = 3  # calls: eager, captured, replayed
 
 
+@dataclass(kw_only=True, slots=True)
+class Measurement:
+    """Repetitions of timed work, and facts on it.
+
+    Attributes:
+        name: Such as ``physics``; it begins the names of all metrics.
+        samples: Figures by name with unit, a number per repetition.
+        totals: Figures over all repetitions, such as the energy.
+        facts: Numbers that hold with or without figures.
+        notes: Facts in words.
+        problem: Why the figures are void; empty where they count.
+        missing: Why there are no figures, which is no failure; empty where there are.
+        headline: The measurement in a few words.
+        rejected: Whether worlds failed the task, so that no figure of these worlds counts.
+    """
+
+    name: str
+    samples: dict[str, list[float]] = field(default_factory=dict)
+    totals: dict[str, float] = field(default_factory=dict)
+    facts: dict[str, float] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
+    problem: str = ""
+    missing: str = ""
+    headline: str = ""
+    rejected: bool = False
+
+    def median(self, sample: str) -> float:
+        """Median of a figure's repetitions."""
+        return statistics.median(self.samples[sample])
+
+    def add_rates(self, seconds: list[float], nworld: int, steps: int, *, decimation: int) -> None:
+        """Add time and rate per physics step.
+
+        Args:
+            seconds: Wall time of each repetition [s].
+            nworld: Number of worlds.
+            steps: Control steps in a repetition.
+            decimation: Physics steps in one of them.
+        """
+        count = steps * decimation
+        self.samples |= {
+            "ms_per_batched_step": [1e3 * s / count for s in seconds],
+            "world_steps_per_s": [nworld * count / s for s in seconds],
+        }
+
+    def add_env_rates(self, seconds: list[float], nworld: int, steps: int) -> None:
+        """Add time and rate per control step; the arguments are those of `add_rates`."""
+        self.samples |= {
+            "ms_per_env_step": [1e3 * s / steps for s in seconds],
+            "env_steps_per_s": [nworld * steps / s for s in seconds],
+        }
+
+    def add_resources(self, sim: Simulation, meter: EnergyMeter | None) -> None:
+        """Add the energy of the repetitions, and the memory that is taken on the GPU."""
+        if meter is not None:
+            self.totals |= meter.metrics()
+            self.notes |= meter.notes()
+        if (used := device_memory(str(sim.device))) is not None:
+            self.facts["gpu_memory_arrays_mib"] = used[0] / 2**20
+            self.facts["gpu_memory_whole_gpu_mib"] = used[1] / 2**20
+
+    def metrics(self) -> dict[str, float]:
+        """All numbers that count, under the measurement's name: median and range of samples."""
+        shown = dict(self.facts)
+        if not self.problem:
+            for name, values in self.samples.items():
+                shown |= {
+                    f"{name}.median": statistics.median(values),
+                    f"{name}.min": min(values),
+                    f"{name}.max": max(values),
+                }
+            shown |= self.totals
+        return {f"{self.name}.{key}": value for key, value in shown.items()}
+
+    def named_notes(self) -> dict[str, str]:
+        """The notes, under the measurement's name."""
+        missing = {"status": f"not measured: {self.missing}"} if self.missing else {}
+        return {f"{self.name}.{key}": text for key, text in (self.notes | missing).items()}
+
+
 def timed(sim: Simulation, work: Callable[[], object], meter: EnergyMeter | None = None) -> float:
-    """Seconds that some work takes, the device idle at both ends; a meter takes in its energy."""
+    """Seconds that some work takes, the device idle at both ends; a meter adds its energy."""
     sim.synchronize()
     if meter is not None:
         meter.start()
@@ -28,64 +111,37 @@ def timed(sim: Simulation, work: Callable[[], object], meter: EnergyMeter | None
     return seconds
 
 
+def lost_worlds(sim: Simulation, steps: int | None = None) -> torch.Tensor:
+    """Worlds whose time would be void, shape ``(nworld,)``, bool.
+
+    Args:
+        sim: The worlds.
+        steps: Physics steps that they must have made since their last reset; None for any number.
+    """
+    lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
+    return lost if steps is None else lost | (sim.step_count != steps)
+
+
+def describe_lost(lost: torch.Tensor) -> str:
+    """The number of lost worlds in a sentence; empty where there are none. Waits for the device."""
+    count = int(lost.sum())
+    return f"{count} worlds overflowed, diverged or were not stepped" if count else ""
+
+
 def capture_problem(sim: Simulation, mode: GraphMode, captured: bool) -> str:
-    """Why work that ran eagerly has no figure: on CUDA it should have been captured. Empty where it
-    has one.
+    """Why work that ran eagerly has no figure: on CUDA it should have been captured.
+
+    Empty where it has one.
     """
     if captured or sim.device.type != "cuda" or mode is GraphMode.off:
         return ""
     return "it was not captured and ran eagerly (run.log says why); graph=off measures it like that"
 
 
-def spread(name: str, values: Sequence[float]) -> dict[str, float]:
-    """Median, least and largest of some values as three metrics."""
-    return {
-        f"{name}.median": statistics.median(values),
-        f"{name}.min": min(values),
-        f"{name}.max": max(values),
-    }
-
-
-@dataclass(kw_only=True, slots=True)
-class Timing:
-    """Repetitions of the same work.
-
-    Attributes:
-        nworld: Number of worlds.
-        steps: Control intervals in one repetition.
-        decimation: Physics steps in one of them.
-        seconds: Wall time of each repetition [s].
-    """
-
-    nworld: int
-    steps: int
-    decimation: int
-    seconds: list[float] = field(default_factory=list)
-
-    @property
-    def median(self) -> float:
-        """Median repetition [s]."""
-        return statistics.median(self.seconds)
-
-    @property
-    def world_steps_per_s(self) -> float:
-        """Physics steps of all worlds together per second, median."""
-        return self.nworld * self.steps * self.decimation / self.median
-
-    def step_metrics(self) -> dict[str, float]:
-        """Per physics step: what a batched one costs, and how many world-steps are made in a
-        second.
-        """
-        steps = self.steps * self.decimation
-        return spread("ms_per_batched_step", [1e3 * s / steps for s in self.seconds]) | spread(
-            "world_steps_per_s", [self.nworld * steps / s for s in self.seconds]
-        )
-
-    def env_step_metrics(self) -> dict[str, float]:
-        """Likewise per control interval."""
-        return spread("ms_per_env_step", [1e3 * s / self.steps for s in self.seconds]) | spread(
-            "env_steps_per_s", [self.nworld * self.steps / s for s in self.seconds]
-        )
+def capture_facts(sim: Simulation, decimation: int) -> dict[str, float]:
+    """On Warp's CPU device, where whole steps never are captured: whether their physics was."""
+    graph = None if sim.device.type == "cuda" else sim.graph_of(decimation, kinematics=True)
+    return {} if graph is None else {"physics_captured": graph.captured}
 
 
 def steps_that_fit(most: int, budget: float, seconds_per_step: float) -> int:

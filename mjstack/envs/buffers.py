@@ -78,7 +78,7 @@ def read_peaks(sim: Simulation) -> Peaks:
     """The peaks since the simulation's last full reset. Waits for the device."""
     contacts = sim.most_contacts.cpu().numpy().astype(np.int64)
     pool: list[int | None] = [int(contacts.sum())]
-    if (counted := getattr(sim, "peak_pool", None)) is not None:
+    if (counted := sim.peak_pool) is not None:
         pool = counted.tolist()
     used, pairs, convex, *_ = [*pool, None, None]
     return Peaks(

@@ -10,7 +10,7 @@ import torch
 
 from mjstack.config.schema import Config
 from mjstack.envs.faults import FaultLatch, count_start
-from mjstack.envs.halves import Eager, Repeated, StepHalves
+from mjstack.envs.halves import StepHalves
 from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.errors import ArgumentError
@@ -23,6 +23,7 @@ from mjstack.managers.termination import TerminationManager
 from mjstack.math import not_finite
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
+from mjstack.sim.repeated import Eager, Repeated
 
 FAULT_WINDOW = (
     200  # steps between two looks at the faults on CUDA; on the CPU looking costs nothing

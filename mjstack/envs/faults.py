@@ -125,8 +125,8 @@ def count_start(sim: Simulation) -> bool:
     Raises:
         FaultError: The start does not fit.
     """
-    sizes = getattr(sim, "sizes", None)
-    pool = getattr(sim, "peak_pool", None)
+    sizes = sim.sizes
+    pool = sim.peak_pool
     if sizes is None or pool is None:
         return False
     pool.zero_()  # it has the peak of everything before
@@ -151,8 +151,8 @@ def count_start(sim: Simulation) -> bool:
 
 def _capacity_hint(sim: Simulation, bits: int) -> str:
     """What to raise for some overflow bits."""
-    sizes = getattr(sim, "sizes", None)
-    pool = getattr(sim, "peak_pool", None)
+    sizes = sim.sizes
+    pool = sim.peak_pool
     # The pools' own sizes take precedence where they are set.
     contacts = "nconmax" if getattr(sizes, "naconmax", None) is None else "naconmax"
     convex = "nccdmax" if getattr(sizes, "naccdmax", None) is None else "naccdmax"

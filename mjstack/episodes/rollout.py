@@ -14,10 +14,10 @@ from mjstack.config.schema import Config, TermCfg
 from mjstack.drivers.driver import Controller, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, driven_config
-from mjstack.envs.halves import Eager, Repeated
 from mjstack.mdp.geometry import source_xy
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
+from mjstack.sim.repeated import Eager, Repeated
 
 CLOSED_LOOP = "closed_loop"  # the controller with feedback; any other name plays a plan
 Reset = dict[str, TermCfg]
@@ -109,7 +109,7 @@ def rollout(
     # On Warp's CPU device physics alone is captured, once for all episodes.
     graph: Repeated | None = play
     if sim.device.type != "cuda" and physics is None:
-        graph = step_graph(sim, env.cfg.timing.decimation, kinematics=True)
+        graph = sim.graph_of(env.cfg.timing.decimation, kinematics=True)
     before = _graph_seconds(graph)
 
     sim.synchronize()
@@ -199,12 +199,6 @@ def make_driver(env: Env, planner: OpenLoopPlanner, advance: Advance | None = No
     sources = source_xy(env).double().cpu().numpy()
     tape = planner.plan(sources, progress).to(sim.device, sim.ctrl.dtype)
     return OpenLoopDriver(tape, planner.phases, sim.nworld, sim.device)
-
-
-def step_graph(sim: Simulation, n: int, *, kinematics: bool = False) -> Repeated | None:
-    """The graph that ``sim.step(n)`` replays; None on native MuJoCo, which has none."""
-    graph_of = getattr(sim, "graph_of", None)
-    return None if graph_of is None else graph_of(n, kinematics=kinematics)
 
 
 def _graph_seconds(graph: Repeated | None) -> tuple[float, float]:

@@ -169,8 +169,8 @@ def _play(
         final=sim.qpos.cpu().numpy().copy(),
         failed=failed,
         seconds=time.perf_counter() - began,
-        data_bytes=sim.memory_bytes() if warp else None,  # type: ignore[attr-defined]
-        borrowed_bytes=sim.borrowed_bytes() if warp else None,  # type: ignore[attr-defined]
+        data_bytes=sim.memory_bytes(),
+        borrowed_bytes=sim.borrowed_bytes(),
         device_bytes=None if before is None or after is None else after - before,
         description=sim.description,
     )

@@ -1,6 +1,4 @@
-"""Gate *throughput*: how fast physics, the validated episode and ``env.step`` are. Void where the
-task or physics failed.
-"""
+"""Gate *throughput*: the speed of physics, of the validated episode and of ``env.step``."""
 
 from __future__ import annotations
 
@@ -10,218 +8,241 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import torch
 
+from mjstack.bench.env_step import measure_env_step
+from mjstack.bench.episode import measure_episode
+from mjstack.bench.physics import measure_physics
 from mjstack.bench.power import EnergyMeter
-from mjstack.bench.sections import (
-    Section,
-    TimeBudget,
-    measure_env_steps,
-    measure_episode,
-    measure_physics,
-)
+from mjstack.bench.timing import Measurement
 from mjstack.config.schema import Backend
 from mjstack.envs import build_env
 from mjstack.episodes.context import GateContext
 from mjstack.errors import MjstackError
 from mjstack.report.record import GateResult, Status
-from mjstack.sim import BatchSizes
+from mjstack.sim import Simulation
 
 log = logging.getLogger(__name__)
 
 CUDA = "throughput_cuda"
+_UNVERIFIED = "a figure counts only where the task was verified"
 
 
 def run_throughput(context: GateContext) -> list[GateResult]:
-    """Measures the CPU-side backend as ``throughput`` and MJWarp on CUDA as ``throughput_cuda``.
+    """Measure the CPU-side backend as ``throughput`` and MJWarp on CUDA as ``throughput_cuda``.
 
     On a machine without CUDA the second is a skip; with CUDA the first is native MuJoCo on all
     cores, as the baseline.
     """
     backend, device = context.backend
-    if device.startswith("cuda"):
-        if context.cfg.gate.throughput.native_baseline:
-            native = _measure(context, "throughput", Backend.native, "cpu")
-        else:
-            native = GateResult(
-                name="throughput",
-                status=Status.skipped,
-                reason="gate.throughput.native_baseline=false",
-            )
-        return [native, _measure(context, CUDA, Backend.mjwarp, device)]
-    reason = "no CUDA device was used: " + (
-        "this machine has none"
-        if not torch.cuda.is_available()
-        else f"sim={backend.value} sim.device={device}"
-    )
-    return [
-        _measure(context, "throughput", backend, device),
-        GateResult(name=CUDA, status=Status.skipped, reason=reason),
-    ]
+    if not device.startswith("cuda"):
+        cause = f"sim={backend.value} sim.device={device}"
+        if not torch.cuda.is_available():
+            cause = "this machine has none"
+        reason = f"no CUDA device was used: {cause}"
+        skip = GateResult(name=CUDA, status=Status.skipped, reason=reason)
+        return [_measure(context, "throughput", backend, device), skip]
+    if context.cfg.gate.throughput.native_baseline:
+        native = _measure(context, "throughput", Backend.native, "cpu")
+    else:
+        reason = "gate.throughput.native_baseline=false"
+        native = GateResult(name="throughput", status=Status.skipped, reason=reason)
+    return [native, _measure(context, CUDA, backend, device)]
+
+
+@dataclass(kw_only=True, slots=True)
+class _Bench:
+    """One backend, and facts on it.
+
+    Attributes:
+        context: The run.
+        backend: What is measured.
+        device: ``"cpu"`` or ``"cuda:N"``.
+        seconds: Time budget of each measurement [s].
+        meter: Energy of the GPU.
+        facts: Numbers on the machine and the worlds.
+        notes: The same in words.
+    """
+
+    context: GateContext
+    backend: Backend
+    device: str
+    seconds: float
+    meter: EnergyMeter
+    facts: dict[str, float]
+    notes: dict[str, str] = field(default_factory=dict)
+
+    def note_worlds(self, sim: Simulation, began: float) -> None:
+        """Note backend, sizes and the time that building the worlds took."""
+        self.facts["build_and_compile_s"] = time.perf_counter() - began
+        self.notes["backend"] = sim.description
+        if (sizes := sim.sizes) is not None:
+            self.facts |= {
+                "nconmax": sizes.nconmax,
+                "naconmax": sizes.contact_pool(sim.nworld),
+                "njmax": sizes.njmax,
+            }
+            self.notes["sizes_from"] = sizes.source
 
 
 def _measure(context: GateContext, name: str, backend: Backend, device: str) -> GateResult:
-    """All sections on one backend. One that breaks, out of memory say, leaves the others their
-    figures.
-    """
+    """Measure one backend. A measurement that breaks leaves the others their figures."""
     cfg = context.cfg
-    t = context.cfg.gate.throughput
+    t = cfg.gate.throughput
     batch = context.results.get("batch")
     if batch is not None and batch.status is Status.failed:
-        reason = (
-            "no figure: the batch gate failed, and a figure counts only where the task was verified"
-        )
+        reason = f"no figure: the batch gate failed, and {_UNVERIFIED}"
         return GateResult(name=name, status=Status.failed, reason=reason)
     began = time.perf_counter()
     on_cuda = device.startswith("cuda")
-    watch = TimeBudget(t.max_seconds if on_cuda else t.cpu_max_seconds, t.repetitions)
-    meter = EnergyMeter(device)
-    facts: dict[str, float] = {"worlds": cfg.nworld, "cpu_count": os.cpu_count() or 1}
-    notes: dict[str, str] = {}
-    sections: list[Section] = []
-    if {"physics", "episode"} & set(t.measurements):
-        sections += _on_scripted_worlds(context, backend, device, watch, meter, facts, notes)
-    if "env_step" in t.measurements:
-        sections.append(
-            _guarded(
-                "env_step",
-                lambda: _on_environment(context, backend, device, watch, meter, facts, notes),
-            )
-        )
-    if not on_cuda:
-        facts |= _peak_memory()
-        notes["gpu_power_and_memory"] = "not measured: no GPU"
-
-    episode = next((section for section in sections if section.name == "episode"), None)
-    if episode is not None and episode.rejected:
-        for section in sections:
-            section.problem = (
-                section.problem
-                or "the episode failed, and a figure counts only where the task was verified"
-            )
-    verified = batch is not None and batch.status is Status.passed
-    verified |= episode is not None and bool(episode.figures) and not episode.problem
-    parts = []
-    for section in sections:
-        facts |= section.metrics()
-        notes |= section.named_notes()
-        text = section.headline
-        if section.problem:
-            text = f"no figure: {section.problem}"
-        elif section.missing:
-            text = f"not measured: {section.missing}"
-        elif on_cuda and not section.facts["captured"]:
-            text += " (eager)"
-        parts.append(f"{section.name}: {text}")
-    reason = "; ".join(parts)
-    if not verified:
-        reason += " (the task was not verified in this run: add batch to gates)"
-    failed = any(section.problem for section in sections)
-    measured = any(section.figures and not section.problem for section in sections)
-    if not failed and not measured:
-        return GateResult(
-            name=name, status=Status.skipped, reason=reason, metrics=facts, notes=notes
-        )
-    return GateResult(
-        name=name,
-        status=Status.failed if failed else Status.passed,
-        reason=reason,
-        seconds=time.perf_counter() - began,
-        thresholds={"repetitions": t.repetitions, "max_seconds_per_section": watch.seconds},
-        metrics=facts,
-        notes=notes,
+    bench = _Bench(
+        context=context,
+        backend=backend,
+        device=device,
+        seconds=t.max_seconds if on_cuda else t.cpu_max_seconds,
+        meter=EnergyMeter(device),
+        facts={"worlds": cfg.nworld, "cpu_count": os.cpu_count() or 1},
     )
 
+    # The measurements
+    found: dict[str, Measurement] = {}
+    if {"physics", "episode"} & set(t.measurements):
+        found |= _on_driven_worlds(bench)
+    if "env_step" in t.measurements:
+        found["env_step"] = _guarded("env_step", lambda: _on_environment(bench))
+    if not on_cuda:
+        bench.facts |= _peak_memory()
+        bench.notes["gpu_power_and_memory"] = "not measured: no GPU"
 
-def _on_scripted_worlds(
-    context: GateContext,
-    backend: Backend,
-    device: str,
-    watch: TimeBudget,
-    meter: EnergyMeter,
-    facts: dict[str, float],
-    notes: dict[str, str],
-) -> list[Section]:
-    """Sections *physics* and *episode*, on the same worlds."""
-    cfg = context.cfg
-    wanted = context.cfg.gate.throughput.measurements
+    # Whether they count
+    episode = found.get("episode")
+    if episode is not None and episode.rejected:
+        for one in found.values():
+            one.problem = one.problem or f"the episode failed, and {_UNVERIFIED}"
+    verified = batch is not None and batch.status is Status.passed
+    verified |= episode is not None and bool(episode.samples) and not episode.problem
+    reason = "; ".join(f"{key}: {_describe(one, on_cuda)}" for key, one in found.items())
+    if not verified:
+        reason += " (the task was not verified in this run: add batch to gates)"
+    status = Status.skipped
+    if any(one.problem for one in found.values()):
+        status = Status.failed
+    elif any(one.samples for one in found.values()):
+        status = Status.passed
+
+    result = GateResult(
+        name=name, status=status, reason=reason, metrics=bench.facts, notes=bench.notes
+    )
+    for one in found.values():
+        result.metrics |= one.metrics()
+        result.notes |= one.named_notes()
+    if status is not Status.skipped:
+        result.seconds = time.perf_counter() - began
+        result.thresholds = {
+            "repetitions": t.repetitions,
+            "max_seconds_per_measurement": bench.seconds,
+        }
+    return result
+
+
+def _describe(one: Measurement, on_cuda: bool) -> str:
+    if one.problem:
+        return f"no figure: {one.problem}"
+    if one.missing:
+        return f"not measured: {one.missing}"
+    return f"{one.headline} (eager)" if on_cuda and not one.facts["captured"] else one.headline
+
+
+def _on_driven_worlds(bench: _Bench) -> dict[str, Measurement]:
+    """Measurements *physics* and *episode*, on the same worlds."""
+    context = bench.context
+    t = context.cfg.gate.throughput
+    wanted = [name for name in ("physics", "episode") if name in t.measurements]
     gc.collect()  # environments hold on to their worlds in cycles, and a GPU has not room for all
     began = time.perf_counter()
     try:
-        sim = context.simulation(cfg.nworld, backend, device)
+        sim = context.simulation(context.cfg.nworld, bench.backend, bench.device)
     except Exception as error:
-        return [
-            Section(name=name, problem=_explain(name, error))
-            for name in ("physics", "episode")
-            if name in wanted
-        ]
-    facts["build_and_compile_s"] = time.perf_counter() - began
-    notes["backend"] = sim.description
-    sizes: BatchSizes | None = getattr(sim, "sizes", None)
-    if sizes is not None:
-        facts |= {
-            "nconmax": sizes.nconmax,
-            "naconmax": sizes.contact_pool(cfg.nworld),
-            "njmax": sizes.njmax,
-        }
-        notes["sizes_from"] = sizes.source
-    sections: list[Section] = []
+        return {name: Measurement(name=name, problem=_explain(name, error)) for name in wanted}
+    bench.note_worlds(sim, began)
     step_seconds: float | None = None
-    if "physics" in wanted:
-        sections.append(_guarded("physics", lambda: measure_physics(context, sim, watch, meter)))
-        step_seconds = sections[0].step_seconds
-    if "episode" in wanted:
-        sections.append(
-            _guarded("episode", lambda: measure_episode(context, sim, watch, meter, step_seconds))
+
+    def physics() -> Measurement:
+        return measure_physics(
+            context, sim, seconds=bench.seconds, repetitions=t.repetitions, meter=bench.meter
         )
+
+    def episode() -> Measurement:
+        return measure_episode(
+            context,
+            sim,
+            seconds=bench.seconds,
+            repetitions=t.repetitions,
+            meter=bench.meter,
+            step_seconds=step_seconds,
+        )
+
+    found = {}
+    if "physics" in wanted:
+        found["physics"] = _guarded("physics", physics)
+        if found["physics"].samples:
+            step_ms = found["physics"].median("ms_per_batched_step")
+            step_seconds = 1e-3 * step_ms * context.cfg.timing.decimation
+    if "episode" in wanted:
+        found["episode"] = _guarded("episode", episode)
     sim.close()
-    return sections
+    return found
 
 
-def _on_environment(
-    context: GateContext,
-    backend: Backend,
-    device: str,
-    watch: TimeBudget,
-    meter: EnergyMeter,
-    facts: dict[str, float],
-    notes: dict[str, str],
-) -> Section:
-    """Section *env_step*, on an environment with room for random actions."""
-    cfg = context.cfg
+def _on_environment(bench: _Bench) -> Measurement:
+    """Measurement *env_step*, on an environment with room for random actions."""
+    context = bench.context
+    t = context.cfg.gate.throughput
     gc.collect()
     began = time.perf_counter()
     env = build_env(
-        cfg, model=context.model, backend=backend, device=device, sizes=context.env_sizes
+        context.cfg,
+        model=context.model,
+        backend=bench.backend,
+        device=bench.device,
+        sizes=context.env_sizes,
     )
-    notes.setdefault("backend", env.sim.description)
     build_seconds = time.perf_counter() - began
+    bench.notes.setdefault("backend", env.sim.description)
     try:
-        section = measure_env_steps(context, env, watch, meter)
+        found = measure_env_step(
+            env,
+            steps=t.env_steps,
+            repetitions=t.repetitions,
+            max_seconds=bench.seconds,
+            meter=bench.meter,
+            progress=lambda done: context.tell("env.step, repetitions", done, t.repetitions),
+        )
+        found.facts["build_and_compile_s"] = build_seconds
+        if (sizes := env.sim.sizes) is not None:
+            found.facts |= {"naconmax": sizes.contact_pool(env.nworld), "njmax": sizes.njmax}
+        return found
     finally:
         env.close()
-    section.facts["build_and_compile_s"] = build_seconds
-    return section
 
 
-def _guarded(name: str, measure: Callable[[], Section]) -> Section:
-    """A section, or the error that broke it as its problem."""
+def _guarded(name: str, measure: Callable[[], Measurement]) -> Measurement:
+    """A measurement, or the error that broke it as its problem."""
     try:
         return measure()
     except Exception as error:
-        return Section(name=name, problem=_explain(name, error))
+        return Measurement(name=name, problem=_explain(name, error))
 
 
 def _explain(name: str, error: Exception) -> str:
-    """One line about an error; run.log gets the traceback of one that is nobody's input."""
+    """An error in one line. Tracebacks of unexpected errors go to run.log."""
     if isinstance(error, MjstackError):
         return str(error).rstrip(".")
     log.error("%s broke", name, exc_info=error)
-    return (
-        f"{type(error).__name__}: {(str(error) or 'no message').splitlines()[0]} (run.log has the"
-        " traceback)"
-    )
+    first = (str(error) or "no message").splitlines()[0]
+    return f"{type(error).__name__}: {first} (run.log has the traceback)"
 
 
 def _peak_memory() -> dict[str, float]:

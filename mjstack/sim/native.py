@@ -84,6 +84,7 @@ class NativeSimulation(FixedViews):
 
     backend = "native"
     version = 0  # nothing is ever captured
+    sizes = peak_pool = solver_limits = None
 
     def __init__(
         self,
@@ -227,6 +228,15 @@ class NativeSimulation(FixedViews):
     def overflow_ever(self) -> torch.Tensor:
         """Overflow bits since the last full reset."""
         return torch.from_numpy(self._all_peaks()[:, 2])
+
+    def graph_of(self, n: int = 1, *, kinematics: bool = False) -> None:
+        """Nothing is captured."""
+
+    def memory_bytes(self) -> None:
+        """Not counted."""
+
+    def borrowed_bytes(self) -> None:
+        """Not known."""
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options of the model."""

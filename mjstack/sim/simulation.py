@@ -10,6 +10,8 @@ from typing import Protocol
 import mujoco
 import torch
 
+from mjstack.sim.repeated import Repeated
+from mjstack.sim.sizes import BatchSizes
 from mjstack.sim.views import Fields
 
 
@@ -105,6 +107,12 @@ class Simulation(Protocol):
         overflow_ever: Bits of `Overflow` raised since the last full reset likewise, shape
             ``(nworld,)``, int32.
         version: Grows when something changes that a captured graph has baked in.
+        sizes: Sizes of fixed buffers; None where there are none, as in native MuJoCo.
+        peak_pool: Most contacts, broad-phase pairs, and contacts of one kind of convex collision,
+            of all worlds at once since the last full reset, shape ``(3,)``, int32; None where the
+            worlds share no pool.
+        solver_limits: Bits of `SolverLimit` for worlds whose solver stopped at a limit, shape
+            ``(nworld,)``, int32; None where the backend does not tell.
     """
 
     model: mujoco.MjModel
@@ -130,6 +138,18 @@ class Simulation(Protocol):
     peak_contacts: torch.Tensor
     peak_constraints: torch.Tensor
     version: int
+
+    @property
+    def sizes(self) -> BatchSizes | None:
+        """See above."""
+
+    @property
+    def peak_pool(self) -> torch.Tensor | None:
+        """See above."""
+
+    @property
+    def solver_limits(self) -> torch.Tensor | None:
+        """See above."""
 
     @property
     def most_contacts(self) -> torch.Tensor:
@@ -175,6 +195,15 @@ class Simulation(Protocol):
             ArgumentError: The mask is not a bool tensor of shape ``(nworld,)`` on the simulation's
                 device.
         """
+
+    def graph_of(self, n: int = 1, *, kinematics: bool = False) -> Repeated | None:
+        """The graph that ``step(n)`` replays; None on a backend that captures nothing."""
+
+    def memory_bytes(self) -> int | None:
+        """Bytes of the arrays that grow with nworld; None where they are not counted."""
+
+    def borrowed_bytes(self) -> int | None:
+        """The most that a step borrows at once beside them; None where it is not known."""
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as this backend holds them, by MuJoCo's names."""

@@ -1,0 +1,188 @@
+"""The whole episode with its check; on MJWarp beside bare steps of the same commands."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from typing import TYPE_CHECKING, cast
+
+from mjstack.bench.power import EnergyMeter, EnergyObserver
+from mjstack.bench.timing import (
+    WARM_UP,
+    Measurement,
+    capture_facts,
+    capture_problem,
+    lost_worlds,
+)
+from mjstack.config.schema import GraphMode
+from mjstack.drivers.driver import Recorded
+from mjstack.episodes.context import GateContext, TimedEpisode
+from mjstack.episodes.observers import CommandRecorder
+from mjstack.episodes.rollout import CLOSED_LOOP, Observer, rollout
+from mjstack.errors import name_worlds
+from mjstack.sim import Simulation
+
+if TYPE_CHECKING:
+    from mjstack.sim.mjwarp import MjwarpSimulation
+
+
+def measure_episode(
+    context: GateContext,
+    sim: Simulation,
+    *,
+    seconds: float,
+    repetitions: int,
+    meter: EnergyMeter,
+    step_seconds: float | None = None,
+) -> Measurement:
+    """Measure whole episodes with their check, alternating with bare steps on MJWarp.
+
+    Native MuJoCo takes the batch gate's episode as its first repetition. There an episode of
+    thousands of worlds lasts minutes, so it is played only as often as the time allows, and not at
+    all where even one would not fit.
+
+    Args:
+        context: Scene and planner.
+        sim: The worlds.
+        seconds: Time budget [s].
+        repetitions: Most repetitions.
+        meter: Measures the energy.
+        step_seconds: About how long a control step takes [s], if it is known.
+    """
+    cfg = context.cfg
+    mjwarp = sim.backend == "mjwarp"
+    out = Measurement(name="episode")
+    steps = context.planner.phases[-1].stop
+    before = context.timed_episode
+    if before is not None and (before.description, before.nworld) != (sim.description, sim.nworld):
+        before = None
+
+    # About how long a repetition takes
+    estimate = 0.0 if step_seconds is None else step_seconds * steps
+    if before is not None:
+        estimate = max(estimate, before.seconds)
+    if mjwarp:
+        estimate *= 2
+
+    # The repetitions
+    played = [before] if before is not None and not mjwarp else []
+    began = time.perf_counter()
+    meter.clear()
+    while len(played) < repetitions and time.perf_counter() - began + estimate <= seconds:
+        repetition_began = time.perf_counter()
+        played.append(_play(context, sim, meter, out))
+        estimate = time.perf_counter() - repetition_began
+        context.tell("episode, repetitions", len(played), repetitions)
+    if not played and before is not None:
+        played = [before]
+    if not played:
+        key = "max_seconds" if sim.device.type == "cuda" else "cpu_max_seconds"
+        out.missing = (
+            f"an episode would take about {estimate:.0f} s, and a measurement has {seconds:g} s"
+            f" (gate.throughput.{key})"
+        )
+        return out
+
+    # The result
+    captured = all(p.captured for p in played)
+    failed = sorted({world for p in played for world in p.failed})
+    times = [p.seconds for p in played]
+    out.samples = {"seconds": times, **out.samples}
+    out.add_rates(times, sim.nworld, steps, decimation=cfg.timing.decimation)
+    out.add_env_rates(times, sim.nworld, steps)
+    out.facts = {
+        "repetitions": len(played),
+        "of_the_batch_gate": sum(p is before for p in played),
+        "steps": steps,
+        "succeeded": sim.nworld - len(failed),
+        # The most of all: where physics alone is captured, on Warp's CPU device, one episode does
+        # it for all.
+        "warm_up_s": max(p.warm_up_seconds for p in played),
+        "capture_s": max(p.capture_seconds for p in played),
+        "captured": captured,
+    }
+    out.facts |= capture_facts(sim, cfg.timing.decimation)
+    if any(p is not before for p in played):
+        out.add_resources(sim, meter)
+    out.problem = out.problem or capture_problem(sim, cfg.graph, captured)
+    out.headline = f"{statistics.median(times):.3g} s"
+    if "bare_ratio" in out.samples:
+        out.headline += f" ({out.median('bare_ratio'):.3f} x bare steps)"
+    elif mjwarp:
+        out.notes["bare_ratio"] = "not measured: no time for an episode and as many bare steps"
+    if "controller_over_step" in out.samples:
+        out.headline += f", controller {100.0 * out.median('controller_over_step'):+.1f} %"
+    if failed:
+        out.rejected = True
+        out.problem = f"{name_worlds(failed, sim.nworld)} failed the check"
+    return out
+
+
+def play_bare(
+    context: GateContext, sim: MjwarpSimulation, recorded: Recorded | None = None
+) -> tuple[float, str]:
+    """Play the same commands from the same start with bare steps.
+
+    Joint trajectories are evaluated in the loop, as in the episode. Overflow bits stay until a
+    reset, so that one look at the end has all.
+
+    Args:
+        context: Scene and planner.
+        sim: The worlds.
+        recorded: The commands, where the driver cannot give them again.
+
+    Returns:
+        Seconds, and why they do not count: empty where they do.
+    """
+    cfg = context.cfg
+    step = sim.bare_step()
+    for _ in range(WARM_UP):  # none of it is timed
+        step()
+    if sim.device.type == "cuda" and cfg.graph is not GraphMode.off and not step.captured:
+        return math.nan, "the bare steps could not be captured"
+    env = context.start(sim, cfg.reset)
+    driver = context.driver(env) if recorded is None else recorded.rewind()
+
+    def physics() -> None:
+        for _ in range(cfg.timing.decimation):
+            step()
+
+    seconds = rollout(env, driver, physics=physics).seconds
+    sim.latch()
+    if lost := int(lost_worlds(sim).sum()):
+        return seconds, f"{lost} worlds overflowed or diverged with bare steps"
+    check = context.check(cfg, context.index, context.planner.phases, sim.nworld, sim.device)
+    fallen = int((~check.placed(sim).all(1)).sum())
+    return seconds, f"{fallen} worlds did not do the task with bare steps" if fallen else ""
+
+
+def _play(
+    context: GateContext, sim: Simulation, meter: EnergyMeter, out: Measurement
+) -> TimedEpisode:
+    """Play one repetition: the episode, on MJWarp the bare steps, and the commands again.
+
+    Joint trajectories can be evaluated again; the commands of a driver with feedback are recorded,
+    and repeated without it. Both episodes record, so that they differ by the driver alone.
+    """
+    cfg = context.cfg
+    keep = sim.backend == "mjwarp" and cfg.controller.name == CLOSED_LOOP
+    commands = CommandRecorder()
+    recorders: list[Observer] = [commands] if keep else []
+    episode = context.play(sim, cfg.reset, [*recorders, EnergyObserver(meter)])
+    seconds = episode.timing.seconds
+    timed = TimedEpisode.of(episode, sim)
+    samples: dict[str, float] = {}
+    if sim.backend == "mjwarp":
+        recorded = commands.recorded if keep else None
+        bare, problem = play_bare(context, cast("MjwarpSimulation", sim), recorded)
+        out.problem = out.problem or problem
+        samples |= {"bare_seconds": bare, "bare_ratio": seconds / bare}
+    if keep:
+        again = context.play(sim, cfg.reset, [CommandRecorder()], repeat=commands.recorded)
+        if lost := int((again.result.failed != 0).sum()):
+            out.problem = out.problem or f"{lost} worlds failed when their commands were repeated"
+        samples["controller_over_step"] = seconds / again.timing.seconds - 1.0
+    for name, value in samples.items():
+        out.samples.setdefault(name, []).append(value)
+    return timed

@@ -1,0 +1,240 @@
+"""Physics steps: under a held joint target with the object in hand, and in each arrangement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+
+from mjstack.bench.power import EnergyMeter
+from mjstack.bench.timing import (
+    WARM_UP,
+    Measurement,
+    capture_problem,
+    describe_lost,
+    lost_worlds,
+    steps_that_fit,
+    timed,
+)
+from mjstack.config.schema import Backend
+from mjstack.episodes.context import GateContext, play_to
+from mjstack.episodes.observers import CommandRecorder, Snapshots
+from mjstack.episodes.rollout import State, restore
+from mjstack.errors import MjstackError
+from mjstack.mdp.geometry import objects_in_hand
+from mjstack.scene.phases import carried_objects
+from mjstack.sim import Simulation, resolve_device
+
+BARE = "mujoco_warp.step as it is"
+
+
+class HeldPhysics:
+    """Physics under a held joint target, timed again and again from one state.
+
+    Attributes:
+        lost: Worlds that overflowed, diverged or were not stepped in some repetition, shape
+            ``(nworld,)``, bool.
+    """
+
+    def __init__(self, sim: Simulation, state: State, decimation: int) -> None:
+        """Put the worlds into the state.
+
+        Args:
+            sim: The worlds.
+            state: Where every repetition starts.
+            decimation: Physics steps in a control step.
+        """
+        self.sim = sim
+        self.state = state
+        self.decimation = decimation
+        restore(sim, state)
+        self.lost = lost_worlds(sim)
+
+    def warm_up(self) -> float:
+        """Compile and capture the step; return the seconds that one takes then."""
+        return [timed(self.sim, lambda: self._play(1)) for _ in range(WARM_UP)][-1]
+
+    def play(self, steps: int, meter: EnergyMeter | None = None) -> float:
+        """Seconds that some control steps take from the state."""
+        restore(self.sim, self.state)
+        seconds = timed(self.sim, lambda: self._play(steps), meter)
+        self.lost |= lost_worlds(self.sim, steps * self.decimation)
+        return seconds
+
+    def _play(self, steps: int) -> None:
+        for _ in range(steps):
+            self.sim.step(self.decimation)
+
+
+def measure_physics(
+    context: GateContext,
+    sim: Simulation,
+    *,
+    seconds: float,
+    repetitions: int,
+    meter: EnergyMeter,
+) -> Measurement:
+    """Measure physics steps under a held joint target, the object in hand.
+
+    A grasp may be empty at the start, about to be retried. The number of full ones is reported, and
+    there is no figure if they are less than half. The figure includes the rest of a simulation's
+    step: counting contacts, latching overflow.
+
+    Args:
+        context: Scene and planner.
+        sim: The worlds.
+        seconds: Time budget [s]; fewer steps are made where it is short.
+        repetitions: Number of repetitions.
+        meter: Measures the energy.
+    """
+    t = context.cfg.gate.throughput
+    out = Measurement(name="physics")
+    held = HeldPhysics(sim, carry_start(context, sim), context.cfg.timing.decimation)
+    full = _in_hand(context, sim)
+    if full is not None:
+        out.facts["worlds_with_cube_in_hand"] = full
+        if 2 * full < sim.nworld:
+            where = f"as {t.from_phase} begins (gate.throughput.from_phase)"
+            out.problem = f"only {full} of {sim.nworld} worlds have the cube in hand {where}"
+            return out
+
+    # The repetitions
+    steps = steps_that_fit(t.steps, seconds, repetitions * held.warm_up())
+    meter.clear()
+    times = []
+    for repetition in range(repetitions):
+        times.append(held.play(steps, meter))
+        context.tell("physics, repetitions", repetition + 1, repetitions)
+
+    # The result
+    graph = sim.graph_of(held.decimation)
+    captured = graph is not None and graph.captured
+    out.add_rates(times, sim.nworld, steps, decimation=held.decimation)
+    out.facts |= {
+        "steps_per_repetition": steps,
+        "repetitions": repetitions,
+        "warm_up_s": 0.0 if graph is None else graph.warm_up_seconds,
+        "capture_s": 0.0 if graph is None else graph.capture_seconds,
+        "captured": captured,
+        "peak_contacts_per_world": int(sim.peak_contacts.max()),
+        "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
+    }
+    out.add_resources(sim, meter)
+    out.problem = describe_lost(held.lost) or capture_problem(sim, context.cfg.graph, captured)
+    out.headline = (
+        f"{out.median('world_steps_per_s'):,.0f} world-steps/s,"
+        f" {out.median('ms_per_batched_step'):.3g} ms per step of {sim.nworld} worlds"
+    )
+    if full is not None and full < sim.nworld:
+        out.headline += f" ({sim.nworld - full} of them with an empty grasp)"
+    return out
+
+
+def carry_start(context: GateContext, sim: Simulation) -> State:
+    """States at the start of the measured phase.
+
+    Those of gate *batch*, or those of some native worlds over and over.
+    """
+    state = context.carry_start
+    if state is not None and state.qpos.shape[0] == sim.nworld:
+        return state
+    t = context.cfg.gate.throughput
+    count = min(sim.nworld, t.start_worlds)
+    some = context.simulation(count, Backend.native, "cpu")
+    state = play_to(context, some, t.from_phase)
+    some.close()
+    rows = np.arange(sim.nworld) % count
+    return State(state.qpos[rows], state.qvel[rows], state.ctrl[rows])
+
+
+def measure_arrangements(
+    context: GateContext,
+    *,
+    steps: int,
+    repetitions: int,
+    progress: Callable[[int], None] | None = None,
+) -> dict[str, list[float]]:
+    """Time the captured step in each arrangement, beside a bare replayed ``mujoco_warp.step``.
+
+    Every repetition plays the same control steps of the task, object in hand, from the same states,
+    for one arrangement after the other. So the ratios are of one run and one trajectory.
+
+    Args:
+        context: The configuration; its worlds run on MJWarp.
+        steps: Control steps per repetition, from the phase ``gate.throughput.from_phase``.
+        repetitions: Measured repetitions; one before them warms up.
+        progress: Gets the number of repetitions done.
+
+    Returns:
+        Milliseconds per batched physics step, one number per repetition, by arrangement.
+
+    Raises:
+        MjstackError: Physics was lost, or a state is not finite: the figures would be void.
+    """
+    from mjstack.sim.mjwarp import Arrangement, MjwarpSimulation
+
+    cfg = context.cfg
+    decimation = cfg.timing.decimation
+    arrangements = {
+        "and counted, its overflow latched": Arrangement(own_stages=False, scratch=False),
+        "temporaries at fixed addresses": Arrangement(own_stages=False),
+        "only the stages that are needed": Arrangement(branches=False, sensors_once=False),
+        "sensors in the last substep of a control step alone": Arrangement(branches=False),
+        "contacts beside smooth dynamics": Arrangement(),
+    }
+    # The trajectory
+    sim = context.simulation(cfg.nworld, Backend.mjwarp, resolve_device(cfg.sim.device))
+    assert isinstance(sim, MjwarpSimulation)
+    first = context.phase_start(cfg.gate.throughput.from_phase)
+    snapshots = Snapshots([first - 1])
+    recorder = CommandRecorder()
+    context.play(sim, cfg.reset, [snapshots, recorder])
+    state = snapshots.states[first - 1]
+    recorded = recorder.recorded.rewind()
+    columns = torch.as_tensor(context.index.ctrl, device=sim.device)
+    targets = [recorded.command() for _ in range(min(first + steps, recorded.steps))][first:]
+    bare = sim.bare_step()
+
+    def bare_steps() -> None:
+        for _ in range(decimation):
+            bare()
+
+    def play(step: Callable[[], None]) -> None:
+        for target in targets:
+            sim.ctrl[:, columns] = target
+            step()
+
+    # The repetitions
+    times: dict[str, list[float]] = {name: [] for name in (BARE, *arrangements)}
+    for repetition in range(repetitions + 1):
+        for name, spent in times.items():
+            if name in arrangements:
+                sim.arrange(arrangements[name])
+            step = bare_steps if name == BARE else partial(sim.step, decimation)
+            for _ in range(2):  # warm-up and capture
+                step()
+            restore(sim, state)
+            seconds = timed(sim, partial(play, step))
+            if repetition:
+                spent.append(1e3 * seconds / (len(targets) * decimation))
+            if bool(lost_worlds(sim).any()):
+                raise MjstackError(
+                    f"{name}: physics was lost, and a figure would be void. Run gates=[capacity]."
+                )
+        if repetition and progress is not None:
+            progress(repetition)
+    sim.close()
+    return times
+
+
+def _in_hand(context: GateContext, sim: Simulation) -> int | None:
+    """Number of worlds in which both jaws press on the object of the measured phase.
+
+    None if the phase carries none.
+    """
+    phases = context.cfg.controller.phases
+    place = list(phases).index(context.cfg.gate.throughput.from_phase)
+    number = carried_objects(context.cfg)[place]
+    return None if number < 0 else int(objects_in_hand(context.index, sim)[:, number].sum())
