@@ -18,9 +18,9 @@ from environments import brisk
 
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import context as gate_module
-from mjstack.episodes.batch_record import FAILING, BatchRecord, clear_records, write_failing
 from mjstack.episodes.context import GateContext
 from mjstack.episodes.observers import Episode, play_episode
+from mjstack.episodes.record import FAILING, EpisodeRecord, clear_records, write_failing
 from mjstack.errors import RunError
 from mjstack.gates.batch import run_batch
 from mjstack.math import wilson_interval
@@ -74,7 +74,7 @@ def two_seeds(
 
 def test_seeds_add_up(two_seeds: tuple[Path, GateResult, list[str]]) -> None:
     folder, result, lines = two_seeds
-    records = [BatchRecord.read(folder, seed) for seed in (0, 1)]
+    records = [EpisodeRecord.read(folder, seed) for seed in (0, 1)]
     failing = [
         f"{seed}:{w}"
         for seed, r in enumerate(records)
@@ -90,7 +90,7 @@ def test_seeds_add_up(two_seeds: tuple[Path, GateResult, list[str]]) -> None:
     low, high = wilson_interval(succeeded, 14)
     metrics = result.metrics
     assert result.status is Status.failed
-    assert (metrics["world_episodes"], metrics["succeeded"], metrics["seeds"]) == (14, succeeded, 2)
+    assert (metrics["episodes"], metrics["succeeded"], metrics["seeds"]) == (14, succeeded, 2)
     assert metrics["seed0.succeeded"] + metrics["seed1.succeeded"] == succeeded
     assert metrics["failed.STACKED"] == len(failing)
     assert metrics["distinct_final_states"] == 14
@@ -111,7 +111,7 @@ def test_failing_worlds_are_a_table(two_seeds: tuple[Path, GateResult, list[str]
     rows = list(csv.DictReader((folder / FAILING).read_text().splitlines()))
     assert len(rows) == result.metrics["failed.STACKED"]
     for row in rows:
-        record = BatchRecord.read(folder, int(row["seed"]))
+        record = EpisodeRecord.read(folder, int(row["seed"]))
         assert record is not None
         assert record.failed[int(row["world"])] == RULES["STACKED"]
         assert row["rules"] == "STACKED"
@@ -129,13 +129,13 @@ def test_second_seed_is_what_it_is_alone(
     nworld does not matter.
     """
     result = play(new_context("sim=native", "nworld=3", "seed=1", TIGHT), tmp_path)
-    alone = BatchRecord.read(tmp_path, 1)
-    after = BatchRecord.read(two_seeds[0], 1)
+    alone = EpisodeRecord.read(tmp_path, 1)
+    after = EpisodeRecord.read(two_seeds[0], 1)
     assert alone is not None
     assert after is not None
     assert np.array_equal(alone.qpos, after.qpos[:3])
     assert np.array_equal(alone.failed, after.failed[:3])
-    first = BatchRecord.read(two_seeds[0], 0)
+    first = EpisodeRecord.read(two_seeds[0], 0)
     assert first is not None
     assert not np.array_equal(first.qpos, after.qpos)
     bad = np.flatnonzero(alone.failed).tolist()
@@ -193,7 +193,7 @@ def test_what_stops_the_second_seed_keeps_the_first(
         assert "seeds 1 to 2 not played: the second seed" in result.reason
         assert result.metrics["seeds"] == 1
     assert len((tmp_path / FAILING).read_text().splitlines()) == 3
-    record = BatchRecord.read(tmp_path, 0)
+    record = EpisodeRecord.read(tmp_path, 0)
     assert record is not None
     assert (record.failed == RULES["STACKED"]).all()
 
@@ -218,14 +218,14 @@ def test_full_disk_takes_no_verdict_back(
 
 
 def test_table_is_replaced_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_failing(tmp_path, "seed,world", ["0,1"])
+    write_failing(tmp_path / FAILING, ["seed", "world"], [[0, 1]])
 
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(os, "replace", killed)
     with pytest.raises(KeyboardInterrupt):
-        write_failing(tmp_path, "seed,world", ["0,1", "1,2"])
+        write_failing(tmp_path / FAILING, ["seed", "world"], [[0, 1], [1, 2]])
     assert (tmp_path / FAILING).read_text() == "seed,world\n0,1\n"
     assert [path.name for path in tmp_path.iterdir()] == [FAILING]
 
@@ -238,10 +238,10 @@ def test_records_of_an_earlier_run_go(tmp_path: Path) -> None:
 
 
 def test_damaged_record_is_one_line(tmp_path: Path) -> None:
-    assert BatchRecord.read(tmp_path, 0) is None
+    assert EpisodeRecord.read(tmp_path, 0) is None
     (tmp_path / "worlds_seed0.npz").write_bytes(b"PK not a zip")
     with pytest.raises(RunError, match=r"worlds_seed0\.npz: cannot be read") as caught:
-        BatchRecord.read(tmp_path, 0)
+        EpisodeRecord.read(tmp_path, 0)
     assert "\n" not in str(caught.value)
 
 

@@ -21,8 +21,8 @@ from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Backend, TermCfg
-from mjstack.episodes.batch_record import BatchRecord
 from mjstack.episodes.context import GateContext
+from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.replay import _sizes_alone
 from mjstack.episodes.rollout import snapshot
 from mjstack.jobs.archived_starts import STEM, archive_starts, copy_names
@@ -81,8 +81,8 @@ def replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tup
     return do
 
 
-def record_of(folder: Path, seed: int) -> BatchRecord:
-    record = BatchRecord.read(folder, seed)
+def record_of(folder: Path, seed: int) -> EpisodeRecord:
+    record = EpisodeRecord.read(folder, seed)
     assert record is not None
     return record
 
@@ -304,7 +304,7 @@ def test_what_is_promised_of_another_end(
     theirs = ours.copy()
     theirs[context.index.object_qpos[1]] = moved
     failed = np.array([0, int(bits)], np.int32)
-    record = BatchRecord(
+    record = EpisodeRecord(
         seed=0,
         backend="mjwarp",
         device=device,

@@ -22,13 +22,13 @@ from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.episodes import context as gate_module
 from mjstack.episodes import failures as watch_module
-from mjstack.episodes.batch_record import FAILING, BatchRecord
 from mjstack.episodes.context import GateContext
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.observers import Episode, Hook, play_episode
+from mjstack.episodes.record import FAILING, PICTURE, REGIONS, EpisodeRecord, clear_records
+from mjstack.episodes.region_report import regions_table
 from mjstack.episodes.regions import Region, find_regions, radial_yaw_deg
-from mjstack.episodes.success_record import PICTURE, REGIONS, STEM, clear_success
-from mjstack.gates.success import _tables, _Tally, run_success, success_config
+from mjstack.gates.success import run_success, success_config
 from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
@@ -80,8 +80,8 @@ def gate_of(folder: Path) -> dict:
     return gate
 
 
-def record_of(folder: Path) -> BatchRecord:
-    record = BatchRecord.read(folder, 0, STEM)
+def record_of(folder: Path) -> EpisodeRecord:
+    record = EpisodeRecord.read(folder, 0, "success")
     assert record is not None
     return record
 
@@ -174,10 +174,9 @@ def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
     assert all("LIFT" in row["rules"].split() for row in rows)
     assert any("no region has 20 episodes" in line for line in gate["details"])
     # It stands alone: where nothing fails, the same folder keeps nothing of this.
-    clear_success(folder, keep=None)
+    clear_records(folder, keep=None)
     assert sorted(path.name for path in folder.iterdir()) == [
         ".hydra",
-        FAILING,
         "report.json",
         "report.md",
         "run.log",
@@ -418,7 +417,7 @@ def test_an_earlier_runs_files_go_but_not_the_layouts_that_are_read(tmp_path: Pa
     ]
     for name in [*names, "report.json"]:
         (tmp_path / name).write_text("old")
-    clear_success(tmp_path, keep=tmp_path / "." / "starts_seed1.csv")
+    clear_records(tmp_path, keep=tmp_path / "." / "starts_seed1.csv")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["starts_seed1.csv", "report.json"]
 
 
@@ -646,12 +645,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
     well = replace(
         found[0], cube="blue", succeeded=found[0].episodes
     )  # has no place among the worst
-    (table,) = _tables(
-        load_config(["gate.success.worst_regions=2"]),
-        _Tally(False, RULES, PHASES),
-        [],
-        [*found[:1], well],
-    )
+    (table,) = regions_table(load_config(["gate.success.worst_regions=2"]), [*found[:1], well])
     assert table.title == "Worst regions of at least 20 episodes (1 of 1 with a failure)"
     assert [row[0] for row in table.rows] == [found[0].where]
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
 
 import mujoco
 import numpy as np
@@ -24,6 +23,7 @@ from mjstack.episodes.observers import (
     WorldRecorder,
     play_episode,
 )
+from mjstack.episodes.record import measured_values
 from mjstack.episodes.rollout import (
     NOMINAL,
     Advance,
@@ -53,7 +53,6 @@ from mjstack.tasks.check import CheckResult, EpisodeCheck, Rules, check_class
 log = logging.getLogger(__name__)
 
 Say = Callable[[str], None]
-Record = TypeVar("Record")
 
 
 def _silent(_: str) -> None:
@@ -323,41 +322,3 @@ def judge_one(rules: Rules, result: CheckResult) -> tuple[Status, str, dict]:
     metrics = {name: float(values[0]) for name, values in measured_values(result).items()}
     status = Status.failed if bits else Status.passed
     return status, f"failed: {rules.describe(bits)}" if bits else "", metrics
-
-
-def measured_values(result: CheckResult) -> dict[str, np.ndarray]:
-    """What the check measured, by name with unit, on the host; each of shape ``(nworld,)``."""
-    return {name: value.double().cpu().numpy() for name, value in result.values.items()}
-
-
-def play_seeds(
-    first: int, count: int, play: Callable[[int], Record], keep: Callable[[Record], None]
-) -> list[str]:
-    """Plays seed after seed. One that breaks ends it, and those before it still count; the very
-    first one's error is raised.
-
-    Args:
-        first: The first seed.
-        count: How many.
-        play: Plays one.
-        keep: Takes in what it gave, before the next one can break or be stopped.
-
-    Returns:
-        What was not played, and why: one line, or none.
-    """
-    for seed in range(first, first + count):
-        try:
-            record = play(seed)
-        except Exception as error:
-            if seed == first:
-                raise
-            log.exception("seed %d broke", seed)
-            what = (str(error) or type(error).__name__).splitlines()[0]
-            left = (
-                f"seed {seed}"
-                if seed == first + count - 1
-                else f"seeds {seed} to {first + count - 1}"
-            )
-            return [f"{left} not played: {what} (run.log has the traceback)"]
-        keep(record)
-    return []

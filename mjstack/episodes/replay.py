@@ -16,8 +16,9 @@ import torch
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
-from mjstack.episodes.context import GateContext, measured_values
+from mjstack.episodes.context import GateContext
 from mjstack.episodes.observers import Episode, WorldRecorder
+from mjstack.episodes.record import measured_values
 from mjstack.episodes.rollout import Observer, State, snapshot
 from mjstack.files import write_atomic
 from mjstack.managers.reset import required_fields

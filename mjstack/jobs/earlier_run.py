@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Config
-from mjstack.episodes.batch_record import WORLDS, BatchRecord
+from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import MjstackError, RunError
 
 
@@ -78,14 +78,13 @@ class EarlierRun:
             ) from error
         return cls(folder=folder, cfg=cfg, provenance=provenance)
 
-    def batch_record(self, seed: int, stem: str = WORLDS) -> BatchRecord | None:
-        """What its batch gate found under a seed, or the gate whose files begin with ``stem``; None
-        if it did not get there.
+    def record(self, seed: int, gate: str) -> EpisodeRecord | None:
+        """The record of a gate under a seed; None if the gate did not get there.
 
         Raises:
             RunError: The record cannot be read, or is not this run's.
         """
-        record = BatchRecord.read(self.folder, seed, stem)
+        record = EpisodeRecord.read(self.folder, seed, gate)
         if record is not None and (record.seed != seed or len(record.failed) != self.cfg.nworld):
             raise RunError(
                 f"run={self.folder}: the record of seed {seed} has {len(record.failed)} worlds of"

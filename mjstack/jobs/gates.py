@@ -9,9 +9,8 @@ from mjstack.config.validate import reads_starts_file
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.drivers.tilt import turn_sign
 from mjstack.envs import build_env
-from mjstack.episodes.batch_record import clear_records
 from mjstack.episodes.context import GateContext
-from mjstack.episodes.success_record import clear_success
+from mjstack.episodes.record import clear_records
 from mjstack.errors import ConfigError
 from mjstack.gates.runner import run_gates
 from mjstack.gates.success import success_config
@@ -80,8 +79,6 @@ def run_gates_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
 def _run(context: GateContext, bar: ProgressBar, record: Record) -> None:
     if context.folder is not None:
         context.cfg = archive_starts(context.cfg, context.folder)
-        clear_records(context.folder)
-        clear_success(
-            context.folder, keep=None if context.cfg.starts is None else Path(context.cfg.starts)
-        )
+        starts = context.cfg.starts
+        clear_records(context.folder, keep=None if starts is None else Path(starts))
     run_gates(context, bar.start, record)

@@ -14,11 +14,10 @@ from omegaconf import OmegaConf
 from rich.markup import escape
 
 from mjstack.config.schema import Backend, Config, SimCfg
-from mjstack.episodes.batch_record import BatchRecord
 from mjstack.episodes.context import GateContext, judge_one
 from mjstack.episodes.failures import FailureMonitor, describe_sign
+from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.replay import ReplayedWorld, replay_world, start_of_world
-from mjstack.episodes.success_record import STEM
 from mjstack.errors import ConfigError, DeviceError, RunError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import run_guarded
@@ -66,7 +65,7 @@ class ReplayPlan:
     seed: int
     world: int
     where: list[tuple[Backend, str]]
-    record: BatchRecord | None
+    record: EpisodeRecord | None
     notes: list[str]
 
 
@@ -112,7 +111,7 @@ def _plan(cfg: Config) -> ReplayPlan:
         raise ConfigError(
             "world", cfg.world, f"a world from 0 to {run.cfg.nworld - 1}, as that run has"
         )
-    record = run.batch_record(seed, *([STEM] if gate == "success" else []))
+    record = run.record(seed, gate)
     kept = archived_starts(run.cfg, run.folder)
     played = success_config(kept) if gate == "success" else kept
     where, notes = _choose(cfg.sim, run, record)
@@ -146,7 +145,7 @@ def _whose(cfg: Config, named: str | None, world: str) -> str:
 
 
 def _choose(
-    asked: SimCfg, run: EarlierRun, record: BatchRecord | None
+    asked: SimCfg, run: EarlierRun, record: EpisodeRecord | None
 ) -> tuple[list[tuple[Backend, str]], list[str]]:
     """Backends and devices to play on, and what could not be as it was."""
     ran = _ran_on(run, record)
@@ -189,7 +188,7 @@ def _check_start(plan: ReplayPlan) -> None:
     )
 
 
-def _ran_on(run: EarlierRun, record: BatchRecord | None) -> tuple[Backend, str]:
+def _ran_on(run: EarlierRun, record: EpisodeRecord | None) -> tuple[Backend, str]:
     """Backend and device of the earlier batch: as recorded, else what its configuration means on
     its machine.
     """

@@ -1,0 +1,113 @@
+"""Plays a gate's episodes, seed after seed, and records each."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+from mjstack.episodes.context import GateContext
+from mjstack.episodes.failures import FailureMonitor
+from mjstack.episodes.record import Circumstances, EpisodeRecord, StartRecorder, write_failing
+from mjstack.episodes.rollout import Observer
+from mjstack.episodes.tally import EpisodeTally, failing_name
+from mjstack.sim import Simulation
+
+log = logging.getLogger(__name__)
+
+
+def play_seeds(
+    context: GateContext,
+    gate: str,
+    *,
+    count: int,
+    noun: str,
+    circumstances: bool = False,
+    observers: Callable[[int], Sequence[Observer]],
+) -> EpisodeTally:
+    """Play seed after seed in as many worlds as are configured, and record each.
+
+    A seed that breaks ends it, and those before it still count; the first one's error is raised.
+
+    Args:
+        context: The run.
+        gate: The gate, which names the files.
+        count: Number of seeds, from the configured one on.
+        noun: What is counted, such as ``worlds``.
+        circumstances: Whether starts and signs of failure are recorded too.
+        observers: More observers, by seed.
+    """
+    cfg = context.cfg
+    tally = EpisodeTally(gate=gate, noun=noun, several=count > 1, rules=context.check.rules)
+    sim = context.batch_simulation(cfg.nworld)
+    sizes = getattr(sim, "sizes", None)
+    tally.notes = {
+        "backend": sim.description,
+        "sizes": (
+            f"{sizes.as_overrides()} ({sizes.source})"
+            if sizes
+            else "native MuJoCo has no fixed buffers"
+        ),
+    }
+    last = cfg.seed + count - 1
+    try:
+        for seed in range(cfg.seed, last + 1):
+            try:
+                record = _play(context, sim, seed, tally, circumstances, observers(seed))
+            except Exception as error:
+                if seed == cfg.seed:
+                    raise
+                log.exception("seed %d broke", seed)
+                why = (str(error) or type(error).__name__).splitlines()[0]
+                left = f"seed {seed}" if seed == last else f"seeds {seed} to {last}"
+                tally.problems.append(f"{left} not played: {why} (run.log has the traceback)")
+                break
+            _write(context, record, tally)
+            if count > 1:
+                context.say(
+                    f"{gate}, seed {seed}: {int(record.succeeded.sum())} of {cfg.nworld} worlds"
+                    f" succeeded, {tally.good} of {tally.episodes} so far"
+                )
+    finally:
+        sim.close()
+    return tally
+
+
+def _play(
+    context: GateContext,
+    sim: Simulation,
+    seed: int,
+    tally: EpisodeTally,
+    circumstances: bool,
+    observers: Sequence[Observer],
+) -> EpisodeRecord:
+    """One seed's episode in every world."""
+    cfg = context.cfg
+    starts = StartRecorder()
+    monitor = FailureMonitor(cfg)
+    looking = [starts, monitor] if circumstances else []
+    episode = context.play(sim, cfg.reset, [*looking, *observers], seed=seed)
+    found = None
+    if circumstances:
+        phases = [phase.name for phase in context.planner.phases]
+        found = Circumstances.of(episode, starts, monitor, phases, cfg.controller.ik_tolerance)
+    record = EpisodeRecord.of(seed, sim, episode, found)
+    tally.add(record, episode, sim)
+    return record
+
+
+def _write(context: GateContext, record: EpisodeRecord, tally: EpisodeTally) -> None:
+    """Write the seed's record, before the next one can break or be stopped. A full disk takes no
+    result back.
+    """
+    folder = context.folder
+    if folder is None:
+        return
+    try:
+        record.write(folder, tally.gate)
+        if tally.rows:
+            write_failing(folder / failing_name(context, tally.gate), record.header(), tally.rows)
+    except OSError as error:
+        log.exception("the record of seed %d was not written", record.seed)
+        tally.details.append(
+            f"seed {record.seed}: no record of its {tally.noun} could be written ({error.strerror})"
+        )
