@@ -242,3 +242,13 @@ def test_an_own_variant_takes_the_rest_from_the_configured_solver() -> None:
     mine = cfg.job.variants["mine"]
     assert (mine.iterations, mine.cone.value, mine.impratio) == (7, "pyramidal", None)
     check_job(cfg)
+
+
+def test_the_box_is_studied_too(tmp_path: Path) -> None:
+    cfg = configure("task=box", keep=("base",))
+    assert run_study_job(cfg, tmp_path, []).exit_code == 0
+    (row,) = table(tmp_path).values()
+    assert row["status"] == "pass"
+    assert row["succeeded"] == "2"
+    assert 0.0 < float(row["slot_err_red_max_m"]) < 0.02
+    assert "xy_err_max_m" not in row

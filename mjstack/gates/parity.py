@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 
 from mjstack.config.schema import Config
@@ -17,88 +17,106 @@ from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation, describe_overflow
 
 
+@dataclass(slots=True)
+class _Findings:
+    """What the comparisons add to the gate's result."""
+
+    metrics: dict[str, float] = field(default_factory=dict)
+    thresholds: dict[str, float] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+    details: list[str] = field(default_factory=list)
+
+
 def run_parity(context: GateContext) -> list[GateResult]:
-    """Compares steps from equal states, the whole task, and the options each backend holds."""
+    """Compare steps from equal states, the options of each backend, and the whole task."""
     cfg = context.cfg
     reference = context.nominal
-    native = reference.sim
     mjwarp = context.parity_simulation()
-    problems: list[str] = []
-    details: list[str] = []
-    metrics: dict[str, float] = {}
-    thresholds: dict[str, float] = dict(context.check.thresholds(cfg))
-
-    for name, phase in cfg.gate.parity.states.items():
-        state = reference.states[context.phase_end(phase)]
-        for steps, limits in ((1, cfg.gate.parity.step1), (50, cfg.gate.parity.step50)):
-            found = compare_steps(native, mjwarp, state, steps)
-            for field, limit in limits.items():
-                metrics[f"{name}.step{steps}.{field}"] = found[field]
-                thresholds[f"step{steps}.{field}"] = limit
-                if not found[field] <= limit:
-                    problems.append(
-                        f"{name}, {steps} steps: {field} differs by {found[field]:.2g}, limit"
-                        f" {limit:.2g}"
-                    )
-
-    for option, (asked, held, uploaded, equal) in compare_options(cfg, native, mjwarp).items():
+    found = _Findings(thresholds=context.check.thresholds(cfg))
+    _compare_states(context, mjwarp, found)
+    for option, (asked, held, uploaded, equal) in compare_options(
+        cfg, reference.sim, mjwarp
+    ).items():
         line = f"option {option}: requested {asked}, native {held}, uploaded {uploaded}"
-        details.append(line)
+        found.details.append(line)
         if not equal:
-            problems.append(line)
+            found.problems.append(line)
 
     world = WorldRecorder()
     episode = context.play(mjwarp, NOMINAL, [*context.viewers, world])
     status, reason, judged = judge_one(context.check.rules, episode.result)
     if status is Status.failed:
-        problems.append(reason)
+        found.problems.append(reason)
     if int(mjwarp.overflow[0]):
-        problems.append(
+        found.problems.append(
             f"{describe_overflow(int(mjwarp.overflow[0]))} overflow: raise batch.njmax or"
             " batch.nconmax"
         )
-    metrics.update(judged)
-    metrics["peak_contacts"] = int(mjwarp.peak_contacts[0])
-    metrics["peak_constraint_rows"] = int(mjwarp.peak_constraints[0])
-    bits = getattr(mjwarp, "solver_limits", None)
-    metrics["solver_limit_hit"] = bool(bits is not None and int(bits[0]))
-    metrics["episode_s"] = episode.timing.seconds
-    for cube, (address, _) in context.index.objects.items():
-        ours = world.qpos[-1, address : address + 7]
-        theirs = reference.world.qpos[-1, address : address + 7]
-        distance = float(np.linalg.norm(ours[:3] - theirs[:3]))
-        angle = math.degrees(
-            float(quat_angle(torch.from_numpy(ours[3:]), torch.from_numpy(theirs[3:])))
-        )
-        metrics[f"final.{cube}.position_m"] = distance
-        metrics[f"final.{cube}.rotation_deg"] = angle
-        if not (
-            distance <= cfg.gate.parity.cube_position and angle <= cfg.gate.parity.cube_rotation_deg
-        ):
-            problems.append(
-                f"{cube} cube ends {1e3 * distance:.2f} mm and {angle:.2f} deg from native's"
-            )
-    thresholds["final.position_m"] = cfg.gate.parity.cube_position
-    thresholds["final.rotation_deg"] = cfg.gate.parity.cube_rotation_deg
+    limits = getattr(mjwarp, "solver_limits", None)
+    found.metrics |= judged | {
+        "peak_contacts": int(mjwarp.peak_contacts[0]),
+        "peak_constraint_rows": int(mjwarp.peak_constraints[0]),
+        "solver_limit_hit": bool(limits is not None and int(limits[0])),
+        "episode_s": episode.timing.seconds,
+    }
+    distance = _compare_ends(context, world, reference.world, found)
+
     headline = context.check.headline(judged)
     context.say(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
     context.shown = world
     context.shown_by = "parity world"
     mjwarp.close()
-    summary = "; ".join(problems) or (
-        f"{headline}; red {1e3 * metrics['final.red.position_m']:.2f} mm from native's"
-    )
     return [
         GateResult(
             name="parity",
-            status=Status.failed if problems else Status.passed,
-            reason=summary,
-            thresholds=thresholds,
-            metrics=metrics,
+            status=Status.failed if found.problems else Status.passed,
+            reason="; ".join(found.problems)
+            or f"{headline}; objects end at most {1e3 * distance:.2f} mm from native's",
+            thresholds=found.thresholds,
+            metrics=found.metrics,
             notes={"backend": mjwarp.description},
-            details=details,
+            details=found.details,
         )
     ]
+
+
+def _compare_states(context: GateContext, mjwarp: Simulation, found: _Findings) -> None:
+    """Steps of both backends from the same states of the reference episode."""
+    limits = context.cfg.gate.parity
+    native = context.nominal.sim
+    for name, phase in limits.states.items():
+        state = context.nominal.states[context.phase_end(phase)]
+        for steps, largest in ((1, limits.step1), (50, limits.step50)):
+            apart = compare_steps(native, mjwarp, state, steps)
+            for field_name, limit in largest.items():
+                found.metrics[f"{name}.step{steps}.{field_name}"] = apart[field_name]
+                found.thresholds[f"step{steps}.{field_name}"] = limit
+                if not apart[field_name] <= limit:
+                    found.problems.append(
+                        f"{name}, {steps} steps: {field_name} differs by {apart[field_name]:.2g},"
+                        f" limit {limit:.2g}"
+                    )
+
+
+def _compare_ends(
+    context: GateContext, ours: WorldRecorder, theirs: WorldRecorder, found: _Findings
+) -> float:
+    """Poses of all objects at the end of the task; returns the largest distance [m]."""
+    limits = context.cfg.gate.parity
+    found.thresholds["final.position_m"] = limits.object_position
+    found.thresholds["final.rotation_deg"] = limits.object_rotation_deg
+    distances = [0.0]
+    for name, (address, _) in context.index.objects.items():
+        a, b = (torch.from_numpy(world.qpos[-1, address : address + 7]) for world in (ours, theirs))
+        distances.append(float((a[:3] - b[:3]).norm()))
+        angle = math.degrees(float(quat_angle(a[3:], b[3:])))
+        found.metrics[f"final.{name}.position_m"] = distances[-1]
+        found.metrics[f"final.{name}.rotation_deg"] = angle
+        if not (distances[-1] <= limits.object_position and angle <= limits.object_rotation_deg):
+            found.problems.append(
+                f"{name} ends {1e3 * distances[-1]:.2f} mm and {angle:.2f} deg from native's"
+            )
+    return max(distances)
 
 
 def compare_steps(
@@ -113,12 +131,12 @@ def compare_steps(
         sim.forward()
         sim.synchronize()
     out = {}
-    for field in PARITY_FIELDS:
-        a = getattr(native, field).double()
-        b = getattr(mjwarp, field).double().cpu()
-        if field == "xquat":  # q and -q are one rotation
+    for name in PARITY_FIELDS:
+        a = getattr(native, name).double()
+        b = getattr(mjwarp, name).double().cpu()
+        if name == "xquat":  # q and -q are one rotation
             b = torch.where((a * b).sum(-1, keepdim=True) < 0.0, -b, b)
-        out[field] = float((a - b).abs().amax())
+        out[name] = float((a - b).abs().amax())
     return out
 
 

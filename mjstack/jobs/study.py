@@ -171,7 +171,10 @@ def _measure(context: GateContext, job: StudyJobCfg, base: _Base, row: StudyRow)
             for name, worlds in rules.failing(failed).items()
         )
         row.peak_rows = int(sim.peak_constraints.max())
-        row.xy_err_max_m = float(result.values["xy_err_m"].max())
+        row.values = {
+            metric: float(getattr(result.values[value], side)())
+            for metric, (value, side) in context.check.summaries.items()
+        }
         limits: torch.Tensor | None = getattr(
             sim, "solver_limits", None
         )  # native MuJoCo does not tell
@@ -257,7 +260,7 @@ def _text(value: object) -> str:
 
 def _as_result(row: StudyRow, seconds: float) -> GateResult:
     """A row as a result of the report."""
-    values = asdict(row).items()
+    values = (asdict(row) | row.values).items()
     metrics = {key: value for key, value in values if isinstance(value, float | int)}
     reason = row.reason
     if row.status == Status.passed.value:
@@ -302,7 +305,8 @@ def _notes(context: GateContext) -> list[str]:
 def _write_tables(
     context: GateContext, folder: Path, rows: list[StudyRow], picture: str = ""
 ) -> None:
-    write_atomic(folder / "study.csv", to_csv(COLUMNS, map(asdict, rows)))
+    columns = [*COLUMNS, *context.check.summaries]
+    write_atomic(folder / "study.csv", to_csv(columns, [asdict(row) | row.values for row in rows]))
     write_atomic(folder / "study.md", to_markdown(rows, _title(context), _notes(context), picture))
 
 

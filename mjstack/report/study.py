@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 from mjstack.report.markdown import format_value
 from mjstack.report.table import Table, to_document
@@ -33,7 +33,7 @@ class StudyRow:
             the episode.
         line_search_limit_worlds: Likewise at the limit of the line search.
         peak_rows: Most constraint rows of a world.
-        xy_err_max_m: Largest distance of the stack's centres at the end [m].
+        values: Extremes of what the task's check measured, by name with unit.
     """
 
     variant: str
@@ -53,10 +53,10 @@ class StudyRow:
     iteration_limit_worlds: int | None = None
     line_search_limit_worlds: int | None = None
     peak_rows: int | None = None
-    xy_err_max_m: float | None = None
+    values: dict[str, float] = field(default_factory=dict)
 
 
-COLUMNS = tuple(field.name for field in fields(StudyRow))
+COLUMNS = tuple(f.name for f in fields(StudyRow) if f.name != "values")
 
 
 def to_markdown(

@@ -54,8 +54,8 @@ class ParityCfg:
     states: dict[str, str] = MISSING
     step1: dict[str, float] = MISSING
     step50: dict[str, float] = MISSING
-    cube_position: float = MISSING
-    cube_rotation_deg: float = MISSING
+    object_position: float = MISSING
+    object_rotation_deg: float = MISSING
 
 
 @dataclass(kw_only=True, slots=True)
