@@ -105,16 +105,18 @@ def test_small_region_passes(passed: Path) -> None:
     assert (metrics["success_rate_low95"], metrics["success_rate_high95"]) == wilson_interval(6, 6)
     assert gate["thresholds"]["success_rate_min"] == 0.99
     assert "cubes within 0.03 x 0.03 m" in gate["notes"]["starts"]
-    assert sorted(path.name for path in passed.iterdir()) == [
-        ".hydra",
-        "starts_seed0.csv",
-        "report.json",
-        "report.md",
-        "run.log",
-        "success.png",
-        "success_regions.csv",
-        "success_seed0.npz",
-    ]
+    assert sorted(path.name for path in passed.iterdir()) == sorted(
+        [
+            ".hydra",
+            "starts_seed0.csv",
+            "report.json",
+            "report.md",
+            "run.log",
+            "success.png",
+            "success_regions.csv",
+            "success_seed0.npz",
+        ]
+    )
     assert "no region of at least 2 episodes had a failure" in gate["details"]
     assert not [table for table in gate["tables"] if "region" in table["title"]]
     assert "![success.png](success.png)" in (passed / "report.md").read_text()
@@ -175,12 +177,14 @@ def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
     assert any("no region has 20 episodes" in line for line in gate["details"])
     # It stands alone: where nothing fails, the same folder keeps nothing of this.
     clear_records(folder, keep=None)
-    assert sorted(path.name for path in folder.iterdir()) == [
-        ".hydra",
-        "report.json",
-        "report.md",
-        "run.log",
-    ]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        [
+            ".hydra",
+            "report.json",
+            "report.md",
+            "run.log",
+        ]
+    )
 
 
 @pytest.fixture
@@ -418,7 +422,7 @@ def test_an_earlier_runs_files_go_but_not_the_layouts_that_are_read(tmp_path: Pa
     for name in [*names, "report.json"]:
         (tmp_path / name).write_text("old")
     clear_records(tmp_path, keep=tmp_path / "." / "starts_seed1.csv")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["starts_seed1.csv", "report.json"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.json", "starts_seed1.csv"]
 
 
 def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> None:
