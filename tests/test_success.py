@@ -104,7 +104,7 @@ def test_small_region_passes(passed: Path) -> None:
     ) == (6, 6, 6, 0)
     assert (metrics["success_rate_low95"], metrics["success_rate_high95"]) == wilson_interval(6, 6)
     assert gate["thresholds"]["success_rate_min"] == 0.99
-    assert "cubes within 0.03 x 0.03 m" in gate["notes"]["starts"]
+    assert "objects within 0.03 x 0.03 m" in gate["notes"]["starts"]
     assert sorted(path.name for path in passed.iterdir()) == sorted(
         [
             ".hydra",
@@ -647,7 +647,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
     assert len(set(found)) == len(found)
     assert isinstance(found[0], Region)
     well = replace(
-        found[0], cube="blue", succeeded=found[0].episodes
+        found[0], object="blue", succeeded=found[0].episodes
     )  # has no place among the worst
     (table,) = regions_table(load_config(["gate.success.worst_regions=2"]), [*found[:1], well])
     assert table.title == "Worst regions of at least 20 episodes (1 of 1 with a failure)"
