@@ -456,8 +456,8 @@ def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> Non
     sim = SimpleNamespace(
         qpos=torch.zeros(n, 3), qvel=torch.zeros(n, 3), overflow=torch.zeros(n, dtype=torch.int32)
     )
-    env = SimpleNamespace(nworld=n, device=device, sim=sim, index=None)
-    controller = SimpleNamespace(phase=torch.zeros(n, dtype=torch.int64))
+    env = SimpleNamespace(nworld=n, device=device, sim=sim, index=None, cfg=cfg)
+    controller = SimpleNamespace(phase=torch.zeros(n, dtype=torch.int64), phases=None)
     check = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.step]))
     monkeypatch.setattr(
         watch_module, "objects_in_hand", lambda *_: torch.from_numpy(forces[now.step] > 0.0).all(2)
@@ -573,8 +573,8 @@ def test_each_cube_of_the_box_has_its_own_release(monkeypatch: pytest.MonkeyPatc
     sim = SimpleNamespace(
         qpos=torch.zeros(5, 3), qvel=torch.zeros(5, 3), overflow=torch.zeros(5, dtype=torch.int32)
     )
-    env = SimpleNamespace(nworld=5, device=torch.device("cpu"), sim=sim, index=None)
-    controller = SimpleNamespace(phase=torch.zeros(5, dtype=torch.int64))
+    env = SimpleNamespace(nworld=5, device=torch.device("cpu"), sim=sim, index=None, cfg=cfg)
+    controller = SimpleNamespace(phase=torch.zeros(5, dtype=torch.int64), phases=None)
     check = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.step]))
     monkeypatch.setattr(
         watch_module, "objects_in_hand", lambda *_: torch.ones(5, 2, dtype=torch.bool)
