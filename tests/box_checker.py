@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import Config
+from mjstack.tasks.check import make_check
 
 RED = 0
 BLUE = 1
@@ -60,7 +61,7 @@ class BoxOutcome:
 
 def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> BoxOutcome:
     """Judges one world."""
-    rules = cfg.gate.box
+    rules = make_check(cfg).t
     box = cfg.scene.box
     out = BoxOutcome()
     assert box is not None

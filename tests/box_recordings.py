@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from box_checker import BLUE, RED, BoxOutcome, BoxRecording, check_box_world
-from check_cases import STOPPED_EARLY
+from check_cases import STOPPED_EARLY, limits
 
 from mjstack.config import load_config
 from mjstack.drivers.driver import Controller
@@ -23,8 +23,7 @@ from mjstack.episodes.failures import FailureMonitor
 from mjstack.episodes.observers import Episode
 from mjstack.episodes.rollout import Observer, Reset
 from mjstack.sim import Simulation
-from mjstack.tasks.box import BoxCheck
-from mjstack.tasks.check import CheckResult
+from mjstack.tasks.check import CheckResult, make_check
 
 NAMES = ("red", "blue")
 STATE = ("qpos", "qvel", "sensordata")
@@ -142,6 +141,11 @@ class World:
             **arrays,
         )
 
+    @property
+    def t(self) -> Any:
+        """Thresholds."""
+        return limits(self.context.cfg)
+
     def steps(self, *names: str) -> np.ndarray:
         """Numbers of the steps of some phases."""
         numbers = [i for i, p in enumerate(self.context.planner.phases) if p.name in names]
@@ -207,11 +211,14 @@ class World:
         return check_box_world(self.recording, self.context.cfg, self.context.model)
 
 
-def feed(worlds: list[World], dtype: torch.dtype = torch.float64) -> CheckResult:
-    """Plays recordings of one robot, equally long and with the same phases, through the check."""
+def feed(
+    worlds: list[World], dtype: torch.dtype = torch.float64, *, phased: bool = True
+) -> CheckResult:
+    """Plays recordings of one robot, equally long and with the same phases, through the check, as
+    of a driver with phases or without.
+    """
     context = worlds[0].context
-    n = len(worlds)
-    check = BoxCheck(context.cfg, context.index, context.planner.phases, n, torch.device("cpu"))
+    phases = context.planner.phases
     stacked = {name: np.stack([getattr(w, name) for w in worlds]) for name in (*STATE, "phase")}
     ends = {
         name: torch.tensor(np.stack([getattr(w, name) for w in worlds]), dtype=dtype)
@@ -219,15 +226,29 @@ def feed(worlds: list[World], dtype: torch.dtype = torch.float64) -> CheckResult
     }
     sim = SimpleNamespace(
         model=context.model,
-        nworld=n,
         device=torch.device("cpu"),
         step_count=torch.tensor([w.step_count for w in worlds]),
         overflow=torch.tensor([w.overflow for w in worlds], dtype=torch.int32),
         kinematics=lambda: None,
         **ends,
     )
-    for step in range(stacked["phase"].shape[1]):
+    env = SimpleNamespace(
+        sim=sim,
+        cfg=context.cfg,
+        index=context.index,
+        nworld=len(worlds),
+        device=torch.device("cpu"),
+        given_places={},
+    )
+
+    def take(step: int) -> None:
         for name in STATE:
             setattr(sim, name, torch.tensor(stacked[name][:, step], dtype=dtype))
-        check.update(sim, torch.tensor(stacked["phase"][:, step]))
-    return check.result(sim)
+
+    take(0)
+    check = make_check(context.cfg)
+    check.start(env, phases[-1].stop, phases if phased else ())
+    for step in range(stacked["phase"].shape[1]):
+        take(step)
+        check.update(torch.tensor(stacked["phase"][:, step]) if phased else None)
+    return check.result()

@@ -6,9 +6,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
-from mjstack.tasks.check import CheckResult, Rules
+from mjstack.config import load_config
+from mjstack.config.schema import Config
+from mjstack.tasks.check import CheckResult, Rules, make_check
+
+
+def limits(cfg: Config) -> Any:
+    """Thresholds of the task's check."""
+    return make_check(cfg).t
+
+
+@cache
+def rules_of(task: str) -> Rules:
+    """Rules of a task's check."""
+    return make_check(load_config([f"task={task}"])).rules
+
 
 Alter = Callable[[Any], None]
 Altered = dict[str, tuple[CheckResult, int, Any]]

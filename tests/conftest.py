@@ -134,6 +134,7 @@ def recorded(
             sim = make_sim("native", 4, robot=robot)
             pose = []
             velocity = []
+            force = []
 
             def keep(_: int, sim: Simulation) -> None:
                 pose.append(
@@ -148,11 +149,14 @@ def recorded(
                         1,
                     )
                 )
+                force.append(sim.sensordata.numpy().copy())
 
             episode = context.play(sim, context.cfg.reset, [Hook(keep)])
             made[robot] = SimpleNamespace(
                 pose=np.stack(pose, 1),
                 velocity=np.stack(velocity, 1),
+                force=np.stack(force, 1),
+                jaw_force=context.index.jaw_force,
                 result=episode.result,
                 step_count=sim.step_count.numpy().copy(),
                 cfg=context.cfg,

@@ -59,8 +59,7 @@ def rushed() -> tuple[str, ...]:
     """Overrides of an episode that is over, and has failed, after a second."""
     phases = _composed(("robot=so101", "task=stack")).controller.phases
     return (
-        "gate.acceptance.window=5",
-        "gate.box.window=5",
+        "task.check.window=5",
         *(f"controller.phases.{name}.seconds=0.1" for name in phases),
     )
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjstack.config.schema import Config
+from mjstack.tasks.check import make_check
 
 RED = 0
 BLUE = 1
@@ -78,7 +79,7 @@ def check_world(
         overflow: Whether it lost contacts or constraint rows.
         finite_elsewhere: Whether the rest of its state stayed finite.
     """
-    rules = cfg.gate.acceptance
+    rules = make_check(cfg).t
     scene = cfg.scene
     half = scene.objects["red"].half_height
     top = scene.table_center[2] + scene.table_half[2]

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from check_cases import rules_of
 from environments import brisk
 
 from mjstack.drivers.open_loop import JointTrajectory
@@ -25,9 +26,10 @@ from mjstack.errors import RunError
 from mjstack.gates.batch import run_batch
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
-from mjstack.tasks.stack import RULES
 
-TIGHT = "gate.acceptance.xy_err=0.0015"  # some worlds end farther off than this
+RULES = rules_of("stack")
+
+TIGHT = "task.check.xy_err=0.0015"  # some worlds end farther off than this
 
 
 @pytest.mark.parametrize(
@@ -180,9 +182,7 @@ def test_what_stops_the_second_seed_keeps_the_first(
         return play_episode(*args, **kwargs)
 
     monkeypatch.setattr(gate_module, "play_episode", stops)
-    context = new_context(
-        "sim=native", "nworld=2", "gate.batch.seeds=3", "gate.acceptance.xy_err=1e-6"
-    )
+    context = new_context("sim=native", "nworld=2", "gate.batch.seeds=3", "task.check.xy_err=1e-6")
     if isinstance(error, KeyboardInterrupt):
         with pytest.raises(KeyboardInterrupt):
             play(context, tmp_path)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from box_checker import BoxRecording, lowest_geometry
+from check_cases import limits
 
 from mjstack import make_env
 from mjstack.config import load_config
@@ -20,9 +21,10 @@ from mjstack.envs import Env
 from mjstack.errors import MjstackError
 from mjstack.math import quat_to_matrix
 from mjstack.scene import LowestPoint, SceneIndex, build_model
-from mjstack.scene.phases import build_phases, nominal_xy
-from mjstack.tasks.box import BoxCheck, BoxSuccess
+from mjstack.scene.phases import nominal_xy
+from mjstack.tasks.box import BoxSuccess
 from mjstack.tasks.box_terms import GraspNext, InBox, Place, ReachNext, ToSlot
+from mjstack.tasks.check import make_check
 
 X0 = {"so101": 0.305, "rebot": 0.47}
 RED = "red"
@@ -95,7 +97,7 @@ def test_the_motion_is_the_protocols(robot: str) -> None:
     seconds = [phase.seconds for phase in cfg.controller.phases.values()]
     assert seconds == [1.6, 1.6, 2.2, 2.0, 3.0, 2.4, 1.6, 1.4, 1.4] * 2 + [5.6]
     assert _planner(robot).phases[-1].stop == cfg.task.episode_steps == 2000
-    t = cfg.gate.box
+    t = limits(cfg)
     assert (t.force, t.grasp_steps, t.open_fraction) == (1e-5, 10, 0.8)
     assert (t.lift_height, t.lift_steps, t.carry_steps, t.carry_distance) == (0.010, 25, 10, 0.05)
     assert (t.inside, t.rest_speed, t.window, t.jaw_clearance) == (0.003, 0.04, 50, 0.02)
@@ -223,8 +225,8 @@ def test_terms_know_the_box(robot: str) -> None:
     wanted = np.subtract(places[BLUE], env.sim.model.body(BLUE).pos)
     np.testing.assert_allclose(ToSlot(env, object=BLUE)(env)[0], wanted, atol=1e-6)
     assert InBox(env)(env).tolist() == [0.0, 0.5, 1.0, 0.0]
-    check = BoxCheck(env.cfg, env.index, build_phases(env.cfg), 4, env.device)
-    assert check.placed(env.sim).tolist() == [
+    check = make_check(env.cfg)
+    assert check.placed(check.view(env).step()).tolist() == [
         [False, False],
         [True, False],
         [True, True],
@@ -278,7 +280,7 @@ def test_success_needs_rest_in_the_box_an_open_gripper_and_the_whole_window(robo
     env = small_env("reset=nominal", robot=robot, nworld=6)
     success = BoxSuccess(env, open_fraction=0.8)
     places = rests(env)
-    window = env.cfg.gate.box.window
+    window = limits(env.cfg).window
     put(env, RED, places[RED], [0, 1, 2, 3, 4])
     put(env, BLUE, places[BLUE], [0, 2, 3, 4, 5])
     put(env, RED, np.add(places[RED], [0.0, 0.0, 0.0085]), [5])
@@ -407,19 +409,20 @@ def test_lowest_point_of_a_mesh_is_never_too_high() -> None:
         (["scene.objects.blue.xy=[0.35,0.0]"], ["scene.objects.blue.xy", "beside the box"]),
         (["scene.random_xy=[0.1]"], ["scene.random_xy", "2 numbers"]),
         (["scene.random_xy=[0.1,-0.1]"], ["scene.random_xy", "at least 0"]),
-        (["gate.box.window=0"], ["gate.box.window=0", "2000"]),
-        (["gate.box.open_fraction=1.2"], ["gate.box.open_fraction=1.2", "up to 1"]),
-        (["gate.box.force=0"], ["gate.box.force=0", "positive"]),
-        (["gate.box.inside=-0.001"], ["gate.box.inside=-0.001", "not negative"]),
-        (["gate.box.lift_steps=0"], ["gate.box.lift_steps=0", "at least 1"]),
-        (["gate.box.rest_sped=1"], ["rest_sped", "rest_speed"]),
+        (["task.check.window=0"], ["task.check.window=0", "at least 1"]),
+        (["task.check.window=2001"], ["task.check.window=2001", "2000"]),
+        (["task.check.open_fraction=1.2"], ["task.check.open_fraction=1.2", "at most 1"]),
+        (["task.check.force=0"], ["task.check.force=0", "above 0"]),
+        (["task.check.inside=-0.001"], ["task.check.inside=-0.001", "at least 0"]),
+        (["task.check.lift_steps=0"], ["task.check.lift_steps=0", "at least 1"]),
+        (["task.check.rest_sped=1"], ["rest_sped", "rest_speed"]),
         (["scene.box.heigth=1"], ["scene.box.heigth"]),
         (["timing=default", "timing.decimation=11"], ["50 Hz"]),
     ],
 )
 def test_bad_input_is_one_line(overrides: list[str], parts: list[str]) -> None:
     with pytest.raises(MjstackError) as caught:
-        load_config(["task=box", *overrides])
+        make_check(load_config(["task=box", *overrides]))
     message = str(caught.value)
     assert "\n" not in message
     for part in parts:

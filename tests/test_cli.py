@@ -319,7 +319,7 @@ def test_baseline_leaves_a_whole_report(folder: Path) -> None:
 
 
 def test_failed_gate_exits_1(folder: Path) -> None:
-    assert run(["gates=[baseline]", "gate.acceptance.xy_err=1e-6"]) == 1
+    assert run(["gates=[baseline]", "task.check.xy_err=1e-6"]) == 1
     report = the_report(folder)
     assert report["status"] == "fail"
     assert report["gates"][0]["status"] == "fail"
@@ -339,7 +339,7 @@ def test_sweep_reports_each_job_and_a_summary(folder: Path) -> None:
 
 
 def test_sweep_exits_with_its_worst_job(folder: Path) -> None:
-    assert run(["-m", "gate.acceptance.xy_err=0.015,1e-6", "gates=[baseline]"]) == 1
+    assert run(["-m", "task.check.xy_err=0.015,1e-6", "gates=[baseline]"]) == 1
     statuses = [
         json.loads(path.read_text())["status"] for path in sorted(folder.rglob("report.json"))
     ]

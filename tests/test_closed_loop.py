@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from check_cases import limits
 
 from mjstack import make_env
 from mjstack.config import load_config
@@ -127,11 +128,11 @@ def test_an_empty_grasp_is_tried_once_more_in_time(robot: str, stage: Stage) -> 
     assert visited[back] == names.index("above_red")
     # The rest at rate 1 would need 530 steps; it was over before the window in which cubes must
     # rest.
-    rest = env.cfg.gate.acceptance.window
+    rest = limits(env.cfg).window
     assert visited[-rest:] == [len(names) - 1] * rest
     red, blue = (env.sim.qpos[:, a : a + 3] for a in env.index.object_qpos)
     apart = red - blue
-    assert (apart[:, :2].norm(dim=1) < env.cfg.gate.acceptance.xy_err).all()
+    assert (apart[:, :2].norm(dim=1) < limits(env.cfg).xy_err).all()
     assert ((apart[:, 2] > 0.035) & (apart[:, 2] < 0.055)).all()
     env.close()
 

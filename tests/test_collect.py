@@ -87,7 +87,7 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         "nworld=4",
         "job.episodes=4",
         "job.keep_failures=true",
-        "gate.acceptance.xy_err=0.001",
+        "task.check.xy_err=0.001",
     ]
     before = os.getcwd()
     os.chdir(folder)
@@ -393,7 +393,7 @@ def test_what_the_hash_is_of() -> None:
     others += [
         "+observation.policy.noise=false",
         "reward.lift.weight=3",
-        "gate.acceptance.xy_err=0.01",
+        "task.check.xy_err=0.01",
     ]
     others += ["job.keep_failures=true", "controller.phases.done.seconds=2.0"]
     assert len({base, *(home(other) for other in others)}) == 1 + len(others)

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import mjstack.conf
 import pytest
+from check_cases import limits
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config, RobotSource
 from mjstack.errors import MjstackError
 from mjstack.jobs.gates import check_machine
+from mjstack.tasks.check import make_check
 
 CONF = Path(next(iter(mjstack.conf.__path__)))
 BELONGS = {"phases=box": ["task=box"]}  # choices that only another one makes sense of
@@ -91,7 +93,7 @@ def test_overrides_arrive() -> None:
             "timing=fine",
             "nworld=7",
             "gates=[capacity]",
-            "gate.acceptance.xy_err=0.01",
+            "task.check.xy_err=0.01",
             "batch.njmax=90",
         ]
     )
@@ -99,7 +101,7 @@ def test_overrides_arrive() -> None:
     assert cfg.timing.step_dt == pytest.approx(0.02)
     assert cfg.nworld == 7
     assert cfg.gates == ["capacity"]
-    assert cfg.gate.acceptance.xy_err == 0.01
+    assert limits(cfg).xy_err == 0.01
     assert cfg.batch.njmax == 90
 
 
@@ -160,7 +162,7 @@ def test_task_figures_of_each_robot(robot: str) -> None:
 
 
 def test_acceptance_figures(so101_cfg: Config) -> None:
-    t = so101_cfg.gate.acceptance
+    t = limits(so101_cfg)
     assert (t.xy_err, t.dz_min, t.dz_max) == (0.015, 0.035, 0.055)
     assert (t.airborne_height, t.lift_steps, t.carry_steps, t.carry_distance) == (
         0.010,
@@ -224,11 +226,11 @@ BAD = [
     (["task.episode_steps=0"], "task.episode_steps=0"),
     (["reward.lift.wait=1"], "wait"),
     (["solver.tolerance=0"], "solver.tolerance"),
-    (["gate.acceptance.carry_phase=above_blu"], "Did you mean 'above_blue'?"),
-    (["gate.acceptance.lift_phases=[lift]"], "lift_red"),
+    (["task.check.carry_phase=above_blu"], "Did you mean 'above_blue'?"),
+    (["task.check.lift_phases=[lift]"], "lift_red"),
     (["gate.parity.states.stacked=don"], "Did you mean 'done'?"),
     (["gate.throughput.from_phase=lift"], "Did you mean 'lift_red'?"),
-    (["gate.acceptance.window=1"], "gate.acceptance.window=1"),
+    (["task.check.window=1"], "task.check.window=1"),
     (["gate.throughput.repetitions=0"], "gate.throughput.repetitions=0"),
     (["controller.phases.release.seconds=0.013"], "multiple of the step"),
     (["controller.phases.release.gripper=ajar"], "open or closed"),
@@ -282,7 +284,7 @@ BAD = [
 @pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
 def test_bad_input_is_one_line(overrides: list[str], says: str) -> None:
     with pytest.raises(MjstackError) as caught:
-        load_config(overrides)
+        make_check(load_config(overrides))
     assert caught.value.exit_code == 2
     message = str(caught.value)
     assert message.strip()

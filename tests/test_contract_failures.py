@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from check_cases import rules_of
 from comparison import assert_same_run
 from environments import brisk
 
@@ -23,7 +24,7 @@ from mjstack.gates.capacity import run_capacity
 from mjstack.gates.throughput import run_throughput
 from mjstack.report.record import Status
 from mjstack.sim import Overflow, Simulation
-from mjstack.tasks.stack import RULES, StackCheck
+from mjstack.tasks.check import make_check
 
 
 def teleport(context: GateContext, world: int) -> Callable[[int, Simulation], None]:
@@ -38,7 +39,7 @@ def teleport(context: GateContext, world: int) -> Callable[[int, Simulation], No
 
 
 def rules(bits: torch.Tensor) -> list[set[str]]:
-    return [set(RULES.broken(int(b))) for b in bits]
+    return [set(rules_of("stack").broken(int(b))) for b in bits]
 
 
 def test_native(
@@ -122,18 +123,19 @@ def test_overflow_in_exactly_the_crowded_world(
     context = stage("so101")
     # Any world needs up to 144 rows in the first steps, the crowded one 192.
     sim = make_sim("mjwarp", 3, "batch.njmax=160")
-    context.start(sim, context.cfg.reset)
+    env = context.start(sim, context.cfg.reset)
     sim.forward()
     assert int(sim.overflow.abs().sum()) == 0
     crowd(context, sim, 1)
-    check = StackCheck(context.cfg, context.index, context.planner.phases, 3, sim.device)
+    check = make_check(context.cfg)
+    check.start(env, context.planner.phases[-1].stop, context.planner.phases)
     for _ in range(3):
         sim.step(10)
-        check.update(sim, torch.zeros(3, dtype=torch.int64))
+        check.update(torch.zeros(3, dtype=torch.int64))
     bits = sim.overflow.tolist()
     assert bits[1] & Overflow.NEFC
     assert bits[0] == bits[2] == 0
-    found = rules(check.result(sim).failed)
+    found = rules(check.result().failed)
     assert ["OVERFLOW" in broken for broken in found] == [False, True, False]
     sim.reset(torch.tensor([False, True, False]))
     sim.step(1)

@@ -62,7 +62,7 @@ PATHS: dict[str, list[str] | None] = {
         "EndEffectorDelta.write_commands",
     ],
     "mdp/reset.py": [
-        *("home", "_write", "_write_robot", "_write_cube"),
+        *("home", "_write", "_write_robot", "_write_object"),
         *(
             f"{name}.__call__"
             for name in (
@@ -75,7 +75,7 @@ PATHS: dict[str, list[str] | None] = {
             )
         ),
     ],
-    "mdp/variation.py": [
+    "mdp/starts/randomization.py": [
         *(
             f"{name}.{n}"
             for name in ("ObjectMasses", "SlidingFriction", "ServoGains")
@@ -83,37 +83,42 @@ PATHS: dict[str, list[str] | None] = {
         ),
         *(f"_Elements.{n}" for n in ("read", "write", "scale")),
     ],
-    "mdp/layout.py": ["FromStartsFile.__call__"],
-    "mdp/placement.py": ["Placement.choose", "Placement._choose"],
-    "tasks/stack.py": [
+    "mdp/starts/starts_file.py": ["FromStartsFile.__call__"],
+    "mdp/starts/placement.py": ["Placement.choose", "Placement._choose"],
+    "tasks/check.py": ["EpisodeCheck.update"],
+    "tasks/view.py": [
+        *(f"TaskView.{n}" for n in ("step", "judged", "forget")),
         *(
-            f"CubePair.{n}"
-            for n in ("pose", "speed", "clearance", "offset", "stacked", "supported")
+            f"Step.{n}"
+            for n in (
+                *("once", "pose", "pos", "velocity", "turn", "height", "bounds", "speed"),
+                *("pressed", "in_hand", "untouched", "supported", "judged", "_judged", "_sensed"),
+            )
         ),
-        "StackCheck.update",
-        "StackCheck.placed",
-        "StackSuccess.__call__",
-        "StackSuccess.reset",
     ],
+    "tasks/parts.py": [
+        *("airborne", "in_hand", "on_top", "offset", "on_table"),
+        *(f"{n}.update" for n in ("Streak", "Carried", "InWindow", "AtRest")),
+        *(f"{n}.held" for n in ("Streak", "Carried", "InWindow")),
+        *("Streak._counts", "RestWindow.append", "RestWindow.compare"),
+    ],
+    "tasks/stack.py": ["StackCheck.placed", "StackSuccess.__call__", "StackSuccess.reset"],
     "tasks/box.py": [
-        *(
-            f"CubesAndBox.{n}"
-            for n in ("pose", "bounds", "speed", "beyond", "over", "inside", "off_slot")
-        ),
-        *(f"CubesAndBox.{n}" for n in ("pressed", "supported", "opening", "_forces")),
-        *(f"BoxCheck.{n}" for n in ("update", "placed")),
+        *(f"Inside.{n}" for n in ("beyond", "holds", "over")),
+        *(f"BoxCheck.{n}" for n in ("airborne", "resting", "placed")),
+        *(f"{n}.update" for n in ("_Grasp", "_CarriedOver", "_Drop", "_Release", "_Settled")),
+        *("corner_speed", "_Order.update", "_Release.held"),
         "BoxSuccess.__call__",
         "BoxSuccess.reset",
     ],
     "tasks/box_terms.py": [
         *(f"{n}.__call__" for n in ("ToSlot", "Place", "InBox", "ReachNext", "GraspNext")),
-        "cubes_inside",
+        *("_ByObject._inside", "_ByObject._next"),
     ],
-    "tasks/runs.py": None,
     "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
-    "control/planner.py": ["JointTrajectory.command"],
-    "control/controller.py": ["Recorded.append", "Recorded.command", "OpenLoopDriver.command"],
-    "control/scripted.py": [
+    "drivers/open_loop.py": ["JointTrajectory.command"],
+    "drivers/driver.py": ["Recorded.append", "Recorded.command", "OpenLoopDriver.command"],
+    "drivers/closed_loop.py": [
         *(
             f"ClosedLoopDriver.{n}"
             for n in (
@@ -127,7 +132,7 @@ PATHS: dict[str, list[str] | None] = {
             )
         )
     ],
-    "control/tilt.py": ["CarryTilt.wish"],
+    "drivers/tilt.py": ["CarryTilt.wish"],
     "episodes/failures.py": ["FailureMonitor.update", "_of"],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from check_cases import limits, rules_of
 from environments import brisk, rushed
 from omegaconf import OmegaConf
 
@@ -28,7 +29,8 @@ from mjstack.episodes.rollout import snapshot
 from mjstack.jobs.archived_starts import STEM, archive_starts, copy_names
 from mjstack.jobs.replay import _compare
 from mjstack.sim import BatchSizes
-from mjstack.tasks.stack import RULES
+
+RULES = rules_of("stack")
 
 FAILING = "0:4"
 SUCCEEDED = "1:3"  # of the run below
@@ -45,7 +47,7 @@ def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "sim=native",
         "nworld=7",
         "gate.batch.seeds=2",
-        "gate.acceptance.xy_err=0.0015",
+        "task.check.xy_err=0.0015",
     ]
     assert run([*args, f"hydra.run.dir={folder}"]) == 1
     return folder
@@ -148,7 +150,7 @@ def test_accepted_world_of_another_seed(earlier: Path, succeeded: tuple[Path, in
 def test_trajectory_holds_the_episode(
     failing: tuple[Path, int, dict], new_context: Callable[..., GateContext]
 ) -> None:
-    context = new_context("sim=native", "gate.acceptance.xy_err=0.0015")
+    context = new_context("sim=native", "task.check.xy_err=0.0015")
     sim = context.batch_simulation(7)
     controller = context.driver(context.start(sim, context.cfg.reset))
     with np.load(failing[0] / "trajectory.npz") as held:
@@ -190,11 +192,11 @@ def test_saved_configuration_is_the_runs_own(
             "sim=native",
             "nworld=7",
             "gate.batch.seeds=2",
-            "gate.acceptance.xy_err=0.0015",
+            "task.check.xy_err=0.0015",
         ]
     )
     played = OmegaConf.load(out / "replayed_config.yaml")
-    assert (played.seed, played.gate.acceptance.xy_err) == (1, 0.0015)
+    assert (played.seed, limits(played).xy_err) == (1, 0.0015)
 
 
 def test_another_verdict_is_said(
@@ -535,7 +537,7 @@ def test_mjwarp_world_is_played_on_both_engines(
         "sim=mjwarp",
         "sim.device=cpu",
         "nworld=2",
-        "gate.acceptance.xy_err=1e-6",
+        "task.check.xy_err=1e-6",
         *brisk(),
     ]
     assert run([*args, f"hydra.run.dir={folder}"]) == 1

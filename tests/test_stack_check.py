@@ -6,16 +6,17 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from check_cases import STOPPED_EARLY, Altered, Cases
+from check_cases import STOPPED_EARLY, Altered, Cases, limits, rules_of
 from stack_checker import BLUE, RED, Outcome, check_world
 
-from mjstack.tasks.check import CheckResult
-from mjstack.tasks.stack import RULES, StackCheck
+from mjstack.tasks.check import CheckResult, make_check
 
+RULES = rules_of("stack")
 CASES = Cases(RULES)
 HAIR = 2e-6  # [m], [m/s], [rad]: a good deal more than float32 rounds at these sizes
 NUMBERS = {
@@ -34,6 +35,7 @@ class World:
 
     pose: np.ndarray
     velocity: np.ndarray
+    force: np.ndarray
     step_count: int
     rec: SimpleNamespace
     overflow: int = 0
@@ -45,32 +47,49 @@ class World:
 
     @property
     def window(self) -> slice:
-        return slice(-self.rec.cfg.gate.acceptance.window, None)
+        return slice(-self.t.window, None)
+
+    @property
+    def t(self) -> Any:
+        return limits(self.rec.cfg)
 
 
 def feed(
-    worlds: list[World], rec: SimpleNamespace, dtype: torch.dtype = torch.float64
+    worlds: list[World],
+    rec: SimpleNamespace,
+    dtype: torch.dtype = torch.float64,
+    *,
+    phased: bool = True,
 ) -> CheckResult:
-    """Plays recordings through the check; the state also has one coordinate of an arm."""
-    addresses = {"red": (1, 1), "blue": (8, 7)}
-    index = SimpleNamespace(object_address=addresses.__getitem__)
+    """Plays recordings through the check, as of a driver with phases or without; the state also has
+    one coordinate of an arm.
+    """
+    index = SimpleNamespace(
+        object_address={"red": (1, 1), "blue": (8, 7)}.__getitem__,
+        jaw_force=rec.jaw_force,
+        support_force={},
+        fixed={},
+    )
     n = len(worlds)
-    check = StackCheck(rec.cfg, index, rec.phases, n, torch.device("cpu"))
     phase_at = torch.tensor([i for i, p in enumerate(rec.phases) for _ in range(p.start, p.stop)])
     arm = np.array([[w.arm] for w in worlds])
     pose = np.stack([w.pose.reshape(len(w.pose), 14) for w in worlds])
     velocity = np.stack([w.velocity.reshape(len(w.velocity), 12) for w in worlds])
+    force = np.stack([w.force for w in worlds])
     sim = SimpleNamespace(
-        nworld=n,
-        device=torch.device("cpu"),
         step_count=torch.tensor([w.step_count for w in worlds]),
         overflow=torch.tensor([w.overflow for w in worlds], dtype=torch.int32),
     )
+    env = SimpleNamespace(sim=sim, cfg=rec.cfg, index=index, nworld=n, device=torch.device("cpu"))
+    check = make_check(rec.cfg)
+    check.start(env, len(phase_at), rec.phases if phased else ())
     for step in range(pose.shape[1]):
         sim.qpos = torch.tensor(np.hstack([arm, pose[:, step]]), dtype=dtype)
         sim.qvel = torch.tensor(np.hstack([arm, velocity[:, step]]), dtype=dtype)
-        check.update(sim, phase_at[min(step, len(phase_at) - 1)].expand(n))
-    return check.result(sim)
+        sim.sensordata = torch.tensor(force[:, step], dtype=dtype)
+        phase = phase_at[min(step, len(phase_at) - 1)].expand(n)
+        check.update(phase if phased else None)
+    return check.result()
 
 
 def reference(w: World) -> Outcome:
@@ -102,7 +121,7 @@ def test_recorded_episodes(
 ) -> None:
     rec = recorded(robot)
     worlds = [
-        World(rec.pose[k], rec.velocity[k], int(rec.step_count[k]), rec)
+        World(rec.pose[k], rec.velocity[k], rec.force[k], int(rec.step_count[k]), rec)
         for k in range(len(rec.pose))
     ]
     result = feed(worlds, rec, dtype)
@@ -130,7 +149,7 @@ def fallen_off_in_the_last_step_only(w: World) -> None:
 
 @CASES.case("STACKED")
 def stacked_late_by_one_step(w: World) -> None:
-    first = len(w.pose) - w.rec.cfg.gate.acceptance.window
+    first = len(w.pose) - w.t.window
     w.pose[w.window, RED, 0] += 0.0149
     w.pose[first, RED, 0] += 0.0002
 
@@ -272,35 +291,35 @@ def hair(name: str, amount: Callable[[World, float], None], *broken: str) -> Non
 
 
 def _xy(w: World, by: float) -> None:
-    w.pose[w.window, RED, 0] = w.pose[w.window, BLUE, 0] + w.rec.cfg.gate.acceptance.xy_err + by
+    w.pose[w.window, RED, 0] = w.pose[w.window, BLUE, 0] + w.t.xy_err + by
 
 
 def _dz_min(w: World, by: float) -> None:
-    w.pose[w.window, RED, 2] = w.pose[w.window, BLUE, 2] + w.rec.cfg.gate.acceptance.dz_min - by
+    w.pose[w.window, RED, 2] = w.pose[w.window, BLUE, 2] + w.t.dz_min - by
 
 
 def _dz_max(w: World, by: float) -> None:
-    w.pose[w.window, RED, 2] = w.pose[w.window, BLUE, 2] + w.rec.cfg.gate.acceptance.dz_max + by
+    w.pose[w.window, RED, 2] = w.pose[w.window, BLUE, 2] + w.t.dz_max + by
 
 
 def _gap_above(w: World, by: float) -> None:
-    w.pose[w.window, :, 2] += w.rec.cfg.gate.acceptance.support_gap + by
+    w.pose[w.window, :, 2] += w.t.support_gap + by
 
 
 def _gap_below(w: World, by: float) -> None:
-    w.pose[w.window, :, 2] -= w.rec.cfg.gate.acceptance.support_gap + by
+    w.pose[w.window, :, 2] -= w.t.support_gap + by
 
 
 def _speed(w: World, by: float) -> None:
-    w.velocity[w.window, RED, 1] = w.rec.cfg.gate.acceptance.rest_speed + by
+    w.velocity[w.window, RED, 1] = w.t.rest_speed + by
 
 
 def _position(w: World, by: float) -> None:
-    w.pose[-30, :, 1] += w.rec.cfg.gate.acceptance.rest_position + by
+    w.pose[-30, :, 1] += w.t.rest_position + by
 
 
 def _rotation(w: World, by: float) -> None:
-    half = 0.5 * (math.radians(w.rec.cfg.gate.acceptance.rest_rotation_deg) + by)
+    half = 0.5 * (math.radians(w.t.rest_rotation_deg) + by)
     w.pose[-30, RED, 3:] = [math.cos(half), 0.0, 0.0, math.sin(half)]
 
 
@@ -308,12 +327,12 @@ def _height(w: World, by: float) -> None:
     top = w.rec.cfg.scene.table_center[2] + w.rec.cfg.scene.table_half[2]
     flight = slice(w.steps("lift_red").start, w.steps("above_blue").stop)
     w.pose[flight, RED, 3:] = [1.0, 0.0, 0.0, 0.0]
-    w.pose[flight, RED, 2] = top + 0.022 + w.rec.cfg.gate.acceptance.airborne_height - by
+    w.pose[flight, RED, 2] = top + 0.022 + w.t.airborne_height - by
 
 
 def _carry_distance(w: World, by: float) -> None:
     w.pose[w.steps("above_blue"), RED, :2] = w.pose[0, RED, :2]
-    w.pose[w.steps("above_blue").stop - 1, RED, 0] += w.rec.cfg.gate.acceptance.carry_distance - by
+    w.pose[w.steps("above_blue").stop - 1, RED, 0] += w.t.carry_distance - by
 
 
 hair("xy_err", _xy, "STACKED")
@@ -333,7 +352,13 @@ def altered(recorded: Callable[[str], SimpleNamespace]) -> Altered:
     rec = recorded("so101")
 
     def fresh() -> World:
-        world = World(rec.pose[0].copy(), rec.velocity[0].copy(), int(rec.step_count[0]), rec)
+        world = World(
+            rec.pose[0].copy(),
+            rec.velocity[0].copy(),
+            rec.force[0].copy(),
+            int(rec.step_count[0]),
+            rec,
+        )
         _make_ideal(world)
         return world
 
@@ -361,7 +386,9 @@ def test_episode_cut_short_fails_whatever_came_before(
     recorded: Callable[[str], SimpleNamespace],
 ) -> None:
     rec = recorded("so101")
-    world = World(rec.pose[0][:-1], rec.velocity[0][:-1], int(rec.step_count[0]), rec)
+    world = World(
+        rec.pose[0][:-1], rec.velocity[0][:-1], rec.force[0][:-1], int(rec.step_count[0]), rec
+    )
     assert {"STEPS", "STACKED", "SUPPORTED"} <= CASES.broken(feed([world], rec))
 
 

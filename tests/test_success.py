@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from check_cases import rules_of
 from environments import brisk, configure, rushed
 
 from mjstack.cli import run
@@ -33,7 +34,8 @@ from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation
-from mjstack.tasks.stack import RULES
+
+RULES = rules_of("stack")
 
 PHASES = list(configure().controller.phases)
 

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from check_cases import limits
 from environments import actions, configure, held, mask_of, new_sim, on_shared_sim, returned
 from stack_checker import BLUE, RED, lowest_corner, rotation_matrix
 
@@ -400,7 +401,7 @@ def test_success_ends_a_scripted_episode(
     """
     rec = scripted(robot)
     first = rec.success.int().argmax(0).tolist()
-    window = rec.cfg.gate.acceptance.window
+    window = limits(rec.cfg).window
     placed = next(p for p in rec.phases if p.name == "place_stack").stop
     assert all(step >= placed + window // 2 for step in first)
     assert rec.success[-1].all()
@@ -435,7 +436,7 @@ def rested(
         cfg: Thresholds, table and cubes.
         since: First frame of the episode that each step belongs to, shape ``(steps,)``.
     """
-    t = cfg.gate.acceptance
+    t = limits(cfg)
     scene = cfg.scene
     half = scene.objects["red"].half_height
     top = table_top(cfg)
@@ -730,7 +731,7 @@ def test_reaching_ends_the_episode_after_ten_steps_in_a_row(backend: str) -> Non
     for step in range(1, 17):
         grasp_point = env.sim.site_xpos[:, env.index.grasp_sites].mean(1)
         env.sim.qpos[1:, q : q + 3] = grasp_point[1:] - torch.tensor(
-            [0.0, 0.0, cfg.task.goal_height], device=env.device
+            [0.0, 0.0, cfg.task.params["goal_height"]], device=env.device
         )
         env.sim.qvel[1:, v : v + 6] = 0.0
         if step == 6:

@@ -218,7 +218,7 @@ def test_rejected_episode_voids_every_measurement(new_context: Callable[..., Gat
             "nworld=2",
             *SHORT,
             "gate.throughput.repetitions=1",
-            "gate.acceptance.xy_err=1e-7",
+            "task.check.xy_err=1e-7",
         )
     )
     assert result.status is Status.failed

@@ -152,8 +152,8 @@ def play_bare(
     sim.latch()
     if lost := int(lost_worlds(sim).sum()):
         return seconds, f"{lost} worlds overflowed or diverged with bare steps"
-    check = context.check(cfg, context.index, context.planner.phases, sim.nworld, sim.device)
-    fallen = int((~check.placed(sim).all(1)).sum())
+    end = context.check.view(env).step()
+    fallen = int((~context.check.placed(end).all(1)).sum())
     return seconds, f"{fallen} worlds did not do the task with bare steps" if fallen else ""
 
 

@@ -43,7 +43,7 @@ def type_terms(cfg: Config) -> None:
         group.terms = _terms(f"observation.{name}.terms", group.terms, ObservationTermCfg)
     if isinstance(cfg.job, StudyJobCfg):
         cfg.job.variants = {
-            name: _typed(
+            name: typed(
                 f"job.variants.{name}",
                 asdict(cfg.solver) | node if isinstance(node, dict) else node,
                 SolverCfg,
@@ -54,13 +54,21 @@ def type_terms(cfg: Config) -> None:
 
 def _terms(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
     return {
-        name: _typed(f"{key}.{name}", node, kind)
-        for name, node in nodes.items()
-        if node is not None
+        name: typed(f"{key}.{name}", node, kind) for name, node in nodes.items() if node is not None
     }
 
 
-def _typed(key: str, node: Any, kind: type) -> Any:
+def typed(key: str, node: Any, kind: type) -> Any:
+    """A mapping of a composed configuration as a dataclass.
+
+    Args:
+        key: Its dotted key, for errors.
+        node: The mapping.
+        kind: The dataclass.
+
+    Raises:
+        MjstackError: A key is unknown or missing, or a value has the wrong type.
+    """
     names = [field.name for field in fields(kind)]
     if not isinstance(node, dict):
         raise ConfigError(key, node, f"a mapping with some of {', '.join(names)}")

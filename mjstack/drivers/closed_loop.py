@@ -18,6 +18,7 @@ from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.base import EnvView
 from mjstack.mdp.geometry import objects_in_hand, place_xy, pose_w, robot
 from mjstack.scene.phases import build_phases, build_targets, grasped_objects, source_names
+from mjstack.tasks.check import make_check
 
 _QUARTER = 0.5 * math.pi
 _STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
@@ -328,7 +329,7 @@ class ClosedLoopDriver:
         # From the start of a phase to that of the last one, where the arm rests.
         self._needed = table([self.phases[-1].start - phase.start for phase in self.phases])
         self._speed_limit = cfg.controller.speed_limit
-        window = cfg.gate.acceptance.window if cfg.scene.box is None else cfg.gate.box.window
+        window = 0 if cfg.task.check is None else make_check(cfg).settle_steps
         self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)
 
 

@@ -48,7 +48,7 @@ from mjstack.sim import (
     resolve_sizes,
 )
 from mjstack.sim.sizes import apply_configured
-from mjstack.tasks.check import CheckResult, EpisodeCheck, Rules, check_class
+from mjstack.tasks.check import CheckResult, EpisodeCheck, Rules, make_check
 
 log = logging.getLogger(__name__)
 
@@ -171,9 +171,9 @@ class GateContext:
         return SceneIndex(self.model, self.cfg.robot, self.cfg.scene)
 
     @cached_property
-    def check(self) -> type[EpisodeCheck]:
-        """How the task is judged."""
-        return check_class(self.cfg)
+    def check(self) -> EpisodeCheck:
+        """Describes how the task is judged: its rules, thresholds and report."""
+        return make_check(self.cfg)
 
     @cached_property
     def planner(self) -> OpenLoopPlanner:

@@ -12,10 +12,9 @@ from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
 from mjstack.episodes.rollout import Observer
 from mjstack.math import not_finite
-from mjstack.mdp.geometry import objects_in_hand
 from mjstack.scene.phases import carried_objects, grasped_objects
 from mjstack.sim.simulation import LOST_PHYSICS
-from mjstack.tasks.check import check_class
+from mjstack.tasks.check import make_check
 
 GONE_FRAMES = 3  # in a row without load on both jaws: less may be a touch in passing
 
@@ -81,18 +80,23 @@ class FailureMonitor(Observer):
     step: torch.Tensor
 
     def __init__(self, cfg: Config) -> None:
-        """Reads the phases."""
-        self._tables = grasped_objects(cfg), carried_objects(cfg)
-        self._releases = _releases(self._tables[1], len(cfg.scene.objects))
+        """Reads the phases, and what belongs where."""
+        self._check = make_check(cfg)
+        objects = self._check.objects
+        numbers = {name: number for number, name in enumerate(cfg.scene.objects)}
+        column = {numbers[name]: place for place, name in enumerate(objects)}
+        # Without phases there is one, in which nothing is grasped or carried.
+        self._tables = tuple(
+            [column.get(number, -1) for number in table] or [-1]
+            for table in (grasped_objects(cfg), carried_objects(cfg))
+        )
+        self._releases = _releases(self._tables[1], len(objects))
 
     def start(self, env: Env, driver: Controller) -> None:
         """Allocate for the environment's worlds."""
         self._env = env
         self._driver = driver
-        # For where objects belong: it is not updated.
-        self._check = check_class(env.cfg)(
-            env.cfg, env.index, driver.phases, env.nworld, env.device
-        )
+        self._view = self._check.view(env)
         n = env.nworld
         device = env.device
 
@@ -114,11 +118,11 @@ class FailureMonitor(Observer):
 
     def update(self) -> None:
         """Process the end of a step. Fixed shapes, no host read."""
-        env = self._env
-        sim = env.sim
+        sim = self._env.sim
         phase = self._driver.phase
-        loaded = objects_in_hand(env.index, sim)
-        placed = self._check.placed(sim)
+        step = self._view.step()
+        loaded = step.in_hand
+        placed = self._check.placed(step)
 
         lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
         entered = phase > self._at

@@ -11,7 +11,7 @@ from mjstack.drivers.driver import Controller, Recorded
 from mjstack.envs import Env
 from mjstack.episodes.rollout import Advance, Observer, RolloutTiming, State, rollout, snapshot
 from mjstack.sim import Simulation
-from mjstack.tasks.check import CheckResult, check_class
+from mjstack.tasks.check import CheckResult, make_check
 
 StepHook = Callable[[int, Simulation], None]
 
@@ -76,18 +76,17 @@ class Judge(Observer):
 
     def start(self, env: Env, driver: Controller) -> None:
         """See `Observer`."""
-        cfg = env.cfg
-        self._sim = env.sim
         self._driver = driver
-        self._check = check_class(cfg)(cfg, env.index, driver.phases, env.nworld, env.device)
+        self._check = make_check(env.cfg)
+        self._check.start(env, driver.steps, driver.phases)
 
     def update(self) -> None:
         """See `Observer`."""
-        self._check.update(self._sim, self._driver.phase)
+        self._check.update(self._driver.phase)
 
     def finish(self) -> None:
         """See `Observer`."""
-        self.result = self._check.result(self._sim)
+        self.result = self._check.result()
 
 
 class WorldRecorder(Observer):

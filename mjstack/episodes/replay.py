@@ -260,7 +260,7 @@ def _explain(
             f"{len(finite) * cfg.timing.decimation} steps",
         ),
         "OVERFLOW": (describe_overflow(int(sim.overflow[0])) or "none", "none"),
-        **context.check.explain(cfg, steps, values),
+        **context.check.report(values),
     }
     return [
         RuleFinding(

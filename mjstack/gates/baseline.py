@@ -24,7 +24,7 @@ def run_baseline(context: GateContext) -> list[GateResult]:
     metrics["peak_constraint_rows"] = int(sim.peak_constraints[0])
     context.shown = nominal.world
     context.shown_by = "baseline world"
-    thresholds = context.check.thresholds(cfg) | {"waypoint_error_m": cfg.controller.ik_tolerance}
+    thresholds = context.check.thresholds() | {"waypoint_error_m": cfg.controller.ik_tolerance}
     summary = reason or headline
     return [
         GateResult(

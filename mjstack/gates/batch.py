@@ -47,7 +47,7 @@ def run_batch(context: GateContext) -> list[GateResult]:
             name="batch",
             status=Status.failed if problems else Status.passed,
             reason="; ".join([summary, *problems]) + tally.way_to_look(context),
-            thresholds=context.check.thresholds(cfg) | thresholds,
+            thresholds=context.check.thresholds() | thresholds,
             metrics=metrics,
             notes=tally.notes,
             details=tally.all_details(context),

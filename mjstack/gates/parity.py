@@ -32,7 +32,7 @@ def run_parity(context: GateContext) -> list[GateResult]:
     cfg = context.cfg
     reference = context.nominal
     mjwarp = context.parity_simulation()
-    found = _Findings(thresholds=context.check.thresholds(cfg))
+    found = _Findings(thresholds=context.check.thresholds())
     _compare_states(context, mjwarp, found)
     for option, (asked, held, uploaded, equal) in compare_options(
         cfg, reference.sim, mjwarp

@@ -100,7 +100,7 @@ def run_success(context: GateContext) -> list[GateResult]:
             name="success",
             status=Status.passed if good else Status.failed,
             reason="; ".join([*parts, *tally.problems]) + tally.way_to_look(own),
-            thresholds=own.check.thresholds(cfg) | {"success_rate_min": t.rate},
+            thresholds=own.check.thresholds() | {"success_rate_min": t.rate},
             metrics=metrics,
             notes=tally.notes,
             details=tally.all_details(own),

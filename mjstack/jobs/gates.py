@@ -20,8 +20,7 @@ from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, check_showing, run_reported
 from mjstack.sim import resolve_backend
-
-_SCRIPTED = ("stack", "box")  # tasks
+from mjstack.tasks.check import make_check
 
 
 def check_machine(cfg: Config) -> None:
@@ -56,9 +55,7 @@ def _check_success(cfg: Config) -> None:
 def check_task(cfg: Config) -> None:
     """Raises if the scripted task cannot be played as configured, on this machine."""
     resolve_backend(cfg)
-    if cfg.task.name not in _SCRIPTED:
-        expected = f"one of {', '.join(_SCRIPTED)}, whose scripted episode the gates verify"
-        raise ConfigError("task", cfg.task.name, expected, "Train it: mjstack.make_env")
+    make_check(cfg)  # reads its thresholds
     OpenLoopPlanner(cfg)  # reads the robot, and reaches every nominal target
     env = build_env(
         cfg, nworld=1, backend=Backend.native, device="cpu"

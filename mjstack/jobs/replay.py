@@ -288,7 +288,7 @@ def _replay(
             name=f"replay_{backend.value}",
             status=status,
             reason=reason,
-            thresholds=context.check.thresholds(plan.cfg),
+            thresholds=context.check.thresholds(),
             metrics={"seed": plan.seed, "world": plan.world, **metrics},
             notes=notes,
             details=told + plan.notes + changes,

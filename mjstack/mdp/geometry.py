@@ -20,7 +20,7 @@ def robot(env: EnvView) -> RobotTensors:
 
 
 POSES = ("home", "start")
-LOADED = 1e-5  # N: a jaw that presses with more touches the cube (as in gate.box.force)
+LOADED = 1e-5  # N: a jaw that presses with more touches the object
 
 
 def named_pose(env: EnvView, pose: str) -> torch.Tensor:

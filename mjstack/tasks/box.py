@@ -1,417 +1,525 @@
-"""Check of the box task: fixed-size state machines on the device, fed step by step, for every world
-at once.
-"""
+"""Task *box*: objects into a box, one after the other, each to its place."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from typing import ClassVar
+from dataclasses import dataclass
 
-import numpy as np
 import torch
 
-from mjstack.config.schema import Config
-from mjstack.config.validate import BOX_ROLES
-from mjstack.errors import ConfigError, ParameterError
+from mjstack.config.fields import spec
+from mjstack.config.schema import BoxCfg, Config
+from mjstack.errors import ConfigError, ParameterError, UnknownName
 from mjstack.managers.base import EnvView
-from mjstack.math import not_finite, quat_to_matrix
 from mjstack.mdp.geometry import gripper_opening
-from mjstack.scene import LowestPoint, SceneIndex, table_top
-from mjstack.scene.index import Columns
-from mjstack.scene.phases import Phase
-from mjstack.sim.simulation import LOST_PHYSICS, Simulation
-from mjstack.tasks.box_report import report_box
-from mjstack.tasks.check import CheckResult, EpisodeCheck, Rules
-from mjstack.tasks.streaks import extend_carry, extend_run
+from mjstack.scene import LowestPoint, table_top
+from mjstack.tasks.check import EpisodeCheck, Rule
+from mjstack.tasks.parts import Carried, InWindow, Streak, away, in_hand, millimetres
+from mjstack.tasks.view import Step, TaskView
 
-COLORS = ("red", "blue")  # the order of every dimension over cubes
-
-
-_PER_CUBE = {
-    "GRASP": "not grasped",
-    "LIFT": "not lifted",
-    "CARRY": "not carried over the box",
-    "DROP": "dropped",
-    "RELEASE": "not released",
-    "SETTLED": "not at rest in the box after its release",
-}
-RULES = Rules(
-    {
-        **{
-            f"{name}_{c.upper()}": f"{c} {text}" for name, text in _PER_CUBE.items() for c in COLORS
-        },
-        "ORDER": "blue grasped before red was released",
-        "INSIDE": "a cube not at rest in the box at the end",
-        "JAW_CLEAR": "gripper too low at the end",
-    }
+ROLES = (
+    "approach",
+    "descend",
+    "close",
+    "lift",
+    "carry",
+    "hold",
+    "open",
+    "retreat",
+    "settle",
 )
+"""Phases of each object, such as ``lift_red``."""
 
 
-class CubesAndBox:
-    """Both cubes of every world as the rules see them, red first, float32.
+def scene_box(cfg: Config) -> BoxCfg:
+    """The scene's box.
 
-    Poses, speeds and the gripper come from qpos and qvel, which are never stale. Forces are those
-    of the last physics step. A sensor gives the net force of a jaw on a cube; that is the sum of
-    the normal forces up to a factor of 1.6, because friction adds at most 1.2 times the normal
-    force across it and the normals of one jaw on a convex cube do not cancel. The threshold is ten
-    million times smaller than a grasp's force: it tells contact from none.
+    Raises:
+        ConfigError: It has none.
     """
+    if cfg.scene.box is None:
+        raise ConfigError("scene", cfg.scene.name, "a scene with a box", "Set scene=box")
+    return cfg.scene.box
 
-    def __init__(self, cfg: Config, index: SceneIndex, device: torch.device) -> None:
-        """Reads addresses, thresholds and the box's place.
+
+class Inside:
+    """The inside of the scene's box, and how objects lie to it."""
+
+    def __init__(self, cfg: Config, tolerance: float) -> None:
+        """Reads the box.
+
+        Args:
+            cfg: The configuration.
+            tolerance: How far a corner may be beyond the inside [m].
 
         Raises:
             ConfigError: The scene has no box.
         """
-        scene = cfg.scene
-        box = cfg.scene.box
-        if box is None:
-            raise ConfigError("scene", scene.name, "a scene with a box", "Set scene=box")
-        self._t = cfg.gate.box
-        self._half = scene.objects[COLORS[0]].size[0]
-        self.top = table_top(scene)
-        self.rim = self.top + box.height
-        self._qpos = [index.object_address(name)[0] for name in COLORS]
-        self._qvel = [index.object_address(name)[1] for name in COLORS]
-        self._jaws = [index.jaw_force[name] for name in COLORS]
-        self._supports = [index.support_force[name] for name in COLORS]
+        box = scene_box(cfg)
+        top = table_top(cfg.scene)
+        self.rim = top + box.height
+        self._low = [*(box.center[i] - box.half[i] for i in (0, 1)), top + box.floor]
+        self._high = [*(box.center[i] + box.half[i] for i in (0, 1)), self.rim]
+        self._tolerance = tolerance
 
-        def constant(values: object) -> torch.Tensor:
-            return torch.tensor(values, dtype=torch.float32, device=device)
-
-        low = [box.center[i] - box.half[i] for i in (0, 1)]
-        high = [box.center[i] + box.half[i] for i in (0, 1)]
-        self._low, self._high = constant([*low, self.top + box.floor]), constant([*high, self.rim])
-        self._slots = constant([scene.places[f"{name}_slot"].xy for name in COLORS])
-        self._corners = self._half * constant(list(itertools.product((-1.0, 1.0), repeat=3)))
-        self._gripper = Columns(index.robot_qpos[index.n_arm :], device)
-        self._closed = constant(cfg.robot.gripper_closed)
-        self._opening = constant(cfg.robot.gripper_open) - self._closed
-
-    def pose(self, sim: Simulation) -> torch.Tensor:
-        """Position [m] and quaternion (wxyz), shape ``(nworld, 2, 7)``."""
-        return torch.stack([sim.qpos[:, a : a + 7] for a in self._qpos], dim=1).float()
-
-    def bounds(self, pos: torch.Tensor, turn: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Least and largest coordinates of the eight corners [m], each ``(nworld, 2, 3)``, from
-        centres and matrices.
+    def beyond(self, step: Step) -> torch.Tensor:
+        """How far the outermost corner is outside [m], negative inside, shape ``(nworld,
+        objects)``.
         """
-        reach = self._half * turn.abs().sum(-1)
-        return pos - reach, pos + reach
 
-    def speed(self, sim: Simulation, turn: torch.Tensor) -> torch.Tensor:
-        """Speed of the fastest corner [m/s], shape ``(nworld, 2)``."""
-        velocity = torch.stack([sim.qvel[:, a : a + 6] for a in self._qvel], dim=1).float()
+        def compute() -> torch.Tensor:
+            low, high = step.bounds
+            outside = step.view.constant(*self._low) - low, high - step.view.constant(*self._high)
+            return torch.maximum(*outside).amax(-1)
+
+        return step.once("beyond", compute)
+
+    def holds(self, step: Step) -> torch.Tensor:
+        """Whether all corners are in the box, shape ``(nworld, objects)``, bool."""
+        return self.beyond(step) <= self._tolerance
+
+    def over(self, step: Step) -> torch.Tensor:
+        """Whether all corners are over the inside or in it, shape ``(nworld, objects)``, bool."""
+        low, high = step.bounds
+        inside = (low >= step.view.constant(*self._low)) & (high <= step.view.constant(*self._high))
+        return inside[..., :2].all(-1)
+
+
+def corner_speed(step: Step) -> torch.Tensor:
+    """Speed of the fastest corner [m/s], shape ``(nworld, objects)``."""
+
+    def compute() -> torch.Tensor:
+        signs = step.view.constant(*itertools.chain(*itertools.product((-1.0, 1.0), repeat=3)))
+        arms = step.view.half[:, None] * signs.view(8, 3)
         # A free joint's linear velocity is the world's, its angular velocity the body's: all of it
         # in the body's frame.
-        linear = (turn * velocity[..., :3, None]).sum(-2)
-        spin = velocity[..., None, 3:].expand(-1, -1, 8, -1)
-        corners = linear[..., None, :] + torch.linalg.cross(spin, self._corners.expand_as(spin))
-        return torch.linalg.vector_norm(corners, dim=-1).amax(-1)
+        linear = (step.turn * step.velocity[..., :3, None]).sum(-2)
+        spin = step.velocity[..., None, 3:].expand(-1, -1, 8, -1)
+        return torch.linalg.vector_norm(
+            linear[..., None, :] + torch.linalg.cross(spin, arms.expand_as(spin)), dim=-1
+        ).amax(-1)
 
-    def beyond(self, low: torch.Tensor, high: torch.Tensor) -> torch.Tensor:
-        """How far the outermost corner is outside of the box [m], negative inside, shape ``(nworld,
-        2)``.
-        """
-        return torch.maximum(self._low - low, high - self._high).amax(-1)
-
-    def over(self, low: torch.Tensor, high: torch.Tensor) -> torch.Tensor:
-        """Whether all eight corners are over the inside of the box or in it, shape ``(nworld, 2)``,
-        bool.
-        """
-        return ((low >= self._low) & (high <= self._high))[..., :2].all(-1)
-
-    def inside(self, low: torch.Tensor, high: torch.Tensor) -> torch.Tensor:
-        """Whether all eight corners are in the box, shape ``(nworld, 2)``, bool."""
-        return self.beyond(low, high) <= self._t.inside
-
-    def off_slot(self, pos: torch.Tensor) -> torch.Tensor:
-        """Horizontal distance of each cube from its place in the box [m], shape ``(nworld, 2)``."""
-        return torch.linalg.vector_norm(pos[..., :2] - self._slots, dim=-1)
-
-    def pressed(self, sim: Simulation) -> torch.Tensor:
-        """Whether each jaw presses on each cube, shape ``(nworld, 2, jaws)``, bool."""
-        return self._forces(sim, self._jaws) > self._t.force
-
-    def supported(self, sim: Simulation) -> torch.Tensor:
-        """Whether the table, the floor, the box or the other cube presses on each cube, shape
-        ``(nworld, 2)``, bool.
-        """
-        return (self._forces(sim, self._supports) > self._t.force).any(-1)
-
-    def opening(self, sim: Simulation) -> torch.Tensor:
-        """How far the gripper is open as measured, 0 closed to 1 open, the least open joint, shape
-        ``(nworld,)``.
-        """
-        return ((self._gripper.read(sim.qpos).float() - self._closed) / self._opening).amin(1)
-
-    def _forces(self, sim: Simulation, addresses: list[list[int]]) -> torch.Tensor:
-        """Sizes of sensed forces [N], shape ``(nworld, 2, n)``."""
-        parts = [
-            torch.stack([sim.sensordata[:, a : a + 3] for a in row], dim=1) for row in addresses
-        ]
-        return torch.linalg.vector_norm(torch.stack(parts, dim=1), dim=-1)
+    return step.once("corner_speed", compute)
 
 
 class BoxCheck(EpisodeCheck):
-    """Collects what the rules of the check need. Memory: some numbers per world and cube, whatever
-    the episode's length.
+    """Each object has been grasped, lifted, carried over the box, let go of there, and is at rest
+    in the box.
 
-    Worlds may be in different phases. A cube's first phase, its approach, forgets what was found
-    before: a world that goes back to it to grasp anew is judged from its last attempt.
+    An object is loaded while all jaws press on it, and airborne while it is loaded, up from the
+    table and touches no support.
 
-    A cube is loaded while both jaws press on it, and airborne while it is loaded, up from the table
-    and touches no support.
+    With phases (`ROLES`), worlds may be in different ones. An object's first phase, its approach,
+    forgets what was found before: a world that goes back to it to grasp anew is judged from its
+    last attempt.
+
+    Without phases, an object is grasped, lifted and carried in that order at any time before the
+    settled window. A load that is lost after the lift while the object is not over the box is a
+    drop. It is released once no jaw touches it and the gripper is open after the carry, and has to
+    be at rest in the box for the window at some time after that.
     """
 
-    rules = RULES
-    summaries: ClassVar = {
-        "slot_err_red_max_m": ("slot_err_red_m", "max"),
-        "slot_err_blue_max_m": ("slot_err_blue_m", "max"),
-        "beyond_max_m": ("beyond_m", "max"),
-        "corner_speed_max_m_per_s": ("corner_speed_m_per_s", "max"),
-        "jaw_clearance_min_m": ("jaw_clearance_m", "min"),
-        "grasp_steps_red_min": ("grasp_steps_red", "min"),
-        "grasp_steps_blue_min": ("grasp_steps_blue", "min"),
-        "settled_steps_red_min": ("settled_steps_red", "min"),
-        "settled_steps_blue_min": ("settled_steps_blue", "min"),
-    }
+    @dataclass(kw_only=True, slots=True)
+    class Thresholds:
+        """When an episode of the box task succeeded, for each object. Sampled at step ends; forces
+        are those of the step's last physics step.
+        """
 
-    def __init__(
-        self, cfg: Config, index: SceneIndex, phases: list[Phase], nworld: int, device: torch.device
-    ) -> None:
-        """Allocates for nworld worlds."""
-        self._t = cfg.gate.box
-        self._timing = cfg.timing
-        self._robot = cfg.robot
-        self._cubes = CubesAndBox(cfg, index, device)
-        self._steps = phases[-1].stop
-        self._step = torch.zeros(1, dtype=torch.int64, device=device)
-        rows = [
-            [[phase.name == f"{role}_{color}" for color in COLORS] for role in BOX_ROLES]
-            for phase in phases
-        ]
-        self._roles = torch.tensor(rows, device=device)  # (phase, role, cube)
+        objects: list[str] = spec()
+        """The objects, in the order in which they go into the box."""
+        places: list[str] = spec()
+        """The place of each in the box."""
+        force: float = spec(unit="N", gt=0.0)
+        """A jaw, or a support, that presses with more than this touches."""
+        grasp_steps: int = spec(unit="steps", ge=1)
+        """Consecutive steps, while closing, in which both jaws press."""
+        lift_height: float = spec(unit="m", gt=0.0)
+        """Height of the lowest corner above the table."""
+        lift_steps: int = spec(unit="steps", ge=1)
+        """Consecutive steps with both jaws pressing and no support touched."""
+        carry_steps: int = spec(unit="steps", ge=1)
+        """Least number of such steps in a row of a carry."""
+        carry_distance: float = spec(unit="m", gt=0.0)
+        """Horizontal distance from where those steps began."""
+        open_fraction: float = spec(gt=0.0, le=1.0)
+        """Share of the gripper's opening, as measured, once released."""
+        inside: float = spec(unit="m", ge=0.0)
+        """How far a corner may be beyond the inside of the box."""
+        rest_speed: float = spec(unit="m/s", gt=0.0)
+        """Speed of the fastest corner."""
+        window: int = spec(unit="steps", ge=1)
+        """Last steps without contact to a jaw, in which an object must be inside and slow."""
+        jaw_clearance: float = spec(unit="m", gt=0.0)
+        """Lowest jaw geometry above the box's rim at the end."""
 
-        self._finite = torch.ones(nworld, dtype=torch.bool, device=device)
-        self._too_early = torch.zeros(
-            nworld, dtype=torch.bool, device=device
-        )  # blue loaded before red was released
-        self._from = torch.zeros(
-            (nworld, 2, 2), dtype=torch.float32, device=device
-        )  # where a carry started
-        # What an approach forgets, in one tensor.
-        self._attempt = torch.zeros((11, nworld, 2), dtype=torch.float32, device=device)
-        (
-            self._grasp_run,
-            self._grasp_best,
-            self._lift_run,
-            self._lift_best,
-            self._carry_run,
-            self._carry_far,
-            self._carry_best,  # farthest of any run that is long enough
-            self._unloaded,  # steps between the last grasp and the release
-            self._over,  # in the last frame of the hold
-            self._opening,  # widest without contact since the opening began
-            self._settled,  # steps at rest in the box, as of the settling's last step
-        ) = self._attempt.unbind(0)
-        self._rest_run = torch.zeros((nworld, 2), dtype=torch.float32, device=device)
-        self._last = torch.full(
-            (3, nworld, 2), torch.nan, device=device
-        )  # beyond, speed, off the slot
+    t: Thresholds
 
-    def update(self, sim: Simulation, phase: torch.Tensor) -> None:
-        """Takes in the state at the end of a step. Fixed shapes, no host read."""
-        t = self._t
-        cubes = self._cubes
-        going = self._step < self._steps  # steps after the end count for nothing
-        role = dict(
-            zip(
-                BOX_ROLES,
-                (self._roles.index_select(0, phase) & going[:, None, None]).unbind(1),
-                strict=True,
-            )
-        )
-        self._finite &= ~not_finite(sim.qpos, sim.qvel)
-        # Not by a product: what an earlier attempt left may be NaN.
-        self._attempt.masked_fill_(role["approach"], 0.0)
-
-        pose = cubes.pose(sim)
-        pos = pose[..., :3]
-        turn = quat_to_matrix(pose[..., 3:])
-        low, high = cubes.bounds(pos, turn)
-        pressed = cubes.pressed(sim)
-        loaded = pressed.all(-1)
-        free = ~pressed.any(-1)
-        airborne = loaded & (low[..., 2] - cubes.top >= t.lift_height) & ~cubes.supported(sim)
-
-        extend_run(self._grasp_run, self._grasp_best, loaded, role["close"])
-        extend_run(self._lift_run, self._lift_best, airborne, role["lift"] | role["carry"])
-        extend_carry(
-            self._carry_run, self._carry_far, self._from, pos[..., :2], airborne & role["carry"]
-        )
-        far = torch.where(self._carry_run >= t.carry_steps, self._carry_far, 0.0)
-        torch.maximum(self._carry_best, far, out=self._carry_best)
-
-        # A grasp that slips while the jaws still close has to be made anew; what counts is the last
-        # one.
-        self._unloaded.masked_fill_(role["close"] & (self._grasp_run == t.grasp_steps), 0.0)
-        grasped = self._grasp_best >= t.grasp_steps
-        in_hand = role["close"] | role["lift"] | role["carry"] | role["hold"]
-        self._unloaded.add_(grasped & in_hand & ~loaded)
-        self._over.copy_(torch.where(role["hold"], cubes.over(low, high), self._over))
-        letting_go = role["open"] | role["retreat"] | role["settle"]
-        opening = torch.where(letting_go & free, cubes.opening(sim)[:, None], 0.0)
-        torch.maximum(self._opening, opening, out=self._opening)
-        self._too_early |= loaded[:, 1] & (self._opening[:, 0] < t.open_fraction) & going
-
-        beyond = cubes.beyond(low, high)
-        speed = cubes.speed(sim, turn)
-        still = free & (beyond <= t.inside) & (speed < t.rest_speed)
-        self._rest_run.copy_(torch.where(going, (self._rest_run + 1.0) * still, self._rest_run))
-        self._settled.copy_(torch.where(role["settle"], self._rest_run, self._settled))
-        self._last.copy_(
-            torch.where(going, torch.stack((beyond, speed, cubes.off_slot(pos))), self._last)
-        )
-        self._step += 1
-
-    def result(self, sim: Simulation) -> CheckResult:
-        """Judges the episode; every rule that was not shown to hold has failed."""
-        t = self._t
-        sim.kinematics()
-        lowest = LowestPoint(sim.model, self._robot.jaw_bodies, sim.device).height(
-            sim.xpos, sim.xquat
-        )
-        clearance = lowest - self._cubes.rim  # the rim is above the table
-        complete = int(self._step) == self._steps
-        beyond, speed, off_slot = self._last.unbind(0)
-        per_cube = {
-            "GRASP": self._grasp_best >= t.grasp_steps,
-            "LIFT": self._lift_best >= t.lift_steps,
-            "CARRY": (self._carry_best >= t.carry_distance) & (self._over > 0.0),
-            "DROP": self._unloaded == 0.0,
-            "RELEASE": self._opening >= t.open_fraction,
-            "SETTLED": self._settled >= t.window,
-        }
-        held = {
-            "FINITE": self._finite,
-            "STEPS": (sim.step_count == self._steps * self._timing.decimation) & complete,
-            "OVERFLOW": (sim.overflow & LOST_PHYSICS) == 0,
+    def build(self) -> list[Rule]:
+        """See `EpisodeCheck`."""
+        t = self.t
+        self.objects = list(t.objects)
+        self.inside = Inside(self.cfg, t.inside)
+        if len(t.places) != len(t.objects):
+            raise ConfigError("task.check.places", t.places, "a place for each object")
+        for place in t.places:
+            if place not in self.cfg.scene.places:
+                raise UnknownName("task.check.places: place", place, self.cfg.scene.places)
+        self.slots = dict(zip(t.objects, t.places, strict=True))
+        phases = self.cfg.controller.phases
+        for name in itertools.chain(*self.during(*ROLES)) if phases else ():
+            if name not in phases:
+                raise UnknownName("task.check: phase", name, phases)
+        self.summaries = {
+            **{f"slot_err_{each}_max_m": (f"slot_err_{each}_m", "max") for each in self.objects},
+            "beyond_max_m": ("beyond_m", "max"),
+            "corner_speed_max_m_per_s": ("corner_speed_m_per_s", "max"),
+            "jaw_clearance_min_m": ("jaw_clearance_m", "min"),
+            **{f"grasp_steps_{each}_min": (f"grasp_steps_{each}", "min") for each in self.objects},
             **{
-                f"{n}_{c.upper()}": ok[:, i]
-                for n, ok in per_cube.items()
-                for i, c in enumerate(COLORS)
+                f"settled_steps_{each}_min": (f"settled_steps_{each}", "min")
+                for each in self.objects
             },
-            "ORDER": ~self._too_early,
-            "INSIDE": (self._rest_run >= t.window).all(1) & complete,
-            "JAW_CLEAR": (clearance >= t.jaw_clearance) & complete,
         }
-        values = {
-            "beyond_m": beyond.amax(1),
-            "corner_speed_m_per_s": speed.amax(1),
-            "jaw_clearance_m": clearance,
-            "rest_steps": self._rest_run.amin(1),
-            "blue_too_early": self._too_early.float(),
-        }
-        kept = {
-            "slot_err_{}_m": off_slot,
-            "grasp_steps_{}": self._grasp_best,
-            "lift_steps_{}": self._lift_best,
-            "carry_{}_m": self._carry_best,
-            "over_box_{}": self._over,
-            "unloaded_steps_{}": self._unloaded,
-            "opening_{}": self._opening,
-            "settled_steps_{}": self._settled,
-        }
-        values |= {
-            name.format(color): value[:, i]
-            for name, value in kept.items()
-            for i, color in enumerate(COLORS)
-        }
-        return CheckResult.of(RULES, held, values)
+        grasp = _Grasp(self)
+        lift = Streak(
+            "LIFT",
+            "{object} not lifted",
+            self.objects,
+            self.airborne,
+            t.lift_steps,
+            phases=self.during("lift", "carry"),
+            doing="loaded in the air",
+            after=grasp,
+        )
+        carry = _CarriedOver(self, lift)
+        release = _Release(self, carry)
+        return [
+            grasp,
+            lift,
+            carry,
+            _Drop(self, grasp, lift, carry),
+            release,
+            _Settled(self, release),
+            _Order(self, release),
+            InWindow(
+                "INSIDE",
+                "an object not at rest in the box at the end",
+                self.resting,
+                t.window,
+                measure=self.trace,
+                wanted=f"out of the jaws, at most {millimetres(t.inside)} outside, corners below"
+                f" {t.rest_speed:g} m/s",
+            ),
+            _JawClear(self),
+        ]
 
-    def placed(self, sim: Simulation) -> torch.Tensor:
-        """Whether each cube is in the box right now."""
-        pose = self._cubes.pose(sim)
-        return self._cubes.inside(*self._cubes.bounds(pose[..., :3], quat_to_matrix(pose[..., 3:])))
+    def during(self, *roles: str) -> list[list[str]]:
+        """Names of each object's phases of some roles."""
+        return [[f"{role}_{each}" for role in roles] for each in self.t.objects]
 
-    @classmethod
-    def thresholds(cls, cfg: Config) -> dict[str, float]:
-        """The rules' numbers, with units."""
-        t = cfg.gate.box
+    def airborne(self, step: Step) -> torch.Tensor:
+        """Whether each object is held in the air, shape ``(nworld, objects)``, bool."""
+
+        def compute() -> torch.Tensor:
+            up = step.bounds[0][..., 2] - step.view.top >= self.t.lift_height
+            return step.in_hand & up & ~step.supported
+
+        return step.once("airborne", compute)
+
+    def resting(self, step: Step) -> torch.Tensor:
+        """Whether each object is out of the jaws, inside and slow, shape ``(nworld, objects)``,
+        bool.
+        """
+
+        def compute() -> torch.Tensor:
+            slow = corner_speed(step) < self.t.rest_speed
+            return step.untouched & self.inside.holds(step) & slow
+
+        return step.once("resting", compute)
+
+    def placed(self, step: Step) -> torch.Tensor:
+        """Whether each object is in the box."""
+        return self.inside.holds(step)
+
+    def trace(self, step: Step) -> dict[str, torch.Tensor]:
+        """See `EpisodeCheck`."""
         return {
-            "force_n": t.force,
-            "grasp_steps": t.grasp_steps,
-            "lift_height_m": t.lift_height,
-            "lift_steps": t.lift_steps,
-            "carry_steps": t.carry_steps,
-            "carry_distance_m": t.carry_distance,
-            "open_fraction": t.open_fraction,
-            "beyond_max_m": t.inside,
-            "rest_speed_m_per_s": t.rest_speed,
-            "window_steps": t.window,
-            "jaw_clearance_m": t.jaw_clearance,
+            **{f"slot_err_{each}_m": away(step, each, self.slots[each]) for each in self.objects},
+            "beyond_m": self.inside.beyond(step).amax(1),
+            "corner_speed_m_per_s": corner_speed(step).amax(1),
         }
 
-    @classmethod
-    def explain(
-        cls, cfg: Config, steps: Mapping[str, np.ndarray], values: Mapping[str, float]
-    ) -> dict[str, tuple[str, str]]:
-        """See `report_box`."""
-        return report_box(cfg, values)
+    def headline(self, values: Mapping[str, float]) -> str:
+        """How well the objects are placed."""
+        off = [f"{each} {1e3 * values[f'slot_err_{each}_m']:.1f} mm" for each in self.objects]
+        clearance = 1e3 * values["jaw_clearance_m"]
+        return f"{', '.join(off)} off their places, jaws {clearance:.0f} mm above the rim"
 
-    @classmethod
-    def headline(cls, values: Mapping[str, float]) -> str:
-        """How well the cubes are placed."""
-        red, blue, jaws = (
-            1e3 * values[name] for name in ("slot_err_red_m", "slot_err_blue_m", "jaw_clearance_m")
+
+class _PerObject(Rule):
+    """A rule of the box task for each object."""
+
+    def __init__(self, name: str, text: str, check: BoxCheck) -> None:
+        super().__init__(name, text, check.objects)
+        self.check = check
+        self.t = check.t
+
+
+class _Grasp(Streak):
+    """GRASP: both jaws press; it begins with forgetting what was found before the approach."""
+
+    def __init__(self, check: BoxCheck) -> None:
+        super().__init__(
+            "GRASP",
+            "{object} not grasped",
+            check.objects,
+            in_hand(*check.objects),
+            check.t.grasp_steps,
+            phases=check.during("close"),
+            doing="between both jaws",
         )
-        return (
-            f"red {red:.1f} mm, blue {blue:.1f} mm off their places, jaws {jaws:.0f} mm above"
-            " the rim"
+        self._approaches = check.during("approach")
+
+    def start(self, view: TaskView) -> None:
+        super().start(view)
+        self._approach = view.during(self._approaches)
+
+    def update(self, step: Step) -> None:
+        if step.view.phased:
+            step.view.forget(step.judged(self._approach))
+        super().update(step)
+
+
+class _CarriedOver(Carried):
+    """CARRY: carried, and over the box when it is let go of."""
+
+    def __init__(self, check: BoxCheck, lift: Streak) -> None:
+        super().__init__(
+            "CARRY",
+            "{object} not carried over the box",
+            check.objects,
+            check.airborne,
+            check.t.carry_steps,
+            distance=check.t.carry_distance,
+            phases=check.during("carry"),
+            doing="loaded in the air",
+            after=lift,
         )
+        self._check = check
+
+    def start(self, view: TaskView) -> None:
+        super().start(view)
+        self._hold = view.during(self._check.during("hold"))
+        self.over = view.counter(len(self.objects))  # in the last step of the hold, or of any load
+
+    def update(self, step: Step) -> None:
+        super().update(step)
+        hold = step.judged(self._hold) if step.view.phased else step.in_hand
+        self.over.copy_(torch.where(hold, self._check.inside.over(step), self.over))
+
+    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        held, values = super().judge(end)
+        return held & (self.over > 0.0), values | self.by_object("over_box{}", self.over)
+
+    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
+        ending = ", not over the box when it was let go of"
+        return [
+            (
+                found if values[f"over_box{suffix}"] else found + ending,
+                f"{wanted}, then over the box",
+            )
+            for suffix, (found, wanted) in zip(self.suffixes, super().report(values), strict=True)
+        ]
+
+
+class _Drop(_PerObject):
+    """DROP: no step without load between the last grasp and the release."""
+
+    def __init__(self, check: BoxCheck, grasp: Streak, lift: Streak, carry: _CarriedOver) -> None:
+        super().__init__("DROP", "{object} dropped", check)
+        self._grasp = grasp
+        self._lift = lift
+        self._carry = carry
+
+    def start(self, view: TaskView) -> None:
+        self._close = view.during(self.check.during("close"))
+        self._held = view.during(self.check.during("close", "lift", "carry", "hold"))
+        self._unloaded = view.counter(len(self.objects))
+
+    def update(self, step: Step) -> None:
+        if step.view.phased:
+            # A grasp that slips while the jaws still close is made anew; the last one counts.
+            grasped = self._grasp.length == self.t.grasp_steps
+            self._unloaded.masked_fill_(step.judged(self._close) & grasped, 0.0)
+            lost = self._grasp.held() & step.judged(self._held)
+        else:
+            lost = self._lift.held() & (self._carry.over == 0.0)
+        self._unloaded.add_(lost & ~step.in_hand)
+
+    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        return self._unloaded == 0.0, self.by_object("unloaded_steps{}", self._unloaded)
+
+    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
+        return [
+            (
+                f"{values[f'unloaded_steps{suffix}']:.0f} steps without both jaws between grasp and"
+                " release",
+                "none",
+            )
+            for suffix in self.suffixes
+        ]
+
+
+class _Release(_PerObject):
+    """RELEASE: out of the jaws, the gripper open."""
+
+    def __init__(self, check: BoxCheck, carry: Carried) -> None:
+        super().__init__("RELEASE", "{object} not released", check)
+        self._carry = carry
+
+    def start(self, view: TaskView) -> None:
+        self._opens = view.during(self.check.during("open", "retreat", "settle"))
+        self.opening = view.counter(len(self.objects))  # widest without contact
+
+    def update(self, step: Step) -> None:
+        opens = step.judged(self._opens) if step.view.phased else self._carry.held()
+        opening = gripper_opening(step.view.env).amin(1).float()[:, None]
+        wide = torch.where(opens & step.untouched, opening, 0.0)
+        torch.maximum(self.opening, wide, out=self.opening)
+
+    def held(self) -> torch.Tensor:
+        """Whether each object has been released, shape ``(nworld, objects)``, bool."""
+        return self.opening >= self.t.open_fraction
+
+    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        return self.held(), self.by_object("opening{}", self.opening)
+
+    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
+        return [
+            (
+                f"opened {100.0 * values[f'opening{suffix}']:.0f} % without contact to a jaw",
+                f"at least {100.0 * self.t.open_fraction:g} %",
+            )
+            for suffix in self.suffixes
+        ]
+
+
+class _Settled(_PerObject):
+    """SETTLED: at rest in the box after the release."""
+
+    def __init__(self, check: BoxCheck, release: _Release) -> None:
+        super().__init__("SETTLED", "{object} not at rest in the box after its release", check)
+        self._release = release
+
+    def start(self, view: TaskView) -> None:
+        size = len(self.objects)
+        self._settle = view.during(self.check.during("settle"))
+        self._rest = view.zeros(size)  # steps at rest in a row
+        self._settled = view.counter(size)  # as of the settling's last step, or the most
+
+    def update(self, step: Step) -> None:
+        self._rest.add_(1.0).mul_(self.check.resting(step))
+        if step.view.phased:
+            settled = torch.where(step.judged(self._settle), self._rest, self._settled)
+        else:
+            settled = torch.maximum(self._settled, self._rest * self._release.held())
+        self._settled.copy_(settled)
+
+    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        held = self._settled >= self.t.window
+        return held, self.by_object("settled_steps{}", self._settled)
+
+    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
+        return [
+            (
+                f"{values[f'settled_steps{suffix}']:.0f} steps at rest in the box after release",
+                f"at least {self.t.window}",
+            )
+            for suffix in self.suffixes
+        ]
+
+
+class _Order(Rule):
+    """ORDER: no object is grasped before the one before it is released."""
+
+    def __init__(self, check: BoxCheck, release: _Release) -> None:
+        first, *others = check.objects
+        pairs = zip(check.objects, others, strict=False)
+        text = " or ".join(f"{later} grasped before {each} was released" for each, later in pairs)
+        super().__init__("ORDER", text or f"{first} grasped too early")
+        self._release = release
+
+    def start(self, view: TaskView) -> None:
+        self._early = torch.zeros(view.env.nworld, dtype=torch.bool, device=view.env.device)
+
+    def update(self, step: Step) -> None:
+        early = step.in_hand[:, 1:] & ~self._release.held()[:, :-1]
+        self._early |= early.any(1)
+
+    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        return ~self._early, {"too_early": self._early.float()}
+
+    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
+        (text,) = self.texts.values()
+        return [(text if values["too_early"] else "in order", "each released before the next")]
+
+
+class _JawClear(Rule):
+    """JAW_CLEAR: the jaws are above the box at the end."""
+
+    at_end = True
+
+    def __init__(self, check: BoxCheck) -> None:
+        super().__init__("JAW_CLEAR", "gripper too low at the end")
+        self._check = check
+
+    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        sim = end.view.env.sim
+        sim.kinematics()
+        jaws = LowestPoint(sim.model, self._check.cfg.robot.jaw_bodies, sim.device)
+        # The rim is above the table.
+        clearance = jaws.height(sim.xpos, sim.xquat) - self._check.inside.rim
+        return clearance >= self._check.t.jaw_clearance, {"jaw_clearance_m": clearance}
+
+    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
+        return [
+            (
+                f"lowest jaw geometry {millimetres(values['jaw_clearance_m'])} above the rim",
+                f"at least {millimetres(self._check.t.jaw_clearance)}",
+            )
+        ]
 
 
 class BoxSuccess:
-    """Achieved while both cubes have been at rest in the box, out of the jaws, for the whole
-    window, and the gripper is open.
-
-    The window and the limits are those of the check, ``gate.box``.
+    """Achieved while all objects have been at rest in the box, out of the jaws, for the whole
+    window, and the gripper is open. It shares the thresholds of the task's check.
     """
 
     def __init__(self, env: EnvView, *, open_fraction: float) -> None:
         """Allocates the counter.
 
         Args:
-            env: The environment.
+            env: The environment, its task's check a `BoxCheck`.
             open_fraction: How far the gripper must be open, from 0 (closed) to 1 (open), as
                 measured.
 
         Raises:
-            MjstackError: The fraction is out of range, or the scene has no box.
+            MjstackError: The fraction is out of range, or the task has another check.
         """
         if not 0.0 <= open_fraction <= 1.0:
             raise ParameterError("open_fraction", open_fraction, "a number from 0 to 1")
-        self._t = env.cfg.gate.box
         self._open = open_fraction
-        self._cubes = CubesAndBox(env.cfg, env.index, env.device)
-        self._held = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
+        check = BoxCheck(env.cfg)
+        self._view = check.view(env)
+        self._rest = InWindow("REST", "", check.resting, check.t.window)
+        self._rest.start(self._view)
 
     def __call__(self, env: EnvView) -> torch.Tensor:
-        """Takes in a step; shape ``(nworld,)``, bool."""
-        cubes = self._cubes
-        pose = cubes.pose(env.sim)
-        turn = quat_to_matrix(pose[..., 3:])
-        inside = cubes.inside(*cubes.bounds(pose[..., :3], turn))
-        still = (
-            inside
-            & (cubes.speed(env.sim, turn) < self._t.rest_speed)
-            & ~cubes.pressed(env.sim).any(-1)
-        )
-        self._held.add_(1).mul_(still.all(1))
-        return (self._held >= self._t.window) & (gripper_opening(env) >= self._open).all(1)
+        """Processes a step; shape ``(nworld,)``, bool."""
+        self._rest.update(self._view.step())
+        return self._rest.held() & (gripper_opening(env) >= self._open).all(1)
 
     def reset(self, mask: torch.Tensor) -> None:
         """Forgets the masked worlds."""
-        self._held.masked_fill_(mask, 0)
+        self._rest.length.masked_fill_(mask, 0.0)

@@ -1,4 +1,6 @@
-"""Observations and rewards of the box task."""
+"""Observations and rewards of the box task. They share objects, places and thresholds with the
+task's check.
+"""
 
 from __future__ import annotations
 
@@ -6,40 +8,42 @@ import math
 
 import torch
 
-from mjstack.errors import ParameterError
+from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.base import EnvView, require_positive, shared
-from mjstack.math import quat_to_matrix
-from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, pose_w
+from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, place_xy, pose_w
 from mjstack.scene import table_top
-from mjstack.tasks.box import COLORS, CubesAndBox
+from mjstack.tasks.box import BoxCheck, scene_box
 
 
 class ToSlot:
-    """From a cube's centre to where it rests at its place in the box [m], shape ``(nworld, 3)``."""
+    """From an object's centre to where it rests at its place in the box [m], shape ``(nworld,
+    3)``.
+    """
 
     def __init__(self, env: EnvView, *, object: str) -> None:
         """Finds the place.
 
         Args:
             env: The environment.
-            object: One of the cubes.
+            object: One of the objects.
 
         Raises:
-            MjstackError: There is no such cube, or no box.
+            MjstackError: There is no such object, or no box.
         """
+        box = scene_box(env.cfg)
         env.index.object_address(object)
-        scene = env.cfg.scene
-        box = env.cfg.scene.box
-        if box is None:
-            raise ParameterError("object", object, "a scene with a box", "Set scene=box")
-        slot = scene.places[f"{object}_slot"].xy
-        place = [*slot, table_top(scene) + box.floor + scene.objects[object].half_height]
+        slots = BoxCheck(env.cfg).slots
+        if object not in slots:
+            raise UnknownName("object", object, slots)
         self._object = object
-        self._place = torch.tensor(place, dtype=env.sim.qpos.dtype, device=env.device)
+        self._place = slots[object]
+        scene = env.cfg.scene
+        self._height = table_top(scene) + box.floor + scene.objects[object].half_height
 
     def __call__(self, env: EnvView) -> torch.Tensor:
         """The offset."""
-        return self._place - pose_w(env, self._object)[:, :3]
+        xy, z = pose_w(env, self._object)[:, :3].split((2, 1), dim=1)
+        return torch.cat((place_xy(env, self._place) - xy, self._height - z), dim=1)
 
 
 class Place:
@@ -65,8 +69,7 @@ class Place:
         self._to_slot = ToSlot(env, object=object)
         self._object = object
         self._scale = scale
-        assert env.cfg.scene.box is not None  # there would be no place
-        self._off_table = 0.5 * env.cfg.scene.box.floor
+        self._off_table = 0.5 * scene_box(env.cfg).floor
 
     def __call__(self, env: EnvView) -> torch.Tensor:
         """The reward, shape ``(nworld,)``."""
@@ -74,21 +77,45 @@ class Place:
         return near * (above_table(env, self._object) > self._off_table)
 
 
-class InBox:
-    """What part of the cubes is in the box, 0 to 1."""
+class _ByObject:
+    """A term that asks which objects are in the box."""
+
+    def __init__(self, env: EnvView) -> None:
+        self._check = BoxCheck(env.cfg)
+        self._view = self._check.view(env)
+
+    def _inside(self, env: EnvView) -> torch.Tensor:
+        """Whether each object is in the box, shape ``(nworld, objects)``, bool. Not to be written
+        into.
+        """
+        return shared((id(env), _ByObject), lambda: self._check.placed(self._view.step()))
+
+    def _next(self, env: EnvView, values: list[torch.Tensor]) -> torch.Tensor:
+        """The value, ``(nworld, n)`` each, of the first object that is not in the box, or of the
+        last one.
+        """
+        inside = self._inside(env)
+        out = values[-1]
+        for column in reversed(range(len(values) - 1)):
+            out = torch.where(inside[:, column : column + 1], out, values[column])
+        return out
+
+
+class InBox(_ByObject):
+    """Share of the objects that is in the box, 0 to 1."""
 
     def __init__(self, env: EnvView) -> None:
         """Reads the box's place."""
-        self._cubes = CubesAndBox(env.cfg, env.index, env.device)
+        super().__init__(env)
 
     def __call__(self, env: EnvView) -> torch.Tensor:
-        """The part, shape ``(nworld,)``."""
-        return cubes_inside(env, self._cubes).float().mean(1)
+        """The share, shape ``(nworld,)``."""
+        return self._inside(env).float().mean(1)
 
 
-class ReachNext:
-    """Nearness of the grasp point to the first cube that is not in the box yet, red first; 1 once
-    both are.
+class ReachNext(_ByObject):
+    """Nearness of the grasp point to the first object that is not in the box yet; 1 once all
+    are.
     """
 
     def __init__(self, env: EnvView, *, scale: float) -> None:
@@ -102,23 +129,20 @@ class ReachNext:
             MjstackError: There is no box, or the scale is out of range.
         """
         require_positive("scale", scale)
-        self._cubes = CubesAndBox(env.cfg, env.index, env.device)
+        super().__init__(env)
         self._scale = scale
 
     def __call__(self, env: EnvView) -> torch.Tensor:
         """The reward, shape ``(nworld,)``."""
-        red, blue = cubes_inside(env, self._cubes).unbind(1)
-        first, second = (pose_w(env, name)[:, :3] for name in COLORS)
-        aim = torch.where(red[:, None], second, first)
-        near = 1.0 - torch.tanh(
-            torch.linalg.vector_norm(aim - grasp_point(env), dim=1) / self._scale
-        )
-        return torch.where(red & blue, 1.0, near)
+        aim = self._next(env, [pose_w(env, name)[:, :3] for name in self._check.objects])
+        distance = torch.linalg.vector_norm(aim - grasp_point(env), dim=1)
+        near = 1.0 - torch.tanh(distance / self._scale)
+        return torch.where(self._inside(env).all(1), 1.0, near)
 
 
-class GraspNext:
-    """1 while both jaws press on the first cube that is not in the box yet, red first, or once both
-    are; else 0.
+class GraspNext(_ByObject):
+    """1 while all jaws press on the first object that is not in the box yet, or once all are; else
+    0.
     """
 
     def __init__(self, env: EnvView, *, force: float = 0.05) -> None:
@@ -133,21 +157,11 @@ class GraspNext:
         """
         if not 0.0 <= force < math.inf:
             raise ParameterError("force", force, "a number that is not negative")
-        self._cubes = CubesAndBox(env.cfg, env.index, env.device)
+        super().__init__(env)
         self._force = force
 
     def __call__(self, env: EnvView) -> torch.Tensor:
         """The reward, shape ``(nworld,)``."""
-        red, blue = cubes_inside(env, self._cubes).unbind(1)
-        holds = [(jaw_forces(env, name) > self._force).all(1) for name in COLORS]
-        return (torch.where(red, holds[1], holds[0]) | (red & blue)).to(torch.float32)
-
-
-def cubes_inside(env: EnvView, cubes: CubesAndBox) -> torch.Tensor:
-    """Whether each cube is in the box, shape ``(nworld, 2)``, bool. Not to be written into."""
-
-    def compute() -> torch.Tensor:
-        pose = cubes.pose(env.sim)
-        return cubes.inside(*cubes.bounds(pose[..., :3], quat_to_matrix(pose[..., 3:])))
-
-    return shared((id(env), cubes_inside), compute)
+        held = [jaw_forces(env, name) > self._force for name in self._check.objects]
+        grasped = self._next(env, held).all(1)
+        return (grasped | self._inside(env).all(1)).to(torch.float32)

@@ -1,21 +1,50 @@
-"""What a task's acceptance gives the gates: rules as bits, check fed step by step, and a result."""
+"""Episode checks: how a task judges an episode.
+
+A check is data and rules. Its thresholds are a dataclass, composed from ``task.check``; its rules
+are parts, most of them from `mjstack.tasks.parts`, which look at every step of every world on the
+device.
+
+Example:
+    >>> class LiftCheck(EpisodeCheck):
+    ...     @dataclass(kw_only=True, slots=True)
+    ...     class Thresholds:
+    ...         object: str = spec()
+    ...         height: float = spec(unit="m", gt=0.0)
+    ...         window: int = spec(unit="steps", ge=1)
+    ...
+    ...     def build(self) -> list[Rule]:
+    ...         t = self.t
+    ...         up = airborne(t.object, height=t.height)
+    ...         return [InWindow("UP", f"{t.object} not in the air", up, t.window)]
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import ClassVar, cast
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
 
+from mjstack.config.fields import check_fields, field_range
 from mjstack.config.schema import Config
-from mjstack.errors import TermError
-from mjstack.managers.base import resolve_func
-from mjstack.scene import SceneIndex
+from mjstack.config.terms import typed
+from mjstack.errors import ConfigError, TermError
+from mjstack.managers.base import EnvView, resolve_func
+from mjstack.math import not_finite
+from mjstack.mdp.geometry import LOADED
 from mjstack.scene.phases import Phase
-from mjstack.sim.simulation import Simulation
+from mjstack.sim.simulation import LOST_PHYSICS
+from mjstack.tasks.view import Step, TaskView
+
+_EVERY_TASK = {
+    "FINITE": "state not finite",
+    "STEPS": "step counter off",
+    "OVERFLOW": "buffer overflow",
+}
+_SUFFIXES = {"m/s": "m_per_s", "rad/s": "rad_per_s", "N": "n"}
 
 
 class Rules(Mapping[str, int]):
@@ -60,112 +89,271 @@ class Rules(Mapping[str, int]):
         return {name: found for name, found in worlds.items() if found}
 
 
-_EVERY_TASK = {
-    "FINITE": "state not finite",
-    "STEPS": "step counter off",
-    "OVERFLOW": "buffer overflow",
-}
-
-
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """What the check says, on the device.
+    """Result of a check, on the device.
 
     Attributes:
         failed: Bits of the task's rules, shape ``(nworld,)``, int32.
-        values: What was measured, by name with unit, each ``(nworld,)``.
+        values: Measured values, by name with unit, each ``(nworld,)``.
     """
 
     failed: torch.Tensor
     values: dict[str, torch.Tensor]
 
-    @classmethod
-    def of(
-        cls, rules: Rules, held: Mapping[str, torch.Tensor], values: dict[str, torch.Tensor]
-    ) -> CheckResult:
-        """From whether each rule held, ``(nworld,)`` bool."""
-        failed = torch.zeros_like(held["FINITE"], dtype=torch.int32)
-        for name, bit in rules.items():
-            failed |= bit * (~held[name]).to(failed.dtype)
-        return cls(failed, values)
+
+class Rule(ABC):
+    """One rule of a check, or the same rule for each of several objects.
+
+    It is data until `start` allocates for every world. `update` may be captured into a CUDA graph.
+
+    Attributes:
+        texts: What went wrong if it is broken, by name; one entry, or one for each object.
+        at_end: Whether it can only hold at the end of a whole episode.
+    """
+
+    at_end = False
+
+    def __init__(self, name: str, text: str, objects: Sequence[str] = ()) -> None:
+        """Names the rule.
+
+        Args:
+            name: In capital letters. The rule of one of several objects is ``NAME_OBJECT``.
+            text: What went wrong if it is broken; ``{object}`` is the object's name.
+            objects: The objects that it judges one by one.
+        """
+        self.objects = list(objects)
+        self.suffixes = [f"_{each}" for each in objects] if len(objects) > 1 else [""]
+        names = objects or [""]
+        self.texts = {
+            f"{name}{suffix.upper()}": text.format(object=each)
+            for suffix, each in zip(self.suffixes, names, strict=True)
+        }
+
+    def start(self, view: TaskView) -> None:  # noqa: B027
+        """Allocates for the worlds of a view."""
+
+    def update(self, step: Step) -> None:  # noqa: B027
+        """Processes the state at the end of a step. Fixed shapes, no host read."""
+
+    @abstractmethod
+    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Judges the episode.
+
+        Args:
+            end: The state at its end.
+
+        Returns:
+            Whether the rule was shown to hold, bool, shape ``(nworld,)`` or ``(nworld, rules)``,
+            and measured values by name with unit, each ``(nworld,)``.
+        """
+
+    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
+        """What was found in one world, and what the rule wants: in words, for each of its names.
+
+        Args:
+            values: Measured values of that world.
+        """
+        return [("see the values", "see the thresholds")] * len(self.texts)
+
+    def by_object(self, name: str, value: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Columns by name: ``{}`` in it is the object, if there are several.
+
+        Args:
+            name: Such as ``lift_steps{}``.
+            value: Shape ``(nworld, objects)``.
+        """
+        return {
+            name.format(suffix): column
+            for suffix, column in zip(self.suffixes, value.unbind(1), strict=True)
+        }
 
 
 class EpisodeCheck(ABC):
-    """Collects what a task's rules of the check need, for every world at once, on the device.
+    """Judges an episode of every world at once, on the device.
 
-    Memory does not grow with the episode. The step is counted on the device, so that a captured
-    graph can hold `update`.
+    A subclass has a dataclass ``Thresholds``, whose values are those of ``task.check``, and builds
+    its rules. Memory does not grow with the episode. The step is counted on the device, so that a
+    captured graph can hold `update`.
+
+    With a driver that has phases, rules count in the phases that they name. Without, they count at
+    any time before the settled window, each once the one before it holds.
 
     Attributes:
-        rules: The task's rules.
-        summaries: What a batch reports: name of the metric, and of the value, and whether its
-            ``min`` or ``max`` counts.
+        cfg: The configuration.
+        t: The thresholds.
+        rules: Names, bits and words of the rules.
+        objects: The objects that the task is about, which the rules read.
+        summaries: Metrics of a batch: by name, a measured value and which of its worlds' counts,
+            ``min`` or ``max``.
     """
 
-    rules: ClassVar[Rules]
-    summaries: ClassVar[Mapping[str, tuple[str, str]]]
+    Thresholds: ClassVar[type]
+    summaries: Mapping[str, tuple[str, str]] = {}
+
+    def __init__(self, cfg: Config) -> None:
+        """Reads the thresholds and builds the rules.
+
+        Raises:
+            MjstackError: A threshold is missing, unknown, of the wrong type or out of range.
+        """
+        if not issubclass(check_class(cfg) or object, type(self)):
+            found = (cfg.task.check or {}).get("func")
+            raise ConfigError(
+                "task.check.func",
+                found,
+                f"{type(self).__module__}.{type(self).__name__}, which a term shares",
+            )
+        self.cfg = cfg
+        node = {key: value for key, value in (cfg.task.check or {}).items() if key != "func"}
+        self.t: Any = typed("task.check", node, self.Thresholds)
+        check_fields("task.check", self.t)
+        phases = cfg.controller.phases.values()
+        steps = sum(round(phase.seconds / cfg.timing.step_dt) for phase in phases)
+        steps = steps or cfg.task.episode_steps
+        if self.settle_steps > steps:
+            expected = f"at most {steps} steps (the episode)"
+            raise ConfigError("task.check.window", self.settle_steps, expected)
+        self.objects = list(cfg.scene.objects)
+        self._rules = self.build()
+        self.rules = Rules(
+            {name: text for rule in self._rules for name, text in rule.texts.items()}
+        )
 
     @abstractmethod
-    def __init__(
-        self, cfg: Config, index: SceneIndex, phases: list[Phase], nworld: int, device: torch.device
-    ) -> None:
-        """Allocates for nworld worlds."""
+    def build(self) -> list[Rule]:
+        """The task's rules, in the order of their bits."""
 
-    @abstractmethod
-    def update(self, sim: Simulation, phase: torch.Tensor) -> None:
-        """Takes in the state at the end of a step. Fixed shapes, no host read.
+    @property
+    def settle_steps(self) -> int:
+        """Length of the window at the episode's end in which everything has to be at rest."""
+        return getattr(self.t, "window", 0)
+
+    def view(self, env: EnvView, steps: int = 0, phases: Sequence[Phase] = ()) -> TaskView:
+        """The task's objects in the worlds of an environment; arguments as of `start`."""
+        return TaskView(
+            env,
+            self.objects,
+            phases,
+            steps=steps,
+            window=self.settle_steps,
+            force=getattr(self.t, "force", LOADED),
+        )
+
+    def start(self, env: EnvView, steps: int, phases: Sequence[Phase] = ()) -> None:
+        """Allocates for an episode.
 
         Args:
-            sim: The worlds.
+            env: The worlds, at their start.
+            steps: Length of the episode.
+            phases: Those of the driver, if it has any.
+        """
+        self._steps = steps
+        self._view = self.view(env, steps, phases)
+        for rule in self._rules:
+            rule.start(self._view)
+        self._finite = torch.ones(env.nworld, dtype=torch.bool, device=env.device)
+
+    def update(self, phase: torch.Tensor | None = None) -> None:
+        """Processes the state at the end of a step. Fixed shapes, no host read.
+
+        Args:
             phase: Number of the phase that each world's command belonged to, shape ``(nworld,)``,
-                int64.
+                int64; None without phases.
         """
+        sim = self._view.env.sim
+        self._finite &= ~not_finite(sim.qpos, sim.qvel)
+        step = self._view.step(phase)
+        for rule in self._rules:
+            rule.update(step)
+        self._view.count += 1
 
-    @abstractmethod
-    def result(self, sim: Simulation) -> CheckResult:
+    def result(self) -> CheckResult:
         """Judges the episode; every rule that was not shown to hold has failed."""
+        sim = self._view.env.sim
+        complete = int(self._view.count) == self._steps
+        wanted = self._steps * self.cfg.timing.decimation
+        held = {
+            "FINITE": self._finite,
+            "STEPS": (sim.step_count == wanted) & complete,
+            "OVERFLOW": (sim.overflow & LOST_PHYSICS) == 0,
+        }
+        values: dict[str, torch.Tensor] = {}
+        end = self._view.step()
+        for rule in self._rules:
+            ok, measured = rule.judge(end)
+            if rule.at_end:
+                ok = ok & complete
+            held |= zip(rule.texts, ok.view(len(ok), -1).unbind(1), strict=True)
+            values |= measured
+        failed = torch.zeros_like(self._finite, dtype=torch.int32)
+        for name, bit in self.rules.items():
+            failed |= bit * (~held[name]).to(failed.dtype)
+        return CheckResult(failed, values)
 
     @abstractmethod
-    def placed(self, sim: Simulation) -> torch.Tensor:
-        """Whether each cube is where it belongs right now, red first, shape ``(nworld, 2)``, bool.
-        No host read.
+    def placed(self, step: Step) -> torch.Tensor:
+        """Whether each object is where it belongs, in the order of ``objects``, shape ``(nworld,
+        objects)``, bool. No host read.
         """
 
-    @classmethod
-    @abstractmethod
-    def thresholds(cls, cfg: Config) -> dict[str, float]:
-        """The rules' numbers, with units, for a report."""
+    def trace(self, step: Step) -> dict[str, torch.Tensor]:
+        """Values that a replay keeps at every step end, by name with unit, each ``(nworld,)``."""
+        return {}
 
-    @classmethod
-    @abstractmethod
-    def explain(
-        cls, cfg: Config, steps: Mapping[str, np.ndarray], values: Mapping[str, float]
-    ) -> dict[str, tuple[str, str]]:
-        """What a world's recording says to each rule: by the rule's name, what was found, and what
-        it wants.
+    def thresholds(self) -> dict[str, float]:
+        """The rules' numbers, by name with unit."""
+        numbers: dict[str, float] = {}
+        for item in fields(self.Thresholds):
+            value = getattr(self.t, item.name)
+            unit = field_range(item).unit
+            suffix = _SUFFIXES.get(unit, unit)
+            bare = not suffix or item.name.endswith(f"_{suffix}")
+            if isinstance(value, int | float):
+                numbers[item.name if bare else f"{item.name}_{suffix}"] = value
+        return numbers
+
+    def report(self, values: Mapping[str, float]) -> dict[str, tuple[str, str]]:
+        """What was found in one world, and what is wanted, by the name of each of the task's rules.
 
         Args:
-            cfg: The configuration.
-            steps: What a replay keeps at step ends, by name, steps first.
-            values: What the check measured.
+            values: Measured values of that world.
         """
+        return {
+            name: told
+            for rule in self._rules
+            for name, told in zip(rule.texts, rule.report(values), strict=True)
+        }
 
-    @classmethod
-    @abstractmethod
-    def headline(cls, values: Mapping[str, float]) -> str:
+    def headline(self, values: Mapping[str, float]) -> str:
         """A world's values in a few words."""
+        return ", ".join(f"{name} {value:.3g}" for name, value in values.items())
 
 
-def check_class(cfg: Config) -> type[EpisodeCheck]:
-    """The check of the configured task.
+def check_class(cfg: Config) -> type[EpisodeCheck] | None:
+    """The class of the task's check; None for a task that can be trained, not verified.
 
     Raises:
-        TermError: ``task.check`` names none.
+        TermError: ``task.check.func`` names none.
     """
-    found = resolve_func("task.check", cfg.task.check)
+    if cfg.task.check is None:
+        return None
+    name = str(cfg.task.check.get("func"))
+    found = resolve_func("task.check.func", name)
     if not (isinstance(found, type) and issubclass(found, EpisodeCheck)):
-        raise TermError(
-            "task.check",
-            f"{cfg.task.check}: expected a subclass of mjstack.tasks.check.EpisodeCheck",
-        )
+        expected = "expected a subclass of mjstack.tasks.check.EpisodeCheck"
+        raise TermError("task.check.func", f"{name}: {expected}")
     return cast(type[EpisodeCheck], found)
+
+
+def make_check(cfg: Config) -> EpisodeCheck:
+    """The task's check, its thresholds checked.
+
+    Raises:
+        MjstackError: The task has none, or a threshold cannot be used.
+    """
+    found = check_class(cfg)
+    if found is None:
+        expected = f"a check of task {cfg.task.name}: without one it can be trained, not verified"
+        raise ConfigError("task.check", "null", expected, "Train it: mjstack.make_env")
+    return found(cfg)

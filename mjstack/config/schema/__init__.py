@@ -7,11 +7,9 @@ here.
 
 from mjstack.config.schema.gate import (
     BatchGateCfg,
-    BoxCheckCfg,
     CapacityCfg,
     GateCfg,
     ParityCfg,
-    StackCheckCfg,
     SuccessGateCfg,
     ThroughputCfg,
 )
@@ -53,7 +51,6 @@ __all__ = [
     "BatchCfg",
     "BatchGateCfg",
     "BoxCfg",
-    "BoxCheckCfg",
     "CapacityCfg",
     "CollectJobCfg",
     "Cone",
@@ -78,7 +75,6 @@ __all__ = [
     "SceneCfg",
     "SimCfg",
     "SolverCfg",
-    "StackCheckCfg",
     "StudyJobCfg",
     "SuccessGateCfg",
     "TaskCfg",

@@ -9,43 +9,6 @@ from omegaconf import MISSING
 
 
 @dataclass(kw_only=True, slots=True)
-class StackCheckCfg:
-    """Thresholds of the stack task's acceptance."""
-
-    lift_phases: list[str] = MISSING
-    carry_phase: str = MISSING
-    airborne_height: float = MISSING
-    lift_steps: int = MISSING
-    carry_steps: int = MISSING
-    carry_distance: float = MISSING
-    window: int = MISSING
-    xy_err: float = MISSING
-    dz_min: float = MISSING
-    dz_max: float = MISSING
-    support_gap: float = MISSING
-    rest_speed: float = MISSING
-    rest_position: float = MISSING
-    rest_rotation_deg: float = MISSING
-
-
-@dataclass(kw_only=True, slots=True)
-class BoxCheckCfg:
-    """Thresholds of the box task's acceptance."""
-
-    force: float = MISSING
-    grasp_steps: int = MISSING
-    lift_height: float = MISSING
-    lift_steps: int = MISSING
-    carry_steps: int = MISSING
-    carry_distance: float = MISSING
-    open_fraction: float = MISSING
-    inside: float = MISSING
-    rest_speed: float = MISSING
-    window: int = MISSING
-    jaw_clearance: float = MISSING
-
-
-@dataclass(kw_only=True, slots=True)
 class ParityCfg:
     """Tolerances of MJWarp against native MuJoCo: ``step1`` and ``step50`` map a field to its
     largest difference.
@@ -129,8 +92,6 @@ class SuccessGateCfg:
 class GateCfg:
     """Thresholds of every gate."""
 
-    acceptance: StackCheckCfg = field(default_factory=StackCheckCfg)
-    box: BoxCheckCfg = field(default_factory=BoxCheckCfg)
     parity: ParityCfg = field(default_factory=ParityCfg)
     capacity: CapacityCfg = field(default_factory=CapacityCfg)
     batch: BatchGateCfg = field(default_factory=BatchGateCfg)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
-
-from omegaconf import MISSING
 
 from mjstack.config.fields import spec
 from mjstack.config.schema.term import TermCfg
@@ -15,20 +13,24 @@ LEVELS = ("center", "table", "on_top")
 
 @dataclass(kw_only=True, slots=True)
 class TaskCfg:
-    """What has to be achieved, sampled at step ends. The rules' thresholds are in `StackCheckCfg`
-    and `BoxCheckCfg`.
+    """What has to be achieved, sampled at step ends."""
 
-    ``check`` names the subclass of ``EpisodeCheck`` that judges a scripted episode. ``instruction``
-    says in words what is to be done, for datasets; null: the task's name.
-    """
-
-    name: str = MISSING
+    name: str = spec()
+    """Name of the task."""
     instruction: str | None = None
-    control_hz: float = MISSING
-    episode_steps: int = MISSING
-    goal_height: float = MISSING
-    check: str = MISSING
+    """The task in words, for datasets; null: its name."""
+    control_hz: float = spec(unit="Hz", gt=0.0)
+    """Control steps per second."""
+    episode_steps: int = spec(unit="steps", ge=1)
+    """Length of an episode of the environment."""
+    params: dict[str, Any] = field(default_factory=dict)
+    """Numbers that several terms of the task share, as ``${task.params.NAME}``."""
+    check: dict[str, Any] | None = None
+    """Judges an episode: ``func`` names a subclass of ``EpisodeCheck``, the other keys are its
+    thresholds; null: the task can be trained, not verified.
+    """
     success: TermCfg | None = None
+    """Term that tells when the task is achieved; null: it never is."""
 
 
 @dataclass(kw_only=True, slots=True)

@@ -6,11 +6,9 @@ import math
 
 from mjstack.config.schema import (
     BatchGateCfg,
-    BoxCheckCfg,
     CapacityCfg,
     Config,
     ParityCfg,
-    StackCheckCfg,
     ThroughputCfg,
 )
 from mjstack.config.validate.term import places_objects, reads_starts_file
@@ -19,27 +17,12 @@ from mjstack.errors import ConfigError, UnknownName
 
 MEASUREMENTS = ("physics", "episode", "env_step")
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
-BOX_ROLES = (
-    "approach",
-    "descend",
-    "close",
-    "lift",
-    "carry",
-    "hold",
-    "open",
-    "retreat",
-    "settle",
-)  # phases of each cube
 
 
 def check_gates(cfg: Config) -> None:
     """The thresholds of every gate but *success*."""
     gate = cfg.gate
-    phases = cfg.controller.phases
     _phase_names(cfg)
-    steps = sum(round(phase.seconds / cfg.timing.step_dt) for phase in phases.values())
-    _acceptance(gate.acceptance, steps)
-    _box_acceptance(gate.box, steps)
     _batch(gate.batch, cfg.seed)
     _parity(gate.parity)
     _capacity(gate.capacity)
@@ -47,57 +30,14 @@ def check_gates(cfg: Config) -> None:
 
 
 def _phase_names(cfg: Config) -> None:
-    """The phases that thresholds and the task's check name are there."""
+    """The phases that thresholds name are there."""
     gate = cfg.gate
     phases = cfg.controller.phases
     named = [("gate.parity.states", name) for name in gate.parity.states.values()]
-    if cfg.task.check.endswith(".StackCheck"):
-        named += [("gate.acceptance.carry_phase", gate.acceptance.carry_phase)]
-        named += [("gate.acceptance.lift_phases", name) for name in gate.acceptance.lift_phases]
-    if cfg.task.check.endswith(".BoxCheck"):
-        if cfg.scene.box is None:
-            raise ConfigError(
-                "scene",
-                cfg.scene.name,
-                "a scene with a box, for task.check BoxCheck",
-                "Set scene=box",
-            )
-        named += [
-            ("task.check", f"{role}_{cube}") for cube in ("red", "blue") for role in BOX_ROLES
-        ]
     named += [("gate.throughput.from_phase", gate.throughput.from_phase)]
     for key, name in named:
         if name not in phases:
             raise UnknownName(f"{key}: phase", name, phases)
-
-
-def _acceptance(t: StackCheckCfg, steps: int) -> None:
-    if not 2 <= t.window <= steps:
-        raise ConfigError("gate.acceptance.window", t.window, f"2 to {steps} steps (the episode)")
-    for name in ("lift_steps", "carry_steps"):
-        positive_int(f"gate.acceptance.{name}", getattr(t, name))
-    for name in (
-        "carry_distance",
-        "xy_err",
-        "support_gap",
-        "rest_speed",
-        "rest_position",
-        "rest_rotation_deg",
-    ):
-        positive(f"gate.acceptance.{name}", getattr(t, name))
-
-
-def _box_acceptance(t: BoxCheckCfg, steps: int) -> None:
-    for name in ("grasp_steps", "lift_steps", "carry_steps"):
-        positive_int(f"gate.box.{name}", getattr(t, name))
-    for name in ("force", "lift_height", "carry_distance", "rest_speed", "jaw_clearance"):
-        positive(f"gate.box.{name}", getattr(t, name))
-    if not 1 <= t.window <= steps:
-        raise ConfigError("gate.box.window", t.window, f"1 to {steps} steps (the episode)")
-    if not 0.0 < t.open_fraction <= 1.0:
-        raise ConfigError("gate.box.open_fraction", t.open_fraction, "a number above 0 and up to 1")
-    if not (math.isfinite(t.inside) and t.inside >= 0.0):
-        raise ConfigError("gate.box.inside", t.inside, "a number that is not negative [m]")
 
 
 def _batch(t: BatchGateCfg, seed: int) -> None:

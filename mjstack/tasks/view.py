@@ -1,0 +1,265 @@
+"""The objects of a task as its rules and terms see them: float32, from qpos, qvel and sensordata
+alone, which are never stale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import torch
+
+from mjstack.errors import UnknownName
+from mjstack.managers.base import EnvView
+from mjstack.math import lowest_point, quat_to_matrix
+from mjstack.mdp.geometry import LOADED, pose_w
+from mjstack.scene import table_top
+from mjstack.scene.index import Columns
+from mjstack.scene.phases import Phase
+
+_ROWS = 16  # of a block of counters
+
+
+class TaskView:
+    """Where the state of a task's objects is read, in every world of an environment.
+
+    Attributes:
+        env: The environment.
+        objects: Names of the objects, the order of every dimension over objects.
+        phased: Whether the driver has phases.
+        count: Steps so far, shape ``(1,)``, int64.
+    """
+
+    def __init__(
+        self,
+        env: EnvView,
+        objects: Sequence[str],
+        phases: Sequence[Phase] = (),
+        *,
+        steps: int = 0,
+        window: int = 0,
+        force: float = LOADED,
+    ) -> None:
+        """Reads addresses and sizes.
+
+        Args:
+            env: The environment.
+            objects: Names of objects of the scene.
+            phases: Those of the driver.
+            steps: Length of the episode; those after it count for no rule.
+            window: The last steps, which count for no rule without phases.
+            force: A jaw or a support that presses with more touches an object [N].
+
+        Raises:
+            UnknownName: There is no such object.
+        """
+        self.env = env
+        self.objects = list(objects)
+        self.phased = bool(phases)
+        self.force = force
+        self.count = torch.zeros(1, dtype=torch.int64, device=env.device)
+        self._phases = [phase.name for phase in phases]
+        self._stop = steps if phases else steps - window
+        self._table = torch.zeros((len(phases), 0), dtype=torch.bool, device=env.device)
+        self._blocks: list[tuple[torch.Tensor, int]] = []
+        self._constants: dict[tuple[float, ...], torch.Tensor] = {}
+        self._columns: dict[tuple[str, ...], slice | torch.Tensor] = {}
+
+        index = env.index
+        scene = env.cfg.scene
+        for name in objects:
+            if name not in scene.objects:
+                raise UnknownName("object", name, scene.objects)
+        self.things = [scene.objects[name] for name in objects]
+        self.top = table_top(scene)
+        self.half = torch.tensor([each.half for each in self.things], device=env.device)
+        self.radius = torch.tensor([each.radius for each in self.things], device=env.device)
+        self.qvel = [
+            None if name in index.fixed else index.object_address(name)[1] for name in objects
+        ]
+        self.jaws = self._forces([index.jaw_force[name] for name in objects])
+        self.supports = self._forces([index.support_force.get(name, []) for name in objects])
+
+    def _forces(self, addresses: Sequence[Sequence[int]]) -> Columns:
+        return Columns([a + i for row in addresses for a in row for i in range(3)], self.env.device)
+
+    def step(self, phase: torch.Tensor | None = None) -> Step:
+        """The state now, computed where it is asked for, once."""
+        return Step(self, phase)
+
+    def column(self, name: str) -> int:
+        """Number of an object."""
+        return self.objects.index(name)
+
+    def columns(self, names: Sequence[str]) -> slice | torch.Tensor:
+        """Numbers of some objects, as an index that needs no copy from the host."""
+        key = tuple(names)
+        if key not in self._columns:
+            found = [self.column(name) for name in names]
+            span = slice(found[0], found[-1] + 1)
+            together = found == list(range(span.start, span.stop))
+            self._columns[key] = span if together else torch.tensor(found, device=self.env.device)
+        return self._columns[key]
+
+    def during(self, phases: Sequence[Sequence[str]]) -> slice:
+        """A key for `Step.judged`: for each column of a rule, the phases in which it counts."""
+        if not self.phased:
+            return slice(0, 0)
+        rows = [[name in column for column in phases] for name in self._phases]
+        new = torch.tensor(rows, dtype=torch.bool, device=self.env.device)
+        first = self._table.shape[1]
+        self._table = torch.cat((self._table, new), dim=1)
+        return slice(first, first + len(phases))
+
+    def judged(self, phase: torch.Tensor | None) -> torch.Tensor:
+        """Every column of every key, shape ``(nworld, n)``; without phases whether the step
+        counts, shape ``(1, 1)``.
+        """
+        going = (self.count < self._stop)[:, None]
+        if phase is None or not self.phased:
+            return going
+        return self._table.index_select(0, phase) & going
+
+    def constant(self, *values: float) -> torch.Tensor:
+        """Numbers on the device, copied there once, shape ``(n,)``, float32."""
+        if values not in self._constants:
+            self._constants[values] = torch.tensor(
+                values, dtype=torch.float32, device=self.env.device
+            )
+        return self._constants[values]
+
+    def zeros(self, *shape: int, fill: float = 0.0) -> torch.Tensor:
+        """A buffer, shape ``(nworld, *shape)``, float32."""
+        size = (self.env.nworld, *shape)
+        return torch.full(size, fill, dtype=torch.float32, device=self.env.device)
+
+    def counter(self, size: int) -> torch.Tensor:
+        """A buffer that `forget` clears, shape ``(nworld, size)``, float32."""
+        for place, (block, used) in enumerate(self._blocks):
+            if block.shape[2] == size and used < _ROWS:
+                self._blocks[place] = (block, used + 1)
+                return block[used]
+        shape = (_ROWS, self.env.nworld, size)
+        self._blocks.append((torch.zeros(shape, dtype=torch.float32, device=self.env.device), 0))
+        return self.counter(size)
+
+    def forget(self, mask: torch.Tensor) -> None:
+        """Clears all counters of the masked columns, shape ``(nworld, size)``."""
+        for block, _ in self._blocks:
+            if block.shape[2] == mask.shape[1]:
+                # Not by a product: an earlier attempt may have left NaN.
+                block.masked_fill_(mask, 0.0)
+
+
+class Step:
+    """The state of a task's objects in one step, each part computed when it is first asked for.
+
+    A dimension over objects has the order of ``view.objects``. Forces are those of the last physics
+    step. A sensor gives the net force of a jaw on an object; that is the sum of the normal forces
+    up to a factor of 1.6, because friction adds at most 1.2 times the normal force across it and
+    the normals of one jaw on a convex object do not cancel. The threshold is ten million times
+    smaller than a grasp's force: it tells contact from none.
+    """
+
+    def __init__(self, view: TaskView, phase: torch.Tensor | None) -> None:
+        """Takes the view, and the phase of every world."""
+        self.view = view
+        self._phase = phase
+        self._known: dict[str, torch.Tensor] = {}
+
+    def once(self, key: str, compute: Callable[[], torch.Tensor]) -> torch.Tensor:
+        """A value that several conditions need, computed once. Not to be written into."""
+        if key not in self._known:
+            self._known[key] = compute()
+        return self._known[key]
+
+    @cached_property
+    def pose(self) -> torch.Tensor:
+        """Position [m] and quaternion (wxyz), shape ``(nworld, objects, 7)``."""
+        env = self.view.env
+        return torch.stack([pose_w(env, name) for name in self.view.objects], dim=1).float()
+
+    @property
+    def pos(self) -> torch.Tensor:
+        """Position [m], shape ``(nworld, objects, 3)``."""
+        return self.pose[..., :3]
+
+    @cached_property
+    def velocity(self) -> torch.Tensor:
+        """Velocity as MuJoCo has it: linear [m/s] in the world, angular [rad/s] in the object's
+        frame, shape ``(nworld, objects, 6)``.
+        """
+        env = self.view.env
+        still = self.view.constant(*[0.0] * 6).expand(env.nworld, -1)
+        parts = [
+            still if at is None else env.sim.qvel[:, at : at + 6].float() for at in self.view.qvel
+        ]
+        return torch.stack(parts, dim=1)
+
+    @cached_property
+    def turn(self) -> torch.Tensor:
+        """Rotation matrices, shape ``(nworld, objects, 3, 3)``."""
+        return quat_to_matrix(self.pose[..., 3:])
+
+    @cached_property
+    def height(self) -> torch.Tensor:
+        """Height of the lowest point above the table [m], shape ``(nworld, objects)``."""
+        pos, quat = self.pose.split((3, 4), dim=-1)
+        first, *others = self.view.things
+        if all((each.shape, each.size) == (first.shape, first.size) for each in others):
+            return lowest_point(pos, quat, first.shape, first.size) - self.view.top
+        heights = [
+            lowest_point(pos[:, column], quat[:, column], each.shape, each.size)
+            for column, each in enumerate(self.view.things)
+        ]
+        return torch.stack(heights, dim=1) - self.view.top
+
+    @cached_property
+    def bounds(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Least and largest coordinates [m] of the corners, or of those of the box around another
+        shape, each ``(nworld, objects, 3)``.
+        """
+        reach = (self.turn.abs() * self.view.half[:, None]).sum(-1)
+        return self.pos - reach, self.pos + reach
+
+    @cached_property
+    def speed(self) -> torch.Tensor:
+        """Fastest that any point can be [m/s], shape ``(nworld, objects)``."""
+        parts = torch.linalg.vector_norm(self.velocity.unflatten(-1, (2, 3)), dim=-1)
+        linear, angular = parts.unbind(-1)
+        return linear + self.view.radius * angular
+
+    @cached_property
+    def pressed(self) -> torch.Tensor:
+        """Whether each jaw presses on each object, shape ``(nworld, objects, jaws)``, bool."""
+        return self._sensed(self.view.jaws)
+
+    @cached_property
+    def in_hand(self) -> torch.Tensor:
+        """Whether all jaws press on each object, shape ``(nworld, objects)``, bool."""
+        return self.pressed.all(-1)
+
+    @cached_property
+    def untouched(self) -> torch.Tensor:
+        """Whether no jaw presses on each object, shape ``(nworld, objects)``, bool."""
+        return ~self.pressed.any(-1)
+
+    @cached_property
+    def supported(self) -> torch.Tensor:
+        """Whether anything but a jaw presses on each object, shape ``(nworld, objects)``, bool;
+        needs ``scene.support_sensors``.
+        """
+        return self._sensed(self.view.supports).any(-1)
+
+    def judged(self, key: slice) -> torch.Tensor:
+        """Whether the step counts for a rule, shape ``(nworld, columns)`` or ``(1, 1)``, bool."""
+        return self._judged[:, key] if self.view.phased else self._judged
+
+    @cached_property
+    def _judged(self) -> torch.Tensor:
+        return self.view.judged(self._phase)
+
+    def _sensed(self, columns: Columns) -> torch.Tensor:
+        forces = columns.read(self.view.env.sim.sensordata)
+        parts = forces.unflatten(1, (len(self.view.objects), -1, 3))
+        return torch.linalg.vector_norm(parts, dim=-1) > self.view.force
