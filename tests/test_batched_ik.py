@@ -16,7 +16,7 @@ import torch
 import warp as wp
 from test_robot_models import REPO, upstream
 
-from mjstack import benchmark_ik
+from mjstack.bench import ik_cli
 from mjstack.config import load_config
 from mjstack.config.schema import RobotCfg
 from mjstack.episodes.context import GateContext
@@ -859,7 +859,7 @@ def test_its_own_output_can_be_its_input(arm: Arm) -> None:
     second, _ = results(ik, first, target)
     (goal,) = tensors("cpu", target)
     ik.solve(*tensors("cpu", start, target))
-    assert (ik.solve(ik._command, goal)[0].numpy() == second).all()
+    assert (ik.solve(ik._view["solution"], goal)[0].numpy() == second).all()
 
 
 def test_float32_and_float64_agree(arm: Arm) -> None:
@@ -1056,15 +1056,13 @@ def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
 
 def test_shapes_are_not_broadcast() -> None:
     ik = odd_arm().solver(3)
-    with pytest.raises(
-        ArgumentError, match=r"command: found shape \(1, 5\), expected shape \(3, 5\)"
-    ):
+    with pytest.raises(ArgumentError, match=r"q: found shape \(1, 5\), expected shape \(3, 5\)"):
         ik.solve(torch.zeros(1, 5), torch.zeros(3, 3))
     with pytest.raises(ArgumentError, match=r"target: found shape \(3,\), expected shape \(3, 3\)"):
         ik.solve(torch.zeros(3, 5), torch.zeros(3))
-    with pytest.raises(ArgumentError, match="command: found shape"):
+    with pytest.raises(ArgumentError, match="q: found shape"):
         ik.grasp_point(torch.zeros(3, 4))
-    with pytest.raises(ArgumentError, match="command: found shape"):
+    with pytest.raises(ArgumentError, match="q: found shape"):
         ik.directions(torch.zeros(3, 4))
     with pytest.raises(
         ArgumentError, match="posture: found one, expected None, because posture_gain is 0"
@@ -1142,7 +1140,7 @@ def test_the_benchmark_prints_a_table_and_writes_its_figures(
         "--out",
         str(out),
     ]
-    benchmark_ik.main(arguments)
+    ik_cli.main(arguments)
     assert "SO-101, cpu" in capsys.readouterr().out
     results = json.loads(out.read_text())["results"]
     assert [(r["iterations"], r["gained"]) for r in results] == [
@@ -1163,6 +1161,6 @@ def test_the_benchmark_prints_a_table_and_writes_its_figures(
         ["--out", str(tmp_path / "no" / "file")],
     ):
         with pytest.raises(SystemExit) as caught:
-            benchmark_ik.main(["sim.device=cpu", "--nworld", "2", *bad])
+            ik_cli.main(["sim.device=cpu", "--nworld", "2", *bad])
         assert caught.value.code == 2
         assert capsys.readouterr().err.count("\n") == 1

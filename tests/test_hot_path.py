@@ -139,7 +139,7 @@ PATHS: dict[str, list[str] | None] = {
         "BatchedIk.grasp_point",
         "BatchedIk.directions",
         "BatchedIk._launch",
-        "BatchedIk._take",
+        "BatchedIk._copy_in",
     ],
     "scene/index.py": ["Columns.read", "Columns.write", "Columns.write_masked"],
     "sim/mjwarp.py": [

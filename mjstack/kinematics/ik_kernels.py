@@ -1,6 +1,4 @@
-"""Warp kernels for the grasp_point: forward kinematics and damped least squares, one thread per
-world.
-"""
+"""Warp kernels for the grasp point: forward and inverse kinematics, one thread per world."""
 
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
 from dataclasses import dataclass
@@ -28,10 +26,10 @@ class Chain:
     ``end`` only the second.
     """
 
-    frame: wp.array[wp.transform]  # the joint's frame at command 0, seen from the link before
+    frame: wp.array[wp.transform]  # the joint's frame at position 0, seen from the link before
     axis: wp.array[wp.vec3]  # of unit length, in that frame
     kind: wp.array[int]  # HINGE or SLIDE
-    column: wp.array[int]  # of the command
+    column: wp.array[int]  # of the joint positions
     low: wp.array[
         float
     ]  # where inverse kinematics keeps the joint; infinite where it does not move it
@@ -70,7 +68,7 @@ def turn(pose: wp.transform, axis: wp.vec3, kind: int, value: float) -> wp.trans
 
 @wp.func
 def follow(
-    chain: Chain, command: wp.array2d[float], w: int, first: int, last: int, start: wp.transform
+    chain: Chain, q: wp.array2d[float], w: int, first: int, last: int, start: wp.transform
 ) -> wp.transform:
     """Pose after links ``first`` to ``last`` (exclusive), from a pose."""
     pose = start
@@ -79,29 +77,29 @@ def follow(
             wp.transform_multiply(pose, chain.frame[i]),
             chain.axis[i],
             chain.kind[i],
-            command[w, chain.column[i]],
+            q[w, chain.column[i]],
         )
     return pose
 
 
 @wp.kernel(enable_backward=False)
-def grasp_point_kernel(chain: Chain, command: wp.array2d[float], centre: wp.array[wp.vec3]) -> None:
+def grasp_point_kernel(chain: Chain, q: wp.array2d[float], point: wp.array[wp.vec3]) -> None:
     """Grasp point of every world."""
     w = wp.tid()
-    trunk = follow(chain, command, w, 0, chain.trunk, wp.transform_identity())
+    trunk = follow(chain, q, w, 0, chain.trunk, wp.transform_identity())
     first = wp.transform_point(
-        follow(chain, command, w, chain.trunk, chain.fork, trunk), chain.first_site
+        follow(chain, q, w, chain.trunk, chain.fork, trunk), chain.first_site
     )
     second = wp.transform_point(
-        follow(chain, command, w, chain.fork, chain.end, trunk), chain.second_site
+        follow(chain, q, w, chain.fork, chain.end, trunk), chain.second_site
     )
-    centre[w] = wp.lerp(first, second, 0.5)
+    point[w] = wp.lerp(first, second, 0.5)
 
 
 @wp.kernel(enable_backward=False)
 def directions_kernel(
     chain: Chain,
-    command: wp.array2d[float],
+    q: wp.array2d[float],
     closing: wp.array[wp.vec3],
     approach: wp.array[wp.vec3],
 ) -> None:
@@ -109,12 +107,12 @@ def directions_kernel(
     axis.
     """
     w = wp.tid()
-    trunk = follow(chain, command, w, 0, chain.trunk, wp.transform_identity())
+    trunk = follow(chain, q, w, 0, chain.trunk, wp.transform_identity())
     first = wp.transform_point(
-        follow(chain, command, w, chain.trunk, chain.fork, trunk), chain.first_site
+        follow(chain, q, w, chain.trunk, chain.fork, trunk), chain.first_site
     )
     second = wp.transform_point(
-        follow(chain, command, w, chain.fork, chain.end, trunk), chain.second_site
+        follow(chain, q, w, chain.fork, chain.end, trunk), chain.second_site
     )
     closing[w] = wp.normalize(wp.sub(second, first))
     approach[w] = wp.transform_vector(trunk, chain.approach)
@@ -133,11 +131,10 @@ def within(value: float, low: float, high: float) -> float:
 
 @cache
 def solve_kernel(shape: Shape) -> wp.Kernel:
-    """The kernel that moves every world's grasp point towards its target.
+    """Compile the kernel that moves every world's grasp point towards its target.
 
-    Joints that inverse kinematics does not move are followed once per solve where they come after
-    the ones that it does, as the wrist's roll and the fingers do: an iteration then takes the moved
-    links alone.
+    Joints behind the last moved one, such as the wrist's roll and the fingers, are followed once
+    per solve. An iteration then follows the moved links alone.
     """
     n = len(shape.kinds)
     forked = any(shape.moved[shape.trunk :])
@@ -154,16 +151,15 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
 
     @wp.func
     def find_step(
-        jacobian: Any, q: Any, wish: Any, low: Any, high: Any, error: wp.vec3, damping: float
+        jacobian: Any, q: Any, guide: Any, low: Any, high: Any, error: wp.vec3, damping: float
     ) -> Any:
-        """Damped least-squares step within the limits; what ``wish`` asks for is done as far as it
-        moves no centre.
+        """Damped least-squares step within the limits, with ``guide`` in its null space.
 
-        A joint that would pass its limit is stopped there, and the others are solved again for what
-        it leaves to do: merely cutting the step would stall beside a limit.
+        A joint that would pass its limit is stopped there, and the others are solved again for the
+        rest: merely cutting the step would stall beside a limit.
         """
-        given = wish  # of a stopped joint: its step
-        step = wish
+        given = guide  # of a stopped joint: its step
+        step = guide
         held = Values()
         lambda_squared = damping * damping + FAR_DAMPING * wp.dot(error, error)
         stopped = wp.int32(1)
@@ -195,29 +191,30 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
         given: wp.array2d[float],
         target: wp.array[wp.vec3],
         posture: wp.array2d[float],
-        wished: wp.array[wp.vec3],
+        desired: wp.array[wp.vec3],
         iterations: int,
-        wishing: int,
+        guided: int,
         damping: float,
         max_step: float,
         posture_gain: float,
         approach_gain: float,
         near: float,
         tolerance: float,
-        command: wp.array2d[float],
+        solution: wp.array2d[float],
         distance: wp.array[float],
         unreachable: wp.array[wp.bool],
     ) -> None:
-        """``command`` is the nearest iterate; of those nearer than ``near``, the last."""
+        """``solution`` is the nearest iterate; of those nearer than ``near``, the last."""
+        # Input: worlds that are not finite keep their joint positions.
         w = wp.tid()
         goal = target[w]
         finite = wp.isfinite(goal)
-        if wishing > 0:
-            finite = finite and wp.isfinite(wished[w])
+        if guided > 0:
+            finite = finite and wp.isfinite(desired[w])
         for j in range(given.shape[1]):
             finite = finite and wp.isfinite(given[w, j])
-            command[w, j] = given[w, j]
-            if wishing > 0:
+            solution[w, j] = given[w, j]
+            if guided > 0:
                 finite = finite and wp.isfinite(posture[w, j])
         q = Values()
         low = Values()
@@ -230,11 +227,12 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             q[i] = within(given[w, j], low[i], high[i])
             home[i] = posture[w, j]
             if wp.static(shape.moved[i]):
-                command[w, j] = q[i]
+                solution[w, j] = q[i]
         if not finite:
             distance[w] = NAN
             unreachable[w] = True
             return
+        # Links behind the moved ones
         rest = follow(
             chain,
             given,
@@ -254,7 +252,9 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
         approach = wp.transform_vector(rest, chain.approach)
         best = q
         nearest = wp.float32(0.0)
+        # Iterations, and one more forward pass for the last one's distance
         for iteration in range(iterations + 1):
+            # Forward kinematics: trunk, first branch, second branch
             anchors = Rows()
             axes = Rows()
             trunk = wp.transform(wp.vec3(), wp.quat_identity())
@@ -277,19 +277,20 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                 axes[i] = wp.transform_vector(pose, chain.axis[i])
                 branch = turn(pose, chain.axis[i], wp.static(shape.kinds[i]), q[i])
             second = wp.transform_point(branch, second_site)
-            centre = wp.lerp(first, second, 0.5)
-            error = goal - centre
+            midpoint = wp.lerp(first, second, 0.5)
+            error = goal - midpoint
             left = wp.length(error)
             if iteration == 0 or left < nearest or left < near:
                 nearest = left
                 best = q
             if iteration < iterations:
+                # Jacobian of the midpoint
                 jacobian = Rows()
                 for i in range(END):
                     if wp.static(shape.moved[i]):
                         # Behind the trunk a joint moves one site only, and so the midpoint by half
                         # as much.
-                        point = centre
+                        point = midpoint
                         share = wp.float32(1.0)
                         if wp.static(i >= FORK):
                             point = second
@@ -301,15 +302,16 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                         if wp.static(shape.kinds[i] == HINGE):
                             direction = wp.cross(direction, point - anchors[i])
                         jacobian[i] = share * direction
-                wish = Values()
-                if iteration < wishing:
-                    lever = wp.cross(wp.transform_vector(trunk, approach), wished[w])
+                # Null-space motion, and the step
+                guide = Values()
+                if iteration < guided:
+                    lever = wp.cross(wp.transform_vector(trunk, approach), desired[w])
                     for i in range(END):
                         if wp.static(shape.moved[i]):
-                            wish[i] = posture_gain * (home[i] - q[i])
+                            guide[i] = posture_gain * (home[i] - q[i])
                             if wp.static(shape.kinds[i] == HINGE and i < TRUNK):
-                                wish[i] += approach_gain * wp.dot(axes[i], lever)
-                step = find_step(jacobian, q, wish, low, high, error, damping)
+                                guide[i] += approach_gain * wp.dot(axes[i], lever)
+                step = find_step(jacobian, q, guide, low, high, error, damping)
                 largest = wp.float32(0.0)
                 for i in range(END):
                     largest = wp.max(largest, wp.abs(step[i]))
@@ -318,7 +320,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                     q[i] = wp.clamp(q[i] + scale * step[i], low[i], high[i])
         for i in range(END):
             if wp.static(shape.moved[i]):
-                command[w, chain.column[i]] = best[i]
+                solution[w, chain.column[i]] = best[i]
         distance[w] = nearest
         unreachable[w] = not (nearest <= tolerance)
 

@@ -1,6 +1,4 @@
-"""Inverse kinematics with mink on a robot-only model: the reference that plans the
-scripted grasp.
-"""
+"""Inverse kinematics with mink on a model of the robot alone: the reference, which plans grasps."""
 
 from __future__ import annotations
 
@@ -16,16 +14,12 @@ from mjstack.robots import robot_spec
 from mjstack.scene.index import find
 
 _POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the grasp point by micrometres
-_CONVERGED = (
-    0.1  # of the tolerance: Newton's method squares the error, one more step would be for nothing
-)
-_MAX_STEP = (
-    0.3  # [rad] per iteration, so that a far target is approached on one branch of solutions
-)
+_CONVERGED = 0.1  # share of the tolerance: Newton's method squares the error, so that is enough
+_MAX_STEP = 0.3  # [rad, m] per iteration: a far target is approached on one branch of solutions
 
 
 class GraspPointTask(mink.Task):
-    """Drives the grasp point, the midpoint of two sites, to a point.
+    """Drive the grasp point, the midpoint of two sites, to a point.
 
     The midpoint belongs to no single frame: on a jaw that swings it moves with the jaw's angle.
     """
@@ -49,14 +43,12 @@ class GraspPointTask(mink.Task):
 
 
 class GraspIk:
-    """Solves for the arm command that brings the grasp point to a target at a given gripper
-    command.
-    """
+    """Arm positions that bring the grasp point to a target at a given gripper opening."""
 
     def __init__(
         self, robot: RobotCfg, model: ModelCfg, *, tolerance: float, iterations: int
     ) -> None:
-        """Compiles the robot without a scene.
+        """Compile the robot without a scene.
 
         Args:
             robot: The robot's profile.
@@ -80,7 +72,7 @@ class GraspIk:
                 low, high = self.model.joint(name).range
                 if not low <= value <= high:
                     raise ConfigError(
-                        f"robot.{key} of {name}", value, f"a command within [{low:.4g}, {high:.4g}]"
+                        f"robot.{key} of {name}", value, f"a value within [{low:.4g}, {high:.4g}]"
                     )
         self._qpos = self.model.jnt_qposadr[joints]
         self._n_arm = len(robot.arm_joints)
@@ -101,21 +93,21 @@ class GraspIk:
     def solve(
         self, target: np.ndarray, gripper: np.ndarray, start: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """Finds a command.
+        """Find joint positions.
 
         Args:
-            target: Where the grasp point goes [m], shape ``(3,)``.
-            gripper: Gripper command, held fixed.
-            start: Command to start from, shape ``(nu,)``, arm joints first.
+            target: Target of the grasp point [m], shape ``(3,)``.
+            gripper: Positions of the gripper joints [rad, m], held fixed.
+            start: Joint positions to start from [rad, m], shape ``(nu,)``, arm joints first.
 
         Returns:
-            The command, shape ``(nu,)``, and the distance [m] that is left.
+            The joint positions, shape ``(nu,)``, and the distance [m] that is left.
         """
-        command = start.copy()
-        command[self._n_arm :] = gripper
+        q = start.copy()
+        q[self._n_arm :] = gripper
         self._task.target[:] = target
         configuration = self._configuration
-        configuration.update(self._to_qpos(command))
+        configuration.update(self._to_qpos(q))
         nearest = configuration.q[self._qpos].copy()
         distance = math.inf
         for _ in range(self._iterations):
@@ -134,23 +126,20 @@ class GraspIk:
             largest = float(np.abs(step).max())
             configuration.integrate_inplace(step * min(1.0, _MAX_STEP / max(largest, 1e-12)), 1.0)
             left = float(np.linalg.norm(self._task.compute_error(configuration)))
-            if (
-                left < distance
-                # undamped, the pull towards home can end in swinging to and fro, farther from the
-                # target
-            ):
+            # The pull towards home can end in oscillations, farther from the target.
+            if left < distance:
                 nearest = configuration.q[self._qpos].copy()
                 distance = left
             if distance < _CONVERGED * self.tolerance:
                 break
         return nearest, distance
 
-    def grasp_point(self, command: np.ndarray) -> np.ndarray:
-        """Grasp point [m] at a command, shape ``(3,)``."""
-        self._configuration.update(self._to_qpos(command))
+    def grasp_point(self, q: np.ndarray) -> np.ndarray:
+        """Grasp point [m] at joint positions of shape ``(nu,)``, shape ``(3,)``."""
+        self._configuration.update(self._to_qpos(q))
         return self._task.compute_error(self._configuration) + self._task.target
 
-    def _to_qpos(self, command: np.ndarray) -> np.ndarray:
+    def _to_qpos(self, q: np.ndarray) -> np.ndarray:
         qpos = self.model.qpos0.copy()
-        qpos[self._qpos] = command
+        qpos[self._qpos] = q
         return qpos

@@ -1,7 +1,7 @@
-"""What the arm reaches: inverse kinematics of many points at once in numpy, for checks and maps.
+"""Reach of an arm: inverse kinematics of many points at once in NumPy, for checks and maps.
 
 `mink_ik` plans and `batched_ik` runs with the worlds. Here points have nothing to do with worlds,
-no Warp is loaded, and the gripper's tilt matters too.
+Warp is not loaded, and the gripper's tilt matters too.
 """
 
 from __future__ import annotations
@@ -17,26 +17,22 @@ from mjstack.kinematics.joints import approach_body, joint_limits
 from mjstack.scene.index import find
 
 _DAMPING = 1e-3  # [m/rad] of the steps towards a point
-_MAX_STEP = 0.3  # [rad] per joint and iteration
+_MAX_STEP = 0.3  # [rad, m] per joint and iteration
 _CONVERGED = 1e-6  # [m]
-_STILL = 1e-5  # [rad] a step that is smaller ends the way
-# [m/rad] what the pointing direction weighs against the position while the tilt is reduced
-_POINTING = 0.02
-_STARTS = (
-    -0.6,
-    0.0,
-    0.6,
-)  # [rad] off home, of each joint after the first: on which branch of solutions it begins
+_STILL = 1e-5  # [rad, m] a smaller step ends the search
+_POINTING = 0.02  # [m/rad] weight of the approach axis against the position
+# [rad] off home, of each hinge after the first: every start has its own branch of solutions
+_STARTS = (-0.6, 0.0, 0.6)
 
 
 @dataclass(frozen=True, slots=True)
 class Reached:
-    """What was found at each point.
+    """Solutions at the points.
 
     Attributes:
-        q: The ik joints [rad], shape ``(n, joints)``.
-        distance: From the grasp point to the point [m], shape ``(n,)``.
-        tilt: Of the gripper from pointing straight down [rad], shape ``(n,)``.
+        q: Positions of the ik joints [rad, m], shape ``(n, joints)``.
+        distance: Distance of the grasp point from the point [m], shape ``(n,)``.
+        tilt: Angle of the approach axis to straight down [rad], shape ``(n,)``.
     """
 
     q: np.ndarray
@@ -45,35 +41,34 @@ class Reached:
 
 
 class PointReach:
-    """Brings the grasp point to points, for one opening of the gripper; collisions are not looked
-    at.
+    """Inverse kinematics for one opening of the gripper, without collisions.
 
-    The other joints stay at the robot's home, or where they are locked. The gripper points along
-    the robot's ``approach_axis``.
+    Arm joints are hinges and slides. Those that are not ik joints stay at the robot's home, or
+    where they are locked.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg, gripper: Sequence[float]) -> None:
-        """Reads axes and limits of the ik joints.
+        """Read axes and limits of the ik joints.
 
         Args:
             model: A compiled model that contains the robot, alone or in a scene. It is not kept.
             robot: The robot's profile.
-            gripper: Command of the gripper [rad, m].
+            gripper: Joint positions of the gripper [rad, m].
 
         Raises:
             UnknownName: The model lacks a joint or site of the robot.
         """
         data = mujoco.MjData(model)
         n_arm = len(robot.arm_joints)
-        command = dict(
+        positions = dict(
             zip(
                 [*robot.arm_joints, *robot.gripper_joints],
                 [*robot.home[:n_arm], *gripper],
                 strict=True,
             )
         )
-        command |= robot.locked
-        for name, value in command.items():
+        positions |= robot.locked
+        for name, value in positions.items():
             data.qpos[model.jnt_qposadr[find(model, "joint", name)]] = value
         mujoco.mj_kinematics(model, data)
         joints = sorted(
@@ -81,7 +76,7 @@ class PointReach:
             key=lambda j: int(model.jnt_bodyid[j]),
         )
         self._slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
-        self._home = np.array([command[model.joint(j).name] for j in joints])
+        self._home = np.array([positions[model.joint(j).name] for j in joints])
         self._anchors = data.xanchor[joints].copy()
         self._axes = data.xaxis[joints].copy()
         sites = [find(model, "site", name) for name in robot.grasp_sites]
@@ -91,7 +86,7 @@ class PointReach:
         self._low, self._high = joint_limits(model, [model.joint(j).name for j in joints])
 
     def solve(self, points: np.ndarray, iterations: int = 60) -> Reached:
-        """Goes as near to each point as it can, from a few starts.
+        """Bring the grasp point as near to each point as possible, from a few starts.
 
         Args:
             points: Targets [m], shape ``(n, 3)``.
@@ -110,8 +105,7 @@ class PointReach:
         return Reached(q, distance, self._tilt(q))
 
     def solve_upright(self, points: np.ndarray, tolerance: float, iterations: int = 60) -> Reached:
-        """Likewise, and of the solutions within tolerance takes the one whose gripper is tilted
-        least.
+        """Solve, and of the solutions within tolerance take the one with the least tilt.
 
         Args:
             points: Targets [m], shape ``(n, 3)``.
@@ -136,8 +130,8 @@ class PointReach:
         return Reached(q, distance, tilt)
 
     def _start(self, points: np.ndarray, off: float) -> np.ndarray:
-        """Home, turned towards the points where the first joint stands upright, the other joints
-        bent by ``off``.
+        """Home with the other hinges bent by ``off``; a first hinge that is upright turns towards
+        the points.
         """
         q = np.tile(self._home + np.where(self._slides, 0.0, off), (len(points), 1))
         axis = self._axes[0]
@@ -153,8 +147,8 @@ class PointReach:
     def _descend(
         self, start: np.ndarray, points: np.ndarray, iterations: int, pointing: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Damped least squares within the limits. Points that are reached drop out, unless the tilt
-        is being reduced.
+        """Damped least squares within the limits. Reached points drop out, unless ``pointing``
+        reduces their tilt.
         """
         q = start.copy()
         left = np.arange(len(points))
@@ -189,7 +183,7 @@ class PointReach:
     def _step(
         self, q: np.ndarray, jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray | float
     ) -> np.ndarray:
-        """One step. A joint that would leave its range is held, and the others take over."""
+        """One step. A joint that would leave its range is held, and the others are solved again."""
         weight = np.broadcast_to(np.square(damping), len(q))[:, None, None] * np.eye(q.shape[1])
         free = np.ones_like(q, dtype=bool)
         for _ in range(3):

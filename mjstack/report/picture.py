@@ -42,13 +42,11 @@ class SceneCamera:
                 " MUJOCO_GL=egl or osmesa."
             ) from error
         table = model.geom("table").id
+        x, _, z = model.geom_pos[table].tolist()
+        tall = max(0.0, float(model.stat.center[2]) - z - 0.03)  # m that an arm stands out
         self._camera = mujoco.MjvCamera()
-        self._camera.lookat = [
-            0.62 * model.geom_pos[table][0],
-            0.0,
-            model.geom_pos[table][2] + 0.08,
-        ]
-        self._camera.distance = 0.55 + 1.0 * float(model.geom_pos[table][0])
+        self._camera.lookat = [0.62 * x, 0.0, z + 0.08 + tall]
+        self._camera.distance = 0.55 + x + 1.5 * tall
         self._camera.azimuth = 140.0
         self._camera.elevation = -24.0
 

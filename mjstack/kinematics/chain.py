@@ -1,0 +1,158 @@
+"""The moving links from the world to a gripper's grasp sites, read from a compiled model."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from mjstack.config.schema import RobotCfg
+from mjstack.errors import ConfigError, MjstackError
+from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape
+from mjstack.kinematics.joints import approach_body
+from mjstack.scene.index import find
+
+_KINDS = {int(mujoco.mjtJoint.mjJNT_HINGE): HINGE, int(mujoco.mjtJoint.mjJNT_SLIDE): SLIDE}
+_NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
+
+_Pose = tuple[np.ndarray, np.ndarray]  # position and quaternion (wxyz)
+_Link = tuple[_Pose, np.ndarray, int, int]  # frame, axis, kind, column of the joint targets
+
+
+def build_chain(
+    model: mujoco.MjModel,
+    robot: RobotCfg,
+    joints: list[int],
+    moved: list[int],
+    low: np.ndarray,
+    high: np.ndarray,
+) -> tuple[Chain, Shape]:
+    """Read the bodies from the world to each site.
+
+    Args:
+        model: The compiled model.
+        robot: The robot's profile.
+        joints: Joint index of each column of the joint targets.
+        moved: Columns that inverse kinematics moves.
+        low: Lower limit of each column [rad, m].
+        high: Upper limit of each column [rad, m].
+
+    Returns:
+        The chain, in Warp arrays on the current device, and its shape.
+    """
+    first, second = (find(model, "site", name) for name in robot.grasp_sites)
+    first_path = _path(model, model.site_bodyid[first])
+    second_path = _path(model, model.site_bodyid[second])
+    shared = len([body for body in first_path if body in second_path])
+    columns = {joint: column for column, joint in enumerate(joints)}
+    chain = Chain()
+    links = []
+
+    def extend(bodies: list[int], start: _Pose) -> _Pose:
+        """Append the bodies' links; return the frame after them, seen from the last joint."""
+        pose = start
+        for body in bodies:
+            pose = _compose(pose, (model.body_pos[body], model.body_quat[body]))
+            for joint in _joints(model, body):
+                if joint in columns:
+                    pose = _compose(pose, (model.jnt_pos[joint], _NO_TURN))
+                    links.append(_read_link(model, joint, pose, columns[joint]))
+                    pose = (-model.jnt_pos[joint], _NO_TURN)
+        return pose
+
+    trunk = extend(first_path[:shared], (np.zeros(3), _NO_TURN))
+    chain.trunk = len(links)
+    chain.approach = wp.vec3(
+        *_read_approach_axis(model, robot, first_path[:shared], trunk, set(columns))
+    )
+    end = extend(first_path[shared:], trunk)
+    chain.first_site = wp.vec3(*_compose(end, (model.site_pos[first], _NO_TURN))[0])
+    chain.fork = len(links)
+    end = extend(second_path[shared:], trunk)
+    chain.second_site = wp.vec3(*_compose(end, (model.site_pos[second], _NO_TURN))[0])
+    chain.end = len(links)
+    kinds = [kind for _, _, kind, _ in links]
+    column = [column for *_, column in links]
+    chain.frame = wp.array(
+        [[*pos, *quat[1:], quat[0]] for (pos, quat), *_ in links], dtype=wp.transform
+    )  # Warp: xyzw
+    chain.axis = wp.array([axis for _, axis, *_ in links], dtype=wp.vec3)
+    chain.kind = wp.array(kinds, dtype=int)
+    chain.column = wp.array(column, dtype=int)
+    chain.low = wp.array(low[column], dtype=float)
+    chain.high = wp.array(high[column], dtype=float)
+    shape = Shape(tuple(kinds), tuple(c in moved for c in column), chain.trunk, chain.fork)
+    return chain, shape
+
+
+def _read_approach_axis(
+    model: mujoco.MjModel, robot: RobotCfg, trunk: list[int], end: _Pose, commanded: set[int]
+) -> np.ndarray:
+    """Read the approach axis, seen from the trunk's last link.
+
+    Args:
+        model: The compiled model.
+        robot: The robot's profile.
+        trunk: Bodies that carry both sites, from the world's side.
+        end: Frame of the last of them, seen from the trunk's last link.
+        commanded: Joints that have a column in the joint targets.
+    """
+    first = max((i for i, b in enumerate(trunk) if commanded & set(_joints(model, b))), default=0)
+    rigid = trunk[first:]
+    body = approach_body(model, robot)
+    if body not in rigid:
+        names = ", ".join(model.body(b).name for b in rigid) or "none"
+        expected = (
+            f"a body that carries both grasp sites and that every joint before them moves: {names}"
+        )
+        raise ConfigError("robot.approach_body", model.body(body).name, expected)
+    turn = np.empty(4)
+    back = end[1].copy()  # from the last body of the trunk to this one, against the way
+    for b in reversed(rigid[rigid.index(body) + 1 :]):
+        mujoco.mju_negQuat(turn, model.body_quat[b])
+        mujoco.mju_mulQuat(back, back.copy(), turn)
+    out = np.empty(3)
+    mujoco.mju_rotVecQuat(out, np.array(robot.approach_axis, dtype=float), back)
+    return out / np.linalg.norm(out)
+
+
+def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose, column: int) -> _Link:
+    """Read a joint whose frame at qpos0 is ``pose``; its frame at 0 is turned, or shifted, back by
+    qpos0.
+    """
+    kind = int(model.jnt_type[joint])
+    axis = model.jnt_axis[joint].copy()
+    if kind not in _KINDS:
+        name = model.joint(joint).name
+        type_ = mujoco.mjtJoint(kind).name.removeprefix("mjJNT_").lower()
+        raise MjstackError(
+            f"joint '{name}' is of type {type_}, expected hinge or slide. Name no other joints."
+        )
+    zero = float(model.qpos0[model.jnt_qposadr[joint]])
+    turn = _NO_TURN.copy()
+    if _KINDS[kind] == HINGE:
+        mujoco.mju_axisAngle2Quat(turn, axis, -zero)
+        back = (np.zeros(3), turn)
+    else:
+        back = (-zero * axis, turn)
+    return _compose(pose, back), axis, _KINDS[kind], column
+
+
+def _path(model: mujoco.MjModel, body: int) -> list[int]:
+    """Bodies from the world, which is left out, to the given one."""
+    path: list[int] = []
+    while body:
+        path.insert(0, int(body))
+        body = model.body_parentid[body]
+    return path
+
+
+def _joints(model: mujoco.MjModel, body: int) -> range:
+    return range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
+
+
+def _compose(a: _Pose, b: _Pose) -> _Pose:
+    pos = np.empty(3)
+    quat = np.empty(4)
+    mujoco.mju_mulPose(pos, quat, a[0], a[1], b[0], b[1])
+    return pos, quat
