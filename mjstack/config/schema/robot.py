@@ -77,49 +77,49 @@ class RobotCfg:
     replace_collision: bool = False
     """Whether ``model=menagerie`` gets the collision geoms of mjstack's own file."""
 
-    arm_joints: list[str] = MISSING
+    arm_joints: list[str] = spec()
     """Joints of the arm, from the base on."""
     gripper_joints: list[str] = MISSING
     """Joints of the gripper."""
     jaw_bodies: list[str] = MISSING
     """Bodies that touch a grasped object. A sensor measures the force of each on each object."""
-    grasp_sites: list[str] = MISSING
+    grasp_sites: list[str] = spec(length=2)
     """Two sites, one on each jaw. Their midpoint is the grasp point."""
     grasp_parts: dict[str, list[str]] = field(default_factory=dict)
     """Where a grasp site goes that the file lacks: the mean of these geoms or bodies of one jaw."""
-    home: list[float] = MISSING
-    """Joint values at which the scripted task begins [rad, m]."""
-    start: list[float] = field(default_factory=list)
-    """Joint values at which environments begin, clear of the table [rad, m]. Empty: ``home``."""
-    gripper_open: list[float] = MISSING
-    """Joint targets of the open gripper [rad, m]."""
-    gripper_closed: list[float] = MISSING
-    """Joint targets of the gripper around an object [rad, m]."""
-    arm_force_limit: float | None = None
-    """Largest force of the arm's servos [N m, N]. null: the file's own."""
+    home: list[float] = spec(unit="rad, m")
+    """Joint values at which the scripted task begins."""
+    start: list[float] = spec(factory=list, unit="rad, m")
+    """Joint values at which environments begin, clear of the table. Empty: ``home``."""
+    gripper_open: list[float] = spec(unit="rad, m")
+    """Joint targets of the open gripper."""
+    gripper_closed: list[float] = spec(unit="rad, m")
+    """Joint targets of the gripper around an object."""
+    arm_force_limit: float | None = spec(None, unit="N m, N", gt=0.0)
+    """Largest force of the arm's servos. null: the file's own."""
 
-    locked: dict[str, float] = field(default_factory=dict)
-    """Arm joints that inverse kinematics holds, with their values [rad, m]."""
+    locked: dict[str, float] = spec(factory=dict, unit="rad, m")
+    """Arm joints that inverse kinematics holds, with their values."""
     ik_joints: list[str] = field(default_factory=list)
     """Arm joints that inverse kinematics moves. Empty: all that are not locked."""
     approach_body: str = ""
     """Body with the approach axis: the last that carries both jaws. Empty: the body of the last arm
     joint."""
-    approach_axis: list[float] = field(default_factory=lambda: [0.0, 0.0, -1.0])
+    approach_axis: list[float] = spec(factory=lambda: [0.0, 0.0, -1.0], length=3)
     """Direction from the wrist towards the grasped object, in that body's frame."""
     roll_joint: str | None = None
     """Arm joint that turns the gripper about the approach axis. null: there is none, and no yaw
     alignment."""
-    posture_gain: float = 0.0
+    posture_gain: float = spec(0.0, ge=0.0, le=1.0)
     """Closed loop: share per iteration of the way to the nominal joint values, in the null
     space."""
-    approach_gain: float = 0.0
-    """Closed loop: turn per iteration of the approach axis towards the desired one [rad]."""
-    yaw_alignment: float = 0.0
-    """Closed loop: how far the jaws turn to an object's nearest face, from 0 to 1."""
-    approach_height: float = 0.1
-    """Height above an object at which a grasp begins [m]."""
-    finger_room: float = 0.01
-    """Free room around an object for the open jaws [m]."""
+    approach_gain: float = spec(0.0, unit="rad", ge=0.0, le=1.0)
+    """Closed loop: turn per iteration of the approach axis towards the desired one."""
+    yaw_alignment: float = spec(0.0, ge=0.0, le=1.0)
+    """Closed loop: how far the jaws turn to an object's nearest face."""
+    approach_height: float = spec(0.1, unit="m", gt=0.0)
+    """Height above an object at which a grasp begins."""
+    finger_room: float = spec(0.01, unit="m", ge=0.0)
+    """Free room around an object for the open jaws."""
     placements: dict[str, PlacementsCfg] = field(default_factory=dict)
     """Where the objects of each scene stand for this robot."""
