@@ -18,7 +18,7 @@ from check_cases import STOPPED_EARLY, limits
 from mjstack.config import load_config
 from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor
 from mjstack.episodes.observers import Episode
 from mjstack.episodes.rollout import Observer, Reset
@@ -35,7 +35,7 @@ class Recorder(Observer):
     """Keeps every world's state and phase at every step end."""
 
     def __init__(
-        self, context: GateContext, observers: Sequence[Observer], disturb: Disturb | None
+        self, context: RunContext, observers: Sequence[Observer], disturb: Disturb | None
     ) -> None:
         self.context = context
         self._observers = observers
@@ -73,7 +73,7 @@ class Recorder(Observer):
 
 
 @dataclass(eq=False)
-class RecordingContext(GateContext):
+class RecordingContext(RunContext):
     """A gate context that records the episodes that it plays; so does one that a gate derives from
     it.
     """
@@ -91,8 +91,8 @@ class RecordingContext(GateContext):
 
 
 @cache
-def base_context(robot: str) -> GateContext:
-    return GateContext(cfg=load_config(["task=box", f"robot={robot}"]))
+def base_context(robot: str) -> RunContext:
+    return RunContext(cfg=load_config(["task=box", f"robot={robot}"]))
 
 
 def recording_context(
@@ -100,11 +100,11 @@ def recording_context(
 ) -> RecordingContext:
     """For overrides that change neither scene nor plan: both are shared by the robot's contexts."""
     base = base_context(robot)
-    context = RecordingContext(
-        cfg=load_config(["task=box", f"robot={robot}", *overrides]), disturb=disturb
+    return RecordingContext(
+        cfg=load_config(["task=box", f"robot={robot}", *overrides]),
+        stage=base.stage,
+        disturb=disturb,
     )
-    context.__dict__.update(model=base.model, planner=base.planner)
-    return context
 
 
 def put_cube(env: Env, cube: int, place: list[float] | np.ndarray) -> None:
@@ -121,7 +121,7 @@ def put_cube(env: Env, cube: int, place: list[float] | np.ndarray) -> None:
 class World:
     """A recorded world, to be checked or altered."""
 
-    context: GateContext
+    context: RunContext
     phase: np.ndarray
     qpos: np.ndarray
     qvel: np.ndarray

@@ -15,7 +15,7 @@ import torch
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Hook
 from mjstack.sim import Simulation, make_simulation
 
@@ -63,42 +63,39 @@ def _outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 
 @pytest.fixture(scope="session")
-def stage() -> Callable[..., GateContext]:
+def stage() -> Callable[..., RunContext]:
     """Configuration, model, index and planner of a robot under some overrides, each made once in
     the session.
     """
-    made: dict[tuple[str, ...], GateContext] = {}
+    made: dict[tuple[str, ...], RunContext] = {}
 
-    def get(robot: str, *overrides: str) -> GateContext:
+    def get(robot: str, *overrides: str) -> RunContext:
         key = (f"robot={robot}", *overrides)
         if key not in made:
-            made[key] = GateContext(cfg=load_config(key))
+            made[key] = RunContext(cfg=load_config(key))
         return made[key]
 
     return get
 
 
 @pytest.fixture(scope="session")
-def new_context(stage: Callable[..., GateContext]) -> Callable[..., GateContext]:
+def new_context(stage: Callable[..., RunContext]) -> Callable[..., RunContext]:
     """A gate context of its own for some overrides that change neither scene nor, but for its
     phases, plan: both are shared.
     """
 
-    def make(*overrides: str, robot: str = "so101") -> GateContext:
+    def make(*overrides: str, robot: str = "so101") -> RunContext:
         shared = stage(
             robot,
             *(override for override in overrides if override.startswith("controller.phases.")),
         )
-        context = GateContext(cfg=load_config([f"robot={robot}", *overrides]))
-        context.__dict__["model"] = shared.model
-        context.__dict__["planner"] = shared.planner
-        return context
+        return RunContext(load_config([f"robot={robot}", *overrides]), shared.stage)
 
     return make
 
 
 @pytest.fixture(scope="session")
-def make_sim(stage: Callable[[str], GateContext]) -> Callable[..., Simulation]:
+def make_sim(stage: Callable[[str], RunContext]) -> Callable[..., Simulation]:
     """Simulations by (backend, nworld, overrides), reset and shared by all tests: MJWarp's are slow
     to build.
     """
@@ -121,7 +118,7 @@ def make_sim(stage: Callable[[str], GateContext]) -> Callable[..., Simulation]:
 
 @pytest.fixture(scope="session")
 def recorded(
-    stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]
+    stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]
 ) -> Callable[[str], SimpleNamespace]:
     """A native episode of four jittered worlds per robot: cube poses and velocities at every step
     end, and the result.

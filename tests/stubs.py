@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import torch
 
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.jobs.demonstration import Played, StepRecorder
 from mjstack.sim import Simulation
 
@@ -41,7 +41,7 @@ def pretended(
     """
 
     def play(
-        context: GateContext,
+        context: RunContext,
         sim: Simulation,
         seed: int,
         values: torch.Tensor,

@@ -19,7 +19,7 @@ from environments import brisk
 
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import context as gate_module
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Episode, play_episode
 from mjstack.episodes.record import FAILING, EpisodeRecord, clear_records, write_failing
 from mjstack.errors import RunError
@@ -54,7 +54,7 @@ def test_wilson_interval(successes: int, trials: int, low: float, high: float) -
     assert 0.0 <= found[0] <= successes / trials <= found[1] <= 1.0
 
 
-def play(context: GateContext, folder: Path | None) -> GateResult:
+def play(context: RunContext, folder: Path | None) -> GateResult:
     context.folder = folder
     (result,) = run_batch(context)
     return result
@@ -62,7 +62,7 @@ def play(context: GateContext, folder: Path | None) -> GateResult:
 
 @pytest.fixture(scope="module")
 def two_seeds(
-    new_context: Callable[..., GateContext], tmp_path_factory: pytest.TempPathFactory
+    new_context: Callable[..., RunContext], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, GateResult, list[str]]:
     """A native batch of seven worlds under seeds 0 and 1, some of which fail, its folder, and what
     it said.
@@ -124,7 +124,7 @@ def test_failing_worlds_are_a_table(two_seeds: tuple[Path, GateResult, list[str]
 
 def test_second_seed_is_what_it_is_alone(
     two_seeds: tuple[Path, GateResult, list[str]],
-    new_context: Callable[..., GateContext],
+    new_context: Callable[..., RunContext],
     tmp_path: Path,
 ) -> None:
     """Worlds are started anew: nothing of seed 0 is left in them. Fewer of them, too, because
@@ -172,7 +172,7 @@ class Stop(Exception):
 @pytest.mark.parametrize("error", [Stop("the second seed"), KeyboardInterrupt()])
 def test_what_stops_the_second_seed_keeps_the_first(
     error: BaseException,
-    new_context: Callable[..., GateContext],
+    new_context: Callable[..., RunContext],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
@@ -199,7 +199,7 @@ def test_what_stops_the_second_seed_keeps_the_first(
 
 
 def test_full_disk_takes_no_verdict_back(
-    new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -245,7 +245,7 @@ def test_damaged_record_is_one_line(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_few_failures_may_be_allowed(new_context: Callable[..., GateContext]) -> None:
+def test_a_few_failures_may_be_allowed(new_context: Callable[..., RunContext]) -> None:
     """nworld=5 of seed 0 has world 4 off; allowed, it is still named."""
     result = play(new_context("sim=native", "nworld=5", "gate.batch.failed_worlds=1", TIGHT), None)
     assert result.status is Status.passed
@@ -256,7 +256,7 @@ def test_a_few_failures_may_be_allowed(new_context: Callable[..., GateContext]) 
     )  # allowed, and void nonetheless
 
 
-def test_no_trajectory_is_kept(new_context: Callable[..., GateContext], tmp_path: Path) -> None:
+def test_no_trajectory_is_kept(new_context: Callable[..., RunContext], tmp_path: Path) -> None:
     """A trajectory of qpos alone would take 48 kB a world on the host."""
 
     def peak(nworld: int) -> int:

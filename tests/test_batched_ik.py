@@ -19,14 +19,14 @@ from test_robot_models import REPO, upstream
 from mjstack.bench import ik_cli
 from mjstack.config import load_config
 from mjstack.config.schema import RobotCfg
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError, ConfigError, MjstackError, UnknownName
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.robots import robot_spec
 from mjstack.sim.streams import torch_stream_scope
 
-Stage = Callable[[str], GateContext]
+Stage = Callable[[str], RunContext]
 
 CUDA = [
     pytest.mark.gpu,
@@ -138,7 +138,7 @@ class Arm:
 
 
 def above_table(
-    context: GateContext, arm: Arm, n: int, seed: int = 0
+    context: RunContext, arm: Arm, n: int, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Random commands, and where they bring the grasp point: up to 25 cm above the table."""
     center = np.array(context.cfg.scene.table_center)
@@ -282,7 +282,7 @@ def by_mink(
     return get
 
 
-def shipped(context: GateContext) -> dict[str, float]:
+def shipped(context: RunContext) -> dict[str, float]:
     """The gains with which ``controller=closed_loop`` runs."""
     c = context.cfg.controller
     return {"posture_gain": c.posture_gain, "approach_gain": c.approach_gain}

@@ -26,7 +26,7 @@ from mjstack.envs.buffers import (
     recommend_sizes,
     require_physics,
 )
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.workloads import Workload, play_task
 from mjstack.errors import FaultError, MjstackError, Unreachable
 from mjstack.gates import capacity as capacity_module
@@ -37,7 +37,7 @@ from mjstack.sim import BatchSizes, Overflow, Simulation, make_simulation, resol
 from mjstack.sim.sizes import apply_configured, resolve_env_sizes, resolve_measuring_sizes
 
 Make = Callable[..., Simulation]
-NewContext = Callable[..., GateContext]
+NewContext = Callable[..., RunContext]
 KEPT = ("most_contacts", "most_constraints", "overflow_ever")
 
 
@@ -52,7 +52,7 @@ def peaks(rows: int = 100, contacts: int = 20, nworld: int = 4, **other: object)
     return Peaks(**(facts | other))
 
 
-def start(sim: Simulation, context: GateContext) -> None:
+def start(sim: Simulation, context: RunContext) -> None:
     context.start(sim, context.cfg.reset)
 
 
@@ -60,7 +60,7 @@ def start(sim: Simulation, context: GateContext) -> None:
 
 
 def test_peaks_survive_masked_resets(
-    backend: str, make_sim: Make, stage: Callable[[str], GateContext]
+    backend: str, make_sim: Make, stage: Callable[[str], RunContext]
 ) -> None:
     sim = make_sim(backend, 3)
     start(sim, stage("so101"))
@@ -91,7 +91,7 @@ def test_peaks_survive_masked_resets(
 
 
 def test_a_peak_after_a_reset_counts(
-    backend: str, make_sim: Make, stage: Callable[[str], GateContext]
+    backend: str, make_sim: Make, stage: Callable[[str], RunContext]
 ) -> None:
     sim = make_sim(backend, 2)
     sim.step(1)
@@ -237,7 +237,7 @@ def test_what_is_set_wins() -> None:
     ],
 )
 def test_convex_room_is_within_the_pool(
-    sizes: BatchSizes, nworld: int, room: int, stage: Callable[[str], GateContext]
+    sizes: BatchSizes, nworld: int, room: int, stage: Callable[[str], RunContext]
 ) -> None:
     """MJWarp refuses more, and one world of parity has less than thousands."""
     sim = make_simulation(
@@ -255,7 +255,7 @@ def test_convex_room_is_within_the_pool(
 
 
 @pytest.fixture(scope="module")
-def first_steps(stage: Callable[[str], GateContext]) -> Iterator[Callable[[BatchSizes], Peaks]]:
+def first_steps(stage: Callable[[str], RunContext]) -> Iterator[Callable[[BatchSizes], Peaks]]:
     """The first steps of two MJWarp worlds, in which SO-101 needs the most rows."""
     context = stage("so101")
 
@@ -296,7 +296,7 @@ def test_sizes_at_the_peak_are_enough_and_one_less_is_not(
 
 
 @pytest.fixture(scope="module")
-def too_small(new_context: NewContext) -> tuple[GateContext, GateResult, list[str]]:
+def too_small(new_context: NewContext) -> tuple[RunContext, GateResult, list[str]]:
     """The gate on Warp's CPU device with too few rows, and what it said."""
     said: list[str] = []
     few = ("nworld=2", "gate.capacity.random_steps=20", *brisk())
@@ -307,7 +307,7 @@ def too_small(new_context: NewContext) -> tuple[GateContext, GateResult, list[st
 
 
 def test_too_small_is_found_and_the_printed_override_cures_it(
-    too_small: tuple[GateContext, GateResult, list[str]], new_context: NewContext
+    too_small: tuple[RunContext, GateResult, list[str]], new_context: NewContext
 ) -> None:
     context, result, said = too_small
     assert result.status is Status.failed
@@ -327,7 +327,7 @@ def test_too_small_is_found_and_the_printed_override_cures_it(
 
 
 def test_sizes_were_tried_with_the_same_outcome(
-    too_small: tuple[GateContext, GateResult, list[str]],
+    too_small: tuple[RunContext, GateResult, list[str]],
 ) -> None:
     m = too_small[1].metrics
     assert m["rerun.task.overflow_worlds"] == m["rerun.random_actions.overflow_worlds"] == 0
@@ -355,7 +355,7 @@ def test_sizes_were_tried_with_the_same_outcome(
 
 
 def test_environments_with_too_few_rows_by_choice_are_a_remark(
-    too_small: tuple[GateContext, GateResult, list[str]],
+    too_small: tuple[RunContext, GateResult, list[str]],
 ) -> None:
     _, result, _ = too_small
     assert "environments" not in result.reason
@@ -366,7 +366,7 @@ def test_environments_with_too_few_rows_by_choice_are_a_remark(
 
 
 def test_memory_is_that_of_the_arrays(
-    too_small: tuple[GateContext, GateResult, list[str]], stage: Callable[[str], GateContext]
+    too_small: tuple[RunContext, GateResult, list[str]], stage: Callable[[str], RunContext]
 ) -> None:
     from mjstack.sim.memory import data_bytes
 
@@ -421,7 +421,7 @@ def test_a_layout_out_of_reach_leaves_the_other_workloads(
     context = new_context("sim=native", "nworld=1", "gate.capacity.random_steps=5", *brisk())
     measure = capacity_module.measure_task
 
-    def unreachable(context: GateContext, reset: dict) -> Workload:
+    def unreachable(context: RunContext, reset: dict) -> Workload:
         if reset is context.cfg.gate.capacity.reset:
             raise Unreachable(0, "grasp_red", (0.9, 0.0, 0.0), 0.3, 5e-4)
         return measure(context, reset)
@@ -488,11 +488,11 @@ def test_each_workload_is_played_again_and_a_flip_fails_where_runs_repeat(
     played: list[tuple[str, BatchSizes]] = []
     other = context.cfg.gate.capacity.reset
 
-    def play_task(context: GateContext, reset: dict, sizes: BatchSizes) -> Workload:
+    def play_task(context: RunContext, reset: dict, sizes: BatchSizes) -> Workload:
         played.append(("randomized" if reset is other else "task", sizes))
         return workload(sizes=sizes, failed=np.array([0, 4 if reset is other else 0]))
 
-    def play_random(context: GateContext, sizes: BatchSizes) -> Workload:
+    def play_random(context: RunContext, sizes: BatchSizes) -> Workload:
         played.append(("random_actions", sizes))
         return workload(sizes=sizes)
 
@@ -508,7 +508,7 @@ def test_each_workload_is_played_again_and_a_flip_fails_where_runs_repeat(
         "random_actions": 256,
         "task": 128,
     }
-    assert {sizes for name, sizes in played if name != "task"} == {context.measured_env}
+    assert {sizes for name, sizes in played if name != "task"} == {context.artifacts.env_sizes}
     flip = "randomized at batch.nconmax=32 batch.njmax=256: another result in 1 of 2 worlds (1)"
     assert result.metrics["rerun.randomized.flipped_worlds"] == 1
     if device == "cpu":
@@ -536,8 +536,8 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     assert result.reason.startswith(
         "environments: NEFC overflow in 1 of 2 worlds (1) even with batch.nconmax=128"
     )
-    assert context.measured is not None
-    assert context.measured_env is None
+    assert context.artifacts.sizes is not None
+    assert context.artifacts.env_sizes is None
     assert said[1].endswith("not known, physics was lost")
     assert "recommended.njmax" in result.metrics
     assert "recommended_env.njmax" not in result.metrics
@@ -617,7 +617,7 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
         match="what the scripted task needs cannot be measured: NEFC overflow in 1 of 2 worlds",
     ):
         context.sizes  # noqa: B018
-    assert context.measured is None
+    assert context.artifacts.sizes is None
 
 
 def test_native_environment_measures_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -629,12 +629,12 @@ def test_batch_uses_what_capacity_measured(new_context: NewContext) -> None:
     context = new_context(
         "sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto", "batch.nconmax=48"
     )
-    context.measured = BatchSizes(nconmax=40, njmax=184, source="batch=auto: somewhere")
+    context.artifacts.sizes = BatchSizes(nconmax=40, njmax=184, source="batch=auto: somewhere")
     sim = context.batch_simulation(2)
     assert sim.sizes == BatchSizes(nconmax=48, njmax=184)  # type: ignore[attr-defined]
     assert context.parity_simulation().sizes == BatchSizes(nconmax=48, njmax=300)  # type: ignore[attr-defined]
     assert context.env_sizes is None
-    context.measured_env = BatchSizes(nconmax=64, njmax=400)
+    context.artifacts.env_sizes = BatchSizes(nconmax=64, njmax=400)
     assert context.env_sizes == BatchSizes(nconmax=48, njmax=400)
     plain = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2")
     plain.measured = plain.measured_env = BatchSizes(nconmax=8, njmax=8)

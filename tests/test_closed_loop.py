@@ -14,17 +14,17 @@ from mjstack.config import load_config
 from mjstack.drivers.closed_loop import ClosedLoopDriver, make_expert
 from mjstack.drivers.tilt import _keeps, _places
 from mjstack.envs import Env, driven_config
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError
 from mjstack.managers.reset import required_fields
 from mjstack.scene.phases import build_targets
 from mjstack.sim import make_simulation
 
-Stage = Callable[[str], GateContext]
+Stage = Callable[[str], RunContext]
 
 
 def driven(
-    context: GateContext, *overrides: str, nworld: int = 3, backend: str = "native"
+    context: RunContext, *overrides: str, nworld: int = 3, backend: str = "native"
 ) -> tuple[Env, ClosedLoopDriver]:
     """Worlds that have started, and their controller."""
     robot = context.cfg.robot.name

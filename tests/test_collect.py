@@ -29,7 +29,7 @@ from mjstack.config.schema import Backend, Config
 from mjstack.datasets import DatasetWriter, Feature, read_dataset
 from mjstack.datasets.shard import Shard
 from mjstack.envs import build_env, demonstration_config
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import CommandRecorder
 from mjstack.errors import ConfigError
 from mjstack.jobs import collection
@@ -64,7 +64,7 @@ def report_of(folder: Path) -> dict:
 
 def gate_episode(cfg: Config) -> SimpleNamespace:
     """The same worlds as a gate plays them: result and commands."""
-    context = GateContext(cfg=cfg)
+    context = RunContext(cfg=cfg)
     sim = make_simulation(
         context.model, cfg, cfg.nworld, backend=Backend.native, fields=required_fields(cfg.reset)
     )
@@ -455,7 +455,7 @@ def collect(*overrides: str) -> int:
     cfg = load_config([*COMMAND, *overrides])
     home = collect_folder(cfg)
     home.mkdir(parents=True, exist_ok=True)
-    return run_collect_job(cfg, home, []).exit_code
+    return run_collect_job(RunContext(cfg), home, []).exit_code
 
 
 def test_seeds_go_on_until_the_episodes_are_there(

@@ -26,7 +26,7 @@ from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetWriter, layout, read_dataset
 from mjstack.datasets.shard import Shard
 from mjstack.datasets.staging import Staging
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import DatasetError, UnwrittenError
 from mjstack.jobs import collection, demonstration_spec
 from mjstack.jobs.collect_record import FILE
@@ -45,7 +45,7 @@ def some_fail(seed: int, world: int) -> bool:
 
 _model = cache(lambda: build_model(configure(*COMMAND)))
 _provenance = cache(
-    lambda: run_provenance(configure(*COMMAND), GateContext(cfg=configure(*COMMAND)))
+    lambda: run_provenance(configure(*COMMAND), RunContext(cfg=configure(*COMMAND)))
 )
 _content = cache(
     lambda keep_failures: config_content(configure(*COMMAND, f"job.keep_failures={keep_failures}"))
@@ -80,7 +80,7 @@ def collection_at(
     cfg.nworld = nworld
     cfg.job.episodes = episodes
     cfg.job.keep_failures = keep_failures
-    context = GateContext(cfg=cfg)
+    context = RunContext(cfg=cfg)
     context.model = _model()
     home.mkdir(parents=True, exist_ok=True)
     return Collection(context, home)

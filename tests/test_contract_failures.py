@@ -17,7 +17,7 @@ from environments import brisk
 from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
 from mjstack.episodes import context as gate_module
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Episode, Hook, play_episode
 from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import run_capacity
@@ -27,7 +27,7 @@ from mjstack.sim import Overflow, Simulation
 from mjstack.tasks.check import make_check
 
 
-def teleport(context: GateContext, world: int) -> Callable[[int, Simulation], None]:
+def teleport(context: RunContext, world: int) -> Callable[[int, Simulation], None]:
     """Moves red beside the stack, once, when it has been released."""
     released = context.phase_start("retreat")
 
@@ -43,7 +43,7 @@ def rules(bits: torch.Tensor) -> list[set[str]]:
 
 
 def test_native(
-    robot: str, stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]
+    robot: str, stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]
 ) -> None:
     context = stage(robot)
     sim = make_sim("native", 6, robot=robot)
@@ -70,7 +70,7 @@ def test_native(
     assert found[5] == {"STEPS"}
 
 
-def test_mjwarp(stage: Callable[..., GateContext], make_sim: Callable[..., Simulation]) -> None:
+def test_mjwarp(stage: Callable[..., RunContext], make_sim: Callable[..., Simulation]) -> None:
     context = stage("so101", *brisk())
     sim = make_sim("mjwarp", 3)
     push = teleport(context, 1)
@@ -88,7 +88,7 @@ def test_mjwarp(stage: Callable[..., GateContext], make_sim: Callable[..., Simul
 
 
 def test_nan_leaves_the_other_worlds_alone(
-    backend: str, stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]
+    backend: str, stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]
 ) -> None:
     context = stage("so101")
     final = []
@@ -105,7 +105,7 @@ def test_nan_leaves_the_other_worlds_alone(
         assert_same_run(clean[[0, 2]], dirty[[0, 2]], backend)
 
 
-def crowd(context: GateContext, sim: Simulation, world: int) -> None:
+def crowd(context: RunContext, sim: Simulation, world: int) -> None:
     """Puts both cubes of one world into each other, the table and the gripper: far more contacts
     than elsewhere.
     """
@@ -118,7 +118,7 @@ def crowd(context: GateContext, sim: Simulation, world: int) -> None:
 
 
 def test_overflow_in_exactly_the_crowded_world(
-    stage: Callable[[str], GateContext], make_sim: Callable[..., Simulation]
+    stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]
 ) -> None:
     context = stage("so101")
     # Any world needs up to 144 rows in the first steps, the crowded one 192.
@@ -145,7 +145,7 @@ def test_overflow_in_exactly_the_crowded_world(
 FEW = ("sim=native", "nworld=2", "gate.capacity.random_steps=20", *brisk())
 
 
-def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., GateContext]) -> None:
+def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., RunContext]) -> None:
     context = new_context(*FEW, "batch.njmax=100")
     (result,) = run_capacity(context)
     assert result.status is Status.failed
@@ -157,7 +157,7 @@ def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., GateC
 
 
 def test_capacity_gate_passes_with_what_it_recommends(
-    new_context: Callable[..., GateContext],
+    new_context: Callable[..., RunContext],
 ) -> None:
     (result,) = run_capacity(new_context(*FEW, "batch.njmax=184", "batch.nconmax=40"))
     assert result.status is Status.passed, result.reason
@@ -165,7 +165,7 @@ def test_capacity_gate_passes_with_what_it_recommends(
     assert int(result.metrics["recommended.nconmax"]) <= 40
 
 
-def test_capacity_gate_sizes_the_contact_pool(new_context: Callable[..., GateContext]) -> None:
+def test_capacity_gate_sizes_the_contact_pool(new_context: Callable[..., RunContext]) -> None:
     (result,) = run_capacity(new_context(*FEW, "batch.nconmax=8"))
     assert result.status is Status.failed
     assert "contact pool overflow in 2 of 2 worlds (0, 1)" in result.reason
@@ -173,7 +173,7 @@ def test_capacity_gate_sizes_the_contact_pool(new_context: Callable[..., GateCon
 
 
 def test_batch_gate_names_world_and_rule_and_voids_throughput(
-    new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch
+    new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     context = new_context(
         "sim=native",
@@ -197,7 +197,7 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
     assert batch.metrics["success_rate"] == pytest.approx(0.75)
     assert batch.metrics["failed.STACKED"] == 1
 
-    context.results["batch"] = batch
+    context.artifacts.results["batch"] = batch
     throughput, _ = run_throughput(context)
     assert throughput.status is Status.failed
     assert "no figure" in throughput.reason
@@ -210,14 +210,14 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
     assert throughput.reason.count("no figure") == 3
     assert not [name for name in throughput.metrics if "per_s" in name or "ms_per" in name]
 
-    context.timed_episode.failed.clear()
+    context.artifacts.timed_episode.failed.clear()
     throughput, cuda = run_throughput(context)
     assert throughput.status is Status.passed
     assert throughput.metrics["physics.world_steps_per_s.median"] > 0
     assert cuda.name == "throughput_cuda"
 
 
-def test_batch_gate_refuses_identical_worlds(new_context: Callable[..., GateContext]) -> None:
+def test_batch_gate_refuses_identical_worlds(new_context: Callable[..., RunContext]) -> None:
     (batch,) = run_batch(new_context("sim=native", "nworld=2", "reset=nominal"))
     assert batch.status is Status.failed
     assert batch.metrics["distinct_final_states"] == 1

@@ -14,7 +14,7 @@ import torch
 import mjstack
 from mjstack.config.schema import ObservationTermCfg, TermCfg
 from mjstack.envs import Env, build_env
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, FaultError, MissingField, TermError
 
 
@@ -83,7 +83,7 @@ def test_an_overflow_names_the_size_that_is_in_force() -> None:
         env.raise_faults()
 
 
-def test_ctrl_c_leaves_no_thread_at_work(stage: Callable[[str], GateContext]) -> None:
+def test_ctrl_c_leaves_no_thread_at_work(stage: Callable[[str], RunContext]) -> None:
     from mjstack.sim.native import NativeSimulation
 
     sim = NativeSimulation(stage("so101").model, 64, nthread=2)

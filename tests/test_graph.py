@@ -255,9 +255,9 @@ def test_without_capture_the_work_just_runs() -> None:
 @pytest.mark.gpu
 @CUDA
 def test_an_episode_of_the_gate_is_captured_and_accepted() -> None:
-    from mjstack.episodes.context import GateContext
+    from mjstack.episodes.context import RunContext
 
-    context = GateContext(cfg=configure("nworld=32", "sim=mjwarp", "graph=require"))
+    context = RunContext(cfg=configure("nworld=32", "sim=mjwarp", "graph=require"))
     sim = context.batch_simulation(32)
     episode = context.play(sim, context.cfg.reset)
     assert not episode.result.failed.any()

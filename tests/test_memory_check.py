@@ -10,7 +10,7 @@ import torch
 
 from mjstack.cli import run
 from mjstack.config import Config, load_config
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError
 from mjstack.gates.runner import run_guarded
 from mjstack.jobs import memory_check as room
@@ -104,10 +104,10 @@ def test_gates_of_one_world_are_not_refused(monkeypatch: pytest.MonkeyPatch) -> 
     ],
 )
 def test_memory_that_runs_out_later(error: Exception, so101_cfg: Config) -> None:
-    def gate(context: GateContext) -> list[GateResult]:
+    def gate(context: RunContext) -> list[GateResult]:
         raise error
 
-    (result,) = run_guarded(GateContext(cfg=so101_cfg), "batch", gate)
+    (result,) = run_guarded(RunContext(cfg=so101_cfg), "batch", gate)
     assert result.status is Status.failed
     assert result.reason.startswith(f"out of memory ({error}). Run fewer worlds")
 

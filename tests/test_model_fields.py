@@ -13,7 +13,7 @@ from comparison import assert_worlds_step_alone
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import RebindError, UnknownName
 from mjstack.sim import BatchSizes, Simulation, make_simulation
 from mjstack.sim.fields import FIELD_NAMES
@@ -31,7 +31,7 @@ FIELDS = (
     "actuator_biasprm",
 )
 Make = Callable[..., Simulation]
-Stage = Callable[[str], GateContext]
+Stage = Callable[[str], RunContext]
 
 
 @pytest.fixture(scope="module")
@@ -60,14 +60,14 @@ def make_fields(stage: Stage) -> Make:
     return make
 
 
-def cube(context: GateContext) -> tuple[int, int, int]:
+def cube(context: RunContext) -> tuple[int, int, int]:
     """First cube: its body, and where its position and velocity begin."""
     q = int(context.index.object_qpos[0])
     v = int(context.index.object_qvel[0])
     return int(context.model.dof_bodyid[v]), q, v
 
 
-def scale_cube(sim: Simulation, context: GateContext, world: int, s: float) -> None:
+def scale_cube(sim: Simulation, context: RunContext, world: int, s: float) -> None:
     """Makes the cube of one world s times as heavy, with all that MuJoCo derives from it."""
     body, _, v = cube(context)
     for name in ("body_mass", "body_inertia", "body_subtreemass"):
@@ -76,7 +76,7 @@ def scale_cube(sim: Simulation, context: GateContext, world: int, s: float) -> N
     sim.fields["dof_invweight0"][world, v : v + 6] /= s
 
 
-def randomise(sim: Simulation, context: GateContext) -> None:
+def randomise(sim: Simulation, context: RunContext) -> None:
     """Other mass, friction and gains in every world, the same for every backend."""
     for k in range(sim.nworld):
         rng = np.random.default_rng(k)
@@ -87,7 +87,7 @@ def randomise(sim: Simulation, context: GateContext) -> None:
         sim.fields["actuator_biasprm"][k, :, 1] *= gain
 
 
-def start(sim: Simulation, context: GateContext) -> None:
+def start(sim: Simulation, context: RunContext) -> None:
     """Home, jittered cubes, and a command that moves every joint."""
     context.start(sim, context.cfg.reset)
     sim.ctrl[:, torch.from_numpy(context.index.ctrl)] += 0.05

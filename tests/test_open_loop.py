@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from mjstack.drivers.open_loop import JointTrajectory
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import Unreachable
 from mjstack.scene.phases import nominal_xy
 
-Stage = Callable[[str], GateContext]
+Stage = Callable[[str], RunContext]
 
 # Anchor, approach heights, offset [m] and gripper of each phase, from the task's definition.
 PHASES = {
@@ -32,11 +32,11 @@ APPROACH = {"so101": 0.09, "rebot": 0.12}
 TOP = {"so101": 0.024, "rebot": 0.212}
 
 
-def nominal(context: GateContext) -> np.ndarray:
+def nominal(context: RunContext) -> np.ndarray:
     return nominal_xy(context.cfg.scene)
 
 
-def layouts(context: GateContext) -> np.ndarray:
+def layouts(context: RunContext) -> np.ndarray:
     shifts = np.random.default_rng(3).uniform(-0.004, 0.004, (3, 2, 2))
     shifts[0] = 0.0
     return nominal(context) + shifts
@@ -48,7 +48,7 @@ def target(robot: str, phase: str, xy: np.ndarray) -> np.ndarray:
     return np.array([*place, TOP[robot] + 0.022 + heights * APPROACH[robot] + offset])
 
 
-def grasp_point(context: GateContext, command: np.ndarray) -> np.ndarray:
+def grasp_point(context: RunContext, command: np.ndarray) -> np.ndarray:
     """Forward kinematics on the scene's model: the midpoint of the two grasp_point sites."""
     data = mujoco.MjData(context.model)
     joints = [*context.cfg.robot.arm_joints, *context.cfg.robot.gripper_joints]

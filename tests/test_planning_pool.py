@@ -16,11 +16,11 @@ from mjstack.drivers import open_loop as planner_module
 from mjstack.drivers import planning_pool
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.drivers.planning_pool import Plan
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import Unreachable, WorkerLost
 from mjstack.scene.phases import nominal_xy
 
-Stage = Callable[[str], GateContext]
+Stage = Callable[[str], RunContext]
 Workers = list[planning_pool._Worker]
 FAR = [1.5, 0.0]
 
@@ -63,7 +63,7 @@ class PatientPlanner(OpenLoopPlanner):
         return super().plan_world(world, xy)
 
 
-def layouts(context: GateContext, nworld: int) -> np.ndarray:
+def layouts(context: RunContext, nworld: int) -> np.ndarray:
     shifts = np.random.default_rng(7).uniform(-0.002, 0.002, (nworld, 4))
     return nominal_xy(context.cfg.scene) + shifts.reshape(nworld, 2, 2)
 

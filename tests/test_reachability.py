@@ -19,7 +19,7 @@ from environments import configure, on_shared_sim
 import mjstack
 from mjstack.cli import run
 from mjstack.config.schema import Config
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, ParameterError
 from mjstack.jobs import check_job, reachability
 from mjstack.jobs.reachability import find_levels, find_region
@@ -29,7 +29,7 @@ from mjstack.mdp.starts.placement import Placement
 from mjstack.report.reachability import ReachLevel
 from mjstack.scene import SceneIndex, build_model, table_top
 
-Stage = Callable[[str], GateContext]
+Stage = Callable[[str], RunContext]
 
 
 def points_over(cfg: Config, n: int, seed: int = 0) -> np.ndarray:
@@ -495,7 +495,7 @@ def test_an_interrupted_job_keeps_its_levels(
 ) -> None:
     whole = reachability.map_level
 
-    def stop_later(context: GateContext, name: str, *rest: object) -> ReachLevel:
+    def stop_later(context: RunContext, name: str, *rest: object) -> ReachLevel:
         if name == "carry":
             raise KeyboardInterrupt
         return whole(context, name, *rest)  # type: ignore[arg-type]

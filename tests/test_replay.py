@@ -22,7 +22,7 @@ from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Backend, TermCfg
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.replay import _sizes_alone
 from mjstack.episodes.rollout import snapshot
@@ -148,7 +148,7 @@ def test_accepted_world_of_another_seed(earlier: Path, succeeded: tuple[Path, in
 
 
 def test_trajectory_holds_the_episode(
-    failing: tuple[Path, int, dict], new_context: Callable[..., GateContext]
+    failing: tuple[Path, int, dict], new_context: Callable[..., RunContext]
 ) -> None:
     context = new_context("sim=native", "task.check.xy_err=0.0015")
     sim = context.batch_simulation(7)
@@ -298,7 +298,7 @@ def test_what_is_promised_of_another_end(
     changes: list[str],
     kept: bool,
     says: str,
-    new_context: Callable[..., GateContext],
+    new_context: Callable[..., RunContext],
 ) -> None:
     """Bit for bit, but on CUDA, with other versions, and where the contact pool was too small."""
     context = new_context("sim=native")

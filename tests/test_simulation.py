@@ -12,7 +12,7 @@ from comparison import assert_same_run, assert_worlds_step_alone
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError, RebindError, UnsupportedModel
 from mjstack.math import quat_angle
 from mjstack.scene import build_scene, table_top
@@ -24,7 +24,7 @@ POSES = ("xpos", "xquat", "site_xpos", "geom_xpos")
 VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata")
 COUNTS = ("contact_count", "constraint_count", "peak_contacts", "peak_constraints", "overflow")
 Make = Callable[..., Simulation]
-Stage = Callable[[str], GateContext]
+Stage = Callable[[str], RunContext]
 
 
 # An arm with an activation and sensors, and a ball: what the robots' scenes lack.
@@ -64,7 +64,7 @@ def sensing() -> Callable[[str], Simulation]:
     return get
 
 
-def start(sim: Simulation, context: GateContext) -> None:
+def start(sim: Simulation, context: RunContext) -> None:
     """Home, jittered cubes, and a command that moves every joint."""
     context.start(sim, context.cfg.reset)
     sim.ctrl[:, torch.from_numpy(context.index.ctrl)] += 0.05

@@ -17,7 +17,7 @@ import torch
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config, StudyJobCfg
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import MjstackError
 from mjstack.gates.parity import compare_options
 from mjstack.jobs import check_job, study
@@ -48,7 +48,7 @@ def report(folder: Path) -> dict:
 
 def test_native_study(tmp_path: Path) -> None:
     cfg = configure(keep=("base", "iterations_5", "iterations_100", "condim_3", "cone_pyramidal"))
-    outcome = run_study_job(cfg, tmp_path, [])
+    outcome = run_study_job(RunContext(cfg), tmp_path, [])
     assert outcome.exit_code == 0
     rows = table(tmp_path)
     assert list(rows) == ["base", "iterations_5", "iterations_100", "condim_3", "cone_pyramidal"]
@@ -86,7 +86,7 @@ def test_native_study(tmp_path: Path) -> None:
 def test_a_broken_variant_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make = study._simulation
 
-    def fragile(context: GateContext) -> Simulation:
+    def fragile(context: RunContext) -> Simulation:
         if context.cfg.solver.iterations == 20:
             raise RuntimeError("out of memory\nat length")
         if context.cfg.solver.iterations == 10:
@@ -95,7 +95,7 @@ def test_a_broken_variant_stops_no_other(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(study, "_simulation", fragile)
     cfg = configure(keep=("iterations_20", "iterations_10", "base"))
-    outcome = run_study_job(cfg, tmp_path, [])
+    outcome = run_study_job(RunContext(cfg), tmp_path, [])
     assert outcome.exit_code == 1
     rows = table(tmp_path)
     assert [row["status"] for row in rows.values()] == ["fail", "fail", "pass"]
@@ -108,11 +108,11 @@ def test_a_broken_variant_stops_no_other(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_without_a_base_there_is_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(_: GateContext) -> Simulation:
+    def broken(_: RunContext) -> Simulation:
         raise RuntimeError("no room")
 
     monkeypatch.setattr(study, "_simulation", broken)
-    assert run_study_job(configure(keep=("base",)), tmp_path, []).exit_code == 1
+    assert run_study_job(RunContext(configure(keep=("base",))), tmp_path, []).exit_code == 1
     (only,) = report(tmp_path)["gates"]
     assert only["reason"] == "the configured solver cannot be timed: no room"
 
@@ -128,7 +128,8 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         measure(*args)  # type: ignore[arg-type]
 
     monkeypatch.setattr(study, "_measure", interrupted)
-    outcome = run_study_job(configure(keep=("base", "condim_3", "condim_4")), tmp_path, [])
+    cfg = configure(keep=("base", "condim_3", "condim_4"))
+    outcome = run_study_job(RunContext(cfg), tmp_path, [])
     assert outcome.exit_code == 130
     assert list(table(tmp_path)) == ["base"]
     found = report(tmp_path)
@@ -138,7 +139,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_mjwarp_tells_who_stopped_at_a_limit(tmp_path: Path) -> None:
     cfg = configure("sim=mjwarp", "sim.device=cpu", "nworld=1", keep=("base", "ls_iterations_5"))
-    assert run_study_job(cfg, tmp_path, []).status is Status.passed
+    assert run_study_job(RunContext(cfg), tmp_path, []).status is Status.passed
     rows = table(tmp_path)
     assert rows["base"]["iteration_limit_worlds"] == rows["base"]["line_search_limit_worlds"] == "0"
     assert rows["ls_iterations_5"]["line_search_limit_worlds"] == "1"
@@ -246,7 +247,7 @@ def test_an_own_variant_takes_the_rest_from_the_configured_solver() -> None:
 
 def test_the_box_is_studied_too(tmp_path: Path) -> None:
     cfg = configure("task=box", keep=("base",))
-    assert run_study_job(cfg, tmp_path, []).exit_code == 0
+    assert run_study_job(RunContext(cfg), tmp_path, []).exit_code == 0
     (row,) = table(tmp_path).values()
     assert row["status"] == "pass"
     assert row["succeeded"] == "2"

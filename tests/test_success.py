@@ -23,7 +23,7 @@ from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.episodes import context as gate_module
 from mjstack.episodes import failures as watch_module
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.observers import Episode, Hook, play_episode
 from mjstack.episodes.record import FAILING, PICTURE, REGIONS, EpisodeRecord, clear_records
@@ -88,7 +88,7 @@ def record_of(folder: Path) -> EpisodeRecord:
     return record
 
 
-def play(context: GateContext, folder: Path | None = None) -> GateResult:
+def play(context: RunContext, folder: Path | None = None) -> GateResult:
     context.folder = folder
     (result,) = run_success(context)
     return result
@@ -133,7 +133,7 @@ def test_small_region_passes(passed: Path) -> None:
         assert held["phase_names"].tolist() == PHASES
 
 
-def test_rebot_passes(new_context: Callable[..., GateContext], tmp_path: Path) -> None:
+def test_rebot_passes(new_context: Callable[..., RunContext], tmp_path: Path) -> None:
     context = new_context("sim=native", "nworld=4", robot="rebot")
     result = play(context, tmp_path)
     assert result.status is Status.passed
@@ -143,7 +143,7 @@ def test_rebot_passes(new_context: Callable[..., GateContext], tmp_path: Path) -
         result.metrics["distinct_starts"],
     ) == (4, 4, 4)
     assert not (tmp_path / FAILING).exists()
-    assert context.pictures == [PICTURE]
+    assert context.artifacts.pictures == [PICTURE]
     assert context.cfg.reset == load_config(["robot=rebot"]).reset  # other gates start as they did
 
 
@@ -190,11 +190,11 @@ def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def hasty() -> Callable[..., GateContext]:
+def hasty() -> Callable[..., RunContext]:
     """Contexts of episodes that are over, and have failed, after a second."""
 
-    def make(*overrides: str) -> GateContext:
-        return GateContext(
+    def make(*overrides: str) -> RunContext:
+        return RunContext(
             cfg=load_config(["gates=[success]", "sim=native", "nworld=2", *rushed(), *overrides])
         )
 
@@ -202,7 +202,7 @@ def hasty() -> Callable[..., GateContext]:
 
 
 def test_seeds_add_up_and_the_rate_decides(
-    hasty: Callable[..., GateContext], tmp_path: Path
+    hasty: Callable[..., RunContext], tmp_path: Path
 ) -> None:
     """The threshold is on the rate itself; what fails is named all the same."""
     context = hasty("gates=[batch,success]", "gate.success.seeds=2", "gate.success.cell_episodes=2")
@@ -378,7 +378,7 @@ class Stop(Exception):
 
 
 def test_what_stops_the_second_seed_keeps_the_first(
-    hasty: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    hasty: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def stops(*args: Any, **kwargs: Any) -> Episode:
         if (tmp_path / "success_seed0.npz").exists():
@@ -398,7 +398,7 @@ def test_what_stops_the_second_seed_keeps_the_first(
 
 
 def test_full_disk_takes_no_verdict_back(
-    hasty: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    hasty: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -513,7 +513,7 @@ def recount(
     return Sign.NONE, -1, -1
 
 
-def test_signs_in_real_episodes(new_context: Callable[..., GateContext]) -> None:
+def test_signs_in_real_episodes(new_context: Callable[..., RunContext]) -> None:
     """Worlds that somebody interferes with: each shows its own sign, in its phase, and one is
     undisturbed.
     """
@@ -660,7 +660,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 @pytest.mark.parametrize("robot", ["so101", "rebot"])
 def test_steps_with_the_tracker_are_one_graph(
-    robot: str, new_context: Callable[..., GateContext], tmp_path: Path
+    robot: str, new_context: Callable[..., RunContext], tmp_path: Path
 ) -> None:
     base = new_context("sim=mjwarp", "sim.device=cuda:0", "nworld=64", "graph=require", robot=robot)
     context = base.with_config(success_config(base.cfg))

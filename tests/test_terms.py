@@ -20,7 +20,7 @@ from stack_checker import BLUE, RED, lowest_corner, rotation_matrix
 from mjstack import make_env
 from mjstack.config.schema import Config
 from mjstack.envs import Env
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.managers import (
     ActionManager,
     ObservationManager,
@@ -40,7 +40,7 @@ from mjstack.tasks.stack import StackSuccess
 
 CUBES = ("red", "blue")
 OBJECT = {"object": "red"}
-Stage = Callable[[str], GateContext]
+Stage = Callable[[str], RunContext]
 
 
 def table_top(cfg: Config) -> float:

@@ -23,7 +23,7 @@ from mjstack.bench.timing import Measurement, capture_problem, steps_that_fit, t
 from mjstack.config import load_config
 from mjstack.config.schema import GraphMode
 from mjstack.envs import Env, build_env
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import State
 from mjstack.gates import throughput
 from mjstack.gates.throughput import run_throughput
@@ -86,7 +86,7 @@ def test_timed_waits_for_the_device_at_both_ends() -> None:
     assert seen == ["wait", "work", "wait"]
 
 
-def test_native_measurements(new_context: Callable[..., GateContext]) -> None:
+def test_native_measurements(new_context: Callable[..., RunContext]) -> None:
     result, cuda = run_throughput(new_context("sim=native", "nworld=2", *SHORT))
     assert result.status is Status.passed, result.reason
     assert cuda.status is Status.skipped or torch.cuda.is_available()
@@ -117,7 +117,7 @@ def test_native_measurements(new_context: Callable[..., GateContext]) -> None:
 
 
 def test_episode_alternates_with_bare_steps_on_mjwarp(
-    new_context: Callable[..., GateContext],
+    new_context: Callable[..., RunContext],
 ) -> None:
     context = new_context(
         "sim=mjwarp",
@@ -141,7 +141,7 @@ def test_episode_alternates_with_bare_steps_on_mjwarp(
     assert m["episode.capture_s"] > 0.0
 
 
-def test_warm_up_and_capture_are_apart_on_mjwarp(new_context: Callable[..., GateContext]) -> None:
+def test_warm_up_and_capture_are_apart_on_mjwarp(new_context: Callable[..., RunContext]) -> None:
     only = "gate.throughput.measurements=[physics,env_step]"
     result, _ = run_throughput(
         new_context("sim=mjwarp", "sim.device=cpu", "nworld=1", *SHORT, only)
@@ -175,7 +175,7 @@ def test_eager_work_is_void_where_it_should_be_captured(
 
 
 def test_bare_steps_play_the_same_trajectory(
-    new_context: Callable[..., GateContext],
+    new_context: Callable[..., RunContext],
     make_sim: Callable[..., Simulation],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -195,7 +195,7 @@ def test_bare_steps_play_the_same_trajectory(
 
 
 def test_bare_steps_that_lose_worlds_do_not_count(
-    new_context: Callable[..., GateContext],
+    new_context: Callable[..., RunContext],
     make_sim: Callable[..., Simulation],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -211,7 +211,7 @@ def test_bare_steps_that_lose_worlds_do_not_count(
     assert episode.play_bare(context, sim)[1] == "1 worlds overflowed or diverged with bare steps"  # type: ignore[arg-type]
 
 
-def test_rejected_episode_voids_every_measurement(new_context: Callable[..., GateContext]) -> None:
+def test_rejected_episode_voids_every_measurement(new_context: Callable[..., RunContext]) -> None:
     result, _ = run_throughput(
         new_context(
             "sim=native",
@@ -229,7 +229,7 @@ def test_rejected_episode_voids_every_measurement(new_context: Callable[..., Gat
 
 
 @pytest.mark.parametrize("name", ["physics", "env_step"])
-def test_overflow_voids_the_figure(new_context: Callable[..., GateContext], name: str) -> None:
+def test_overflow_voids_the_figure(new_context: Callable[..., RunContext], name: str) -> None:
     """40 rows hold a start above the table, and neither a grasped cube nor thrashing."""
     result, _ = run_throughput(
         new_context(
@@ -248,7 +248,7 @@ def test_overflow_voids_the_figure(new_context: Callable[..., GateContext], name
 
 
 def test_steps_not_made_void_the_figure(
-    new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch
+    new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     step = NativeSimulation.step
 
@@ -265,7 +265,7 @@ def test_steps_not_made_void_the_figure(
 
 
 def test_broken_measurement_leaves_the_others(
-    new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch
+    new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def out_of_memory(*_: object, **__: object) -> None:
         raise MemoryError("Unable to allocate 9 GiB")
@@ -286,7 +286,7 @@ def test_broken_measurement_leaves_the_others(
 
 
 def test_broken_episode_does_not_verify_the_task(
-    new_context: Callable[..., GateContext], monkeypatch: pytest.MonkeyPatch
+    new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("bad")
@@ -300,12 +300,12 @@ def test_broken_episode_does_not_verify_the_task(
     assert "episode: no figure: RuntimeError: bad" in result.reason
     assert "the task was not verified in this run" in result.reason
     for status, verified in ((Status.passed, True), (Status.skipped, False)):
-        context.results["batch"] = GateResult(name="batch", status=status, reason="")
+        context.artifacts.results["batch"] = GateResult(name="batch", status=status, reason="")
         result, _ = run_throughput(context)
         assert ("the task was not verified" not in result.reason) is verified
 
 
-def test_no_time_for_an_episode_is_said(new_context: Callable[..., GateContext]) -> None:
+def test_no_time_for_an_episode_is_said(new_context: Callable[..., RunContext]) -> None:
     result, _ = run_throughput(
         new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.cpu_max_seconds=1e-4")
     )
@@ -318,7 +318,7 @@ def test_no_time_for_an_episode_is_said(new_context: Callable[..., GateContext])
 
 
 def test_start_states_repeat_without_the_batch_gate(
-    new_context: Callable[..., GateContext],
+    new_context: Callable[..., RunContext],
 ) -> None:
     context = new_context("sim=native", "nworld=5", *SHORT, "gate.throughput.start_worlds=2")
     sim = context.batch_simulation(5)
@@ -333,11 +333,11 @@ def test_start_states_repeat_without_the_batch_gate(
         state.qpos[:, gripper].max() < context.cfg.robot.gripper_open[0] - 0.1
     )  # closed on the cube
     kept = State(state.qpos.copy(), state.qvel, state.ctrl)
-    context.carry_start = kept
+    context.artifacts.carry_start = kept
     assert physics.carry_start(context, sim) is kept
 
 
-def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., GateContext]) -> None:
+def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., RunContext]) -> None:
     """Red beside the jaws in two of five worlds, then in three of them."""
     context = new_context(
         "sim=native", "nworld=5", *SHORT, "gate.throughput.measurements=[physics]"
@@ -346,7 +346,7 @@ def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., GateC
     state = physics.carry_start(context, sim)
     red = context.index.object_qpos[0]
     state.qpos[[1, 4], red + 1] -= 0.1
-    context.carry_start = state
+    context.artifacts.carry_start = state
     result, _ = run_throughput(context)
     assert result.metrics["physics.worlds_with_cube_in_hand"] == 3
     assert speeds(result, "physics")
@@ -481,7 +481,7 @@ def test_the_meter_runs_while_the_work_does() -> None:
     assert seen == ["wait", "start", "work", "wait", "stop"]
 
 
-def test_the_meter_sees_an_episodes_replayed_steps(new_context: Callable[..., GateContext]) -> None:
+def test_the_meter_sees_an_episodes_replayed_steps(new_context: Callable[..., RunContext]) -> None:
     context = new_context("sim=native", "nworld=1")
     seen = []
     sim = context.batch_simulation(1)
@@ -552,7 +552,7 @@ def test_a_benchmark_prints_its_table_and_keeps_its_figures(
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
-def test_episode_costs_hardly_more_than_bare_steps(new_context: Callable[..., GateContext]) -> None:
+def test_episode_costs_hardly_more_than_bare_steps(new_context: Callable[..., RunContext]) -> None:
     context = new_context(
         "sim=mjwarp",
         "nworld=2048",

@@ -19,7 +19,7 @@ from mjstack.bench.timing import Measurement
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import build_env
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.table import Table
@@ -157,7 +157,7 @@ def _physics(args: argparse.Namespace, progress: Progress) -> tuple[Table, objec
     cfg = _config(args)
     progress("playing the task up to the grasp")
     times = physics.measure_arrangements(
-        GateContext(cfg=cfg),
+        RunContext(cfg=cfg),
         steps=args.steps,
         repetitions=args.repetitions,
         progress=lambda done: progress(f"repetition {done} of {args.repetitions}"),

@@ -17,7 +17,7 @@ from mjstack.bench.timing import (
 )
 from mjstack.config.schema import GraphMode
 from mjstack.drivers.driver import Recorded
-from mjstack.episodes.context import GateContext, TimedEpisode
+from mjstack.episodes.context import RunContext, TimedEpisode
 from mjstack.episodes.observers import CommandRecorder
 from mjstack.episodes.rollout import CLOSED_LOOP, Observer, rollout
 from mjstack.errors import name_worlds
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def measure_episode(
-    context: GateContext,
+    context: RunContext,
     sim: Simulation,
     *,
     seconds: float,
@@ -54,7 +54,7 @@ def measure_episode(
     mjwarp = sim.backend == "mjwarp"
     out = Measurement(name="episode")
     steps = context.planner.phases[-1].stop
-    before = context.timed_episode
+    before = context.artifacts.timed_episode
     if before is not None and (before.description, before.nworld) != (sim.description, sim.nworld):
         before = None
 
@@ -120,7 +120,7 @@ def measure_episode(
 
 
 def play_bare(
-    context: GateContext, sim: MjwarpSimulation, recorded: Recorded | None = None
+    context: RunContext, sim: MjwarpSimulation, recorded: Recorded | None = None
 ) -> tuple[float, str]:
     """Play the same commands from the same start with bare steps.
 
@@ -158,7 +158,7 @@ def play_bare(
 
 
 def _play(
-    context: GateContext, sim: Simulation, meter: EnergyMeter, out: Measurement
+    context: RunContext, sim: Simulation, meter: EnergyMeter, out: Measurement
 ) -> TimedEpisode:
     """Play one repetition: the episode, on MJWarp the bare steps, and the commands again.
 

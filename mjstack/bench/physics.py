@@ -19,7 +19,7 @@ from mjstack.bench.timing import (
     timed,
 )
 from mjstack.config.schema import Backend
-from mjstack.episodes.context import GateContext, play_to
+from mjstack.episodes.context import RunContext, play_to
 from mjstack.episodes.observers import CommandRecorder, Snapshots
 from mjstack.episodes.rollout import State, restore
 from mjstack.errors import MjstackError
@@ -69,7 +69,7 @@ class HeldPhysics:
 
 
 def measure_physics(
-    context: GateContext,
+    context: RunContext,
     sim: Simulation,
     *,
     seconds: float,
@@ -132,12 +132,12 @@ def measure_physics(
     return out
 
 
-def carry_start(context: GateContext, sim: Simulation) -> State:
+def carry_start(context: RunContext, sim: Simulation) -> State:
     """States at the start of the measured phase.
 
     Those of gate *batch*, or those of some native worlds over and over.
     """
-    state = context.carry_start
+    state = context.artifacts.carry_start
     if state is not None and state.qpos.shape[0] == sim.nworld:
         return state
     t = context.cfg.gate.throughput
@@ -150,7 +150,7 @@ def carry_start(context: GateContext, sim: Simulation) -> State:
 
 
 def measure_arrangements(
-    context: GateContext,
+    context: RunContext,
     *,
     steps: int,
     repetitions: int,
@@ -229,7 +229,7 @@ def measure_arrangements(
     return times
 
 
-def _in_hand(context: GateContext, sim: Simulation) -> int | None:
+def _in_hand(context: RunContext, sim: Simulation) -> int | None:
     """Number of worlds in which both jaws press on the object of the measured phase.
 
     None if the phase carries none.

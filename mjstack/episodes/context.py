@@ -1,4 +1,4 @@
-"""What a gate is given and what it shares with the others."""
+"""The context of a run: configuration, scene, plan, and the products of its gates."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import mujoco
 import numpy as np
@@ -36,6 +37,7 @@ from mjstack.episodes.rollout import (
     start_worlds,
 )
 from mjstack.episodes.workloads import size_batch
+from mjstack.errors import ConfigError
 from mjstack.managers.reset import required_fields
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import SceneIndex, build_model
@@ -53,6 +55,7 @@ from mjstack.tasks.check import CheckResult, EpisodeCheck, Rules, make_check
 log = logging.getLogger(__name__)
 
 Say = Callable[[str], None]
+AnyGate = TypeVar("AnyGate", bound=Callable)
 
 
 def _silent(_: str) -> None:
@@ -115,45 +118,14 @@ class NominalRun:
 
 
 @dataclass(eq=False)
-class GateContext:
-    """Everything gates need, and what one leaves for the next.
+class Stage:
+    """Scene and plan of a run, each built once when it is first needed.
 
     Attributes:
-        cfg: The configuration.
-        folder: Where the run's files go, or None for none.
-        say: Prints a line.
-        advance: Told about progress.
-        on_step: Called after each frame of the one-world episode that is shown (viewer).
-        results: Results so far, by gate.
-        measured: Sizes that the scripted task needs, with a margin, once they have been measured.
-        measured_env: Sizes that environments need likewise.
-        shown: The one-world episode that pictures show, and ``shown_by``, what it is.
-        pictures: Files that gates have drawn.
+        cfg: The configuration of scene, robot and phases.
     """
 
     cfg: Config
-    folder: Path | None = None
-    say: Say = _silent
-    advance: Advance | None = None
-    on_step: StepHook | None = None
-    results: dict[str, GateResult] = field(default_factory=dict)
-    measured: BatchSizes | None = None
-    measured_env: BatchSizes | None = None
-    carry_start: State | None = None
-    timed_episode: TimedEpisode | None = None
-    shown: WorldRecorder | None = None
-    shown_by: str = ""
-    pictures: list[str] = field(default_factory=list)
-
-    def with_config(self, cfg: Config) -> GateContext:
-        """A context for another configuration of the same scene and plan, which it shares; sizes
-        and pictures are its own.
-        """
-        # Other starts and another controller have other peaks: sizes of the batch, or of random
-        # actions, would say nothing.
-        other = replace(self, cfg=cfg, measured=None, measured_env=None, pictures=[])
-        other.__dict__.update(model=self.model, planner=self.planner)
-        return other
 
     @cached_property
     def model(self) -> mujoco.MjModel:
@@ -171,14 +143,91 @@ class GateContext:
         return SceneIndex(self.model, self.cfg.robot, self.cfg.scene)
 
     @cached_property
-    def check(self) -> EpisodeCheck:
-        """Describes how the task is judged: its rules, thresholds and report."""
-        return make_check(self.cfg)
-
-    @cached_property
     def planner(self) -> OpenLoopPlanner:
         """The planner, its nominal plan made."""
         return OpenLoopPlanner(self.cfg)
+
+
+@dataclass(eq=False, kw_only=True, slots=True)
+class Artifacts:
+    """Products of gates that later gates and the report use.
+
+    Attributes:
+        results: Results so far, by gate.
+        sizes: Buffer sizes that the driven task needs, with a margin, from *capacity* or from
+            ``batch=auto``.
+        env_sizes: Buffer sizes that environments need, from *capacity*.
+        carry_start: States of all worlds as the phase ``gate.throughput.from_phase`` begins, from
+            *batch*.
+        timed_episode: Time of the first seed's episode, from *batch*.
+        shown: The one-world episode that pictures show.
+        shown_by: Its title.
+        pictures: Files that gates have drawn.
+    """
+
+    results: dict[str, GateResult] = field(default_factory=dict)
+    sizes: BatchSizes | None = None
+    env_sizes: BatchSizes | None = None
+    carry_start: State | None = None
+    timed_episode: TimedEpisode | None = None
+    shown: WorldRecorder | None = None
+    shown_by: str = ""
+    pictures: list[str] = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class RunContext:
+    """A run's configuration, scene, plan and output.
+
+    A job's check makes it, and the job's run gets it, so that everything is built once.
+
+    Attributes:
+        cfg: The configuration.
+        stage: Scene and plan; by default those of the configuration.
+        folder: Where the run's files go, or None for none.
+        say: Prints a line.
+        advance: Told about progress.
+        on_step: Called after each step of the one-world episode that is shown (viewer).
+        artifacts: Products of gates.
+    """
+
+    cfg: Config
+    stage: Stage = None  # type: ignore[assignment]
+    folder: Path | None = None
+    say: Say = _silent
+    advance: Advance | None = None
+    on_step: StepHook | None = None
+    artifacts: Artifacts = field(default_factory=Artifacts)
+
+    def __post_init__(self) -> None:
+        if self.stage is None:
+            self.stage = Stage(self.cfg)
+
+    def with_config(self, cfg: Config) -> RunContext:
+        """A context for another configuration of the same scene and plan, which it shares. Its
+        artifacts are its own: other starts, say, have other peaks.
+        """
+        return replace(self, cfg=cfg, artifacts=Artifacts())
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The scene for physics."""
+        return self.stage.model
+
+    @property
+    def index(self) -> SceneIndex:
+        """Addresses in the model."""
+        return self.stage.index
+
+    @property
+    def planner(self) -> OpenLoopPlanner:
+        """The planner, its nominal plan made."""
+        return self.stage.planner
+
+    @cached_property
+    def check(self) -> EpisodeCheck:
+        """The task's check, for its rules, thresholds and report."""
+        return make_check(self.cfg)
 
     @cached_property
     def backend(self) -> tuple[Backend, str]:
@@ -265,28 +314,23 @@ class GateContext:
         """Buffer sizes of the batch; with ``batch=auto`` they are measured first, unless *capacity*
         has done so.
         """
-        if (
-            not self.cfg.batch.auto or self.backend[0] is Backend.native
-        ):  # native MuJoCo has no fixed buffers
+        # Native MuJoCo has no fixed buffers.
+        if not self.cfg.batch.auto or self.backend[0] is Backend.native:
             return resolve_sizes(self.cfg)
-        if self.measured is None:
-            self.measured = size_batch(self)
-            self.say(
-                f"{apply_configured(self.cfg, self.measured).as_overrides()}"
-                f" ({self.measured.source})"
-            )
-        return apply_configured(self.cfg, self.measured)
+        found = self.artifacts.sizes
+        if found is None:
+            found = self.artifacts.sizes = size_batch(self)
+            sizes = apply_configured(self.cfg, found)
+            self.say(f"{sizes.as_overrides()} ({found.source})")
+        return apply_configured(self.cfg, found)
 
     @property
     def env_sizes(self) -> BatchSizes | None:
         """Buffer sizes of environments with ``batch=auto``, if *capacity* has measured them; None
         leaves it to `build_env`.
         """
-        return (
-            apply_configured(self.cfg, self.measured_env)
-            if self.cfg.batch.auto and self.measured_env
-            else None
-        )
+        found = self.artifacts.env_sizes
+        return apply_configured(self.cfg, found) if self.cfg.batch.auto and found else None
 
     def parity_simulation(self) -> Simulation:
         """One MJWarp world."""
@@ -307,7 +351,33 @@ class GateContext:
         return next(phase.start for phase in self.planner.phases if phase.name == name)
 
 
-def play_to(context: GateContext, sim: Simulation, phase: str) -> State:
+def lacks_episode(cfg: Config) -> str:
+    """Why no driver can play a judged episode of the task; empty if one can."""
+    if not cfg.controller.phases:
+        return f"task {cfg.task.name} has no phases: no open- or closed-loop driver"
+    if cfg.task.check is None:
+        return f"task {cfg.task.name} has no check"
+    return ""
+
+
+def needs_episode(gate: AnyGate) -> AnyGate:
+    """Mark a gate that plays judged episodes. It is skipped for a task that has none."""
+    gate.needs_episode = True  # type: ignore[attr-defined]
+    return gate
+
+
+def require_episode(cfg: Config) -> None:
+    """Refuse a job that plays episodes of a task that has none.
+
+    Raises:
+        ConfigError: The task has no phases, or no check.
+    """
+    if reason := lacks_episode(cfg):
+        expected = f"a task with phases and a check, which job={cfg.job.name} plays ({reason})"
+        raise ConfigError("task", cfg.task.name, expected, "Train it: mjstack.make_env")
+
+
+def play_to(context: RunContext, sim: Simulation, phase: str) -> State:
     """The state of every world as a phase begins, played from the configured starts."""
     env = context.start(sim, context.cfg.reset)
     first = context.phase_start(phase)

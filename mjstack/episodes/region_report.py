@@ -8,7 +8,7 @@ from dataclasses import asdict, fields
 import numpy as np
 
 from mjstack.config.schema import Config
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.record import PICTURE, REGIONS
 from mjstack.episodes.regions import Region
 from mjstack.episodes.tally import EpisodeTally, rate_cells
@@ -40,7 +40,7 @@ def regions_table(cfg: Config, regions: list[Region]) -> list[Table]:
 
 
 def save_regions(
-    context: GateContext, regions: list[Region], starts: np.ndarray, tally: EpisodeTally
+    context: RunContext, regions: list[Region], starts: np.ndarray, tally: EpisodeTally
 ) -> list[str]:
     """Write the table of regions and the picture of all starts. A failure takes no result back.
 
@@ -64,5 +64,5 @@ def save_regions(
     problem = safely_draw(folder / PICTURE, save_places, starts, succeeded, table, title, colors)
     if problem:
         return [*lost, problem]
-    context.pictures.append(PICTURE)
+    context.artifacts.pictures.append(PICTURE)
     return lost

@@ -16,7 +16,7 @@ import torch
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Episode, WorldRecorder
 from mjstack.episodes.record import measured_values
 from mjstack.episodes.rollout import Observer, State, snapshot
@@ -92,7 +92,7 @@ class ReplayedWorld:
 
 
 def replay_world(
-    context: GateContext,
+    context: RunContext,
     *,
     seed: int,
     world: int,
@@ -152,7 +152,7 @@ class _Trace(Observer):
 
 
 def start_of_world(
-    context: GateContext, *, seed: int, world: int, backend: Backend, device: str
+    context: RunContext, *, seed: int, world: int, backend: Backend, device: str
 ) -> np.ndarray:
     """Positions at which a world starts, shape ``(nq,)``; arguments as of `replay_world`."""
     sim = _alone(context, backend, device)
@@ -163,7 +163,7 @@ def start_of_world(
         sim.close()
 
 
-def _alone(context: GateContext, backend: Backend, device: str) -> Simulation:
+def _alone(context: RunContext, backend: Backend, device: str) -> Simulation:
     """A simulation for one world of the batch."""
     cfg = context.cfg
     return make_simulation(
@@ -199,7 +199,7 @@ def _sizes_alone(sizes: BatchSizes, nworld: int) -> BatchSizes:
 
 
 def _steps(
-    states: list[State], recorder: WorldRecorder, cfg: Config, context: GateContext
+    states: list[State], recorder: WorldRecorder, cfg: Config, context: RunContext
 ) -> dict[str, np.ndarray]:
     """State and what the check looks at, at step ends; red is 0 and blue is 1."""
     index = context.index
@@ -240,7 +240,7 @@ def _explain(
     steps: dict[str, np.ndarray],
     sim: Simulation,
     cfg: Config,
-    context: GateContext,
+    context: RunContext,
 ) -> list[RuleFinding]:
     """Every rule with what was found. Whether it held is the check's own result; the numbers say
     why.

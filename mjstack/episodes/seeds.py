@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor
 from mjstack.episodes.record import Circumstances, EpisodeRecord, StartRecorder, write_failing
 from mjstack.episodes.rollout import Observer
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 def play_seeds(
-    context: GateContext,
+    context: RunContext,
     gate: str,
     *,
     count: int,
@@ -73,7 +73,7 @@ def play_seeds(
 
 
 def _play(
-    context: GateContext,
+    context: RunContext,
     sim: Simulation,
     seed: int,
     tally: EpisodeTally,
@@ -95,7 +95,7 @@ def _play(
     return record
 
 
-def _write(context: GateContext, record: EpisodeRecord, tally: EpisodeTally) -> None:
+def _write(context: RunContext, record: EpisodeRecord, tally: EpisodeTally) -> None:
     """Write the seed's record, before the next one can break or be stopped. A full disk takes no
     result back.
     """

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mjstack.episodes.context import GateContext, TimedEpisode
+from mjstack.episodes.context import RunContext, TimedEpisode
 from mjstack.episodes.failures import describe_sign
 from mjstack.episodes.observers import Episode
 from mjstack.episodes.record import (
@@ -125,7 +125,7 @@ class EpisodeTally:
         """Names of a seed's episodes, as ``world=`` of job=replay takes them."""
         return [f"{seed}:{world}" if self.several else str(world) for world in worlds]
 
-    def metrics(self, context: GateContext) -> dict[str, float]:
+    def metrics(self, context: RunContext) -> dict[str, float]:
         """Counts, the success rate with its interval, and the extremes of what was measured."""
         low, high = wilson_interval(self.good, self.episodes)
         extremes = {"min": self.low, "max": self.high}
@@ -172,7 +172,7 @@ class EpisodeTally:
         )
         return f"{name_worlds(self.failed, self.episodes, what=self.noun)} failed: {counts}"
 
-    def all_details(self, context: GateContext) -> list[str]:
+    def all_details(self, context: RunContext) -> list[str]:
         """Lines of the report: the failing episodes by rule, and remarks."""
         named = [(self.rules.texts[rule], names) for rule, names in self.broken.items()]
         if self.unreachable:
@@ -186,7 +186,7 @@ class EpisodeTally:
             lines.append(f"{table} has every failing episode with what was measured")
         return lines
 
-    def way_to_look(self, context: GateContext) -> str:
+    def way_to_look(self, context: RunContext) -> str:
         """The command that replays a failing episode; empty if there is none."""
         if not self.failed or context.folder is None:
             return ""
@@ -232,6 +232,6 @@ def rate_cells(k: int, n: int) -> list[str]:
     return [f"{100.0 * k / n:.1f} %", f"{100.0 * low:.1f} to {100.0 * high:.1f} %"]
 
 
-def failing_name(context: GateContext, gate: str) -> str:
+def failing_name(context: RunContext, gate: str) -> str:
     """Name of a gate's table of failing episodes."""
     return SUCCESS_FAILING if gate != "batch" and "batch" in context.cfg.gates else FAILING

@@ -25,7 +25,7 @@ from mjstack.managers.reset import required_fields
 from mjstack.sim import BatchSizes, Simulation, make_simulation
 
 if TYPE_CHECKING:
-    from mjstack.episodes.context import GateContext
+    from mjstack.episodes.context import RunContext
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -61,7 +61,7 @@ class Workload:
         return int((self.failed == 0).sum())
 
 
-def measuring_worlds(context: GateContext) -> int:
+def measuring_worlds(context: RunContext) -> int:
     """How many worlds size the buffers."""
     on_cuda = context.backend[1].startswith("cuda")
     return (
@@ -71,17 +71,17 @@ def measuring_worlds(context: GateContext) -> int:
     )
 
 
-def measure_task(context: GateContext, reset: Reset) -> Workload:
+def measure_task(context: RunContext, reset: Reset) -> Workload:
     """The scripted task from some start, with room to spare."""
     return _measure(context, lambda sizes: play_task(context, reset, sizes))
 
 
-def measure_random(context: GateContext) -> Workload:
+def measure_random(context: RunContext) -> Workload:
     """Random actions, with room to spare."""
     return _measure(context, lambda sizes: play_random(context, sizes))
 
 
-def play_task(context: GateContext, reset: Reset, sizes: BatchSizes | None) -> Workload:
+def play_task(context: RunContext, reset: Reset, sizes: BatchSizes | None) -> Workload:
     """Plays the scripted task once in worlds of exactly these sizes."""
 
     def play(sim: Simulation) -> np.ndarray:
@@ -90,7 +90,7 @@ def play_task(context: GateContext, reset: Reset, sizes: BatchSizes | None) -> W
     return _play(context, reset, sizes, play)
 
 
-def play_random(context: GateContext, sizes: BatchSizes | None) -> Workload:
+def play_random(context: RunContext, sizes: BatchSizes | None) -> Workload:
     """Steps the task's own environment with random actions; worlds end and start anew as its
     managers say.
     """
@@ -111,7 +111,7 @@ def play_random(context: GateContext, sizes: BatchSizes | None) -> Workload:
     return _play(context, cfg.reset, sizes, play)
 
 
-def size_batch(context: GateContext) -> BatchSizes:
+def size_batch(context: RunContext) -> BatchSizes:
     """Sizes for ``batch=auto`` where the capacity gate does not run before.
 
     Raises:
@@ -126,7 +126,7 @@ def size_batch(context: GateContext) -> BatchSizes:
     )
 
 
-def _measure(context: GateContext, play: Callable[[BatchSizes | None], Workload]) -> Workload:
+def _measure(context: RunContext, play: Callable[[BatchSizes | None], Workload]) -> Workload:
     if context.backend[0] is Backend.native:
         return play(None)
     runs: list[Workload] = []
@@ -140,7 +140,7 @@ def _measure(context: GateContext, play: Callable[[BatchSizes | None], Workload]
 
 
 def _play(
-    context: GateContext,
+    context: RunContext,
     reset: Reset,
     sizes: BatchSizes | None,
     play: Callable[[Simulation], np.ndarray],

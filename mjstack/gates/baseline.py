@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from mjstack.episodes.context import GateContext, judge_one
+from mjstack.episodes.context import RunContext, judge_one, needs_episode
 from mjstack.report.record import GateResult
 
 
-def run_baseline(context: GateContext) -> list[GateResult]:
+@needs_episode
+def run_baseline(context: RunContext) -> list[GateResult]:
     """Runs the nominal episode on native MuJoCo and judges it."""
     cfg = context.cfg
     nominal = context.nominal
@@ -22,8 +23,8 @@ def run_baseline(context: GateContext) -> list[GateResult]:
     metrics["path_error_m"] = context.planner.path_error()
     metrics["peak_contacts"] = int(sim.peak_contacts[0])
     metrics["peak_constraint_rows"] = int(sim.peak_constraints[0])
-    context.shown = nominal.world
-    context.shown_by = "baseline world"
+    context.artifacts.shown = nominal.world
+    context.artifacts.shown_by = "baseline world"
     thresholds = context.check.thresholds() | {"waypoint_error_m": cfg.controller.ik_tolerance}
     summary = reason or headline
     return [

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext, needs_episode
 from mjstack.episodes.observers import Snapshots
 from mjstack.episodes.seeds import play_seeds
 from mjstack.report.record import GateResult, Status
 
 
-def run_batch(context: GateContext) -> list[GateResult]:
+@needs_episode
+def run_batch(context: RunContext) -> list[GateResult]:
     """Play the task in nworld worlds that start differently, under every seed, and judge each."""
     cfg = context.cfg
     t = cfg.gate.batch
@@ -22,8 +23,8 @@ def run_batch(context: GateContext) -> list[GateResult]:
         noun="worlds" if t.seeds == 1 else "world-episodes",
         observers=lambda seed: [snapshots] if seed == cfg.seed else [],
     )
-    context.carry_start = snapshots.states.get(carry)
-    context.timed_episode = tally.first
+    context.artifacts.carry_start = snapshots.states.get(carry)
+    context.artifacts.timed_episode = tally.first
 
     metrics = tally.metrics(context) | {"distinct_final_states": len(tally.ends)}
     if not tally.failed:  # worlds that fail have no speed

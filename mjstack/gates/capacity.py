@@ -11,7 +11,7 @@ import numpy as np
 
 from mjstack.config.schema import Config
 from mjstack.envs.buffers import Peaks, describe_loss, join_peaks, recommend_sizes
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext, needs_episode
 from mjstack.episodes.workloads import (
     Workload,
     measure_random,
@@ -49,7 +49,8 @@ class _Trial:
     remark: str = ""
 
 
-def run_capacity(context: GateContext) -> list[GateResult]:
+@needs_episode
+def run_capacity(context: RunContext) -> list[GateResult]:
     """Finds what the scripted task, randomised starts and random actions need, and tries the sizes
     that it recommends.
 
@@ -100,8 +101,8 @@ def run_capacity(context: GateContext) -> list[GateResult]:
     )
 
     # Motion that lost physics sizes nothing that follows.
-    context.measured = None if task_lost else wanted
-    context.measured_env = None if env_lost else env_wanted
+    context.artifacts.sizes = None if task_lost else wanted
+    context.artifacts.env_sizes = None if env_lost else env_wanted
     sizes = resolve_sizes(cfg)
     env_sizes = resolve_env_sizes(cfg)
     if cfg.batch.auto:
@@ -311,7 +312,7 @@ def _compare(name: str, first: Workload, again: Workload, *, judged: bool, exact
 
 
 def _memory_metrics(
-    context: GateContext, pairs: dict[str, tuple[BatchSizes, BatchSizes]]
+    context: RunContext, pairs: dict[str, tuple[BatchSizes, BatchSizes]]
 ) -> dict[str, float]:
     """What MJWarp's arrays take for the whole batch, with the sizes in force and with the
     recommended ones.

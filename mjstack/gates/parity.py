@@ -9,7 +9,7 @@ import torch
 
 from mjstack.config.schema import Config
 from mjstack.config.validate import PARITY_FIELDS
-from mjstack.episodes.context import GateContext, judge_one
+from mjstack.episodes.context import RunContext, judge_one, needs_episode
 from mjstack.episodes.observers import WorldRecorder
 from mjstack.episodes.rollout import NOMINAL, State, restore
 from mjstack.math import quat_angle
@@ -27,7 +27,8 @@ class _Findings:
     details: list[str] = field(default_factory=list)
 
 
-def run_parity(context: GateContext) -> list[GateResult]:
+@needs_episode
+def run_parity(context: RunContext) -> list[GateResult]:
     """Compare steps from equal states, the options of each backend, and the whole task."""
     cfg = context.cfg
     reference = context.nominal
@@ -63,8 +64,8 @@ def run_parity(context: GateContext) -> list[GateResult]:
 
     headline = context.check.headline(judged)
     context.say(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
-    context.shown = world
-    context.shown_by = "parity world"
+    context.artifacts.shown = world
+    context.artifacts.shown_by = "parity world"
     mjwarp.close()
     return [
         GateResult(
@@ -80,7 +81,7 @@ def run_parity(context: GateContext) -> list[GateResult]:
     ]
 
 
-def _compare_states(context: GateContext, mjwarp: Simulation, found: _Findings) -> None:
+def _compare_states(context: RunContext, mjwarp: Simulation, found: _Findings) -> None:
     """Steps of both backends from the same states of the reference episode."""
     limits = context.cfg.gate.parity
     native = context.nominal.sim
@@ -99,7 +100,7 @@ def _compare_states(context: GateContext, mjwarp: Simulation, found: _Findings) 
 
 
 def _compare_ends(
-    context: GateContext, ours: WorldRecorder, theirs: WorldRecorder, found: _Findings
+    context: RunContext, ours: WorldRecorder, theirs: WorldRecorder, found: _Findings
 ) -> float:
     """Poses of all objects at the end of the task; returns the largest distance [m]."""
     limits = context.cfg.gate.parity

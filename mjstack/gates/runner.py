@@ -7,7 +7,7 @@ import time
 import traceback
 from collections.abc import Callable
 
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext, lacks_episode
 from mjstack.errors import MjstackError, is_out_of_memory
 from mjstack.gates.baseline import run_baseline
 from mjstack.gates.batch import run_batch
@@ -19,7 +19,7 @@ from mjstack.report.record import GateResult, Status
 
 log = logging.getLogger(__name__)
 
-Gate = Callable[[GateContext], list[GateResult]]
+Gate = Callable[[RunContext], list[GateResult]]
 
 GATES: dict[str, Gate] = {
     "baseline": run_baseline,
@@ -32,7 +32,7 @@ GATES: dict[str, Gate] = {
 
 
 def run_gates(
-    context: GateContext,
+    context: RunContext,
     on_start: Callable[[str], None] = lambda _: None,
     on_result: Callable[[GateResult], None] = lambda _: None,
 ) -> list[GateResult]:
@@ -56,7 +56,7 @@ def run_gates(
 
 
 def run_guarded(
-    context: GateContext,
+    context: RunContext,
     name: str,
     run: Gate,
     on_result: Callable[[GateResult], None] = lambda _: None,
@@ -66,7 +66,9 @@ def run_guarded(
     """
     began = time.perf_counter()
     try:
-        results = run(context)
+        lack = lacks_episode(context.cfg) if getattr(run, "needs_episode", False) else ""
+        skipped = [GateResult(name=name, status=Status.skipped, reason=lack)]
+        results = skipped if lack else run(context)
     except MjstackError as error:
         results = [GateResult(name=name, status=Status.failed, reason=str(error))]
     except Exception as error:
@@ -81,7 +83,7 @@ def run_guarded(
     for result in results:
         if result.status is not Status.skipped and not result.seconds:
             result.seconds = seconds
-        context.results[result.name] = result
+        context.artifacts.results[result.name] = result
         log.info("gate %s: %s %s", result.name, result.status.value, result.reason)
         on_result(result)
     return results

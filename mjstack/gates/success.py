@@ -14,7 +14,7 @@ from mjstack.config.schema import Config
 from mjstack.config.validate import places_objects, reads_starts_file
 from mjstack.drivers.driver import Controller
 from mjstack.envs import Env
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext, needs_episode
 from mjstack.episodes.record import starts_name
 from mjstack.episodes.region_report import regions_table, save_regions
 from mjstack.episodes.regions import find_regions
@@ -39,7 +39,8 @@ def success_config(cfg: Config) -> Config:
     return replace(cfg, reset=reset, controller=replace(cfg.controller, name=CLOSED_LOOP))
 
 
-def run_success(context: GateContext) -> list[GateResult]:
+@needs_episode
+def run_success(context: RunContext) -> list[GateResult]:
     """Play the task from random starts under every seed, and hold the share of episodes that
     succeed against ``rate``.
     """
@@ -93,7 +94,7 @@ def run_success(context: GateContext) -> list[GateResult]:
         tally.details.append(f"no region of at least {t.cell_episodes} episodes had a failure")
     if own.folder is not None:
         tally.details += save_regions(own, regions, starts, tally)
-    context.pictures += own.pictures
+    context.artifacts.pictures += own.artifacts.pictures
     good = metrics["success_rate"] >= t.rate and not tally.problems
     return [
         GateResult(
@@ -128,7 +129,7 @@ class _StartsWriter(Observer):
             )
 
 
-def _starts_writers(context: GateContext, seed: int, unwritten: list[str]) -> list[Observer]:
+def _starts_writers(context: RunContext, seed: int, unwritten: list[str]) -> list[Observer]:
     """The writer of a seed's starts; none if the worlds start from that very file."""
     if context.folder is None:
         return []

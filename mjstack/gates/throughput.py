@@ -19,7 +19,7 @@ from mjstack.bench.power import EnergyMeter
 from mjstack.bench.timing import Measurement
 from mjstack.config.schema import Backend
 from mjstack.envs import build_env
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext, lacks_episode
 from mjstack.errors import MjstackError
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation
@@ -30,7 +30,7 @@ CUDA = "throughput_cuda"
 _UNVERIFIED = "a figure counts only where the task was verified"
 
 
-def run_throughput(context: GateContext) -> list[GateResult]:
+def run_throughput(context: RunContext) -> list[GateResult]:
     """Measure the CPU-side backend as ``throughput`` and MJWarp on CUDA as ``throughput_cuda``.
 
     On a machine without CUDA the second is a skip; with CUDA the first is native MuJoCo on all
@@ -66,7 +66,7 @@ class _Bench:
         notes: The same in words.
     """
 
-    context: GateContext
+    context: RunContext
     backend: Backend
     device: str
     seconds: float
@@ -87,11 +87,11 @@ class _Bench:
             self.notes["sizes_from"] = sizes.source
 
 
-def _measure(context: GateContext, name: str, backend: Backend, device: str) -> GateResult:
+def _measure(context: RunContext, name: str, backend: Backend, device: str) -> GateResult:
     """Measure one backend. A measurement that breaks leaves the others their figures."""
     cfg = context.cfg
     t = cfg.gate.throughput
-    batch = context.results.get("batch")
+    batch = context.artifacts.results.get("batch")
     if batch is not None and batch.status is Status.failed:
         reason = f"no figure: the batch gate failed, and {_UNVERIFIED}"
         return GateResult(name=name, status=Status.failed, reason=reason)
@@ -160,6 +160,8 @@ def _on_driven_worlds(bench: _Bench) -> dict[str, Measurement]:
     context = bench.context
     t = context.cfg.gate.throughput
     wanted = [name for name in ("physics", "episode") if name in t.measurements]
+    if lack := lacks_episode(context.cfg):
+        return {name: Measurement(name=name, missing=lack) for name in wanted}
     gc.collect()  # environments hold on to their worlds in cycles, and a GPU has not room for all
     began = time.perf_counter()
     try:

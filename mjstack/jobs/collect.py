@@ -20,7 +20,7 @@ from mjstack.config.schema import Backend, CollectJobCfg, Config
 from mjstack.datasets import DatasetSpec, require_pyarrow
 from mjstack.datasets.resume import check_same, lock_folder, read_committed, read_info
 from mjstack.envs import Env, build_env, demonstration_config
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext, require_episode
 from mjstack.errors import ConfigError, DatasetError, UnwrittenError
 from mjstack.jobs.collect_record import read_batches
 from mjstack.jobs.collection import DATASET, Collection, most_worlds
@@ -48,7 +48,7 @@ def collect_folder(cfg: Config) -> Path:
     )
 
 
-def check_collect(cfg: Config) -> None:
+def check_collect(cfg: Config) -> RunContext:
     """Raises for what cannot be done, before anything is written."""
     for key in ("view", "video"):
         if getattr(cfg, key):
@@ -56,8 +56,16 @@ def check_collect(cfg: Config) -> None:
                 key, "true", "false with job=collect, which shows no world", "Leave it out"
             )
     require_pyarrow()
-    check_task(cfg)
-    env = build_env(demonstration_config(cfg), nworld=2, backend=Backend.native, device="cpu")
+    require_episode(cfg)
+    context = RunContext(cfg)
+    check_task(context)
+    env = build_env(
+        demonstration_config(cfg),
+        model=context.model,
+        nworld=2,
+        backend=Backend.native,
+        device="cpu",
+    )
     try:
         if _job(cfg).episodes > 1:
             _check_starts(env)
@@ -65,21 +73,23 @@ def check_collect(cfg: Config) -> None:
         _check_folder(collect_folder(cfg), make_spec(env, cfg, {}))
     finally:
         env.close()
+    return context
 
 
-def run_collect_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
+def run_collect_job(context: RunContext, folder: Path, overrides: list[str]) -> JobResult:
     """Adds what is missing to the dataset, and leaves dataset.md and the report.
 
     Args:
-        cfg: The configuration.
+        context: The configuration, and what its check built.
         folder: Where the report goes; the dataset's place is `collect_folder`'s.
         overrides: What was asked for on the command line.
 
     Returns:
         How it ended: a pass if the dataset has as many episodes as were asked for.
     """
+    cfg = context.cfg
 
-    def work(context: GateContext, bar: ProgressBar, record: Record) -> None:
+    def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
         bar.start("collect")
         began = time.perf_counter()
         collection = Collection(context, collect_folder(cfg))
@@ -104,7 +114,7 @@ def run_collect_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResul
         conclude(Status.failed if problem else Status.passed, problem)
 
     title = f"task {cfg.task.name}, {_job(cfg).episodes:,} demonstrations"
-    return run_reported(cfg, folder, overrides, title, work)
+    return run_reported(context, folder, overrides, title, work)
 
 
 def _job(cfg: Config) -> CollectJobCfg:

@@ -19,7 +19,7 @@ from mjstack.config.fingerprint import config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
 from mjstack.datasets import DatasetWriter, EpisodeData, lerobot
 from mjstack.envs import Env, build_env, demonstration_config
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import NOMINAL
 from mjstack.errors import ConfigError, UnwrittenError
 from mjstack.files import write_atomic
@@ -68,7 +68,7 @@ class Collection:
         steps: Likewise.
     """
 
-    def __init__(self, context: GateContext, home: Path) -> None:
+    def __init__(self, context: RunContext, home: Path) -> None:
         """Finds out what a step holds."""
         cfg = context.cfg
         self._context = context

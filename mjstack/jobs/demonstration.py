@@ -13,7 +13,7 @@ import torch
 
 from mjstack.drivers.driver import Controller
 from mjstack.envs import Env, demonstration_config
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import play_episode
 from mjstack.episodes.rollout import Observer, reset_worlds
 from mjstack.sim import Simulation
@@ -126,7 +126,7 @@ def steps_block(sim: Simulation, steps: int, dim: int) -> torch.Tensor:
 
 
 def play_demonstrations(
-    context: GateContext, sim: Simulation, seed: int, values: torch.Tensor, worlds: Sequence[int]
+    context: RunContext, sim: Simulation, seed: int, values: torch.Tensor, worlds: Sequence[int]
 ) -> Played:
     """Plays the configured controller once in some worlds of a seed, and judges it by the task's
     check.

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from mjstack.config.schema import Backend, Config
 from mjstack.config.validate import reads_starts_file
-from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.drivers.tilt import turn_sign
 from mjstack.envs import build_env
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.record import clear_records
 from mjstack.errors import ConfigError
 from mjstack.gates.runner import run_gates
@@ -20,29 +20,31 @@ from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, check_showing, run_reported
 from mjstack.sim import resolve_backend
-from mjstack.tasks.check import make_check
 
 
-def check_machine(cfg: Config) -> None:
-    """Raises for what this machine cannot do, before anything is written."""
-    check_task(cfg)
+def check_machine(cfg: Config) -> RunContext:
+    """Build scene and plan, and raise for what this machine cannot do, before anything is written.
+
+    Returns:
+        The context of the run.
+    """
+    context = RunContext(cfg)
+    check_task(context)
     if (cfg.view or cfg.video) and not {"baseline", "parity"} & set(cfg.gates):
         key = "view" if cfg.view else "video"
-        raise ConfigError(
-            key,
-            "true",
-            "gates with baseline or parity, whose world is shown",
-            "Add one of them to gates",
-        )
+        expected = "gates with baseline or parity, whose world is shown"
+        raise ConfigError(key, "true", expected, "Add one of them to gates")
     check_showing(cfg)
     if "success" in cfg.gates:
-        _check_success(cfg)
+        _check_success(context)
+    return context
 
 
-def _check_success(cfg: Config) -> None:
+def _check_success(context: RunContext) -> None:
     """Raises if worlds cannot start as the success gate has them, by the key that says so."""
+    cfg = context.cfg
     try:
-        build_env(success_config(cfg), nworld=1, backend=Backend.native, device="cpu").close()
+        check_env(context, success_config(cfg))
     except ConfigError as error:
         if error.key.startswith("reset.") and not reads_starts_file(cfg.reset):
             region = cfg.gate.success.region is not None and error.key.endswith(".params.xy")
@@ -52,30 +54,37 @@ def _check_success(cfg: Config) -> None:
         raise
 
 
-def check_task(cfg: Config) -> None:
-    """Raises if the scripted task cannot be played as configured, on this machine."""
+def check_task(context: RunContext) -> None:
+    """Raises if the task cannot be played as configured, on this machine."""
+    cfg = context.cfg
     resolve_backend(cfg)
-    make_check(cfg)  # reads its thresholds
-    OpenLoopPlanner(cfg)  # reads the robot, and reaches every nominal target
-    env = build_env(
-        cfg, nworld=1, backend=Backend.native, device="cpu"
-    )  # builds and checks every term
+    if cfg.task.check is not None:
+        _ = context.check  # reads its thresholds
+    if cfg.controller.phases:
+        _ = context.planner  # reads the robot, and reaches every nominal target
+    check_env(context, cfg)
     if cfg.job.name in ("gates", "study"):
-        check_room(cfg, env.sim.model)
-    if cfg.controller.approach_gain > 0.0:
-        turn_sign(env.sim.model, cfg)
-    env.close()
+        check_room(cfg, context.model)
+    if cfg.controller.phases and cfg.controller.approach_gain > 0.0:
+        turn_sign(context.model, cfg)
 
 
-def run_gates_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
-    """Runs the gates of one configuration and writes its report after each; see `run_reported`."""
+def check_env(context: RunContext, cfg: Config) -> None:
+    """Build an environment in the context's scene, which checks every term."""
+    build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu").close()
+
+
+def run_gates_job(context: RunContext, folder: Path, overrides: list[str]) -> JobResult:
+    """Run the gates of one configuration, and write its report after each; see `run_reported`."""
+    cfg = context.cfg
     title = f"task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)}"
-    return run_reported(cfg, folder, overrides, title, _run)
+    return run_reported(context, folder, overrides, title, _run)
 
 
-def _run(context: GateContext, bar: ProgressBar, record: Record) -> None:
-    if context.folder is not None:
-        context.cfg = archive_starts(context.cfg, context.folder)
+def _run(context: RunContext, bar: ProgressBar, record: Record) -> None:
+    folder = context.folder
+    if folder is not None:
+        context = replace(context, cfg=archive_starts(context.cfg, folder))
         starts = context.cfg.starts
-        clear_records(context.folder, keep=None if starts is None else Path(starts))
+        clear_records(folder, keep=None if starts is None else Path(starts))
     run_gates(context, bar.start, record)

@@ -14,7 +14,7 @@ from typing import cast
 import numpy as np
 
 from mjstack.config.schema import Config, ReachabilityJobCfg
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError
 from mjstack.files import write_atomic
 from mjstack.jobs.progress import ProgressBar
@@ -76,7 +76,7 @@ def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> Job
         around every object's position.
     """
 
-    def work(context: GateContext, bar: ProgressBar, record: Record) -> None:
+    def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
         levels: list[ReachLevel] = []
         for name, (height, gripper) in find_levels(cfg).items():
             bar.start(name)
@@ -99,7 +99,9 @@ def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> Job
             record(_region_result(cfg, region, time.perf_counter() - began))
         _draw(context, folder, levels, regions)
 
-    return run_reported(cfg, folder, overrides, f"task {cfg.task.name}, what the arm reaches", work)
+    return run_reported(
+        RunContext(cfg), folder, overrides, f"task {cfg.task.name}, what the arm reaches", work
+    )
 
 
 def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
@@ -136,7 +138,7 @@ def axes(cfg: Config) -> tuple[np.ndarray, np.ndarray]:
 
 
 def map_level(
-    context: GateContext,
+    context: RunContext,
     name: str,
     height: float,
     gripper: str,
@@ -275,7 +277,7 @@ def _region_result(cfg: Config, region: ObjectRegion, seconds: float) -> GateRes
     )
 
 
-def _map(context: GateContext, levels: list[ReachLevel], regions: list[ObjectRegion]) -> ReachMap:
+def _map(context: RunContext, levels: list[ReachLevel], regions: list[ObjectRegion]) -> ReachMap:
     cfg = context.cfg
     x, y = axes(cfg)
     return ReachMap(
@@ -290,7 +292,7 @@ def _map(context: GateContext, levels: list[ReachLevel], regions: list[ObjectReg
 
 
 def _write(
-    context: GateContext,
+    context: RunContext,
     folder: Path,
     levels: list[ReachLevel],
     regions: list[ObjectRegion],
@@ -324,7 +326,7 @@ def _write(
 
 
 def _draw(
-    context: GateContext, folder: Path, levels: list[ReachLevel], regions: list[ObjectRegion]
+    context: RunContext, folder: Path, levels: list[ReachLevel], regions: list[ObjectRegion]
 ) -> None:
     """The picture. Its failure takes nothing back."""
     try:

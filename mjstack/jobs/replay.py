@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from rich.markup import escape
 
 from mjstack.config.schema import Backend, Config, SimCfg
-from mjstack.episodes.context import GateContext, judge_one
+from mjstack.episodes.context import RunContext, judge_one, require_episode
 from mjstack.episodes.failures import FailureMonitor, describe_sign
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.replay import ReplayedWorld, replay_world, start_of_world
@@ -57,6 +57,7 @@ class ReplayPlan:
             says otherwise.
         record: What the gate found there, or None.
         notes: What could not be as it was.
+        context: Scene and plan of the configuration.
     """
 
     run: EarlierRun
@@ -67,25 +68,27 @@ class ReplayPlan:
     where: list[tuple[Backend, str]]
     record: EpisodeRecord | None
     notes: list[str]
+    context: RunContext
 
 
-def check_replay(cfg: Config) -> None:
+def check_replay(cfg: Config) -> ReplayPlan:
     """Raises for what cannot be replayed, before anything is written."""
     plan = _plan(cfg)
-    check_task(plan.cfg)
+    require_episode(plan.cfg)
+    check_task(plan.context)
     check_showing(plan.cfg)
     _check_start(plan)
+    return plan
 
 
-def run_replay_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
+def run_replay_job(plan: ReplayPlan, folder: Path, overrides: list[str]) -> JobResult:
     """Plays the world on its run's backend and, where that was MJWarp, on native MuJoCo too; see
     `run_reported`.
     """
-    plan = _plan(cfg)
     title = (
         f"replay of world {plan.world} of {plan.cfg.nworld}, seed {plan.seed}, of {plan.run.folder}"
     )
-    return run_reported(plan.cfg, folder, overrides, title, partial(_run, plan))
+    return run_reported(plan.context, folder, overrides, title, partial(_run, plan))
 
 
 def _plan(cfg: Config) -> ReplayPlan:
@@ -116,12 +119,13 @@ def _plan(cfg: Config) -> ReplayPlan:
     played = success_config(kept) if gate == "success" else kept
     where, notes = _choose(cfg.sim, run, record)
     backend, device = where[0]
+    sim = SimCfg(backend=backend, device=device)
+    played = replace(played, sim=sim, view=cfg.view, video=cfg.video)
     return ReplayPlan(
         run=run,
         gate=gate,
-        cfg=replace(
-            played, sim=SimCfg(backend=backend, device=device), view=cfg.view, video=cfg.video
-        ),
+        cfg=played,
+        context=RunContext(played),
         seed=seed,
         world=world,
         where=where,
@@ -167,7 +171,7 @@ def _check_start(plan: ReplayPlan) -> None:
     """Raises if the world would start elsewhere than it did in that run."""
     if plan.record is None or plan.record.start is None:
         return
-    context = GateContext(cfg=plan.cfg)
+    context = plan.context
     then = plan.record.start[plan.world]
     # MJWarp takes longer to load than the native start does to compute, and rounding may have it
     # draw otherwise.
@@ -201,7 +205,7 @@ def _ran_on(run: EarlierRun, record: EpisodeRecord | None) -> tuple[Backend, str
     return backend, device if device.startswith("cuda") else "cpu"
 
 
-def _run(plan: ReplayPlan, context: GateContext, bar: ProgressBar, record: Record) -> None:
+def _run(plan: ReplayPlan, context: RunContext, bar: ProgressBar, record: Record) -> None:
     assert context.folder is not None
     played = replace(plan.cfg, seed=plan.seed)
     write_atomic(
@@ -241,7 +245,7 @@ def _replay(
     backend: Backend,
     device: str,
     changes: list[str],
-    context: GateContext,
+    context: RunContext,
 ) -> list[GateResult]:
     """Plays the world on one backend and says how it went, and whether that is what was
     recorded.
@@ -263,8 +267,10 @@ def _replay(
     if not kept:
         status = Status.failed
     if first:
-        context.shown = done.recorder
-        context.shown_by = f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
+        context.artifacts.shown = done.recorder
+        context.artifacts.shown_by = (
+            f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
+        )
     told = [str(finding) for finding in done.findings] + (
         [] if monitor is None else [_first_sign(monitor, done, context)]
     )
@@ -296,7 +302,7 @@ def _replay(
     ]
 
 
-def _first_sign(monitor: FailureMonitor, done: ReplayedWorld, context: GateContext) -> str:
+def _first_sign(monitor: FailureMonitor, done: ReplayedWorld, context: RunContext) -> str:
     """What the success gate would say of where the world went wrong."""
     sign = int(monitor.sign[0])
     step = int(monitor.step[0])
@@ -315,7 +321,7 @@ def _compare(
     backend: Backend,
     device: str,
     changes: list[str],
-    context: GateContext,
+    context: RunContext,
 ) -> tuple[bool, str]:
     """What the gate recorded of this world against what happened now, and whether that keeps what
     is promised.

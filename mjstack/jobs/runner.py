@@ -10,6 +10,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -19,7 +20,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from mjstack.config.schema import Config
-from mjstack.episodes.context import GateContext
+from mjstack.episodes.context import Artifacts, RunContext
 from mjstack.episodes.observers import StepHook
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.jobs.progress import ProgressBar
@@ -34,7 +35,7 @@ from mjstack.sim import Simulation, cuda_driver, cuda_name
 log = logging.getLogger(__name__)
 
 Record = Callable[[GateResult], None]
-Work = Callable[[GateContext, ProgressBar, Record], None]
+Work = Callable[[RunContext, ProgressBar, Record], None]
 
 
 def check_showing(cfg: Config) -> None:
@@ -56,12 +57,12 @@ def check_showing(cfg: Config) -> None:
 
 
 def run_reported(
-    cfg: Config, folder: Path, overrides: list[str], title: str, work: Work
+    context: RunContext, folder: Path, overrides: list[str], title: str, work: Work
 ) -> JobResult:
     """Does some work and writes its report after each result.
 
     Args:
-        cfg: The configuration.
+        context: The configuration, and what its check built.
         folder: Where report.json, report.md, pictures and logs go.
         overrides: What was asked for on the command line.
         title: What is done, in one line.
@@ -72,7 +73,8 @@ def run_reported(
         report.
     """
     console = Console(highlight=False)
-    context = GateContext(cfg=cfg, folder=folder)
+    context = replace(context, folder=folder, artifacts=Artifacts())
+    cfg = context.cfg
     report: Report | None = None
     outcome = JobResult(status=Status.interrupted, folder=folder, overrides=overrides)
     try:
@@ -82,15 +84,14 @@ def run_reported(
         report = Report(provenance=run_provenance(cfg, context))
         write_report(report, folder)
         with ProgressBar(console) as bar:
-            context.say = bar.say
-            context.advance = bar.advance
-            context.on_step = _viewer(context) if cfg.view else None
+            viewer = _viewer(context) if cfg.view else None
+            context = replace(context, say=bar.say, advance=bar.advance, on_step=viewer)
             work(context, bar, lambda result: _record(report, result, folder, bar))
         report.conclude()
         outcome.status = report.status
         write_report(report, folder)
         _draw(context, report, folder, console)
-        report.pictures += context.pictures
+        report.pictures += context.artifacts.pictures
         write_report(report, folder)
     except KeyboardInterrupt:
         outcome.status = Status.interrupted
@@ -134,7 +135,7 @@ def _record(report: Report, result: GateResult, folder: Path, bar: ProgressBar) 
     bar.finish(result)
 
 
-def run_provenance(cfg: Config, context: GateContext) -> dict:
+def run_provenance(cfg: Config, context: RunContext) -> dict:
     """Versions, device, and hashes of configuration and model."""
     backend, device = context.backend
     driver = "no CUDA device"
@@ -161,18 +162,18 @@ def model_text(model: mujoco.MjModel) -> str:
     return buffer.tobytes().hex()
 
 
-def _draw(context: GateContext, report: Report, folder: Path, console: Console) -> None:
+def _draw(context: RunContext, report: Report, folder: Path, console: Console) -> None:
     """Pictures and video of the one-world episode, if there was one. Their failure fails
     no gate.
     """
-    episode = context.shown
+    episode = context.artifacts.shown
     cfg = context.cfg
     if episode is None:
         return
     objects = {name: (thing.half, thing.color) for name, thing in cfg.scene.free.items()}
     positions = np.stack([episode.qpos[:, a : a + 3] for a in context.index.object_qpos], axis=1)
-    title = f"{cfg.robot.title}, {cfg.task.name}: {context.shown_by}"
-    model = context.visual_model
+    title = f"{cfg.robot.title}, {cfg.task.name}: {context.artifacts.shown_by}"
+    model = context.stage.visual_model
     drawn: dict[str, tuple[Callable[..., object], tuple]] = {
         "scene.png": (save_scene, (model, episode.qpos[-1], positions[-1], objects, title)),
         "trajectories.png": (save_trajectories, (positions, objects, title)),
@@ -189,13 +190,13 @@ def _draw(context: GateContext, report: Report, folder: Path, console: Console) 
             console.print(f"video: {folder}/{name}", soft_wrap=True)
 
 
-def _viewer(context: GateContext) -> StepHook:
+def _viewer(context: RunContext) -> StepHook:
     """Shows a one-world episode in MuJoCo's viewer, in real time; closing the window lets the run
     go on.
     """
     import mujoco.viewer
 
-    model = context.visual_model
+    model = context.stage.visual_model
     data = mujoco.MjData(model)
     handle = mujoco.viewer.launch_passive(model, data)
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
-from mjstack.episodes.context import GateContext, play_to
+from mjstack.episodes.context import RunContext, Stage, play_to, require_episode
 from mjstack.episodes.rollout import State, restore
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import to_csv, write_atomic
@@ -51,30 +51,32 @@ class _Base:
     steps: int
 
 
-def check_study(cfg: Config) -> None:
+def check_study(cfg: Config) -> RunContext:
     """Raises for what this machine cannot do, before anything is written."""
     for key in ("view", "video"):
         if getattr(cfg, key):
             raise ConfigError(
                 key, "true", "false with job=study, which shows no world", "Leave it out"
             )
-    check_machine(cfg)
+    require_episode(cfg)
+    return check_machine(cfg)
 
 
-def run_study_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
+def run_study_job(context: RunContext, folder: Path, overrides: list[str]) -> JobResult:
     """Measures every variant and leaves study.csv, study.md, study.png and the report.
 
     Args:
-        cfg: The configuration.
+        context: The configuration, and what its check built.
         folder: Where they go.
         overrides: What was asked for on the command line.
 
     Returns:
         How it ended: a pass if every variant was measured, whatever was found.
     """
+    cfg = context.cfg
     job = cast(StudyJobCfg, cfg.job)
 
-    def work(context: GateContext, bar: ProgressBar, record: Record) -> None:
+    def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
         rows: list[StudyRow] = []
         bar.start("base")
         try:
@@ -106,10 +108,10 @@ def run_study_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
         f"task {cfg.task.name}, {cfg.nworld} worlds, study of {len(job.variants)} variants of the"
         " solver"
     )
-    return run_reported(cfg, folder, overrides, title, work)
+    return run_reported(context, folder, overrides, title, work)
 
 
-def _prepare(context: GateContext, job: StudyJobCfg) -> _Base:
+def _prepare(context: RunContext, job: StudyJobCfg) -> _Base:
     """The configured solver's worlds, played up to where they hold the cube."""
     cfg = context.cfg
     sim = _simulation(context)
@@ -121,7 +123,7 @@ def _prepare(context: GateContext, job: StudyJobCfg) -> _Base:
 
 
 def _guarded(
-    context: GateContext, job: StudyJobCfg, base: _Base, name: str, solver: SolverCfg
+    context: RunContext, job: StudyJobCfg, base: _Base, name: str, solver: SolverCfg
 ) -> StudyRow:
     """One variant; if it breaks, the others still run."""
     cfg = context.cfg
@@ -144,16 +146,17 @@ def _guarded(
     return row
 
 
-def _variant(context: GateContext, solver: SolverCfg) -> GateContext:
+def _variant(context: RunContext, solver: SolverCfg) -> RunContext:
     """The same run with another solver. Its plan is the same too, because inverse kinematics has no
     contacts.
     """
-    out = GateContext(cfg=replace(context.cfg, solver=solver), advance=context.advance)
-    out.planner = context.planner
-    return out
+    cfg = replace(context.cfg, solver=solver)
+    stage = Stage(cfg)
+    stage.planner = context.planner
+    return replace(context, cfg=cfg, stage=stage)
 
 
-def _measure(context: GateContext, job: StudyJobCfg, base: _Base, row: StudyRow) -> None:
+def _measure(context: RunContext, job: StudyJobCfg, base: _Base, row: StudyRow) -> None:
     """The whole episode, judged; then turns of some steps with the base, from the base's state with
     the cube in hand.
     """
@@ -206,7 +209,7 @@ def _measure(context: GateContext, job: StudyJobCfg, base: _Base, row: StudyRow)
     row.status = Status.passed.value
 
 
-def _simulation(context: GateContext) -> Simulation:
+def _simulation(context: RunContext) -> Simulation:
     """Worlds with room to spare: buffer sizes are not what is studied."""
     cfg, (backend, device) = context.cfg, context.backend
     fields = required_fields(cfg.reset)
@@ -279,12 +282,12 @@ def _as_result(row: StudyRow, seconds: float) -> GateResult:
     )
 
 
-def _title(context: GateContext) -> str:
+def _title(context: RunContext) -> str:
     cfg = context.cfg
     return f"{cfg.robot.title}, task {cfg.task.name}: the solver's settings, {cfg.nworld} worlds"
 
 
-def _notes(context: GateContext) -> list[str]:
+def _notes(context: RunContext) -> list[str]:
     job = cast(StudyJobCfg, context.cfg.job)
     base = asdict(context.cfg.solver)
     backend, device = context.backend
@@ -303,14 +306,14 @@ def _notes(context: GateContext) -> list[str]:
 
 
 def _write_tables(
-    context: GateContext, folder: Path, rows: list[StudyRow], picture: str = ""
+    context: RunContext, folder: Path, rows: list[StudyRow], picture: str = ""
 ) -> None:
     columns = [*COLUMNS, *context.check.summaries]
     write_atomic(folder / "study.csv", to_csv(columns, [asdict(row) | row.values for row in rows]))
     write_atomic(folder / "study.md", to_markdown(rows, _title(context), _notes(context), picture))
 
 
-def _draw(context: GateContext, folder: Path, rows: list[StudyRow]) -> None:
+def _draw(context: RunContext, folder: Path, rows: list[StudyRow]) -> None:
     """The picture of what was measured. Its failure takes nothing back."""
     done = [row for row in rows if row.status == Status.passed.value]
     if not done:
