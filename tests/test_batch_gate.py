@@ -17,6 +17,7 @@ import torch
 from check_cases import rules_of
 from environments import brisk
 
+from mjstack.config import load_config
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
@@ -24,6 +25,7 @@ from mjstack.episodes.observers import Episode, play_episode
 from mjstack.episodes.record import FAILING, EpisodeRecord, clear_records, write_failing
 from mjstack.errors import RunError
 from mjstack.gates.batch import run_batch
+from mjstack.gates.runner import run_gates
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
 
@@ -271,3 +273,16 @@ def test_no_trajectory_is_kept(new_context: Callable[..., RunContext], tmp_path:
 
     peak(2)  # whatever is made once
     assert (peak(12) - peak(2)) / 10 < 15_000
+
+
+@pytest.mark.parametrize("lacks", ["check", "phases"])
+def test_gates_of_a_task_without_an_episode_are_skipped(lacks: str) -> None:
+    cfg = load_config(["sim=native", "gates=[baseline,parity,capacity,batch,success]"])
+    if lacks == "check":
+        cfg.task.check = None
+    else:
+        cfg.controller.phases = {}
+    results = run_gates(RunContext(cfg))
+    assert [result.name for result in results] == cfg.gates
+    assert all(result.status is Status.skipped for result in results)
+    assert all(f"task stack has no {lacks}" in result.reason for result in results)

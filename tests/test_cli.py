@@ -91,7 +91,6 @@ BAD = [
     ["action.arm.params.mode=sideways"],
     ["observation.policy.terms.joint_pos.history=0"],
     ["reset=randomized", "reset.cubes.params.xy=[0.0,0.001]", "reset.cubes.params.gap=0.5"],
-    ["task=reach"],
     ["gate.parity.step1.qpos=nan"],
     ["-cn", "foo"],
     ["-m", "robot=glob(*)"],
