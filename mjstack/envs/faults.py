@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjstack.errors import FaultError, name_worlds
+from mjstack.managers.base import resolve_func
 from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS, Overflow, Simulation, describe_overflow
 
@@ -95,11 +96,11 @@ class FaultLatch:
                 where = f"{name_worlds(worlds, nworld)}{self._culprits(fault, worlds[0])}"
                 raise FaultError(f"{fault.value} in {where}", _FIXES[fault])
 
-    def _ends_on(self, term: str) -> bool:
-        """Whether one of mjstack's own terminations is in use, under whatever name."""
+    def _ends_on(self, fault: str) -> bool:
+        """Whether a termination ends worlds with this fault."""
         return any(
-            cfg.func == f"mjstack.mdp.termination.{term}"
-            for cfg in self._env.cfg.termination.values()
+            getattr(resolve_func(name, cfg.func), "ends_on", None) == fault
+            for name, cfg in self._env.cfg.termination.items()
         )
 
     def _culprits(self, fault: Fault, world: int) -> str:

@@ -17,6 +17,7 @@ from mjstack.datasets import DatasetSpec, Feature
 from mjstack.envs import Env
 from mjstack.errors import ConfigError
 from mjstack.jobs.demonstration import ACTION, REWARD, STATE
+from mjstack.managers.base import resolve_func
 from mjstack.sim import resolve_backend
 
 # Changing one of these changes no episode. The action terms are the controller's, and nothing ends
@@ -36,22 +37,6 @@ _NO_MATTER = (
     "world",
 )
 _OTHER_GATES = ("parity", "capacity", "batch", "throughput", "success")
-_JOINTS = "of the joints"
-_JOINT_SPEEDS = "of the joints, per second"
-# Of the observation terms; one that is not here, such as a user's own, has the unit "unknown".
-_UNITS: dict[str, str | tuple[str, ...]] = {
-    "mjstack.mdp.observation.joint_pos": _JOINTS,
-    "mjstack.mdp.observation.joint_pos_relative": _JOINTS,
-    "mjstack.mdp.observation.joint_vel": _JOINT_SPEEDS,
-    "mjstack.mdp.observation.grasp_point_pos": "m",
-    "mjstack.mdp.observation.grasp_point_to_object": "m",
-    "mjstack.mdp.observation.object_to_object": "m",
-    "mjstack.mdp.observation.object_pose": ("m",) * 3 + ("1",) * 4,
-    "mjstack.mdp.observation.object_velocity": ("m/s",) * 3 + ("rad/s",) * 3,
-    "mjstack.mdp.observation.jaw_force": "N",
-    "mjstack.mdp.observation.last_action": _JOINTS,
-    "mjstack.tasks.box_terms.ToSlot": "m",
-}
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:
@@ -199,10 +184,10 @@ def _group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
 
 
 def _term_units(func: str, width: int, joints: tuple[str, ...]) -> Sequence[str]:
-    unit = _UNITS.get(func, "unknown")
-    if unit == _JOINTS:
+    unit = getattr(resolve_func("observation", func), "unit", "unknown")
+    if unit == "joint":
         return joints
-    if unit == _JOINT_SPEEDS:
+    if unit == "joint/s":
         return [f"{joint}/s" for joint in joints]
     return [unit] * width if isinstance(unit, str) else unit
 

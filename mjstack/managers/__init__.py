@@ -3,7 +3,7 @@ at once.
 """
 
 from mjstack.managers.action import ActionManager, ActionTerm
-from mjstack.managers.base import EnvView, episode_draw, random_uniform, uses_fields
+from mjstack.managers.base import EnvView, episode_draw, offers, random_uniform, uses_fields
 from mjstack.managers.observation import ObservationManager
 from mjstack.managers.reset import ResetManager, required_fields
 from mjstack.managers.reward import RewardManager
@@ -18,6 +18,7 @@ __all__ = [
     "RewardManager",
     "TerminationManager",
     "episode_draw",
+    "offers",
     "random_uniform",
     "required_fields",
     "uses_fields",

@@ -83,6 +83,28 @@ def uses_fields(*names: str) -> Callable[[Any], Any]:
     return mark
 
 
+def offers(**attributes: Any) -> Callable[[Any], Any]:
+    """Marks a term with what others may ask of it.
+
+    Known attributes: ``unit`` of an observation (one, or one per number; ``joint`` and ``joint/s``
+    are those of the robot's joints); ``ends_on`` of a termination, ``overflow`` or ``non_finite``,
+    where it ends such worlds; of a reset term ``reads_file``, where its parameter ``path`` names a
+    file of starts, ``places_objects``, where its parameter ``xy`` is a region, and ``joint_noise``,
+    where its parameter ``arm`` moves the arm's joints.
+
+    Example:
+        >>> @offers(unit="m")
+        ... def tip_height(env): ...
+    """
+
+    def mark(term: Any) -> Any:
+        for name, value in attributes.items():
+            setattr(term, name, value)
+        return term
+
+    return mark
+
+
 def random_uniform(
     env: EnvView,
     name: str,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from mjstack.managers.base import EnvView
+from mjstack.managers.base import EnvView, offers
 from mjstack.mdp.geometry import (
     grasp_point,
     jaw_forces,
@@ -17,26 +17,31 @@ from mjstack.mdp.geometry import (
 from mjstack.scene import table_top
 
 
+@offers(unit="joint")
 def joint_pos(env: EnvView) -> torch.Tensor:
     """Joint positions [rad, m], arm then gripper, shape ``(nworld, n)``."""
     return joint_positions(env)
 
 
+@offers(unit="joint")
 def joint_pos_relative(env: EnvView) -> torch.Tensor:
     """Joint positions less home [rad, m], shape ``(nworld, n)``."""
     return joint_positions(env) - robot(env).home
 
 
+@offers(unit="joint/s")
 def joint_vel(env: EnvView) -> torch.Tensor:
     """Joint velocities [rad/s, m/s], shape ``(nworld, n)``."""
     return joint_velocities(env)
 
 
+@offers(unit="m")
 def grasp_point_pos(env: EnvView) -> torch.Tensor:
     """Grasp point [m], world frame, shape ``(nworld, 3)``."""
     return grasp_point(env)
 
 
+@offers(unit="m")
 def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> torch.Tensor:
     """From the grasp point to a point above an object's centre [m], shape ``(nworld, 3)``.
 
@@ -50,11 +55,13 @@ def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> 
     return offset
 
 
+@offers(unit="m")
 def object_to_object(env: EnvView, *, a: str, b: str) -> torch.Tensor:
     """From one object's centre to another's [m], shape ``(nworld, 3)``."""
     return pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
 
 
+@offers(unit="m")
 def object_to_place(env: EnvView, *, object: str, place: str) -> torch.Tensor:
     """From an object's centre to where it is when it stands at a place on the table [m], shape
     ``(nworld, 3)``.
@@ -64,17 +71,20 @@ def object_to_place(env: EnvView, *, object: str, place: str) -> torch.Tensor:
     return torch.cat((place_xy(env, place) - at[:, :2], height - at[:, 2:]), dim=1)
 
 
+@offers(unit=("m",) * 3 + ("1",) * 4)
 def object_pose(env: EnvView, *, object: str) -> torch.Tensor:
     """Position [m] and quaternion (wxyz), world frame, shape ``(nworld, 7)``."""
     return pose_w(env, object)
 
 
+@offers(unit=("m/s",) * 3 + ("rad/s",) * 3)
 def object_velocity(env: EnvView, *, object: str) -> torch.Tensor:
     """Linear [m/s, world frame] and angular [rad/s, body frame] velocity, shape ``(nworld, 6)``."""
     _, address = env.index.object_address(object)
     return env.sim.qvel[:, address : address + 6]
 
 
+@offers(unit="N")
 def jaw_force(env: EnvView, *, object: str) -> torch.Tensor:
     """Size of each jaw's contact force on an object [N], at the last physics step, shape ``(nworld,
     2)``.
@@ -82,6 +92,7 @@ def jaw_force(env: EnvView, *, object: str) -> torch.Tensor:
     return jaw_forces(env, object)
 
 
+@offers(unit="joint")
 def last_action(env: EnvView) -> torch.Tensor:
     """The policy's last action, shape ``(nworld, action_dim)``."""
     return env.action

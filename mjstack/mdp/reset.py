@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 
 from mjstack.errors import ParameterError
-from mjstack.managers.base import EnvView, random_uniform, uses_fields
+from mjstack.managers.base import EnvView, offers, random_uniform, resolve_func, uses_fields
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import named_pose, pose_w, robot
 from mjstack.mdp.starts.placement import Placement
@@ -32,6 +32,7 @@ def home(env: EnvView, mask: torch.Tensor, *, pose: str = "home") -> None:
     env.sim.qvel.masked_fill_(mask[:, None], 0.0)
 
 
+@offers(joint_noise=True)
 class JointNoise:
     """Adds uniform noise to the robot's joint positions and commands, within the joints' ranges."""
 
@@ -94,6 +95,7 @@ class JitterObjects:
             _write_object(env, mask, name, self._xy * dx, self._xy * dy, self._yaw * yaw)
 
 
+@offers(places_objects=True)
 class RandomizeObjects:
     """Puts each object anywhere in a region around its nominal position where nothing is in its
     way.
@@ -141,7 +143,7 @@ class RandomizeObjects:
         noise = [
             term.params.get("arm", 0.0)
             for term in env.cfg.reset.values()
-            if term.func.endswith(".JointNoise")
+            if getattr(resolve_func("reset", term.func), "joint_noise", False)
         ]
         self._placement = Placement(
             env.cfg,

@@ -7,7 +7,7 @@ import math
 import torch
 
 from mjstack.errors import ParameterError
-from mjstack.managers.base import EnvView
+from mjstack.managers.base import EnvView, offers
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import joint_positions, pose_w, robot
 from mjstack.scene import table_top
@@ -74,11 +74,13 @@ class JointLimit:
         return ((q < self._low) | (q > self._high)).any(1)
 
 
+@offers(ends_on="non_finite")
 def non_finite(env: EnvView) -> torch.Tensor:
     """When a position or velocity is NaN or infinite: such a world cannot go on."""
     return not_finite(env.sim.qpos, env.sim.qvel)
 
 
+@offers(ends_on="overflow")
 def overflow(env: EnvView) -> torch.Tensor:
     """When a buffer of the world was too small, so that physics was lost."""
     return (env.sim.overflow & LOST_PHYSICS) != 0

@@ -9,12 +9,13 @@ import math
 import torch
 
 from mjstack.errors import ParameterError, UnknownName
-from mjstack.managers.base import EnvView, require_positive, shared
+from mjstack.managers.base import EnvView, offers, require_positive, shared
 from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, place_xy, pose_w
 from mjstack.scene import table_top
 from mjstack.tasks.box import BoxCheck, scene_box
 
 
+@offers(unit="m")
 class ToSlot:
     """From an object's centre to where it rests at its place in the box [m], shape ``(nworld,
     3)``.

@@ -14,7 +14,7 @@ import torch
 
 from mjstack.errors import ArgumentError, ConfigError, ParameterError
 from mjstack.files import write_atomic
-from mjstack.managers.base import EnvView, uses_fields
+from mjstack.managers.base import EnvView, offers, uses_fields
 from mjstack.mdp.geometry import joint_positions, named_pose, place_xy, pose_w, robot
 from mjstack.mdp.starts.randomization import (
     FRICTION_FIELDS,
@@ -33,6 +33,7 @@ _ROUNDING = 1e-6  # of a range's ends, which float32 does not hold exactly
 _FLAT = 1e-5
 
 
+@offers(reads_file=True)
 @uses_fields(*MASS_FIELDS, *FRICTION_FIELDS, *GAIN_FIELDS)
 class FromStartsFile:
     """World w starts as row w of a file says, at every reset.

@@ -1,0 +1,339 @@
+"""Scenes of a stranger: any number of objects of any shape, and places drawn per episode."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from mjstack import make_env
+from mjstack.config import load_config
+from mjstack.config.schema import Config
+from mjstack.drivers.closed_loop import make_expert
+from mjstack.drivers.open_loop import OpenLoopPlanner
+from mjstack.envs import Env
+from mjstack.errors import MjstackError
+from mjstack.managers import episode_draw
+from mjstack.math import lowest_point
+from mjstack.mdp.geometry import above_table, place_xy, pose_w, source_xy
+from mjstack.mdp.observation import object_to_place
+from mjstack.mdp.reward import near_place
+from mjstack.mdp.starts.starts_file import write_starts
+from mjstack.scene.phases import build_targets, nominal_xy, target_xy
+
+TABLE = """
+  table_center: [0.35, -0.04, 0.012]
+  table_half: [0.16, 0.26, 0.012]
+  random_xy: [0.02, 0.02]
+"""
+ONE = """
+  objects:
+    puck: {shape: cylinder, size: [0.03, 0.012], mass: 0.1, xy: [0.33, -0.10]}
+  places:
+    goal: {xy: [0.33, 0.08], random_xy: [0.03, 0.02]}
+"""
+MANY = """
+  objects:
+    brick: {size: [0.03, 0.015, 0.02], mass: 0.1, xy: [0.30, -0.20]}
+    can: {shape: cylinder, size: [0.02, 0.03], mass: 0.1, xy: [0.36, -0.10]}
+    post: {size: [0.01, 0.01, 0.05], mass: 1.0, xy: [0.44, 0.0], fixed: true}
+    ball: {shape: sphere, size: [0.02], mass: 0.05, xy: [0.32, 0.04]}
+    pill: {shape: capsule, size: [0.015, 0.02], mass: 0.05, xy: [0.32, 0.15]}
+  places:
+    goal: {xy: [0.30, -0.04], random_xy: [0.01, 0.01]}
+    corner: {xy: [0.28, -0.25]}
+"""
+# Pushes the first object: from beside it, opposite to the goal, to where the goal is.
+PHASES = """
+approach:
+  {{anchor: {0}, offset: [-0.06, 0.01, 0.1], toward: goal, gripper: closed, seconds: 1.0,
+    observe: true}}
+push: {{anchor: goal, offset: [0.03, 0.0, 0.08], toward: {0}, gripper: closed, seconds: 1.0}}
+done: {{gripper: closed, seconds: 0.4}}
+"""
+TASK = """
+# @package _global_
+defaults:
+  - override /scene: mine
+  - override /phases: mine
+  - override /observation: mine
+  - override /reward: mine
+task:
+  name: mine
+  control_hz: 50.0
+  episode_steps: 100
+  goal_height: 0.0
+  check: none
+gate:
+  parity: {states: {before_contact: approach, in_grasp: push, stacked: done}}
+  throughput: {from_phase: push}
+"""
+OBSERVATION = """
+policy:
+  terms:
+    to_goal: {{func: mjstack.mdp.observation.object_to_place, params: {{object: {0}, place: goal}}}}
+"""
+REWARD = """
+near:
+  func: mjstack.mdp.reward.near_place
+  params: {{object: {0}, place: goal, scale: 0.1}}
+  weight: 1.0
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Callable[[str], Path]:
+    """A stranger's folder, with a scene of some objects and a task that pushes the first one."""
+
+    def write(objects: str) -> Path:
+        first = objects.split()[1].rstrip(":")
+        for group, text in (
+            ("scene", "name: mine\n" + "\n".join(x[2:] for x in (TABLE + objects).splitlines())),
+            ("phases", "# @package controller.phases\n" + PHASES.format(first)),
+            ("task", TASK.lstrip()),
+            ("observation", OBSERVATION.format(first)),
+            ("reward", REWARD.format(first)),
+        ):
+            (tmp_path / "conf" / group).mkdir(parents=True)
+            (tmp_path / "conf" / group / "mine.yaml").write_text(text)
+        return tmp_path / "conf"
+
+    return write
+
+
+def build(conf: Path, *overrides: str, nworld: int = 8) -> Env:
+    env = make_env(["task=mine", "sim=native", *overrides], nworld=nworld, config_dir=conf)
+    env.reset(seed=0)
+    return env
+
+
+def corners(name: str, cfg: Config, pose: np.ndarray) -> np.ndarray:
+    """Points of an object's surface in x and y, seen from above."""
+    thing = cfg.scene.objects[name]
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, pose[3:])
+    if thing.shape == "box":
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        points = signs * thing.size
+    else:
+        angle = np.linspace(0.0, 2.0 * math.pi, 48, endpoint=False)
+        ring = thing.size[0] * np.column_stack((np.cos(angle), np.sin(angle), 0.0 * angle))
+        half = np.array([thing.size[1] if thing.shape == "capsule" else 0.0, 0.0, 0.0])
+        points = np.concatenate((ring + half, ring - half))
+    return pose[:2] + (points @ turn.reshape(3, 3).T)[:, :2]
+
+
+def test_every_shape_stands_on_the_table(folder: Callable[[str], Path]) -> None:
+    env = build(folder(MANY), "reset=nominal", nworld=1)
+    model = env.sim.model
+    assert list(env.index.bodies) == ["brick", "can", "post", "ball", "pill"]
+    assert list(env.index.objects) == ["brick", "can", "ball", "pill"]
+    assert [model.geom(name).type[0] for name in env.index.bodies] == [6, 5, 6, 2, 3]
+    for name in env.index.bodies:
+        assert float(above_table(env, name)[0]) == pytest.approx(0.0, abs=1e-6)
+        assert pose_w(env, name)[0, :2].tolist() == env.cfg.scene.objects[name].xy
+    for _ in range(5):
+        env.step(torch.zeros((1, env.action_manager.action_dim)))
+    contacts = mujoco.MjData(model)
+    contacts.qpos[:] = env.sim.qpos[0].numpy()
+    mujoco.mj_forward(model, contacts)
+    table = model.geom("table").id
+    pairs = contacts.contact.geom[: contacts.ncon].tolist()
+    for name in env.index.objects:
+        touching = {g for pair in pairs if model.geom(name).id in pair for g in pair}
+        assert touching == {table, model.geom(name).id}
+    env.close()
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder", "sphere", "capsule"])
+def test_lowest_point_of_any_shape(shape: str) -> None:
+    """Against MuJoCo's distance from a plane far below."""
+    size = {"box": [0.03, 0.015, 0.02], "cylinder": [0.02, 0.03], "sphere": [0.02]}.get(
+        shape, [0.015, 0.02]
+    )
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(name="plane", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+    body = spec.worldbody.add_body()
+    body.add_freejoint()
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}")
+    turn = (
+        [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0] if shape == "capsule" else [1.0, 0.0, 0.0, 0.0]
+    )
+    body.add_geom(name="thing", type=kind, size=[*size, 0.0, 0.0][:3], mass=1.0, quat=turn)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        quat = rng.normal(size=4)
+        quat /= np.linalg.norm(quat)
+        data.qpos[:] = [0.0, 0.0, 0.5, *quat]
+        mujoco.mj_forward(model, data)
+        found = lowest_point(torch.tensor(data.qpos[:3]), torch.tensor(quat), shape, size)
+        want = mujoco.mj_geomDistance(model, data, 0, 1, 2.0, None)
+        assert float(found) == pytest.approx(want, abs=1e-6)
+
+
+@pytest.mark.parametrize("objects", [ONE, MANY], ids=["one", "many"])
+def test_random_starts_keep_apart_and_come_back_from_a_file(
+    folder: Callable[[str], Path], objects: str, tmp_path: Path
+) -> None:
+    conf = folder(objects)
+    env = build(conf, "reset=randomized", nworld=32)
+    names = list(env.cfg.scene.objects)
+    poses = {name: pose_w(env, name).double().numpy() for name in names}
+    for world in range(32):
+        for a, b in itertools.combinations(names, 2):
+            first = corners(a, env.cfg, poses[a][world])
+            second = corners(b, env.cfg, poses[b][world])
+            assert np.linalg.norm(first[:, None] - second[None], axis=2).min() > 0.005, (a, b)
+    moved = env.index.object_qpos[0]
+    assert float(env.sim.qpos[:, moved].std()) > 0.005
+    write_starts(env, tmp_path / "starts.csv")
+    header = (tmp_path / "starts.csv").read_text().splitlines()[0].split(",")
+    assert f"{names[0]}_yaw_rad" in header
+    assert {"goal_x_m", "goal_y_m"} <= set(header)
+    assert not {"post_x_m", "corner_x_m"} & set(header)
+    again = build(conf, "reset=starts_file", f"starts={tmp_path}/starts.csv", "seed=9", nworld=32)
+    torch.testing.assert_close(again.sim.qpos, env.sim.qpos, rtol=0.0, atol=1e-15)
+    torch.testing.assert_close(place_xy(again, "goal"), place_xy(env, "goal"), rtol=0.0, atol=0.0)
+    for name, field in env.sim.fields.items():
+        torch.testing.assert_close(again.sim.fields[name], field, rtol=0.0, atol=1e-12)
+    env.close()
+    again.close()
+
+
+def test_a_place_is_drawn_once_an_episode(folder: Callable[[str], Path]) -> None:
+    conf = folder(ONE)
+    env = build(conf)
+    goal = place_xy(env, "goal").clone()
+    assert float((goal - torch.tensor([0.33, 0.08])).abs().max()) <= 0.03
+    assert len(set(goal[:, 0].tolist())) == env.nworld
+    puck = pose_w(env, "puck")[:, :3]
+    away = torch.cat((goal - puck[:, :2], torch.zeros_like(goal[:, :1])), dim=1)
+    for _ in range(3):
+        observed = env.step(torch.zeros((env.nworld, env.action_manager.action_dim)))[0]["policy"]
+        torch.testing.assert_close(place_xy(env, "goal"), goal, rtol=0.0, atol=0.0)
+    torch.testing.assert_close(observed, away.float(), rtol=0.0, atol=2e-3)
+    torch.testing.assert_close(
+        object_to_place(env, object="puck", place="goal").float(), observed, rtol=0.0, atol=1e-6
+    )
+    near = 1.0 - torch.tanh(observed[:, :2].norm(dim=1) / 0.1)
+    got = near_place(env, object="puck", place="goal", scale=0.1)
+    torch.testing.assert_close(got.float(), near, rtol=0.0, atol=1e-5)
+    draw = episode_draw(env, "goal", 2)
+    torch.testing.assert_close(draw * torch.tensor([0.03, 0.02]) + torch.tensor([0.33, 0.08]), goal)
+
+    # Another episode has another goal, in the worlds that reset alone.
+    mask = torch.zeros(env.nworld, dtype=torch.bool)
+    mask[2] = True
+    env.reset(mask=mask)
+    changed = (place_xy(env, "goal") != goal).any(1)
+    assert changed.tolist() == mask.tolist()
+    fewer = build(conf, nworld=3)
+    torch.testing.assert_close(place_xy(fewer, "goal"), goal[:3], rtol=0.0, atol=0.0)
+    env.close()
+    fewer.close()
+
+
+def test_both_drivers_aim_toward_the_goal(folder: Callable[[str], Path]) -> None:
+    env = build(folder(ONE), "action=joint_absolute", nworld=2)
+    sources = source_xy(env).double().numpy()
+    puck = sources[:, 0]
+    goal = sources[:, 1]
+    along = (goal - puck) / np.linalg.norm(goal - puck, axis=1, keepdims=True)
+    left = np.column_stack((-along[:, 1], along[:, 0]))
+    want = {"approach": puck - 0.06 * along + 0.01 * left, "push": goal - 0.03 * along}
+    targets = build_targets(env.cfg)
+    for name, xy in want.items():
+        target = targets[name]
+        assert target is not None
+        np.testing.assert_allclose(target_xy(target, sources), xy, atol=1e-9)
+    assert targets["done"] is None
+    planner = OpenLoopPlanner(env.cfg)
+    trajectory = planner.plan(sources)
+    driver = make_expert(env)
+    for step in range(driver.phases[1].stop):
+        command = driver.command()
+        for number, name in enumerate(want):
+            if step == driver.phases[number].stop - 1:
+                closed = driver._ik.grasp_point(command).double().numpy()
+                np.testing.assert_allclose(closed[:, :2], want[name], atol=6e-4)
+                for world in range(2):
+                    planned = planner.ik.grasp_point(trajectory.command(step)[world].numpy())
+                    np.testing.assert_allclose(planned[:2], want[name][world], atol=6e-4)
+        env.step(command)
+    env.close()
+
+
+def test_what_is_stacked_is_higher_from_then_on() -> None:
+    """After red was put on blue, red's centre is a cube higher."""
+    cfg = load_config([])
+    before = build_targets(cfg)
+    cfg.controller.phases["retreat"].anchor = "red"
+    after = build_targets(cfg)
+    target, moved = before["retreat"], after["retreat"]
+    assert target is not None
+    assert moved is not None
+    assert moved.z - target.z == pytest.approx(0.044)
+    # And the plan takes it to be where it was let go.
+    planner = OpenLoopPlanner(cfg)
+    ends = planner._targets(nominal_xy(cfg.scene))
+    names = list(cfg.controller.phases)
+    np.testing.assert_allclose(
+        ends[names.index("retreat")][1][:2], cfg.scene.objects["blue"].xy, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("shape: cylinder", "shape: cone"), "scene.objects.puck.shape=cone"),
+        (("[0.03, 0.012]", "[0.03, 0.012, 0.1]"), "scene.objects.puck.size"),
+        (("mass: 0.1", "mass: 0.0"), "scene.objects.puck.mass=0"),
+        (("xy: [0.33, -0.10]", "xy: [0.9, -0.10]"), "on the table"),
+        (("goal:", "puck:"), "a name that no object has"),
+        (("puck:", "table:"), "scene.objects.table"),
+        (("random_xy: [0.03, 0.02]", "random_xy: [0.03, 0.5]"), "scene.places.goal.xy"),
+    ],
+)
+def test_a_scene_that_cannot_be(
+    folder: Callable[[str], Path], change: tuple[str, str], message: str
+) -> None:
+    with pytest.raises(MjstackError, match=message) as caught:
+        load_config(["task=mine"], config_dir=folder(ONE.replace(*change)))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("task", ["stack", "box"])
+def test_starts_and_commands_are_those_of_before(robot: str, task: str) -> None:
+    """Recorded at commit 3e08f6d, which knew two cubes only: starts, joint targets of drivers."""
+    with np.load(Path(__file__).parent / "data" / "commit_3e08f6d.npz") as file:
+        want = {
+            key.rsplit(".")[-1]: file[key] for key in file if key.startswith(f"{task}.{robot}.")
+        }
+    driven = [f"task={task}", f"robot={robot}", "action=joint_absolute", "sim=native"]
+    env = make_env([*driven, "reset=randomized"], nworld=2)
+    env.reset(seed=0)
+    np.testing.assert_allclose(env.sim.qpos.numpy(), want["start"], rtol=0.0, atol=1e-15)
+    driver = make_expert(env)
+    np.testing.assert_allclose(driver._nominal.numpy(), want["nominal"], atol=1e-6)
+    commands = []
+    for _ in range(61):
+        commands.append(driver.command().numpy().copy())
+        env.step(driver._command)
+    np.testing.assert_allclose(np.stack(commands[::15]), want["closed_loop"], rtol=0.0, atol=1e-5)
+    env.close()
+    jitter = make_env([*driven, "reset=jitter"], nworld=2)
+    jitter.reset(seed=0)
+    planner = OpenLoopPlanner(jitter.cfg)
+    trajectory = planner.plan(source_xy(jitter).double().numpy())
+    for number, phase in enumerate(planner.phases):
+        ours = trajectory.command(phase.stop - 1).numpy()
+        np.testing.assert_allclose(ours, want["open_loop"][:, number], rtol=0.0, atol=1e-9)
+    jitter.close()
