@@ -218,7 +218,7 @@ BAD = [
     (["graph=sometimes"], "graph"),
     (["view=perhaps"], "view"),
     (["scene.objects.red.xy=[0.9,0.0]"], "on the table"),
-    (["scene.objects.red.xy=[0.33]"], "2 numbers"),
+    (["scene.objects.red.xy=[0.33]"], "2 finite numbers"),
     (["scene.objects.red.xy=[0.33,0.06]"], "clear of blue"),
     (["scene.objects.red.mass=0"], "scene.objects.red.mass"),
     (["task.episode_steps=0"], "task.episode_steps=0"),
@@ -231,7 +231,7 @@ BAD = [
     (["task.check.window=1"], "task.check.window=1"),
     (["gate.throughput.repetitions=0"], "gate.throughput.repetitions=0"),
     (["controller.phases.release.seconds=0.013"], "multiple of the step"),
-    (["controller.phases.release.gripper=ajar"], "open or closed"),
+    (["controller.phases.release.gripper=ajar"], "one of open, closed"),
     (["controller.phases.release.anchor=green"], "anchor"),
     (["controller.knots=2"], "controller.knots=2"),
     (
