@@ -68,8 +68,6 @@ task:
   name: mine
   control_hz: 50.0
   episode_steps: 100
-  goal_height: 0.0
-  check: none
 gate:
   parity: {states: {before_contact: approach, in_grasp: push, stacked: done}}
   throughput: {from_phase: push}
