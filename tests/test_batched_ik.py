@@ -24,7 +24,7 @@ from mjstack.errors import ArgumentError, ConfigError, MjstackError, UnknownName
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.robots import robot_spec
-from mjstack.sim.streams import torch_stream_scope
+from mjstack.sim.warp_setup import torch_stream_scope
 
 Stage = Callable[[str], RunContext]
 

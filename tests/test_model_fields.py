@@ -16,7 +16,7 @@ from mjstack.config.schema import Backend
 from mjstack.episodes.context import RunContext
 from mjstack.errors import RebindError, UnknownName
 from mjstack.sim import BatchSizes, Simulation, make_simulation
-from mjstack.sim.fields import FIELD_NAMES
+from mjstack.sim.model_fields import FIELD_NAMES
 
 N = 3
 FIELDS = (

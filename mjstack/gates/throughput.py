@@ -97,13 +97,18 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
         return GateResult(name=name, status=Status.failed, reason=reason)
     began = time.perf_counter()
     on_cuda = device.startswith("cuda")
+    seconds = t.max_seconds if on_cuda else t.cpu_max_seconds
     bench = _Bench(
         context=context,
         backend=backend,
         device=device,
-        seconds=t.max_seconds if on_cuda else t.cpu_max_seconds,
+        seconds=seconds,
         meter=EnergyMeter(device),
-        facts={"worlds": cfg.nworld, "cpu_count": os.cpu_count() or 1},
+        facts={
+            "worlds": cfg.nworld,
+            "cpu_count": os.cpu_count() or 1,
+            "max_seconds_per_measurement": seconds,
+        },
     )
 
     # The measurements
@@ -140,10 +145,6 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
         result.notes |= one.named_notes()
     if status is not Status.skipped:
         result.seconds = time.perf_counter() - began
-        result.thresholds = {
-            "repetitions": t.repetitions,
-            "max_seconds_per_measurement": bench.seconds,
-        }
     return result
 
 

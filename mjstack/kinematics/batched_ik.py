@@ -15,7 +15,7 @@ from mjstack.kinematics.chain import build_chain
 from mjstack.kinematics.ik_kernels import directions_kernel, grasp_point_kernel, solve_kernel
 from mjstack.kinematics.joints import joint_limits
 from mjstack.scene.index import find
-from mjstack.sim.streams import torch_stream_scope
+from mjstack.sim.warp_setup import torch_stream_scope
 
 # m: with a gain, an iterate this close to the target replaces a closer one that came before
 _NEAR = 0.00002

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from mjstack.sim.start import wp
+from mjstack.sim.warp_setup import wp
 
 HINGE = 0
 SLIDE = 1

@@ -74,8 +74,9 @@ def format_percent(rate: float, unit: str = " %") -> str:
 def _tables(gate: GateResult) -> list[Table]:
     """The gate's numbers, every one once.
 
-    Repeated figures have their median and range in a row. A metric ``STATE.NAME`` whose threshold
-    is called ``NAME`` stands beside that limit, in a row per state. The rest is name and value.
+    Repeated figures have their median and range in a row. A metric ``STATE.GROUP.NAME`` whose
+    threshold is called ``GROUP.NAME`` stands beside that limit, in a row per state. The rest has
+    name and value.
     """
     metrics = dict(gate.metrics)
     thresholds = dict(gate.thresholds)
@@ -95,7 +96,7 @@ def _tables(gate: GateResult) -> list[Table]:
     rest: dict[str, Mapping[str, object]] = {
         "measured": metrics,
         "required": thresholds,
-        "note": gate.notes,
+        "notes": gate.notes,
     }
     for name, values in rest.items():
         if values:
@@ -111,7 +112,7 @@ def _with_limits(metrics: dict[str, float], thresholds: dict[str, float]) -> Tab
     for name in list(metrics):
         state, _, quantity = name.partition(".")
         limit = thresholds.get(quantity)
-        if limit is None:
+        if limit is None or "." not in quantity:
             continue
         used.add(quantity)
         group, _, column = quantity.rpartition(".")

@@ -9,6 +9,7 @@ from mjstack.sim.build import (
     resolve_backend,
     resolve_device,
 )
+from mjstack.sim.model_fields import Fields
 from mjstack.sim.simulation import (
     LOST_PHYSICS,
     Overflow,
@@ -17,7 +18,6 @@ from mjstack.sim.simulation import (
     describe_overflow,
 )
 from mjstack.sim.sizes import BatchSizes, resolve_sizes
-from mjstack.sim.views import Fields
 
 __all__ = [
     "LOST_PHYSICS",

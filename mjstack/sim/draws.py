@@ -6,7 +6,7 @@ cost more than the numbers.
 import torch
 import warp as wp
 
-from mjstack.sim.streams import torch_stream_scope
+from mjstack.sim.warp_setup import torch_stream_scope
 
 # Without this the compiler may fuse a product and a sum, and the last digit would differ from
 # torch's.

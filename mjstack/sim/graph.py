@@ -16,7 +16,7 @@ import warp as wp
 from mjstack.config.schema import GraphMode
 from mjstack.errors import CaptureError
 from mjstack.sim.scratch import Scratch
-from mjstack.sim.streams import torch_stream_scope
+from mjstack.sim.warp_setup import torch_stream_scope
 
 log = logging.getLogger(__name__)
 

@@ -1,6 +1,4 @@
-"""What worlds cost in memory: arrays that stay, what a step borrows, and what the device has given
-out.
-"""
+"""The arrays of worlds in memory: those that stay, and the ones that a step borrows."""
 
 from __future__ import annotations
 
@@ -24,6 +22,17 @@ def array_bytes(node: object) -> int:
     if dataclasses.is_dataclass(node):
         return sum(array_bytes(getattr(node, field.name)) for field in dataclasses.fields(node))
     return 0
+
+
+def keep_arrays(fresh: object, old: object) -> None:
+    """Put the arrays of old data into new data where their size is the same, so that views stay."""
+    for field in dataclasses.fields(fresh):  # type: ignore[arg-type]
+        ours = getattr(fresh, field.name)
+        theirs = getattr(old, field.name)
+        if isinstance(ours, wp.array) and ours.shape == theirs.shape and ours.dtype == theirs.dtype:
+            setattr(fresh, field.name, theirs)
+        elif dataclasses.is_dataclass(ours):
+            keep_arrays(ours, theirs)
 
 
 def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import fields as dataclass_fields
-from dataclasses import is_dataclass
 from functools import partial
 
 import mujoco
@@ -14,18 +12,16 @@ import warp as wp
 
 from mjstack.config.schema import GraphMode
 from mjstack.errors import UnsupportedModel
-from mjstack.sim.convex import convex_kinds
-from mjstack.sim.counters import clear_counters, record_convex_contacts, record_usage
 from mjstack.sim.engine import mjw
-from mjstack.sim.fields import PLACING_FIELDS, check_fields
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
-from mjstack.sim.memory import array_bytes, borrowed_bytes
-from mjstack.sim.simulation import LOST_PHYSICS
+from mjstack.sim.memory import array_bytes, borrowed_bytes, keep_arrays
+from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
 from mjstack.sim.sizes import BatchSizes
 from mjstack.sim.static_geoms import place_static_geoms
-from mjstack.sim.streams import torch_stream_scope
 from mjstack.sim.substep import Arrangement, can_rearrange, rearranged_step
-from mjstack.sim.views import Fields, FixedViews, check_mask
+from mjstack.sim.usage import Usage
+from mjstack.sim.views import FixedViews, check_mask
+from mjstack.sim.warp_setup import torch_stream_scope
 
 
 class MjwarpSimulation(FixedViews):
@@ -97,17 +93,7 @@ class MjwarpSimulation(FixedViews):
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
             self._can_rearrange = can_rearrange(model, self._m)
-            self._contacts = wp.zeros(nworld, dtype=int)
-            self._peak_nefc = wp.zeros(nworld, dtype=int)
-            self._peak_contacts = wp.zeros(nworld, dtype=int)
-            self._peak_pool = wp.zeros(3, dtype=int)
-            kinds = convex_kinds(model)
-            self._kinds = None if kinds is None else wp.array(kinds, dtype=int)
-            self._kind_counts = wp.zeros(0 if kinds is None else int(kinds.max()) + 1, dtype=int)
-            self._lost = wp.zeros(nworld, dtype=int)
-            self._limits = wp.zeros(nworld, dtype=int)
-            self._steps = wp.zeros(nworld, dtype=wp.int64)
-            self._mask = wp.zeros(nworld, dtype=bool)
+            self._usage = Usage(model, nworld)
         d = self._d
         self.qpos, self.qvel, self.act, self.ctrl = map(
             wp.to_torch, (d.qpos, d.qvel, d.act, d.ctrl)
@@ -127,20 +113,14 @@ class MjwarpSimulation(FixedViews):
             }
         )
         self.constraint_count = wp.to_torch(d.nefc)
-        self.contact_count = wp.to_torch(self._contacts)
-        self.peak_constraints = wp.to_torch(self._peak_nefc)
-        self.peak_contacts = wp.to_torch(self._peak_contacts)
-        self.peak_pool = wp.to_torch(self._peak_pool)
-        self.overflow = wp.to_torch(self._lost)
-        self.solver_limits = wp.to_torch(self._limits)
-        self.step_count = wp.to_torch(self._steps)
-        self._torch_mask = wp.to_torch(self._mask)
-        # What masked resets would erase. It is taken in there, just before, and not in every
-        # substep: nothing else lowers a counter, so the two together never miss one, and it costs a
-        # captured step three small operations.
-        self._most_contacts, self._most_constraints, self._overflow_ever = (
-            torch.zeros_like(self.overflow) for _ in range(3)
-        )
+        usage = self._usage
+        self.contact_count = usage.contacts
+        self.peak_contacts = usage.peak_contacts
+        self.peak_constraints = usage.peak_rows
+        self.peak_pool = usage.peak_pool
+        self.overflow = usage.overflow
+        self.solver_limits = usage.limits
+        self.step_count = usage.steps
         self._warm_up()
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
@@ -171,43 +151,27 @@ class MjwarpSimulation(FixedViews):
         """Puts the masked worlds back to qpos0, at rest, and clears their counters and overflow
         bits.
         """
-        if mask is None:
-            self._torch_mask.fill_(True)
-            self.peak_pool.zero_()
-        else:
+        if mask is not None:
             check_mask(mask, self.nworld, self.device)
-            self._torch_mask.copy_(mask)
-        self._keep_peaks(clear=mask is None)
+        selected = self._usage.select(mask)
         with torch_stream_scope(self._device):
-            mjw.reset_data(self._m, self._d, reset=self._mask)
-            wp.launch(
-                clear_counters,
-                dim=self.nworld,
-                inputs=[self._mask],
-                outputs=[
-                    self._peak_contacts,
-                    self._peak_nefc,
-                    self._contacts,
-                    self._lost,
-                    self._limits,
-                    self._steps,
-                ],
-            )
+            mjw.reset_data(self._m, self._d, reset=selected)
+            self._usage.clear()
 
     @property
     def most_contacts(self) -> torch.Tensor:
         """Largest contact_count since the last full reset."""
-        return torch.maximum(self._most_contacts, self.peak_contacts)
+        return torch.maximum(self._usage.most[0], self.peak_contacts)
 
     @property
     def most_constraints(self) -> torch.Tensor:
         """Largest constraint_count since the last full reset."""
-        return torch.maximum(self._most_constraints, self.peak_constraints)
+        return torch.maximum(self._usage.most[1], self.peak_constraints)
 
     @property
     def overflow_ever(self) -> torch.Tensor:
         """Overflow bits since the last full reset."""
-        return self._overflow_ever | self.overflow
+        return self._usage.most[2] | self.overflow
 
     def memory_bytes(self) -> int:
         """Bytes of MJWarp's data: all that grows with nworld, but for per-world fields and what a
@@ -275,7 +239,7 @@ class MjwarpSimulation(FixedViews):
         self._graphs.clear()
         with wp.ScopedDevice(self._device):
             fresh = mjw.make_data(self.model, nworld=self.nworld, **sizes.as_kwargs(self.nworld))
-            _keep_arrays(fresh, self._d)
+            keep_arrays(fresh, self._d)
             for count in (fresh.nacon, fresh.nefc, fresh.ncollision):
                 count.zero_()
         self._d = fresh
@@ -322,16 +286,6 @@ class MjwarpSimulation(FixedViews):
     def close(self) -> None:
         """Drops the graphs; buffers go with the object."""
         self._graphs.clear()
-
-    def _keep_peaks(self, *, clear: bool) -> None:
-        """Takes in the counters that a reset is about to erase, or forgets all of them."""
-        if clear:
-            for buffer in (self._most_contacts, self._most_constraints, self._overflow_ever):
-                buffer.zero_()
-            return
-        torch.maximum(self._most_contacts, self.peak_contacts, out=self._most_contacts)
-        torch.maximum(self._most_constraints, self.peak_constraints, out=self._most_constraints)
-        self._overflow_ever |= self.overflow
 
     def _decimation(self, n: int, kinematics: bool) -> None:
         self._place()
@@ -398,45 +352,8 @@ class MjwarpSimulation(FixedViews):
         )
 
     def _count(self, *, steps: int) -> None:
-        """Steps made, what each world uses now, and the most it has used."""
-        d = self._d
-        contacts = self._d.contact
-        pool = contacts.worldid.shape[0]
-        # A thread per world, and at least one for every eighth place of the pool, which is mostly
-        # empty.
-        stride = max(self.nworld, pool // 8)
-        self._contacts.zero_()
-        wp.launch(
-            record_usage,
-            dim=stride,
-            inputs=[
-                d.nacon,
-                contacts.worldid,
-                d.nefc,
-                d.ncollision,
-                d.overflow,
-                LOST_PHYSICS,
-                steps,
-                stride,
-            ],
-            outputs=[
-                self._contacts,
-                self._peak_contacts,
-                self._peak_nefc,
-                self._peak_pool,
-                self._lost,
-                self._limits,
-                self._steps,
-            ],
-        )
-        if self._kinds is not None:
-            self._kind_counts.zero_()
-            wp.launch(
-                record_convex_contacts,
-                dim=stride,
-                inputs=[d.nacon, contacts.geom, self._m.geom_type, self._kinds, stride],
-                outputs=[self._kind_counts, self._peak_pool],
-            )
+        """Count steps made, what each world uses now, and the most it has used."""
+        self._usage.count(self._m, self._d, steps)
 
     def _warm_up(self) -> None:
         """Compiles and loads every kernel, then leaves the worlds as new."""
@@ -458,16 +375,3 @@ class MjwarpSimulation(FixedViews):
                 scratch=lambda: self.arrangement.scratch,
             )
         return self._graphs[key]
-
-
-def _keep_arrays(fresh: object, old: object) -> None:
-    """Hands the arrays whose size is the same over to new data, so that whoever looks at them goes
-    on doing so.
-    """
-    for field in dataclass_fields(fresh):  # type: ignore[arg-type]
-        ours = getattr(fresh, field.name)
-        theirs = getattr(old, field.name)
-        if isinstance(ours, wp.array) and ours.shape == theirs.shape and ours.dtype == theirs.dtype:
-            setattr(fresh, field.name, theirs)
-        elif is_dataclass(ours):
-            _keep_arrays(ours, theirs)

@@ -16,10 +16,9 @@ import mujoco
 import numpy as np
 import torch
 
-from mjstack.sim.fields import check_fields
-from mjstack.sim.simple_bodies import SimpleBodies
+from mjstack.sim.model_fields import Fields, SimpleBodies, check_fields
 from mjstack.sim.simulation import Overflow
-from mjstack.sim.views import Fields, FixedViews, check_mask
+from mjstack.sim.views import FixedViews, check_mask
 
 _S = mujoco.mjtState
 _SPEC = int(
@@ -46,9 +45,7 @@ def available_cores() -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Worker:
-    """What one thread works with. Each pair is an array of all worlds and the one of the thread's
-    model or data beside it.
-    """
+    """The memory of a thread; pairs are an array of all worlds and the thread's own."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
@@ -84,7 +81,6 @@ class NativeSimulation(FixedViews):
 
     backend = "native"
     version = 0  # nothing is ever captured
-    sizes = peak_pool = solver_limits = None
 
     def __init__(
         self,
@@ -229,15 +225,6 @@ class NativeSimulation(FixedViews):
         """Overflow bits since the last full reset."""
         return torch.from_numpy(self._all_peaks()[:, 2])
 
-    def graph_of(self, n: int = 1, *, kinematics: bool = False) -> None:
-        """Nothing is captured."""
-
-    def memory_bytes(self) -> None:
-        """Not counted."""
-
-    def borrowed_bytes(self) -> None:
-        """Not known."""
-
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options of the model."""
         opt = self.model.opt
@@ -301,9 +288,7 @@ class NativeSimulation(FixedViews):
         return _Worker(model, data, fields, pairs(data, self._poses), pairs(data, self._others))
 
     def _all_peaks(self) -> np.ndarray:
-        """Peak contacts, peak rows and overflow bits since the last full reset, shape ``(nworld,
-        3)``.
-        """
+        """Peak contacts, rows, and overflow bits since the last full reset, ``(nworld, 3)``."""
         peaks = np.maximum(self._most[:, :2], self._counts[:, 2:4])
         bits = self._most[:, 2] | self._counts[:, 4]
         return np.column_stack((peaks, bits))

@@ -10,9 +10,9 @@ from typing import Protocol
 import mujoco
 import torch
 
+from mjstack.sim.model_fields import Fields
 from mjstack.sim.repeated import Repeated
 from mjstack.sim.sizes import BatchSizes
-from mjstack.sim.views import Fields
 
 
 class Overflow(IntFlag):

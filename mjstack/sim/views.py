@@ -1,48 +1,37 @@
-"""Views that keep their memory: what guards them against rebinding, and the check of a mask over
-worlds.
-"""
+"""The base of a simulation, whose views keep their memory, and the check of a mask over worlds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-
 import torch
 
-from mjstack.errors import ArgumentError, MissingField, RebindError
-
-
-class Fields(Mapping[str, torch.Tensor]):
-    """Per-world model fields by MuJoCo's name. Write into a tensor; the mapping itself cannot be
-    changed.
-    """
-
-    def __init__(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        self._tensors = dict(tensors)
-
-    def __getitem__(self, name: str) -> torch.Tensor:
-        if name not in self._tensors:
-            raise MissingField(name)
-        return self._tensors[name]
-
-    def __setitem__(self, name: str, value: torch.Tensor) -> None:
-        # Python ends `fields[name] *= 2` by setting the item to the tensor that it has just changed
-        # in place.
-        if self[name] is not value:
-            raise RebindError(f"sim.fields['{name}']")
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._tensors)
-
-    def __len__(self) -> int:
-        return len(self._tensors)
+from mjstack.errors import ArgumentError, RebindError
+from mjstack.sim.model_fields import Fields
+from mjstack.sim.repeated import Repeated
+from mjstack.sim.sizes import BatchSizes
 
 
 class FixedViews:
     """Base of a simulation: an attribute that holds a tensor keeps that tensor for life.
 
     Captured graphs and the stepping code know the memory, not the attribute: a rebound view would
-    be ignored without a word.
+    be ignored without a word. Capabilities that not every backend has are None here.
     """
+
+    sizes: BatchSizes | None = None
+    peak_pool: torch.Tensor | None = None
+    solver_limits: torch.Tensor | None = None
+
+    def graph_of(self, n: int = 1, *, kinematics: bool = False) -> Repeated | None:
+        """The graph that ``step(n)`` replays; None: nothing is captured."""
+        return None
+
+    def memory_bytes(self) -> int | None:
+        """Bytes of the arrays that grow with nworld; None: they are not counted."""
+        return None
+
+    def borrowed_bytes(self) -> int | None:
+        """The most that a step borrows at once beside them; None: it is not known."""
+        return None
 
     def __setattr__(self, name: str, value: object) -> None:
         bound = self.__dict__.get(name)

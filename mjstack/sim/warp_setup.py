@@ -1,9 +1,13 @@
-"""Orders Warp's work with torch's."""
+"""Warp, configured before its first use, and ordered with torch's work."""
 
 from __future__ import annotations
 
 import torch
 import warp as wp
+
+__all__ = ["torch_stream_scope", "wp"]
+
+wp.config.log_level = wp.LOG_ERROR  # it would greet on every run
 
 # One object per torch stream, for ever: a second one for the same stream would unregister it when
 # freed.

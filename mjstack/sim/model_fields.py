@@ -1,0 +1,146 @@
+"""Model fields that may differ from world to world, and what native MuJoCo derives from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+import mujoco
+import numpy as np
+import torch
+
+from mjstack.errors import MissingField, RebindError, UnknownName
+
+# The float arrays that `mujoco_warp.put_model` batches, as of 4.0, by the first word of MuJoCo's
+# names; a test compares them with the installed version. Left out: integers, which are the model's
+# structure, and delays, which size the history buffers.
+_NAMES = {
+    "qpos0": "",
+    "qpos": "spring",
+    "body": "pos quat ipos iquat mass subtreemass inertia invweight0 gravcomp",
+    "jnt": "solref solimp pos axis stiffness stiffnesspoly springyield range actfrcrange margin",
+    "dof": "solref solimp frictionloss armature damping dampingpoly invweight0",
+    "geom": (
+        "solmix solref solimp size aabb rbound pos quat friction margin gap surfacevel adhesion"
+        " rgba"
+    ),
+    "site": "pos quat",
+    "cam": "pos quat poscom0 pos0 mat0 fovy intrinsic",
+    "light": "pos dir poscom0 pos0 dir0 attenuation cutoff exponent ambient diffuse specular",
+    "mat": "texrepeat emission specular shininess rgba",
+    "pair": "solref solreffriction solimp margin gap adhesion friction",
+    "eq": "solref solimp data",
+    "tendon": (
+        "solref_lim solimp_lim solref_fri solimp_fri range actfrcrange margin stiffness"
+        " stiffnesspoly damping dampingpoly armature frictionloss lengthspring springyield length0"
+        " invweight0"
+    ),
+    "actuator": (
+        "cranklength dynprm gainprm biasprm actrange damping dampingpoly armature forcerange"
+        " ctrlrange gear acc0 lengthrange"
+    ),
+}
+FIELD_NAMES = tuple(
+    f"{first}_{rest}" if rest else first
+    for first, words in _NAMES.items()
+    for rest in words.split() or [""]
+)
+
+# Fields that place geoms: MJWarp places the ones that never move only once.
+PLACING_FIELDS = frozenset({"body_pos", "body_quat", "geom_pos", "geom_quat"})
+
+
+def check_fields(names: Iterable[str]) -> tuple[str, ...]:
+    """The names, each once.
+
+    Raises:
+        UnknownName: A name is not a model field, or one that every world shares.
+    """
+    for name in names:
+        if name not in FIELD_NAMES:
+            first = name.partition("_")[0]
+            alike = [known for known in FIELD_NAMES if known.partition("_")[0] == first]
+            raise UnknownName("per-world model field", name, alike or FIELD_NAMES)
+    return tuple(dict.fromkeys(names))
+
+
+class Fields(Mapping[str, torch.Tensor]):
+    """Per-world model fields by MuJoCo's name. Write into a tensor; the mapping itself cannot be
+    changed.
+    """
+
+    def __init__(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        self._tensors = dict(tensors)
+
+    def __getitem__(self, name: str) -> torch.Tensor:
+        if name not in self._tensors:
+            raise MissingField(name)
+        return self._tensors[name]
+
+    def __setitem__(self, name: str, value: torch.Tensor) -> None:
+        # Python ends `fields[name] *= 2` by setting the item to the tensor that it has just changed
+        # in place.
+        if self[name] is not value:
+            raise RebindError(f"sim.fields['{name}']")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tensors)
+
+    def __len__(self) -> int:
+        return len(self._tensors)
+
+
+class SimpleBodies:
+    """Keeps ``dof_M0`` of simple bodies up to date with per-world mass, inertia and armature.
+
+    Native MuJoCo does not compute the mass matrix of a body that it calls simple, such as a free
+    cube: it reads ``dof_M0``, which the compiler made from mass, inertia and armature. A body whose
+    mass is changed would weigh more and resist no more, so ``dof_M0`` has to follow.
+
+    Attributes:
+        dof_M0: Diagonal of the mass matrix at qpos0 [kg, kg m2], shape ``(nworld, nv)``.
+    """
+
+    FIELDS = frozenset({"body_mass", "body_inertia", "dof_armature"})
+
+    def __init__(
+        self, model: mujoco.MjModel, fields: Mapping[str, np.ndarray], nworld: int
+    ) -> None:
+        """Finds the degrees of freedom and what their inertia is made of.
+
+        Args:
+            model: The compiled model.
+            fields: Every world's values of the fields that differ.
+            nworld: Number of worlds.
+        """
+        self.dof_M0 = np.repeat(model.dof_M0[None], nworld, axis=0)
+        self._dofs = np.flatnonzero(model.dof_simplenum)
+        self._bodies = model.dof_bodyid[self._dofs]
+        self._sources = [
+            fields.get(name, getattr(model, name)[None])
+            for name in ("body_mass", "body_inertia", "dof_armature")
+        ]
+        # A simple body's inertial step is its own frame, so inertia is diagonal there: M0 =
+        # armature + a * mass + b . inertia.
+        self._a, self._b = np.zeros(len(self._dofs)), np.zeros((len(self._dofs), 3))
+        for i, dof in enumerate(self._dofs):
+            joint = model.dof_jntid[dof]
+            k = int(dof - model.jnt_dofadr[joint])
+            kind = model.jnt_type[joint]
+            if kind == mujoco.mjtJoint.mjJNT_SLIDE or (
+                kind == mujoco.mjtJoint.mjJNT_FREE and k < 3
+            ):
+                self._a[i] = 1.0
+            elif kind == mujoco.mjtJoint.mjJNT_HINGE:
+                axis = model.jnt_axis[joint]
+                self._a[i] = np.sum(np.cross(axis, model.jnt_pos[joint]) ** 2)
+                self._b[i] = axis**2
+            else:
+                self._b[i, k % 3] = 1.0
+
+    def update(self) -> None:
+        """Computes dof_M0 from what the fields hold now."""
+        mass, inertia, armature = self._sources
+        spin = (inertia[:, self._bodies] * self._b).sum(-1)
+        self.dof_M0[:, self._dofs] = (
+            armature[:, self._dofs] + mass[:, self._bodies] * self._a + spin
+        )
