@@ -16,6 +16,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from mjstack import MjstackError, load_config
+from mjstack.cli import run
 
 DOCS = ROOT / "docs"
 GUIDES = [page.name for page in PAGES[1:] if python_blocks(page.read_text(encoding="utf-8"))]
@@ -45,7 +46,7 @@ def test_python_blocks_run(name: str, tmp_path: Path) -> None:
     script = tmp_path / f"{Path(name).stem}_blocks.py"
     script.write_text(program, encoding="utf-8")
     env = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
-    run = subprocess.run(
+    done = subprocess.run(
         [sys.executable, str(script)],
         cwd=tmp_path,
         env=env,
@@ -53,7 +54,9 @@ def test_python_blocks_run(name: str, tmp_path: Path) -> None:
         text=True,
         timeout=600,
     )
-    assert run.returncode == 0, f"line numbers are those of docs/{name}\n{run.stdout}\n{run.stderr}"
+    assert done.returncode == 0, (
+        f"line numbers are those of docs/{name}\n{done.stdout}\n{done.stderr}"
+    )
 
 
 def shown_commands() -> list[dict[str, str]]:
@@ -94,6 +97,18 @@ def test_shown_commands_compose() -> None:
         except MjstackError:  # they do not fit together, or one of them does not fit at all
             for command in group:
                 load_config(list(command.values()))
+
+
+def test_the_task_of_the_guide_passes_its_gate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (DOCS / "own_tasks.md").read_text(encoding="utf-8")
+    write_files(text, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    command = re.findall(r"(?m)^\$ mjstack (--config-dir lift/conf .*)$", text)[0]
+    assert run(shlex.split(command)) == 0, capsys.readouterr()
+    assert "pass baseline" in capsys.readouterr().out
 
 
 def train(block: str, folder: Path) -> list[float]:
