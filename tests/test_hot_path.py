@@ -136,8 +136,7 @@ PATHS: dict[str, list[str] | None] = {
     "episodes/failures.py": ["FailureMonitor.update", "_of"],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",
-        "BatchedIk.grasp_point",
-        "BatchedIk.directions",
+        "BatchedIk._forward",
         "BatchedIk._launch",
         "BatchedIk._copy_in",
     ],

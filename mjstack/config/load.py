@@ -27,9 +27,9 @@ from mjstack.config.session import (
     without_hydra,
 )
 from mjstack.config.terms import type_terms
-from mjstack.config.trust import check_trusted
+from mjstack.config.trust import check_trusted, used_folder
 from mjstack.config.validate import validate
-from mjstack.errors import CompositionError
+from mjstack.errors import CompositionError, ConfigError
 
 ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
 for _name, _node in JOB_SCHEMAS.items():
@@ -111,7 +111,12 @@ def load_saved(path: Path) -> Config:
     if missing:
         raise CompositionError(f"{missing[0]} is missing, expected every key of this version.")
     check_trusted(cast(DictConfig, merged), path.parent)
-    return to_config(cast(DictConfig, merged))
+    try:
+        return to_config(cast(DictConfig, merged))
+    except ConfigError as error:
+        if error.key != "robot.file":
+            raise
+        raise CompositionError(f"{error} {used_folder(path.parent)}") from error
 
 
 def to_config(cfg: DictConfig) -> Config:

@@ -23,13 +23,17 @@ def check_trusted(cfg: DictConfig, saved: Path) -> None:
     """
     for key, name in _functions("", OmegaConf.to_container(cfg, resolve=False)):
         if not is_trusted(name):
-            used = _used_folders(saved)
-            had = f"the run used --config-dir {used[0]}" if used else "the run had none"
             raise CompositionError(
                 f"{key}={name}: expected a name of mjstack, of a package registered under"
-                f" mjstack.configs, or beside a folder of the search path; {had}. If you trust it,"
-                " add --config-dir DIR."
+                f" mjstack.configs, or beside a folder of the search path. {used_folder(saved)}"
             )
+
+
+def used_folder(saved: Path) -> str:
+    """What to do about a name or a file that only the search path of an earlier run has."""
+    used = _used_folders(saved)
+    had = f"used --config-dir {used[0]}" if used else "had no --config-dir"
+    return f"The run {had}: if you trust it, add --config-dir DIR."
 
 
 def _functions(prefix: str, node: object) -> Iterator[tuple[str, str]]:

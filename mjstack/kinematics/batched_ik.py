@@ -12,7 +12,7 @@ import warp as wp
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError, UnknownName
 from mjstack.kinematics.chain import build_chain
-from mjstack.kinematics.ik_kernels import directions_kernel, grasp_point_kernel, solve_kernel
+from mjstack.kinematics.ik_kernels import forward_kernel, solve_kernel
 from mjstack.kinematics.joints import joint_limits
 from mjstack.scene.index import find
 from mjstack.sim.warp_setup import torch_stream_scope
@@ -125,8 +125,7 @@ class BatchedIk:
         # Memory and kernels
         self._allocate(model, robot)
         q = self._view["q"]
-        self.grasp_point(q)  # compiles and loads the kernels: a capture may do neither
-        self.directions(q)
+        self._forward(q)  # compiles and loads the kernels: a capture may do neither
         self.solve(q, self._view["target"])
         wp.synchronize_device(self._device)
 
@@ -139,9 +138,7 @@ class BatchedIk:
         Returns:
             Grasp point [m], shape ``(nworld, 3)``, float32.
         """
-        self._copy_in("q", q)
-        self._launch(grasp_point_kernel, ["q"], [], ["point"])
-        return self._view["point"]
+        return self._forward(q)[0]
 
     def directions(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The closing and the approach axis in one launch.
@@ -152,9 +149,7 @@ class BatchedIk:
         Returns:
             The results of `closing_axis` and `approach`.
         """
-        self._copy_in("q", q)
-        self._launch(directions_kernel, ["q"], [], ["closing", "pointing"])
-        return self._view["closing"], self._view["pointing"]
+        return self._forward(q)[1:]
 
     def closing_axis(self, q: torch.Tensor) -> torch.Tensor:
         """Unit vector from the first grasp site to the second; zero where they meet.
@@ -165,7 +160,7 @@ class BatchedIk:
         Returns:
             The closing axis, shape ``(nworld, 3)``, float32.
         """
-        return self.directions(q)[0]
+        return self._forward(q)[1]
 
     def approach(self, q: torch.Tensor) -> torch.Tensor:
         """The robot's approach axis, from the wrist towards the grasped object.
@@ -176,7 +171,7 @@ class BatchedIk:
         Returns:
             A unit vector, shape ``(nworld, 3)``, float32.
         """
-        return self.directions(q)[1]
+        return self._forward(q)[2]
 
     def solve(
         self,
@@ -232,6 +227,12 @@ class BatchedIk:
             ["solution", "distance", "unreachable"],
         )
         return self._view["solution"], self._view["distance"]
+
+    def _forward(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Grasp point, closing axis and approach axis."""
+        self._copy_in("q", q)
+        self._launch(forward_kernel, ["q"], [], ["point", "closing", "pointing"])
+        return self._view["point"], self._view["closing"], self._view["pointing"]
 
     def _allocate(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
         """Make the chain, the kernel and all buffers, each a Warp array and a torch view of it."""

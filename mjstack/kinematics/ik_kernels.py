@@ -83,28 +83,15 @@ def follow(
 
 
 @wp.kernel(enable_backward=False)
-def grasp_point_kernel(chain: Chain, q: wp.array2d[float], point: wp.array[wp.vec3]) -> None:
-    """Grasp point of every world."""
-    w = wp.tid()
-    trunk = follow(chain, q, w, 0, chain.trunk, wp.transform_identity())
-    first = wp.transform_point(
-        follow(chain, q, w, chain.trunk, chain.fork, trunk), chain.first_site
-    )
-    second = wp.transform_point(
-        follow(chain, q, w, chain.fork, chain.end, trunk), chain.second_site
-    )
-    point[w] = wp.lerp(first, second, 0.5)
-
-
-@wp.kernel(enable_backward=False)
-def directions_kernel(
+def forward_kernel(
     chain: Chain,
     q: wp.array2d[float],
+    point: wp.array[wp.vec3],
     closing: wp.array[wp.vec3],
     approach: wp.array[wp.vec3],
 ) -> None:
-    """Unit vectors of every world's gripper: from the first site to the second, and the approach
-    axis.
+    """Grasp point of every world, and unit vectors of its gripper: from the first site to the
+    second, and the approach axis.
     """
     w = wp.tid()
     trunk = follow(chain, q, w, 0, chain.trunk, wp.transform_identity())
@@ -114,6 +101,7 @@ def directions_kernel(
     second = wp.transform_point(
         follow(chain, q, w, chain.fork, chain.end, trunk), chain.second_site
     )
+    point[w] = wp.lerp(first, second, 0.5)
     closing[w] = wp.normalize(wp.sub(second, first))
     approach[w] = wp.transform_vector(trunk, chain.approach)
 
