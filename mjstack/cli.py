@@ -30,7 +30,7 @@ from rich.console import Console
 
 import mjstack
 from mjstack.config import Config
-from mjstack.config.help import help_text
+from mjstack.config.help import help_text, key_help
 from mjstack.config.load import compose, explained, split_search_path, to_config
 from mjstack.config.overrides import check_overrides, parse
 from mjstack.config.session import (
@@ -84,11 +84,10 @@ def run(args: list[str]) -> int:
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     """Does what the flags ask for, on the current search path."""
-    if flags.help:
-        _print_help()
-        return 0
     with hydra_session() as hydra:
-        if flags.hydra_help:
+        if flags.help:
+            _print_help(hydra, overrides)
+        elif flags.hydra_help:
             hydra.hydra_help(CONFIG_NAME, args_parser=get_args_parser(), args=flags)
         elif flags.info is not None:
             hydra.show_info(flags.info, CONFIG_NAME, overrides)
@@ -148,10 +147,17 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     return max(result.exit_code for result in results)
 
 
-def _print_help() -> None:
-    """Prints what `--help` says, to a reader that may not want all of it, such as ``| head``."""
+def _print_help(hydra: Hydra, args: list[str]) -> None:
+    """Prints the help, or the keys below the ones among the arguments, as the overrides have them.
+
+    The reader may not want all of it, such as ``| head``.
+    """
+    width = min(max(shutil.get_terminal_size((120, 24)).columns, 60), 120)
+    keys = [arg for arg in args if "=" not in arg and not arg.startswith("~")]
+    cfg = to_config(compose(hydra, [arg for arg in args if arg not in keys]))
+    texts = [key_help(cfg, key, width) for key in keys] or [help_text(cfg, width)]
     try:
-        print(help_text(min(max(shutil.get_terminal_size((120, 24)).columns, 60), 120)), flush=True)
+        print("\n".join(texts), flush=True)
     except BrokenPipeError:
         os.dup2(
             os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()

@@ -31,8 +31,34 @@ reward:
     weight: 2.0
 """
 MODULE = """
+from dataclasses import dataclass
+
+from mjstack.config import spec
+from mjstack.config.schema import GateFuncCfg
+from mjstack.report.record import GateResult, Status
+
+
 def height(env, *, scale=3.0):
     return scale * env.sim.qpos[:, 0]
+
+
+@dataclass(kw_only=True)
+class UprightCfg(GateFuncCfg):
+    limit: float = spec(unit="m", gt=0.0)
+    note: str = "none"
+
+
+def run_upright(context):
+    cfg = context.cfg.gate["upright"]
+    status = Status.passed if cfg.limit < 2.0 else Status.failed
+    return [GateResult(name="upright", status=status, reason=cfg.note)]
+
+
+run_upright.config = UprightCfg
+"""
+GATE = """# A gate of one's own.
+func: lean.run_upright
+limit: 1.0
 """
 
 
@@ -44,6 +70,8 @@ def lean(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     conf = tmp_path / "lean" / "conf"
     (conf / "task").mkdir(parents=True)
     (conf / "task" / "lean.yaml").write_text(TASK)
+    (conf / "gate").mkdir()
+    (conf / "gate" / "upright.yaml").write_text(GATE)
     (tmp_path / "lean" / "lean.py").write_text(MODULE)
     yield conf
     sys.modules.pop("lean", None)
@@ -101,6 +129,24 @@ def test_a_sweep_and_a_replay(
     saved.write_text(saved.read_text().replace("lean.height", "shutil.rmtree"))
     with search_path([lean]), pytest.raises(MjstackError, match=r"shutil\.rmtree"):
         load_saved(saved)
+
+
+def test_a_gate_of_one_s_own(
+    lean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--config-dir", str(lean), "gates=[upright]"]
+    assert run([*flags, "hydra.run.dir=a"]) == 0
+    report = json.loads((tmp_path / "a" / "report.json").read_text())
+    assert [gate["name"] for gate in report["gates"]] == ["upright"]
+    assert "gate=" not in (tmp_path / "a" / ".hydra" / "overrides.yaml").read_text()
+    assert run([*flags, "gate.upright.limit=3.0", "hydra.run.dir=b"]) == 1
+    assert run([*flags, "--help", "gate.upright"]) == 0
+    capsys.readouterr()
+    said = refused([*flags, "gate.upright.limit=0.0"], capsys)
+    assert said == "mjstack: gate.upright.limit=0.0: expected a number above 0 [m]."
+    assert "Did you mean 'limit'?" in refused([*flags, "+gate.upright.limits=1.0"], capsys)
+    assert "Did you mean 'upright'?" in refused([*flags, "gate.uprigt.limit=1.0"], capsys)
+    assert "Available: baseline" in refused(["gates=[upright]"], capsys)
 
 
 def test_a_bad_folder_is_refused(lean: Path, capsys: pytest.CaptureFixture[str]) -> None:

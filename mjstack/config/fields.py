@@ -16,8 +16,8 @@ import inspect
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING as NO_DEFAULT
 from dataclasses import Field, dataclass, field, fields, is_dataclass
+from enum import EnumMeta
 from functools import cache
 from itertools import pairwise
 from types import NoneType, UnionType
@@ -27,6 +27,8 @@ from omegaconf import MISSING
 
 from mjstack.errors import ConfigError
 
+MOST_WORLDS = (1 << 31) - 1  # Warp counts them with 32 bits
+MOST_SEEDS = 1 << 32  # seeds are 32-bit
 _SPEC = "mjstack"  # key of a field's metadata
 
 
@@ -152,13 +154,24 @@ def _check(path: str, value: object, owner: type, item: Field) -> None:
 
 def accepted(owner: type, item: Field) -> str:
     """Values that a field accepts, in words: ``a number above 0 [s]``."""
-    limits = field_range(item)
-    if limits.choices:
-        return f"one of {', '.join(map(str, limits.choices))}"
-    kind, several = _kind(_hints(owner)[item.name])
-    noun = {int: "integer", float: "number", str: "name"}.get(kind, "value")
+    hint = _hints(owner)[item.name]
+    null = " or null" if NoneType in get_args(hint) else ""
+    return _accepted(field_range(item), hint) + null
+
+
+def _accepted(limits: Range, hint: Any) -> str:
+    hint, several, mapping = _kind(hint)
+    if limits.choices or isinstance(hint, EnumMeta):
+        choices = limits.choices or hint.__members__
+        return f"{'some' if several else 'one'} of {', '.join(map(str, choices))}"
+    if hint is bool:
+        return "true or false"
+    noun = {int: "integer", float: "number", str: "name"}.get(hint, "value")
     if several:
-        noun = f"{'' if limits.length is None else f'{limits.length} '}{noun}s"
+        of = "keys and " if mapping else "a list of "
+        noun = f"{of}{'' if limits.length is None else f'{limits.length} '}{noun}s"
+    elif noun == "name":
+        noun = "text"
     else:
         noun = f"{'an' if noun == 'integer' else 'a'} {noun}"
     bounds = [
@@ -172,7 +185,7 @@ def accepted(owner: type, item: Field) -> str:
         bounds.append(f"of at least {limits.ge:.10g}")
     elif limits.le is not None:
         bounds.append(f"of at most {limits.le:.10g}")
-    if kind is float and not bounds and limits.finite:
+    if hint is float and not bounds and limits.finite:
         noun = noun.replace("number", "finite number")
     unit = f" [{limits.unit}]" if limits.unit else ""
     return " ".join([noun, " and ".join(bounds)]).rstrip() + unit
@@ -185,13 +198,6 @@ def field_docs(owner: type) -> dict[str, str]:
         if is_dataclass(cls):
             docs |= _own_docs(cls)
     return docs
-
-
-def field_default(item: Field) -> Any:
-    """A field's default, MISSING where the YAML must have a value."""
-    if item.default_factory is not NO_DEFAULT:
-        return item.default_factory()
-    return MISSING if item.default is NO_DEFAULT else item.default
 
 
 @cache
@@ -215,13 +221,15 @@ def _hints(owner: type) -> dict[str, Any]:
     return get_type_hints(owner)
 
 
-def _kind(hint: Any) -> tuple[Any, bool]:
-    """The type of a field's single values, and whether the field holds several of them."""
+def _kind(hint: Any) -> tuple[Any, bool, bool]:
+    """The type of a field's single values, whether it holds several, and whether by name."""
     several = False
+    mapping = False
     while get_args(hint):
         if get_origin(hint) in (Union, UnionType):
             hint = next(kind for kind in get_args(hint) if kind is not NoneType)
         else:
-            hint = get_args(hint)[-1]
+            mapping = mapping or get_origin(hint) is dict
             several = True
-    return hint, several
+            hint = get_args(hint)[-1]
+    return hint, several, mapping

@@ -1,20 +1,25 @@
-"""What ``--help`` says. Groups, choices, keys and the words for them are read from `conf/`, where
-they are defined.
+"""Text of ``--help`` and of the configuration reference.
+
+Groups and choices are those of the search path; units, ranges and words are those of the fields.
 """
 
 from __future__ import annotations
 
+import json
 import re
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
 from importlib.resources import files
 
+from mjstack.config.fields import accepted, field_docs
+from mjstack.config.schema import JOB_SCHEMAS, Config
 from mjstack.config.session import list_choices
+from mjstack.errors import UnknownName
 
 _CONF = files("mjstack.conf")
 _GROUP = re.compile(r"  - (?P<name>\w+): (?P<default>\[.*\]|\S+) # (?P<words>.+)")
-_KEY = re.compile(r"(?P<name>\w+): (?P<default>\[.*\]|\S+) # (?P<words>.+)")
 _EXAMPLES = (
     ("robot=rebot nworld=64", "all gates this machine can run"),
     ("'gates=[baseline,parity]' timing=fine", "two gates, 1 ms physics"),
@@ -39,6 +44,7 @@ _EXAMPLES = (
     ),
 )
 _FLAGS = (
+    ("--help gate.batch", "keys below one, with unit, range and meaning"),
     ("--cfg job", "print the whole configuration as the other arguments make it, and run nothing"),
     (
         "--cfg job -p gate.batch",
@@ -69,17 +75,27 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A top-level key: its name, its default as YAML has it, and what it is."""
+    """A configuration key.
+
+    Attributes:
+        name: Dotted, such as ``gate.batch.seeds``.
+        value: Its value, as YAML has it.
+        accepts: Its type, range and unit.
+        words: Its meaning.
+    """
 
     name: str
-    default: str
+    value: str
+    accepts: str
     words: str
 
 
 def list_groups() -> list[Group]:
     """The groups of the whole search path, mjstack's in the order of composition first."""
     choices = list_choices()
-    known = {name: (default, words) for name, default, words in _entries(_GROUP)}
+    lines = _CONF.joinpath("config.yaml").read_text(encoding="utf-8").splitlines()
+    found = [match for line in lines if (match := _GROUP.fullmatch(line))]
+    known = {match["name"]: (match["default"], match["words"]) for match in found}
     groups = []
     for name in [*known, *(name for name in choices if name not in known)]:
         default, words = known.get(name, ("", "added by the search path"))
@@ -89,15 +105,88 @@ def list_groups() -> list[Group]:
     return groups
 
 
-def list_keys() -> list[Key]:
-    """The top-level keys that are no groups."""
-    return [Key(*entry) for entry in _entries(_KEY)]
+def list_keys(value: object, name: str = "", *, named: bool = True) -> Iterator[Key]:
+    """Keys of a configuration at and below one of its parts.
+
+    Args:
+        value: The part.
+        name: Its dotted key.
+        named: Whether entries that users name, such as terms, are listed each. Otherwise the first
+            one stands for all, as NAME and without values.
+    """
+    docs = field_docs(type(value))
+    for item in fields(value) if is_dataclass(value) else ():
+        part = getattr(value, item.name)
+        key = f"{name}.{item.name}".lstrip(".")
+        if is_dataclass(part):
+            yield from list_keys(part, key, named=named)
+        elif isinstance(part, dict) and any(map(is_dataclass, part.values())):
+            for entry in part if named else list(part)[:1]:
+                yield from list_keys(
+                    part[entry], f"{key}.{entry if named else 'NAME'}", named=named
+                )
+        else:
+            shown = "" if ".NAME" in key else _yaml(part)
+            yield Key(key, shown, accepted(type(value), item), docs.get(item.name, ""))
 
 
-def help_text(width: int) -> str:
-    """The whole text, in lines that are not longer than ``width``."""
+def key_help(cfg: Config, prefix: str, width: int) -> str:
+    """Keys of a configuration at and below a dotted one, with unit, range and meaning.
+
+    Raises:
+        UnknownName: There is no such key.
+    """
+    keys = [key for key in list_keys(cfg) if key.name != "gate.added"]
+    for name, params in cfg.gate.added.items():  # typed only when its module is loaded
+        keys += [
+            Key(f"gate.{name}.{k}", _yaml(v), "what its gate does", "") for k, v in params.items()
+        ]
+    found = [key for key in keys if f"{key.name}.".startswith(f"{prefix}.")]
+    if not found:
+        parent = prefix.rpartition(".")[0]
+        depth = prefix.count(".") + 1
+        beside = [key.name for key in keys if f".{key.name}".startswith(f".{parent}")]
+        raise UnknownName("key", prefix, {".".join(name.split(".")[:depth]) for name in beside})
+    rows = [(f"{k.name}={k.value}", f"{k.words} Accepts {k.accepts}.".strip()) for k in found]
+    lines = []
+    for name, words in rows:
+        lines += [name, *textwrap.wrap(words, width, initial_indent="  ", subsequent_indent="  ")]
+    return "\n".join(lines)
+
+
+def reference_markdown() -> str:
+    """Every key of the default configuration and of the jobs as Markdown tables, by group."""
+    from mjstack.config.load import load_config  # which needs this module for its errors
+
+    cfg = load_config()
+    words = field_docs(Config)
+    groups = {group.name: group for group in list_groups()}
+    sections: dict[str, list[Key]] = {}
+    for key in list_keys(cfg, named=False):
+        sections.setdefault(key.name.partition(".")[0] if "." in key.name else "", []).append(key)
+    sections["job"] = []
+    for name in JOB_SCHEMAS:
+        own = list_keys(load_config([f"job={name}"]).job, "job", named=False)
+        sections["job"] += [k for k in own if k.name not in ("job.name", "job.func")]
+    text = []
+    for section, keys in sections.items():
+        choices = f" Choices: {', '.join(groups[section].choices)}." if section in groups else ""
+        text += [f"## {section or 'Top level'}", "", words.get(section, "") + choices, ""]
+        text += ["| key | default | accepts | meaning |", "| --- | --- | --- | --- |"]
+        for k in keys:
+            cells = (f"`{k.name}`", f"`{k.value}`" if k.value else "", k.accepts, k.words)
+            text.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
+        text.append("")
+    return "\n".join(text)
+
+
+def help_text(cfg: Config, width: int) -> str:
+    """The whole text, in lines that are not longer than ``width``, with a configuration's
+    values.
+    """
     groups = [(group.name, f"{group.words}: {', '.join(group.choices)}") for group in list_groups()]
-    keys = [(key.name, f"{key.words} ({key.default.replace(', ', ',')})") for key in list_keys()]
+    keys = [(k.name, f"{k.words} ({k.value})") for k in list_keys(cfg) if "." not in k.name]
+    keys = [(name, words) for name, words in keys if name not in {g for g, _ in groups}]
     parts = [
         [
             "mjstack: two cubes and one simulated arm, from native MuJoCo to thousands of MuJoCo"
@@ -117,8 +206,8 @@ def help_text(width: int) -> str:
         ],
         ["Keys, to be set as key=value, and their defaults:", *_table(keys, width)],
         [
-            "What groups hold can be set too: gate.batch.seeds=10. ~reward.grasp leaves a term out,"
-            " +reward.mine=... adds one. --cfg job prints them all."
+            "Keys below a group can be set too: gate.batch.seeds=10. ~reward.grasp leaves a term"
+            " out, +reward.mine=... adds one."
         ],
         ["Flags:", *_table(_FLAGS, width)],
         [_STATUSES],
@@ -128,10 +217,15 @@ def help_text(width: int) -> str:
     )
 
 
-def _entries(pattern: re.Pattern[str]) -> Iterator[tuple[str, str, str]]:
-    for line in _CONF.joinpath("config.yaml").read_text(encoding="utf-8").splitlines():
-        if match := pattern.fullmatch(line):
-            yield match["name"], match["default"], match["words"]
+def _yaml(value: object) -> str:
+    """A value as a command line has it."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, Enum):
+        return str(value.value)
+    if isinstance(value, list | tuple) and all(isinstance(part, str) for part in value):
+        return f"[{','.join(value)}]"
+    return json.dumps(value, default=str).replace(", ", ",").replace('"', "")
 
 
 def _table(rows: Sequence[tuple[str, str]], width: int) -> list[str]:

@@ -31,7 +31,9 @@ from mjstack.config.trust import check_trusted, used_folder
 from mjstack.config.validate import validate
 from mjstack.errors import CompositionError, ConfigError
 
-ConfigStore.instance().store(name="mjstack_schema", node=Config, provider="mjstack")
+_schema = OmegaConf.structured(Config)
+_schema.gate._set_flag("struct", False)  # gates of the search path are added to it
+ConfigStore.instance().store(name="mjstack_schema", node=_schema, provider="mjstack")
 for _name, _node in JOB_SCHEMAS.items():
     ConfigStore.instance().store(name=f"{_name}_schema", node=_node, provider="mjstack")
 
@@ -100,7 +102,7 @@ def load_saved(path: Path) -> Config:
             functions that are not in the search path.
     """
     try:
-        merged = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.load(path))
+        merged = OmegaConf.merge(_schema, OmegaConf.load(path))
         missing = sorted(OmegaConf.missing_keys(merged))
     except OmegaConfBaseException as error:
         raise explain(error) from error

@@ -170,10 +170,22 @@ class _Loader(ConfigLoaderImpl):
         """Compose, or return the composition of an earlier call."""
         key = (config_name, *overrides, run_mode)
         if key not in self._composed:
-            self._composed[key] = super().load_configuration(
-                config_name, overrides, run_mode, from_shell, validate_sweep_overrides
+            gates = [f"+gate@gate.{name}={name}" for name in self._added_gates()]
+            cfg = super().load_configuration(
+                config_name, [*gates, *overrides], run_mode, from_shell, validate_sweep_overrides
             )
+            said = cfg.hydra.overrides.task
+            cfg.hydra.overrides.task = [override for override in said if override not in gates]
+            self._composed[key] = cfg
         return self._composed[key]
+
+    def _added_gates(self) -> list[str]:
+        """Gates of the search path that are not mjstack's: all of them are composed."""
+        names = set(self.repository.get_group_options("gate", ObjectType.CONFIG))
+        for source in self.repository.get_sources():
+            if source.provider == "main":
+                names -= set(source.list("gate", ObjectType.CONFIG))
+        return sorted(names)
 
 
 def _entry(text: str) -> str:

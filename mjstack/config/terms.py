@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, fields
-from enum import EnumMeta
 from functools import cache
-from typing import Any, cast, get_type_hints
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from mjstack.config.fields import accepted
 from mjstack.config.schema import (
     ActionTermCfg,
     Config,
@@ -31,6 +31,9 @@ def type_terms(cfg: Config) -> None:
     Raises:
         MjstackError: A term has an unknown key, lacks one, or a value has the wrong type.
     """
+    known = {field.name for field in fields(cfg.gate)}
+    for name in [name for name in vars(cfg.gate) if name not in known]:
+        cfg.gate.added[name] = vars(cfg.gate).pop(name)
     cfg.action = _terms("action", cfg.action, ActionTermCfg)
     cfg.controller.action = _terms("controller.action", cfg.controller.action, ActionTermCfg)
     cfg.reset = _terms("reset", cfg.reset, TermCfg)
@@ -101,10 +104,5 @@ def _find_misfit(key: str, node: dict[str, Any], kind: type) -> None:
         try:
             OmegaConf.merge(_schema(kind), {name: value})
         except OmegaConfBaseException as error:
-            hint = get_type_hints(kind)[name]
-            wanted = (
-                " or ".join(hint.__members__)
-                if isinstance(hint, EnumMeta)
-                else fields(kind)[names.index(name)].type
-            )
-            raise ConfigError(f"{key}.{name}", value, str(wanted)) from error
+            item = fields(kind)[names.index(name)]
+            raise ConfigError(f"{key}.{name}", value, accepted(kind, item)) from error

@@ -7,28 +7,39 @@ import time
 import traceback
 from collections.abc import Callable
 
+from mjstack.config.fields import check_fields
+from mjstack.config.schema import Config
+from mjstack.config.terms import typed
 from mjstack.episodes.context import RunContext, lacks_episode
 from mjstack.errors import MjstackError, is_out_of_memory
-from mjstack.gates.baseline import run_baseline
-from mjstack.gates.batch import run_batch
-from mjstack.gates.capacity import run_capacity
-from mjstack.gates.parity import run_parity
-from mjstack.gates.success import run_success
-from mjstack.gates.throughput import run_throughput
+from mjstack.managers.base import resolve_func
 from mjstack.report.record import GateResult, Status
 
 log = logging.getLogger(__name__)
 
 Gate = Callable[[RunContext], list[GateResult]]
 
-GATES: dict[str, Gate] = {
-    "baseline": run_baseline,
-    "parity": run_parity,
-    "capacity": run_capacity,
-    "batch": run_batch,
-    "throughput": run_throughput,
-    "success": run_success,
-}
+
+def find_gates(cfg: Config) -> dict[str, Gate]:
+    """Functions of the gates that run, by name and in their order.
+
+    A gate of the search path may carry a subclass of `GateFuncCfg` as its attribute ``config``: its
+    parameters, ``cfg.gate[name]``, become one of these.
+
+    Raises:
+        MjstackError: A function cannot be found, or does not take its parameters.
+    """
+    gates = {}
+    for name, path in cfg.gate.functions().items():
+        if name not in cfg.gates:
+            continue
+        func = resolve_func(f"gate.{name}", path)
+        kind = getattr(func, "config", None)
+        if kind is not None and isinstance(cfg.gate[name], dict):
+            cfg.gate.added[name] = typed(f"gate.{name}", cfg.gate[name], kind)
+            check_fields(f"gate.{name}", cfg.gate[name])
+        gates[name] = func
+    return gates
 
 
 def run_gates(
@@ -36,7 +47,8 @@ def run_gates(
     on_start: Callable[[str], None] = lambda _: None,
     on_result: Callable[[GateResult], None] = lambda _: None,
 ) -> list[GateResult]:
-    """Runs the gates that the configuration names, each once, in the order of `GATES`.
+    """Runs the gates that the configuration names, each once, in the order of
+    ``cfg.gate``.
 
     Args:
         context: What they need. Its ``results`` fill up.
@@ -48,10 +60,9 @@ def run_gates(
         run.
     """
     out: list[GateResult] = []
-    for name, run in GATES.items():
-        if name in context.cfg.gates:
-            on_start(name)
-            out += run_guarded(context, name, run, on_result)
+    for name, run in find_gates(context.cfg).items():
+        on_start(name)
+        out += run_guarded(context, name, run, on_result)
     return out
 
 

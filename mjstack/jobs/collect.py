@@ -32,6 +32,7 @@ from mjstack.jobs.demonstration_spec import (
     make_spec,
 )
 from mjstack.jobs.gates import check_task
+from mjstack.jobs.job import Job
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, run_reported
@@ -197,3 +198,6 @@ def _way_back(home: Path, difference: Difference) -> str:
     ):  # it was made by other means than the command line
         return ""
     return f", or give what it was made with: {shlex.join(map(str, OmegaConf.load(saved)))}"
+
+
+JOB = Job(check_collect, run_collect_job, folder=collect_folder)

@@ -12,9 +12,10 @@ from mjstack.envs import build_env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.record import clear_records
 from mjstack.errors import ConfigError
-from mjstack.gates.runner import run_gates
+from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
 from mjstack.jobs.archived_starts import archive_starts
+from mjstack.jobs.job import Job
 from mjstack.jobs.memory_check import check_room
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import JobResult
@@ -28,6 +29,7 @@ def check_machine(cfg: Config) -> RunContext:
     Returns:
         The context of the run.
     """
+    find_gates(cfg)
     context = RunContext(cfg)
     check_task(context)
     if (cfg.view or cfg.video) and not {"baseline", "parity"} & set(cfg.gates):
@@ -88,3 +90,6 @@ def _run(context: RunContext, bar: ProgressBar, record: Record) -> None:
         starts = context.cfg.starts
         clear_records(folder, keep=None if starts is None else Path(starts))
     run_gates(context, bar.start, record)
+
+
+JOB = Job(check_machine, run_gates_job)

@@ -17,6 +17,7 @@ from mjstack.config.schema import Config, ReachabilityJobCfg
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError
 from mjstack.files import write_atomic
+from mjstack.jobs.job import Job
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, run_reported
@@ -336,3 +337,6 @@ def _draw(
         context.say(f"no picture: {str(error) or type(error).__name__}")
         return
     _write(context, folder, levels, regions, "reachability.png")
+
+
+JOB = Job(check_reachability, run_reachability_job)

@@ -25,6 +25,7 @@ from mjstack.gates.success import success_config
 from mjstack.jobs.archived_starts import archived_starts, copy_names
 from mjstack.jobs.earlier_run import EarlierRun
 from mjstack.jobs.gates import check_task
+from mjstack.jobs.job import Job
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, check_showing, run_provenance, run_reported
@@ -369,3 +370,6 @@ def _compare(
     return True, (
         f"as recorded, but {ends}{why}" if same else f"NOT as recorded ({told}): {ends}{why}"
     )
+
+
+JOB = Job(check_replay, run_replay_job, keys=KEYS)

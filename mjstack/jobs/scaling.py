@@ -19,6 +19,7 @@ from mjstack.config.schema import Backend, Config, ScalingJobCfg
 from mjstack.errors import ConfigError
 from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.gates import check_machine
+from mjstack.jobs.job import Job
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import model_text
 from mjstack.jobs.scaling_run import OutOfTime, is_done, read_run, run_process
@@ -310,3 +311,6 @@ def _as_gate(row: Row) -> GateResult:
         metrics={key: value for key, value in row.items() if isinstance(value, float | int)},
         notes={key: row[key] for key in ("hardware", "git_commit") if row[key]},
     )
+
+
+JOB = Job(check_scaling, run_scaling_job, folder=scaling_folder)

@@ -21,6 +21,7 @@ from mjstack.episodes.rollout import State, restore
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.gates import check_machine
+from mjstack.jobs.job import Job
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, run_reported
@@ -330,3 +331,6 @@ def _draw(context: RunContext, folder: Path, rows: list[StudyRow]) -> None:
         context.say(f"no picture: {str(error) or type(error).__name__}")
         return
     _write_tables(context, folder, rows, "study.png")
+
+
+JOB = Job(check_study, run_study_job)

@@ -175,6 +175,18 @@ def resolve_func(label: str, path: str) -> Callable[..., Any]:
     Raises:
         TermError: There is no such module, or nothing callable of that name in it.
     """
+    func = find_object(label, path)
+    if not callable(func):
+        raise TermError(label, f"func={path}: expected a function or a class")
+    return func
+
+
+def find_object(label: str, path: str) -> Any:
+    """Finds anything in a module by its dotted name.
+
+    Raises:
+        TermError: There is no such module, or nothing of that name in it.
+    """
     module_name, _, attribute = path.rpartition(".")
     if not module_name:
         raise TermError(
@@ -188,8 +200,7 @@ def resolve_func(label: str, path: str) -> Callable[..., Any]:
         raise TermError(
             label, f"func={path}: module '{module_name}' cannot be imported ({kind}{reason})"
         ) from error
-    func = getattr(module, attribute, None)
-    if not callable(func):
+    if not hasattr(module, attribute):
         names = [
             name
             for name, value in vars(module).items()
@@ -198,7 +209,7 @@ def resolve_func(label: str, path: str) -> Callable[..., Any]:
         raise TermError(
             label, f"func={path}: '{attribute}' does not exist. {suggest(attribute, names)}"
         )
-    return func
+    return getattr(module, attribute)
 
 
 def check_params(

@@ -5,95 +5,138 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from omegaconf import MISSING
+from mjstack.config.fields import spec
 
 
 @dataclass(kw_only=True, slots=True)
-class ParityCfg:
-    """Tolerances of MJWarp against native MuJoCo: ``step1`` and ``step50`` map a field to its
-    largest difference.
-    """
+class GateFuncCfg:
+    """A gate: a function of the run's context, and its parameters."""
 
-    states: dict[str, str] = MISSING
-    step1: dict[str, float] = MISSING
-    step50: dict[str, float] = MISSING
-    object_position: float = MISSING
-    object_rotation_deg: float = MISSING
+    func: str = spec()
+    """Dotted name of the function: ``func(context) -> list[GateResult]``."""
 
 
 @dataclass(kw_only=True, slots=True)
-class CapacityCfg:
-    """How buffers are sized.
+class ParityCfg(GateFuncCfg):
+    """Tolerances of MJWarp against native MuJoCo."""
 
-    ``cpu_nworld`` worlds do where worlds are slow (any CPU backend); on CUDA all nworld do.
-    Recommended sizes are ``margin`` times the peaks. Random actions last ``random_steps``, one
-    whole episode if null. ``reset`` is how worlds start in the workload of randomised starts. An
-    environment with ``batch=auto`` is sized by ``probe_steps`` of random actions, on CUDA in at
-    most ``probe_nworld`` worlds.
-    """
-
-    cpu_nworld: int = MISSING
-    margin: float = MISSING
-    random_steps: int | None = None
-    probe_nworld: int = MISSING
-    probe_steps: int = MISSING
-    reset: dict[str, Any] = field(default_factory=dict)
+    states: dict[str, str] = spec()
+    """States from which both step: a name, and the phase at whose end the state is taken."""
+    step1: dict[str, float] = spec(unit="SI", ge=0.0)
+    """Largest difference of each field after one physics step."""
+    step50: dict[str, float] = spec(unit="SI", ge=0.0)
+    """Largest difference of each field after 50 physics steps."""
+    object_position: float = spec(unit="m", ge=0.0)
+    """Largest difference of an object's position after the whole task."""
+    object_rotation_deg: float = spec(unit="deg", ge=0.0)
+    """Largest difference of an object's orientation after the whole task."""
 
 
 @dataclass(kw_only=True, slots=True)
-class BatchGateCfg:
-    """The batch gate. It plays ``seeds`` seeds, the configured one and those after it, and judges
-    their worlds together.
-    """
+class CapacityCfg(GateFuncCfg):
+    """How buffers are sized."""
 
-    seeds: int = MISSING
-    failed_worlds: int = MISSING
-    distinct_fraction: float = MISSING
+    cpu_nworld: int = spec(unit="worlds", ge=1)
+    """Worlds that size the buffers on a CPU; on CUDA all nworld do."""
+    margin: float = spec(ge=1.0)
+    """Recommended sizes over the peaks."""
+    random_steps: int | None = spec(None, unit="steps", ge=1)
+    """Steps of random actions; null: one whole episode."""
+    probe_nworld: int = spec(unit="worlds", ge=1)
+    """Most worlds that size an environment with ``batch=auto`` on CUDA; on a CPU, cpu_nworld."""
+    probe_steps: int = spec(unit="steps", ge=1)
+    """Steps of random actions that size an environment with ``batch=auto``."""
+    reset: dict[str, Any] = spec(factory=dict)
+    """Reset terms of the workload with randomised starts."""
 
 
 @dataclass(kw_only=True, slots=True)
-class ThroughputCfg:
+class BatchGateCfg(GateFuncCfg):
+    """The batch gate plays every world of some seeds and judges them together."""
+
+    seeds: int = spec(unit="seeds", ge=1)
+    """Seeds that are played: the configured one and those after it."""
+    failed_worlds: int = spec(unit="worlds", ge=0)
+    """Worlds that may fail, over all seeds."""
+    distinct_fraction: float = spec(ge=0.0, le=1.0)
+    """Smallest share of distinct final states."""
+
+
+@dataclass(kw_only=True, slots=True)
+class ThroughputCfg(GateFuncCfg):
     """How throughput is measured."""
 
-    measurements: list[str] = MISSING
-    repetitions: int = MISSING
-    steps: int = MISSING
-    env_steps: int = MISSING
-    max_seconds: float = MISSING
-    cpu_max_seconds: float = MISSING
-    from_phase: str = MISSING
-    start_worlds: int = MISSING
-    native_baseline: bool = MISSING
+    measurements: list[str] = spec(choices=("physics", "episode", "env_step"))
+    """Measurements that are made."""
+    repetitions: int = spec(ge=1)
+    """Repetitions of each measurement."""
+    steps: int = spec(unit="steps", ge=1)
+    """physics: control steps per repetition."""
+    env_steps: int = spec(unit="steps", ge=1)
+    """env_step: steps per repetition."""
+    max_seconds: float = spec(unit="s", gt=0.0)
+    """Time budget of each measurement on CUDA."""
+    cpu_max_seconds: float = spec(unit="s", gt=0.0)
+    """Time budget of each measurement on a CPU."""
+    from_phase: str = spec()
+    """Phase at whose start physics begins; it holds the joint target from there."""
+    start_worlds: int = spec(unit="worlds", ge=1)
+    """Worlds that are played to that phase where the batch gate has not; the others are copies."""
+    native_baseline: bool = spec()
+    """Whether native MuJoCo is measured too on CUDA machines."""
 
 
 @dataclass(kw_only=True, slots=True)
-class SuccessGateCfg:
-    """The success gate: ``seeds`` seeds of nworld episodes each, of which the share ``rate`` must
-    succeed.
+class SuccessGateCfg(GateFuncCfg):
+    """The success gate plays episodes from randomised starts and needs a success rate."""
 
-    ``reset`` is how worlds start, unless ``reset=starts_file`` names a file. ``region`` sets the
-    half-widths of the cubes' region in x and y; null leaves them as ``reset`` has them. Start
-    places are counted in cells ``cell`` wide, directions of a cube relative to that of its place as
-    seen from the base in bins of ``yaw_cell_deg``. The ``worst_regions`` worst cells with at least
-    ``cell_episodes`` episodes are in the report's text.
-    """
+    seeds: int = spec(unit="seeds", ge=1)
+    """Seeds of nworld episodes each: the configured one and those after it."""
+    rate: float = spec(ge=0.0, le=1.0)
+    """Share of the episodes that must succeed."""
+    region: list[float] | None = spec(None, unit="m", length=2, ge=0.0)
+    """Half-widths of the objects' region in x and y; null: as ``reset`` has them."""
+    cell: float = spec(unit="m", gt=0.0)
+    """Width of the cells in which start positions are counted, in x and y."""
+    yaw_cell_deg: float = spec(unit="deg", gt=0.0, le=90.0)
+    """Width of the bins of an object's yaw relative to its direction as seen from the base."""
+    cell_episodes: int = spec(unit="episodes", ge=1)
+    """Episodes below which a cell has no rate."""
+    worst_regions: int = spec(unit="cells", ge=1)
+    """Worst cells in report.md."""
+    reset: dict[str, Any] = spec(factory=dict)
+    """Reset terms, unless ``reset=starts_file`` names a file."""
 
-    seeds: int = MISSING
-    rate: float = MISSING
-    region: list[float] | None = None
-    cell: float = MISSING
-    yaw_cell_deg: float = MISSING
-    cell_episodes: int = MISSING
-    worst_regions: int = MISSING
-    reset: dict[str, Any] = field(default_factory=dict)
 
-
-@dataclass(kw_only=True, slots=True)
+@dataclass(kw_only=True)  # without slots: OmegaConf sets what is no field, see `type_terms`
 class GateCfg:
-    """Thresholds of every gate."""
+    """The gates by name, in the order in which they run; those of the search path come last."""
 
+    baseline: GateFuncCfg = field(default_factory=GateFuncCfg)
+    """A single native world."""
     parity: ParityCfg = field(default_factory=ParityCfg)
+    """MJWarp against native MuJoCo."""
     capacity: CapacityCfg = field(default_factory=CapacityCfg)
+    """Buffer sizes."""
     batch: BatchGateCfg = field(default_factory=BatchGateCfg)
+    """Every world of a batch."""
     throughput: ThroughputCfg = field(default_factory=ThroughputCfg)
+    """Speed."""
     success: SuccessGateCfg = field(default_factory=SuccessGateCfg)
+    """Success rate from randomised starts."""
+    added: dict[str, Any] = spec(factory=dict)
+    """Gates of the search path by name; their keys are ``gate.NAME.KEY``."""
+
+    def __getitem__(self, name: str) -> Any:
+        """The parameters of a gate."""
+        return self.added[name] if name in self.added else getattr(self, name)
+
+    def functions(self) -> dict[str, str]:
+        """Dotted name of every gate's function, by the gate's name."""
+        funcs = {}
+        for name, gate in {**vars(self), **self.added}.items():
+            if isinstance(gate, GateFuncCfg):
+                funcs[name] = gate.func
+            elif isinstance(gate, dict) and "func" in gate:
+                funcs[name] = gate["func"]
+        return funcs

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from omegaconf import MISSING
-
+from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
 from mjstack.config.schema.gate import GateCfg
 from mjstack.config.schema.job import JobCfg
 from mjstack.config.schema.physics import BatchCfg, GraphMode, SimCfg, SolverCfg, TimingCfg
@@ -20,29 +19,57 @@ class Config:
     """Everything a run needs."""
 
     robot: RobotCfg = field(default_factory=RobotCfg)
+    """The arm."""
     model: ModelCfg = field(default_factory=ModelCfg)
+    """Source of the arm's MJCF file."""
     scene: SceneCfg = field(default_factory=SceneCfg)
+    """Table and objects."""
     timing: TimingCfg = field(default_factory=TimingCfg)
+    """Physics step and control step."""
     solver: SolverCfg = field(default_factory=SolverCfg)
+    """Limits of the constraint solver, and the friction cone."""
     batch: BatchCfg = field(default_factory=BatchCfg)
+    """MJWarp's buffer sizes."""
     sim: SimCfg = field(default_factory=SimCfg)
-    # Terms by name. OmegaConf would not let a command line add a term to a typed dict, so the store
-    # types them: ActionTermCfg, ObservationGroupCfg, TermCfg, TerminationTermCfg and RewardTermCfg.
-    action: dict[str, Any] = field(default_factory=dict)
-    observation: dict[str, Any] = field(default_factory=dict)
-    reset: dict[str, Any] = field(default_factory=dict)
-    termination: dict[str, Any] = field(default_factory=dict)
-    reward: dict[str, Any] = field(default_factory=dict)
+    """Physics engine and device."""
+    # Terms by name. OmegaConf would not let a command line add a term to a typed dict, so
+    # `type_terms` types them: ActionTermCfg, ObservationGroupCfg, TermCfg, TerminationTermCfg and
+    # RewardTermCfg.
+    action: dict[str, Any] = spec(factory=dict)
+    """Action of a policy."""
+    observation: dict[str, Any] = spec(factory=dict)
+    """Observations of a policy."""
+    reset: dict[str, Any] = spec(factory=dict)
+    """Start states of the worlds."""
+    termination: dict[str, Any] = spec(factory=dict)
+    """Ends of an episode."""
+    reward: dict[str, Any] = spec(factory=dict)
+    """Rewards of a policy."""
     task: TaskCfg = field(default_factory=TaskCfg)
+    """The task; it chooses some of the groups above."""
     controller: ControllerCfg = field(default_factory=ControllerCfg)
+    """Joint trajectories planned before the episode, or feedback."""
     gate: GateCfg = field(default_factory=GateCfg)
+    """Parameters of the gates, all in use at once; gates=[...] chooses gates."""
     job: JobCfg = field(default_factory=JobCfg)
-    nworld: int = MISSING
-    seed: int = MISSING
-    gates: list[str] = MISSING
-    graph: GraphMode = MISSING
-    view: bool = MISSING
-    video: bool = MISSING
-    starts: str | None = None
-    run: str | None = None
-    world: str | None = None
+    """Work of the command."""
+    nworld: int = spec(unit="worlds", ge=1, le=MOST_WORLDS)
+    """Worlds of the batch, capacity and throughput gates."""
+    seed: int = spec(ge=0, lt=MOST_SEEDS)
+    """Seed of every random number."""
+    gates: list[str] = spec()
+    """Gates that run; their order is fixed. There is also success."""
+    graph: GraphMode = spec()
+    """Capture the step as a CUDA graph: auto, require or off. Ignored on native MuJoCo; on Warp's
+    CPU device, of physics alone."""
+    view: bool = spec()
+    """Open MuJoCo's viewer on the parity world; gates without parity: the baseline world."""
+    video: bool = spec()
+    """Write an mp4 of the same world."""
+    starts: str | None = spec(None)
+    """reset=starts_file: a file with one row per world, from which all of them start."""
+    run: str | None = spec(None)
+    """job=replay: the folder of an earlier run."""
+    world: str | None = spec(None)
+    """job=replay: a world of it, such as 17, or 3:17 for world 17 of seed 3; success:3:17 where
+    batch ran too."""

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-from omegaconf import MISSING
+from mjstack.config.fields import spec
 
 
 @dataclass(kw_only=True, slots=True)
 class TermCfg:
-    """A function or class by its dotted name, and the values of its keyword parameters."""
+    """A function or class, and the values of its keyword parameters."""
 
-    func: str = MISSING
-    params: dict[str, Any] = field(default_factory=dict)
+    func: str = spec()
+    """Dotted name of the function or class."""
+    params: dict[str, Any] = spec(factory=dict, finite=False)
+    """Keyword parameters."""
 
 
 @dataclass(kw_only=True, slots=True)
@@ -23,38 +25,39 @@ class ActionTermCfg(TermCfg):
 
 @dataclass(kw_only=True, slots=True)
 class ObservationTermCfg(TermCfg):
-    """A part of an observation group.
+    """A part of an observation group: value, plus noise, clipped, times scale."""
 
-    ``noise`` is the half-width of uniform noise in the term's own unit, added first; then values
-    are clipped to ``clip`` (low, high) and multiplied by ``scale``. ``history`` steps are kept,
-    oldest first.
-    """
-
-    scale: float = 1.0
-    clip: list[float] | None = None
-    noise: float = 0.0
-    history: int = 1
+    scale: float = spec(1.0)
+    """Factor, applied last."""
+    clip: list[float] | None = spec(None, unit="the term's", length=2, finite=False)
+    """Smallest and largest value."""
+    noise: float = spec(0.0, unit="the term's", ge=0.0)
+    """Half-width of uniform noise, added first."""
+    history: int = spec(1, unit="steps", ge=1)
+    """Steps that are kept, oldest first."""
 
 
 @dataclass(kw_only=True, slots=True)
 class ObservationGroupCfg:
-    """Terms that are concatenated into one tensor; ``noise: false`` switches the noise of all of
-    them off.
-    """
+    """Terms that are concatenated into one tensor."""
 
     noise: bool = True
-    terms: dict[str, Any] = field(default_factory=dict)
+    """Whether its terms have their noise."""
+    terms: dict[str, Any] = spec(factory=dict)
+    """Its terms, by name."""
 
 
 @dataclass(kw_only=True, slots=True)
 class RewardTermCfg(TermCfg):
-    """A reward per second of simulated time: each step adds weight x value x step_dt."""
+    """A reward per second of simulated time."""
 
-    weight: float = MISSING
+    weight: float = spec()
+    """Each step adds weight x value x step_dt."""
 
 
 @dataclass(kw_only=True, slots=True)
 class TerminationTermCfg(TermCfg):
-    """Ends an episode; with ``time_out`` it is truncated, otherwise terminated."""
+    """A reason for which an episode ends."""
 
     time_out: bool = False
+    """Whether the episode is truncated then, not terminated."""

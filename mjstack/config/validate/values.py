@@ -6,22 +6,11 @@ import math
 
 from mjstack.errors import ConfigError
 
-MOST_WORLDS = (1 << 31) - 1
-
 
 def positive_int(key: str, value: int) -> None:
     """Raises a `ConfigError` unless a value is an integer of at least 1."""
     if value < 1:
         raise ConfigError(key, value, "an integer of at least 1")
-
-
-def world_count(key: str, value: int) -> None:
-    """Raises a `ConfigError` unless a value is a number of worlds that Warp can count."""
-    positive_int(key, value)
-    if value > MOST_WORLDS:
-        raise ConfigError(
-            key, value, f"at most {MOST_WORLDS} worlds, because Warp counts them with 32 bits"
-        )
 
 
 def positive(key: str, value: float, unit: str = "") -> None:
