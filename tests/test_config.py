@@ -11,6 +11,7 @@ import pytest
 from check_cases import limits
 
 from mjstack.config import load_config
+from mjstack.config.help import list_keys, reference_markdown
 from mjstack.config.schema import Backend, Config, RobotSource
 from mjstack.errors import MjstackError
 from mjstack.jobs.gates import check_machine
@@ -250,7 +251,7 @@ BAD = [
     (["nworld=[1,"], "'nworld=[1,' cannot be read: expected key=value"),
     (["nworld =3"], "'nworld =3' cannot be read: expected key=value"),
     (["robot=so101\n"], "cannot be read"),
-    (["nworld=99999999999"], "nworld=99999999999: expected at most 2147483647 worlds"),
+    (["nworld=99999999999"], "expected an integer from 1 to 2147483647 [worlds]"),
     (["video=yep"], "video=yep: expected true or false."),
     (["graph=yes"], "graph=yes: expected one of auto, require, off."),
     (["nworld=null"], "nworld=null: expected a value."),
@@ -288,6 +289,27 @@ def test_bad_input_is_one_line(overrides: list[str], says: str) -> None:
     assert message.strip()
     assert "\n" not in message
     assert says in message
+
+
+def test_every_field_says_what_it_means() -> None:
+    keys = list(list_keys(load_config()))
+    assert len(keys) > 150
+    # a task's check and the gates' old thresholds are not documented yet
+    bare = [
+        k.name
+        for k in keys
+        if not k.words and not k.name.startswith(("task.", "gate.acc", "gate.box"))
+    ]
+    assert bare == []
+    rate = next(key for key in keys if key.name == "gate.success.rate")
+    assert (rate.value, rate.accepts) == ("0.99", "a number from 0 to 1")
+
+
+def test_the_reference_has_every_group_and_job() -> None:
+    text = reference_markdown()
+    for key in ("nworld", "gate.batch.seeds", "controller.phases.NAME.gripper", "job.margin"):
+        assert f"| `{key}` |" in text, key
+    assert "| a number above 0 [s] | Duration of one physics step. |" in text
 
 
 def test_missing_cuda_device_is_refused_before_the_run() -> None:

@@ -185,7 +185,7 @@ def _accepted(limits: Range, hint: Any) -> str:
         bounds.append(f"of at least {limits.ge:.10g}")
     elif limits.le is not None:
         bounds.append(f"of at most {limits.le:.10g}")
-    if hint is float and not bounds and limits.finite:
+    if hint is float and not bounds and limits.finite and limits.length is None:
         noun = noun.replace("number", "finite number")
     unit = f" [{limits.unit}]" if limits.unit else ""
     return " ".join([noun, " and ".join(bounds)]).rstrip() + unit
