@@ -35,8 +35,8 @@ _NO_MATTER = (
     "video",
     "run",
     "world",
+    "gate",
 )
-_OTHER_GATES = ("parity", "capacity", "batch", "throughput", "success")
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:
@@ -49,8 +49,6 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     config = config_content(cfg)
     for key in _NO_MATTER:
         del config[key]
-    for key in _OTHER_GATES:
-        del config["gate"][key]
     backend, _ = resolve_backend(cfg)
     config["sim"] = {"backend": backend.value}
     config["job"] = {"keep_failures": cast(CollectJobCfg, cfg.job).keep_failures}
