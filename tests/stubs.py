@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -45,23 +45,24 @@ def pretended(
         sim: Simulation,
         seed: int,
         values: torch.Tensor,
-        worlds: Sequence[int],
+        worlds: int,
     ) -> Played:
-        for place, world in enumerate(worlds):
-            values[:, place] = 1e-3 * seed + 1e-6 * world
+        for world in range(worlds):
+            values[:, world] = 1e-3 * seed + 1e-6 * world
             if noise:
-                values[:, place] = torch.randn(
+                values[:, world] = torch.randn(
                     values[:, 0].shape, generator=torch.Generator().manual_seed(1000 * seed + world)
                 )
-        failed = np.array([BROKEN if fails(seed, world) else 0 for world in worlds], dtype=np.int32)
+        failed = np.array(
+            [BROKEN if fails(seed, world) else 0 for world in range(worlds)], dtype=np.int32
+        )
         if after is not None:
             after(seed, values)
         return Played(
             seed=seed,
-            worlds=worlds,
             steps=cast(StepRecorder, SimpleNamespace(values=values, layout=LAYOUT)),
             failed=failed,
-            retries=np.array([world % 3 for world in worlds], dtype=np.int32),
+            retries=np.array([world % 3 for world in range(worlds)], dtype=np.int32),
             seconds=0.5,
         )
 

@@ -33,9 +33,9 @@ from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import CommandRecorder
 from mjstack.errors import ConfigError
 from mjstack.jobs import collection
-from mjstack.jobs.collect import collect_folder, run_collect_job
+from mjstack.jobs.collect import collect_folder, plan_collection, run_collect_job
 from mjstack.jobs.collect_record import FILE
-from mjstack.jobs.demonstration import Played, StepRecorder
+from mjstack.jobs.demonstration import Played, StepRecorder, most_worlds
 from mjstack.jobs.demonstration_spec import episode_config, first_difference, make_spec
 from mjstack.managers.reset import required_fields
 from mjstack.report.collect import LOADING
@@ -455,7 +455,7 @@ def collect(*overrides: str) -> int:
     cfg = load_config([*COMMAND, *overrides])
     home = collect_folder(cfg)
     home.mkdir(parents=True, exist_ok=True)
-    return run_collect_job(RunContext(cfg), home, []).exit_code
+    return run_collect_job(plan_collection(RunContext(cfg)), home, []).exit_code
 
 
 def test_seeds_go_on_until_the_episodes_are_there(
@@ -525,7 +525,7 @@ def test_a_layout_counts_by_its_content(
         capsys.readouterr().err.strip()
         == "mjstack: outputs/demos/dataset has episodes of another configuration:"
         f" starts=sha256:{was}, expected sha256:{now}. Set job.folder to another folder, or"
-        " layout to a file with that content."
+        " starts to a file with that content."
     )
     assert contents(Path.cwd()) == before
 
@@ -542,32 +542,6 @@ def test_a_layout_that_only_the_term_names_counts_too(folder: Path) -> None:
             )
         )
     assert len(homes) == 2
-
-
-def test_a_layout_that_changes_while_it_is_played(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    layout = Path("worlds.csv")
-    layout.write_text(LAYOUT)
-
-    def edit(seed: int, values: torch.Tensor) -> None:
-        if seed == 1:
-            layout.write_text(LAYOUT + "\n")
-
-    monkeypatch.setattr(
-        collection, "play_demonstrations", pretended(lambda seed, world: False, edit)
-    )
-    assert collect(*FROM_LAYOUT, "starts=worlds.csv", "job.episodes=4") == 1
-    (result,) = report_of(folder)["gates"]
-    assert result["status"] == "fail"
-    assert result["reason"].startswith(
-        "the file of reset=starts_file changed while seed 1 was played: "
-    )
-    assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
-    layout.write_text(LAYOUT)
-    assert collect(*FROM_LAYOUT, "starts=worlds.csv", "job.episodes=4") == 0
-    assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1)]
 
 
 def test_failures_are_kept_and_marked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -749,12 +723,12 @@ def test_the_buffer_bounds_the_worlds() -> None:
     world = 4 * 600 * (6 + 24 + 46 + 6 + 1)  # bytes: state, both groups, action, reward
     for worlds in (1, 3, 7):
         cfg.job.buffer_gib = (worlds + 0.5) * world / 2**30  # type: ignore[attr-defined]
-        assert collection.most_worlds(cfg, env) == worlds
+        assert most_worlds(cfg, env) == worlds
     cfg.job.buffer_gib = 1.0  # type: ignore[attr-defined]
-    assert collection.most_worlds(cfg, env) == 100
+    assert most_worlds(cfg, env) == 100
     cfg.job.buffer_gib = 0.9 * world / 2**30  # type: ignore[attr-defined]
     with pytest.raises(ConfigError, match=r"job.buffer_gib"):
-        collection.most_worlds(cfg, env)
+        most_worlds(cfg, env)
     env.close()
 
 
@@ -762,7 +736,7 @@ def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> No
     values = torch.randn(5, 7, 4)
     steps = cast(StepRecorder, SimpleNamespace(values=values, layout={"a": 3, "b": 1}))
     none = np.zeros(7, dtype=np.int32)
-    played = Played(seed=0, worlds=range(7), steps=steps, failed=none, retries=none, seconds=0.0)
+    played = Played(seed=0, steps=steps, failed=none, retries=none, seconds=0.0)
     for size in (1, 2 * 5 * 4 * 4, 10**6):  # one world, two and all at once
         monkeypatch.setattr("mjstack.jobs.demonstration._CHUNK_BYTES", size)
         found = dict(played.episodes([6, 0, 3]))

@@ -23,18 +23,18 @@ from stubs import episodes_of, pairs, pretended
 from mjstack.cli import run
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import CollectJobCfg
-from mjstack.datasets import DatasetWriter, layout, read_dataset
+from mjstack.datasets import DatasetWriter, lerobot, read_dataset
 from mjstack.datasets.shard import Shard
 from mjstack.datasets.staging import Staging
-from mjstack.episodes.context import RunContext
+from mjstack.envs import build_env, demonstration_config
+from mjstack.episodes.context import RunContext, Stage
 from mjstack.errors import DatasetError, UnwrittenError
 from mjstack.jobs import collection, demonstration_spec
 from mjstack.jobs.collect_record import FILE
-from mjstack.jobs.collection import Collection
+from mjstack.jobs.collection import Collection, CollectPlan
 from mjstack.jobs.demonstration import play_demonstrations
 from mjstack.jobs.runner import run_provenance
 from mjstack.report.record import GateResult, Status
-from mjstack.scene import build_model
 
 COMMAND = ["job=collect", "sim=native"]
 
@@ -43,7 +43,8 @@ def some_fail(seed: int, world: int) -> bool:
     return world % 4 == 1
 
 
-_model = cache(lambda: build_model(configure(*COMMAND)))
+_stage = cache(lambda: Stage(configure(*COMMAND)))
+_env = cache(lambda: build_env(demonstration_config(configure(*COMMAND)), nworld=1))
 _provenance = cache(
     lambda: run_provenance(configure(*COMMAND), RunContext(cfg=configure(*COMMAND)))
 )
@@ -80,10 +81,11 @@ def collection_at(
     cfg.nworld = nworld
     cfg.job.episodes = episodes
     cfg.job.keep_failures = keep_failures
-    context = RunContext(cfg=cfg)
-    context.model = _model()
+    context = RunContext(cfg, _stage())
     home.mkdir(parents=True, exist_ok=True)
-    return Collection(context, home)
+    env = _env()
+    plan = CollectPlan.of(context, home, env)
+    return Collection(plan, context)
 
 
 def collect(home: Path, **kwargs: Any) -> GateResult:
@@ -106,7 +108,7 @@ def left_in(home: Path, result: GateResult) -> dict[str, Any]:
     return {
         "rows": rows,
         "steps": {name: steps[name].combine_chunks() for name in steps.column_names},
-        "statistics": json.loads((home / "dataset" / layout.STATS).read_text()),
+        "statistics": json.loads((home / "dataset" / lerobot.STATS).read_text()),
         "notes": [
             {name: value for name, value in note.items() if not name.endswith("_s")}
             for note in notes
@@ -151,14 +153,14 @@ def test_figures_of_the_uninterrupted_one(whole: dict[str, Any]) -> None:
     notes = whole["left"]["notes"]
     metrics = whole["left"]["metrics"]
     found = [
-        (note["seed"], note["worlds"], note["succeeded"], note["kept"], note["missing"])
+        (note["seed"], note["worlds"], note["succeeded"], note["kept"], note["keep"])
         for note in notes
     ]
     if whole["keep_failures"]:
-        assert found == [(0, 9, 7, 9, {}), (1, 1, 1, 1, {})]
+        assert found == [(0, 9, 7, 9, 9), (1, 1, 1, 1, 1)]
         assert (metrics["worlds_played"], metrics["succeeded"], metrics["episodes"]) == (10, 8, 10)
     else:
-        assert found == [(0, 9, 7, 7, {}), (1, 4, 3, 3, {})]
+        assert found == [(0, 9, 7, 7, 7), (1, 4, 3, 3, 3)]
         assert (metrics["worlds_played"], metrics["succeeded"], metrics["episodes"]) == (13, 10, 10)
     assert notes[0]["retries"] == sum(world % 3 for world in range(9))
     assert "episodes_without_note" not in metrics
@@ -200,10 +202,7 @@ def test_ctrl_c_in_an_episode(call: int, whole: dict[str, Any], tmp_path: Path) 
     assert found["rows"] == whole["left"]["rows"][:call]
     assert result.metrics["succeeded"] >= sum(row["success"] for row in found["rows"])  # type: ignore[operator]
     assert sum(note["kept"] for note in found["notes"]) == call
-    for note in found["notes"]:
-        there = [row["world"] for row in found["rows"] if row["seed"] == note["seed"]]
-        assert not {int(world) for world in note["missing"]} & set(there)
-    unfinished = [note for note in found["notes"] if note["missing"]]
+    unfinished = [note for note in found["notes"] if note["kept"] < note["keep"]]
     assert sum("is unfinished" in line for line in result.details) == len(unfinished)
     assert_same(
         left_in(tmp_path, collect(tmp_path, keep_failures=whole["keep_failures"])), whole["left"]
@@ -220,8 +219,8 @@ def test_ctrl_c_after_ctrl_c(tmp_path: Path) -> None:
     played = []
     play = pretended(some_fail, noise=True)
 
-    def told(context: Any, sim: Any, seed: int, values: torch.Tensor, worlds: list[int]) -> Any:
-        played.append((seed, list(worlds)))
+    def told(context: Any, sim: Any, seed: int, values: torch.Tensor, worlds: int) -> Any:
+        played.append((seed, worlds))
         return play(context, sim, seed, values, worlds)
 
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -229,12 +228,7 @@ def test_ctrl_c_after_ctrl_c(tmp_path: Path) -> None:
         play_interrupted(home, 3, nworld=16, episodes=20)
         play_interrupted(home, 4, nworld=3, episodes=20)
         result = collect(home, nworld=16, episodes=20)
-    assert played[:4] == [
-        (0, list(range(16))),
-        (0, [4, 6, 7]),
-        (0, [8, 10, 11]),
-        (0, [10, 11, 12, 14, 15]),
-    ]
+    assert played[:3] == [(0, 16)] * 3
     assert_same(left_in(home, result), one)
 
 
@@ -348,8 +342,8 @@ def test_no_room_for_the_notes(
 def test_worlds_that_are_judged_otherwise_the_second_time(
     keep_failures: bool, tmp_path: Path
 ) -> None:
-    """As on CUDA: what is committed stays, the first result counts, and no episode
-    contradicts it.
+    """As on CUDA: what is committed stays, the first play counts in the success rate, and every
+    episode has the result of its own play.
     """
     play_interrupted(tmp_path, 3, keep_failures=keep_failures)
     first = episodes_of(tmp_path / "dataset")
@@ -363,14 +357,14 @@ def test_worlds_that_are_judged_otherwise_the_second_time(
     rows = episodes_of(tmp_path / "dataset")
     assert rows[:3] == first
     notes = left_in(tmp_path, result)["notes"]
-    changed = 2 if keep_failures else 1
-    assert [note["changed"] for note in notes] == [changed, 0]
     assert (notes[0]["worlds"], notes[0]["succeeded"]) == (9, 7)
-    left_out = {4, 5} if keep_failures else {1, 4, 5}
+    left_out = set() if keep_failures else {1, 4}
     assert {row["world"] for row in rows if row["seed"] == 0} == set(range(9)) - left_out
-    assert all(row["success"] != some_fail(row["seed"], row["world"]) for row in rows)
-    assert any(line.startswith(f"{changed} episodes judged otherwise") for line in result.details)
+    for row in rows[3:]:
+        flip = row["seed"] == 0 and row["world"] in flipped
+        assert row["success"] == (some_fail(row["seed"], row["world"]) == flip)
     assert len(rows) == 10 == sum(note["kept"] for note in notes)
+    assert all(note["kept"] == note["keep"] for note in notes)
 
 
 @pytest.mark.parametrize(
@@ -449,8 +443,8 @@ def test_notes_of_other_episodes_are_one_line(capsys: pytest.CaptureFixture[str]
     assert {path: path.read_bytes() for path in home.rglob("*") if path.is_file()} == before
 
 
-def test_real_worlds_are_the_same_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No pretence: the second of two worlds, played again without the first."""
+def test_real_worlds_are_the_same_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No pretence: the second of two worlds is added by another call, with another nworld."""
     monkeypatch.setattr(collection, "play_demonstrations", play_demonstrations)
     options: dict[str, Any] = {"episodes": 2, "keep_failures": True}
     expected = left_in(tmp_path / "whole", collect(tmp_path / "whole", nworld=2, **options))
@@ -495,10 +489,7 @@ def test_ctrl_c_on_cuda() -> None:
     found = pairs(home / "dataset")
     notes = json.loads((home / FILE).read_text())
     assert len(set(found)) == len(found) == 8
-    assert all(
-        not note["missing"] and note["kept"] <= note["succeeded"] <= note["worlds"]
-        for note in notes
-    )
+    assert all(note["kept"] == note["keep"] <= note["worlds"] for note in notes)
     assert [note["kept"] for note in notes] == [
         sum(seed == note["seed"] for seed, _ in found) for note in notes
     ]

@@ -171,11 +171,11 @@ def start_worlds(
 
 
 def reset_worlds(env: Env, seed: int, worlds: Sequence[int] | None = None) -> Env:
-    """Reset the first worlds of an environment under these numbers, and bring everything that
-    derives from their state up to date.
+    """Reset every world, under these numbers if there are any, and bring everything that derives
+    from their state up to date.
     """
     if worlds is not None:
-        env.world[: len(worlds)].copy_(torch.tensor(worlds))
+        env.world.copy_(torch.tensor(worlds))
     env.reset(seed=seed)
     env.sim.forward()
     return env

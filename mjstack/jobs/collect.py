@@ -23,13 +23,12 @@ from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.context import RunContext, require_episode
 from mjstack.errors import ConfigError, DatasetError, UnwrittenError
 from mjstack.jobs.collect_record import read_batches
-from mjstack.jobs.collection import DATASET, Collection, most_worlds
+from mjstack.jobs.collection import DATASET, Collection, CollectPlan
 from mjstack.jobs.demonstration_spec import (
     Difference,
     as_override,
     episode_config,
     first_difference,
-    make_spec,
 )
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.job import Job
@@ -49,8 +48,8 @@ def collect_folder(cfg: Config) -> Path:
     )
 
 
-def check_collect(cfg: Config) -> RunContext:
-    """Raises for what cannot be done, before anything is written."""
+def check_collect(cfg: Config) -> CollectPlan:
+    """Raise for what cannot be done, before anything is written."""
     for key in ("view", "video"):
         if getattr(cfg, key):
             raise ConfigError(
@@ -60,40 +59,45 @@ def check_collect(cfg: Config) -> RunContext:
     require_episode(cfg)
     context = RunContext(cfg)
     check_task(context)
-    env = build_env(
-        demonstration_config(cfg),
-        model=context.model,
-        nworld=2,
-        backend=Backend.native,
-        device="cpu",
-    )
+    plan = plan_collection(context)
+    _check_folder(plan.home, plan.spec)
+    return plan
+
+
+def plan_collection(context: RunContext) -> CollectPlan:
+    """Plan the configured dataset.
+
+    Raises:
+        ConfigError: Its episodes would not differ, or do not fit into the buffer.
+    """
+    cfg = context.cfg
+    shown = demonstration_config(cfg)
+    env = build_env(shown, model=context.model, nworld=2, backend=Backend.native, device="cpu")
     try:
         if _job(cfg).episodes > 1:
             _check_starts(env)
-        most_worlds(cfg, env)
-        _check_folder(collect_folder(cfg), make_spec(env, cfg, {}))
+        return CollectPlan.of(context, collect_folder(cfg), env)
     finally:
         env.close()
-    return context
 
 
-def run_collect_job(context: RunContext, folder: Path, overrides: list[str]) -> JobResult:
-    """Adds what is missing to the dataset, and leaves dataset.md and the report.
+def run_collect_job(plan: CollectPlan, folder: Path, overrides: list[str]) -> JobResult:
+    """Add the missing episodes to the dataset, and leave dataset.md and the report.
 
     Args:
-        context: The configuration, and what its check built.
+        plan: The dataset.
         folder: Where the report goes; the dataset's place is `collect_folder`'s.
         overrides: What was asked for on the command line.
 
     Returns:
         How it ended: a pass if the dataset has as many episodes as were asked for.
     """
-    cfg = context.cfg
+    cfg = plan.context.cfg
 
     def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
         bar.start("collect")
         began = time.perf_counter()
-        collection = Collection(context, collect_folder(cfg))
+        collection = Collection(plan, context)
 
         def conclude(status: Status, problem: str = "") -> None:
             result = collection.result(status, problem, time.perf_counter() - began)
@@ -115,7 +119,7 @@ def run_collect_job(context: RunContext, folder: Path, overrides: list[str]) -> 
         conclude(Status.failed if problem else Status.passed, problem)
 
     title = f"task {cfg.task.name}, {_job(cfg).episodes:,} demonstrations"
-    return run_reported(context, folder, overrides, title, work)
+    return run_reported(plan.context, folder, overrides, title, work)
 
 
 def _job(cfg: Config) -> CollectJobCfg:

@@ -8,31 +8,36 @@ import json
 import math
 import time
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 import torch
 
-from mjstack.config.fingerprint import config_hash
-from mjstack.config.schema import Backend, CollectJobCfg, Config
-from mjstack.datasets import DatasetWriter, EpisodeData, lerobot
-from mjstack.envs import Env, build_env, demonstration_config
+from mjstack.config.schema import CollectJobCfg
+from mjstack.datasets import DatasetSpec, DatasetWriter, EpisodeData, lerobot
+from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.rollout import NOMINAL
-from mjstack.errors import ConfigError, UnwrittenError
+from mjstack.errors import UnwrittenError
 from mjstack.files import write_atomic
-from mjstack.jobs.collect_record import FILE, CollectedBatch, read_batches, write_batches
+from mjstack.jobs.collect_record import (
+    FILE,
+    CollectedBatch,
+    count_kept,
+    read_batches,
+    write_batches,
+)
 from mjstack.jobs.demonstration import (
     ACTION,
     STATE,
     Played,
     column_widths,
+    most_worlds,
     play_demonstrations,
     steps_block,
 )
-from mjstack.jobs.demonstration_spec import episode_config, make_spec
+from mjstack.jobs.demonstration_spec import make_spec
 from mjstack.jobs.runner import run_provenance
 from mjstack.math import wilson_interval
 from mjstack.report.collect import ColumnRange, to_markdown
@@ -43,66 +48,92 @@ from mjstack.sim import Simulation
 DATASET = "dataset"  # within the job's folder
 _SPARE = 1.05  # worlds played over episodes that are missing: some fail
 _GIVE_UP = 3  # batches in a row without an episode
-_SEEDS = 1 << 32
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CollectPlan:
+    """A dataset to be collected.
+
+    Attributes:
+        context: Configuration, scene and plan.
+        home: The job's folder.
+        spec: The dataset's columns and provenance.
+        most: Largest number of worlds of a batch.
+        dim: Numbers in a step.
+    """
+
+    context: RunContext
+    home: Path
+    spec: DatasetSpec
+    most: int
+    dim: int
+
+    @classmethod
+    def of(cls, context: RunContext, home: Path, env: Env) -> CollectPlan:
+        """Plan from an environment of the demonstrations, with any number of worlds.
+
+        Raises:
+            ConfigError: The steps of not even one world fit into the buffer, or a column's name is
+                taken.
+        """
+        provenance = run_provenance(context.cfg, context)
+        # They differ between calls that make the same episodes.
+        del provenance["date"], provenance["config_sha256"]
+        return cls(
+            context=context,
+            home=home,
+            spec=make_spec(env, context.cfg, provenance),
+            most=most_worlds(context.cfg, env),
+            dim=sum(column_widths(env).values()),
+        )
 
 
 class Collection:
-    """A dataset, and what it takes to add to it.
+    """A dataset, and the worlds that add to it.
 
     A batch is one seed in as many worlds as are needed and fit; the next batch has the next seed,
     in later calls too. So a pair of seed and world is one episode, whatever nworld was.
 
-    A batch's results and what is to be kept of it are noted beside the dataset before the first
-    episode is added. So whatever stops it in between, the next call finds what is missing and
-    begins with it: those worlds of that seed are played again, as many at a time as nworld then
-    allows, and added in order. What was committed stays as it is. On CUDA two plays of a world
-    agree only nearly: an episode that is judged otherwise than noted is left out, and the first
-    result counts.
+    A batch's record is written beside the dataset before its first episode is added. If a call is
+    stopped in between, the next one plays the whole batch again and adds the missing episodes. What
+    was committed stays as it is. On CUDA two plays of a world agree only nearly: the first play
+    counts in the success rate, and every episode has the result of its own play.
 
     Attributes:
         home: The job's folder.
         path: The dataset.
-        spec: What it holds.
+        spec: Its columns and provenance.
         batches: All that were played, in earlier calls too; read by `play`.
-        committed: Episodes of the dataset.
-        steps: Likewise.
+        committed: Number of episodes of the dataset.
+        steps: Number of their steps.
     """
 
-    def __init__(self, context: RunContext, home: Path) -> None:
-        """Finds out what a step holds."""
-        cfg = context.cfg
+    def __init__(self, plan: CollectPlan, context: RunContext) -> None:
+        """Takes a plan and the run's context."""
         self._context = context
-        self._cfg = cfg
-        self._job = cast(CollectJobCfg, cfg.job)
-        shown = replace(
-            demonstration_config(cfg), reset=NOMINAL
-        )  # what a step holds, no start changes
-        env = build_env(shown, nworld=1, model=context.model, backend=Backend.native, device="cpu")
-        self._most = most_worlds(cfg, env)
-        self._dim = sum(column_widths(env).values())
-        provenance = run_provenance(cfg, context)
-        del (
-            provenance["date"],
-            provenance["config_sha256"],
-        )  # they differ between calls that make the same episodes
-        self.spec = make_spec(env, cfg, provenance)
-        env.close()
-        self.home = home
-        self.path = home / DATASET
+        self._cfg = context.cfg
+        self._job = cast(CollectJobCfg, context.cfg.job)
+        self._most = plan.most
+        self._dim = plan.dim
+        self.spec = plan.spec
+        self.home = plan.home
+        self.path = plan.home / DATASET
         self.batches: list[CollectedBatch] = []
-        self.committed = self.steps = self._before = 0
+        self.committed = 0
+        self.steps = 0
+        self._before = 0
         self._seconds = {"simulation": 0.0, "copy": 0.0, "writing": 0.0}  # of this call
         self._sim: Simulation | None = None
         self._block: torch.Tensor | None = None
 
     def play(self) -> str:
-        """Plays and writes until the episodes are there.
+        """Play and write until the episodes are there.
 
         Returns:
-            What keeps it from that; empty if nothing does.
+            Why that cannot be done; empty if it is done.
 
         Raises:
-            DatasetError: The folder is somebody else's.
+            DatasetError: The folder has another dataset.
             UnwrittenError: The dataset cannot be written any further; what was committed is kept.
         """
         if not (self.path / lerobot.INFO).exists():
@@ -118,58 +149,37 @@ class Collection:
             self._count(writer)
             if self.batches:
                 with suppress(UnwrittenError):  # the next call counts again
-                    self._note(writer)
+                    self._record(writer)
             self._close_worlds()
 
     def _play(self, writer: DatasetWriter) -> str:
         empty = 0
         while (wanted := self._job.episodes - len(writer.committed)) > 0:
-            batch = next((batch for batch in self.batches if batch.missing), None)
-            if batch is not None:
-                seed = batch.seed
-                worlds = list(batch.missing)[: min(self._most, wanted)]
-                # In fewer of MJWarp's worlds a world could find less room in their common buffers
-                # than it had.
-                room = (
-                    min(batch.worlds, self._most)
-                    if self._context.backend[0] is Backend.mjwarp
-                    else len(worlds)
-                )
+            begun = next((batch for batch in self.batches if batch.kept < batch.keep), None)
+            if begun is not None:
+                seed = begun.seed
+                worlds = begun.worlds
             else:
-                seed = (
-                    max(
-                        [
-                            self._cfg.seed - 1,
-                            *(seed for seed, _ in writer.committed),
-                            *(b.seed for b in self.batches),
-                        ]
-                    )
-                    + 1
-                )
-                room = min(
-                    self._most, wanted if self._job.keep_failures else math.ceil(_SPARE * wanted)
-                )
-                worlds = list(range(room))
-            if seed >= _SEEDS:
-                return (
-                    f"the next seed would be {seed}, expected at most {_SEEDS - 1}: begin another"
-                    " dataset with a smaller seed"
-                )
-            sim, block = self._worlds(room)
+                seeds = [seed for seed, _ in writer.committed] + [b.seed for b in self.batches]
+                seed = max([self._cfg.seed - 1, *seeds]) + 1
+                spare = 1.0 if self._job.keep_failures else _SPARE
+                worlds = min(self._most, math.ceil(spare * wanted))
+            sim, block = self._worlds(worlds)
             played = play_demonstrations(self._context, sim, seed, block, worlds)
-            if not self._unchanged():
-                return (
-                    f"the file of reset=starts_file changed while seed {seed} was played: restore"
-                    " it, or begin another dataset"
-                )
-            done = f"{len(worlds)} worlds played again"
-            if batch is None:
-                batch = self._judge(played, wanted)
+            self._seconds["simulation"] += played.seconds
+
+            batch, usable = self._judge(played, wanted)
+            done = f"{batch.succeeded} of {batch.worlds} worlds succeeded"
+            if begun is None:
                 self.batches.append(batch)
-                done = f"{batch.succeeded} of {batch.worlds} worlds succeeded"
-            self._spend(batch, "simulation", played.seconds)
-            self._note(writer)
-            self._add(writer, batch, played)
+                self._record(writer)
+            else:
+                batch = begun
+                done = f"{worlds} worlds played again"
+                there = {world for other, world in writer.committed if other == seed}
+                usable = [world for world in usable if world not in there]
+                batch.keep = min(batch.keep, batch.kept + len(usable))
+            self._add(writer, played, usable[: min(batch.keep - batch.kept, wanted)])
             self._count(writer)
             self._context.say(
                 f"collect, seed {seed}: {done}, {self.committed} of {self._job.episodes} episodes"
@@ -186,94 +196,61 @@ class Collection:
                 return f"{_GIVE_UP} seeds in a row brought no episode, the last because of: {why}"
         return ""
 
-    def _unchanged(self) -> bool:
-        """Whether a layout file still has the content that the dataset is of."""
-        try:
-            return config_hash(episode_config(self._cfg)) == self.spec.config_sha256
-        except ConfigError:  # it cannot be read any more
-            return False
-
-    def _judge(self, played: Played, wanted: int) -> CollectedBatch:
-        """What is to be noted of a seed that was played for the first time, with the episodes that
-        are to be kept of it.
-        """
+    def _judge(self, played: Played, wanted: int) -> tuple[CollectedBatch, list[int]]:
+        """The record of a batch, and the worlds whose episodes can be kept."""
         rules = self._context.check.rules
-        keep_all = self._job.keep_failures
-        good = (
-            range(len(played.worlds)) if keep_all else np.flatnonzero(played.failed == 0).tolist()
-        )
-        keep = [place for place in good if played.finite(place)]
-        return CollectedBatch(
+        good = np.flatnonzero((played.failed == 0) | self._job.keep_failures).tolist()
+        usable = [world for world in good if played.finite(world)]
+        batch = CollectedBatch(
             seed=played.seed,
-            worlds=len(played.worlds),
+            worlds=len(played.failed),
+            keep=min(len(usable), wanted),
             succeeded=int((played.failed == 0).sum()),
-            missing={
-                played.worlds[place]: rules.describe(int(played.failed[place]))
-                for place in keep[:wanted]
-            },
-            not_finite=len(good) - len(keep),
+            not_finite=len(good) - len(usable),
             retries=int(played.retries.sum()),
             broken={
-                rules.texts[name]: len(places)
-                for name, places in rules.failing(played.failed).items()
+                rules.texts[name]: len(worlds)
+                for name, worlds in rules.failing(played.failed).items()
             },
         )
+        return batch, usable
 
-    def _add(self, writer: DatasetWriter, batch: CollectedBatch, played: Played) -> None:
-        """Commits the episodes of a batch that are missing, as far as they were played, and notes
-        it.
-        """
-        places = [place for place, world in enumerate(played.worlds) if world in batch.missing]
-        changed: list[int] = []
+    def _add(self, writer: DatasetWriter, played: Played, worlds: list[int]) -> None:
+        """Commit the episodes of some worlds, and record it."""
         began = time.perf_counter()
-        for count, (place, arrays) in enumerate(played.episodes(places), 1):
+        for count, (world, arrays) in enumerate(played.episodes(worlds), 1):
             copied = time.perf_counter()
-            self._spend(batch, "copy", copied - began)
-            broken = self._context.check.rules.describe(int(played.failed[place]))
-            if broken != batch.missing[played.worlds[place]] or not played.finite(place):
-                changed.append(played.worlds[place])
-            else:
-                writer.add([self._episode(played, place, arrays, broken)])
-            self._context.tell(f"episodes of seed {played.seed}", count, len(places))
+            self._seconds["copy"] += copied - began
+            writer.add([self._episode(played, world, arrays)])
+            self._context.tell(f"episodes of seed {played.seed}", count, len(worlds))
             began = time.perf_counter()
-            self._spend(batch, "writing", began - copied)
+            self._seconds["writing"] += began - copied
         writer.flush()
-        self._spend(batch, "writing", time.perf_counter() - began)
-        for world in changed:
-            del batch.missing[world]
-        batch.changed += len(changed)
-        self._note(writer)
+        self._seconds["writing"] += time.perf_counter() - began
+        self._record(writer)
 
-    def _spend(self, batch: CollectedBatch, name: str, seconds: float) -> None:
-        """Counts time to a batch and to this call."""
-        self._seconds[name] += seconds
-        setattr(batch, f"{name}_s", getattr(batch, f"{name}_s") + seconds)
-
-    def _note(self, writer: DatasetWriter) -> None:
-        """Writes down what was played, and what of it is in the dataset."""
-        for batch in self.batches:
-            if batch.missing:
-                batch.take_in(writer.committed)
+    def _record(self, writer: DatasetWriter) -> None:
+        """Write the record of all batches."""
+        count_kept(self.batches, writer.committed)
         try:
             write_batches(self.home, self.batches)
         except OSError as error:
             raise UnwrittenError(str(self.home / FILE), error, len(writer.committed)) from error
 
-    def _episode(
-        self, played: Played, place: int, arrays: dict[str, np.ndarray], broken: str
-    ) -> EpisodeData:
-        """A world's steps and what is known of it. `next.success` is true in the last step of an
-        succeeded episode alone.
+    def _episode(self, played: Played, world: int, arrays: dict[str, np.ndarray]) -> EpisodeData:
+        """A world's steps and its result. `next.success` is true in the last step of a successful
+        episode alone.
         """
+        broken = self._context.check.rules.describe(int(played.failed[world]))
         last = np.arange(len(arrays[STATE])) == len(arrays[STATE]) - 1
         return EpisodeData(
             arrays={**arrays, "next.done": last, "next.success": last & (not broken)},
             task=self._cfg.task.instruction or self._cfg.task.name,
             success=not broken,
             seed=played.seed,
-            world=played.worlds[place],
+            world=world,
             values={
-                "retries": int(played.retries[place]),
+                "retries": int(played.retries[world]),
                 "failed_rules": broken,
                 "config_sha256": self.spec.config_sha256,
             },
@@ -358,16 +335,11 @@ class Collection:
                 details.append(
                     f"{lost} episodes with a number that is not finite are not in the dataset"
                 )
-            if changed := sum(batch.changed for batch in self.batches):
-                details.append(
-                    f"{changed} episodes judged otherwise when they were played again are not in"
-                    " the dataset"
-                )
             details += [
-                f"seed {batch.seed} is unfinished: {len(batch.missing)} of its episodes are still"
-                " to come"
+                f"seed {batch.seed} is unfinished: {batch.keep - batch.kept} of its episodes are"
+                " still to come"
                 for batch in self.batches
-                if batch.missing
+                if batch.kept < batch.keep
             ]
         if unknown := self.committed - sum(batch.kept for batch in self.batches):
             metrics["episodes_without_note"] = unknown
@@ -415,22 +387,3 @@ class Collection:
             to_markdown(title, {**result.notes, **result.metrics}, ranges, str(self.path)),
         )
         return True
-
-
-def most_worlds(cfg: Config, env: Env) -> int:
-    """Worlds whose steps fit into the buffer, at most nworld.
-
-    Args:
-        cfg: The job's configuration.
-        env: An environment of its demonstrations, with any number of worlds.
-
-    Raises:
-        ConfigError: Not even one world's do.
-    """
-    gib = cast(CollectJobCfg, cfg.job).buffer_gib
-    world = 4.0 * build_phases(cfg)[-1].stop * sum(column_widths(env).values()) / 2**30
-    if gib < world:
-        raise ConfigError(
-            "job.buffer_gib", gib, f"at least {world:.2g}, which the steps of one world take"
-        )
-    return min(cfg.nworld, int(gib / world))

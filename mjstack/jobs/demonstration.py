@@ -7,15 +7,19 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import torch
 
+from mjstack.config.schema import CollectJobCfg, Config
 from mjstack.drivers.driver import Controller
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import play_episode
 from mjstack.episodes.rollout import Observer, reset_worlds
+from mjstack.errors import ConfigError
+from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation
 
 STATE = "observation.state"
@@ -82,42 +86,51 @@ class Played:
 
     Attributes:
         seed: What it was played with.
-        worlds: Numbers of its worlds.
-        steps: All steps, on the device; the first of them, along the worlds, are of these worlds.
-        failed: Bits of the task's rules, shape ``(len(worlds),)``, int32.
-        retries: Grasps that were tried again, shape ``(len(worlds),)``.
+        steps: All steps, on the device; along the worlds the first ones count.
+        failed: Bits of the task's rules, shape ``(worlds,)``, int32.
+        retries: Grasps that were tried again, shape ``(worlds,)``.
         seconds: Wall time, from the reset to the result [s].
     """
 
     seed: int
-    worlds: Sequence[int]
     steps: StepRecorder
     failed: np.ndarray
     retries: np.ndarray
     seconds: float
 
-    def finite(self, place: int) -> bool:
-        """Whether every number of a world's steps is finite.
+    def finite(self, world: int) -> bool:
+        """Whether every number of a world's steps is finite."""
+        return bool(self.steps.values[:, world].isfinite().all())
 
-        Args:
-            place: Which world, by its place in the batch.
-        """
-        return bool(self.steps.values[:, place].isfinite().all())
-
-    def episodes(self, places: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-        """Some worlds' steps on the host, by kind, each ``(steps, dim)``; copied in chunks.
-
-        Args:
-            places: Which, by their place in the batch.
-        """
+    def episodes(self, worlds: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """Some worlds' steps on the host, by kind, each ``(steps, dim)``; copied in chunks."""
         values = self.steps.values
         size = max(1, _CHUNK_BYTES // (values[:, 0].numel() * values.element_size()))
         ends = np.cumsum(list(self.steps.layout.values()))[:-1]
-        for first in range(0, len(places), size):
-            chunk = torch.tensor(places[first : first + size], device=values.device)
+        for first in range(0, len(worlds), size):
+            chunk = torch.tensor(worlds[first : first + size], device=values.device)
             rows = values.index_select(1, chunk).transpose(0, 1).contiguous().cpu().numpy()
-            for place, row in zip(places[first:], rows, strict=False):
-                yield place, dict(zip(self.steps.layout, np.split(row, ends, axis=1), strict=True))
+            for world, row in zip(worlds[first:], rows, strict=False):
+                yield world, dict(zip(self.steps.layout, np.split(row, ends, axis=1), strict=True))
+
+
+def most_worlds(cfg: Config, env: Env) -> int:
+    """Worlds whose steps fit into the buffer, at most nworld.
+
+    Args:
+        cfg: The job's configuration.
+        env: An environment of its demonstrations, with any number of worlds.
+
+    Raises:
+        ConfigError: Not even one world's do.
+    """
+    gib = cast(CollectJobCfg, cfg.job).buffer_gib
+    world = 4.0 * build_phases(cfg)[-1].stop * sum(column_widths(env).values()) / 2**30
+    if gib < world:
+        raise ConfigError(
+            "job.buffer_gib", gib, f"at least {world:.2g}, which the steps of one world take"
+        )
+    return min(cfg.nworld, int(gib / world))
 
 
 def steps_block(sim: Simulation, steps: int, dim: int) -> torch.Tensor:
@@ -126,25 +139,24 @@ def steps_block(sim: Simulation, steps: int, dim: int) -> torch.Tensor:
 
 
 def play_demonstrations(
-    context: RunContext, sim: Simulation, seed: int, values: torch.Tensor, worlds: Sequence[int]
+    context: RunContext, sim: Simulation, seed: int, values: torch.Tensor, worlds: int
 ) -> Played:
-    """Plays the configured controller once in some worlds of a seed, and judges it by the task's
+    """Play the configured driver once in the first worlds of a seed, and judge it by the task's
     check.
 
-    Nothing ends an episode: worlds go on to its end, so all have as many steps. On CUDA a step is
-    one graph.
+    Nothing ends an episode: worlds go on to its end, so all have as many steps.
 
     Args:
         context: Configuration, scene and planner.
-        sim: Room for the worlds; what it has more of them is played as well and not looked at.
-        seed: What they start by.
+        sim: Room for the worlds; more of them are played as well and not looked at.
+        seed: Seed of the starts.
         values: Room for the steps, shape ``(steps, nworld, dim)``; see `steps_block`.
-        worlds: Their numbers, which random numbers depend on.
+        worlds: Number of worlds.
     """
     began = time.perf_counter()
     cfg = demonstration_config(replace(context.cfg, seed=seed))
     env = Env(sim, context.index, cfg, check_faults=False)  # the check names lost worlds
-    reset_worlds(env, seed, worlds)
+    reset_worlds(env, seed)
     recorder = StepRecorder(values)
     episode = play_episode(
         env,
@@ -155,9 +167,8 @@ def play_demonstrations(
     )
     return Played(
         seed=seed,
-        worlds=worlds,
         steps=recorder,
-        failed=episode.result.failed.cpu().numpy()[: len(worlds)],
-        retries=episode.retries[: len(worlds)],
+        failed=episode.result.failed.cpu().numpy()[:worlds],
+        retries=episode.retries[:worlds],
         seconds=time.perf_counter() - began,
     )
