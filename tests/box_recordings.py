@@ -16,7 +16,7 @@ from box_checker import BLUE, RED, BoxOutcome, BoxRecording, check_box_world
 from check_cases import STOPPED_EARLY, limits
 
 from mjstack.config import load_config
-from mjstack.drivers.driver import Controller
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor
@@ -43,7 +43,7 @@ class Recorder(Observer):
         self._names = [phase.name for phase in context.planner.phases]
         self._rows: dict[str, list[np.ndarray]] = {name: [] for name in (*STATE, "phase")}
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         self._env = env
         self._driver = driver
 

@@ -14,7 +14,7 @@ from check_cases import rules_of
 from comparison import assert_same_run
 from environments import brisk
 
-from mjstack.drivers.driver import Controller
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
@@ -184,7 +184,7 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
         *brisk(),
     )
 
-    def broken_episode(env: Env, driver: Controller, observers: list, **kwargs: Any) -> Episode:
+    def broken_episode(env: Env, driver: Driver, observers: list, **kwargs: Any) -> Episode:
         return play_episode(env, driver, [*observers, Hook(teleport(context, 2))], **kwargs)
 
     monkeypatch.setattr(gate_module, "play_episode", broken_episode)

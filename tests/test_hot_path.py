@@ -132,7 +132,7 @@ PATHS: dict[str, list[str] | None] = {
             )
         )
     ],
-    "drivers/tilt.py": ["CarryTilt.wish"],
+    "drivers/tilt.py": ["CarryTilt.desired_approach"],
     "episodes/failures.py": ["FailureMonitor.update", "_of"],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from mjstack.drivers.driver import Controller
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.rollout import Observer
 from mjstack.sim import cuda_uuid
@@ -103,7 +103,7 @@ class EnergyObserver(Observer):
         """``meter`` adds it up."""
         self._meter = meter
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         self._sim = env.sim
 

@@ -36,7 +36,7 @@ class ClosedLoopDriver:
     done in time: such a world then goes faster than the others, at most ``controller.speed_limit``
     times.
 
-    Where the robot has an ``approach_gain``, the gripper leans at the grasp as it must where the
+    Where the robot has an ``approach_gain``, the gripper tilts at the grasp as it must where the
     object is let go (`CarryTilt`).
 
     A world that the environment has reset starts over by itself.
@@ -58,7 +58,7 @@ class ClosedLoopDriver:
 
         Args:
             env: The environment; its action terms must take absolute joint commands.
-            nominal: Commands at the end of each phase in the nominal layout, which redundant joints
+            nominal: Commands at the end of each phase of the nominal plan, which redundant joints
                 keep close to, shape ``(phases, nu)``.
 
         Raises:
@@ -140,7 +140,7 @@ class ClosedLoopDriver:
         length = self._length.index_select(0, self.phase)
         u = (self._time / length).clamp(max=1.0)
         s = _smoothstep(u)[:, None]
-        # After an empty grasp straight up first, and only then to where the cube is now: it may
+        # After an empty grasp straight up first, and only then to where the object is now: it may
         # stand beside the jaws.
         up = _smoothstep((2.0 * u).clamp(max=1.0))
         over = _smoothstep((2.0 * u - 1.0).clamp(min=0.0))
@@ -154,7 +154,7 @@ class ClosedLoopDriver:
             self._turn(start, fresh)
         approach = None
         if self._tilt is not None:
-            approach = self._tilt.wish(
+            approach = self._tilt.desired_approach(
                 start, self.phase, self._aim(self._tilt.place.index_select(0, self.phase)), fresh
             )
         command, distance = self._ik.solve(
@@ -338,7 +338,7 @@ def _smoothstep(u: torch.Tensor) -> torch.Tensor:
 
 
 def make_expert(env: Env) -> ClosedLoopDriver:
-    """The scripted controller of an environment of one's own: call ``command()`` once before every
+    """Closed-loop driver of an environment: call ``command()`` once before every
     ``env.episode_step``.
 
     Worlds may end and start anew whenever they like; each goes through its own phases from its own
@@ -350,6 +350,6 @@ def make_expert(env: Env) -> ClosedLoopDriver:
     Raises:
         ArgumentError: Its actions are not absolute joint commands, or its worlds have moved on
             since their reset.
-        Unreachable: The nominal layout is out of the arm's reach.
+        Unreachable: A nominal target is out of the arm's reach.
     """
     return ClosedLoopDriver(env, OpenLoopPlanner(env.cfg).nominal)

@@ -1,4 +1,4 @@
-"""What drives a scripted episode: commands step by step, and the phase that each world is in."""
+"""Drivers give the joint targets of every world, step by step, and the phase of each world."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.scene.phases import Phase
 
 
-class Controller(Protocol):
-    """Gives the commands of every world, one step at a time. Fixed shapes, no host read: a captured
-    graph may hold it.
+class Driver(Protocol):
+    """Gives the joint targets of every world, one step at a time. Fixed shapes, no host read: a
+    captured graph may hold it.
 
     Attributes:
-        phases: The phases, laid out as a world that is not held up goes through them.
+        phases: The phases, laid out as a world without a retry goes through them. Empty for a
+            driver without phases.
         steps: Length of the episode.
         phase: Number of the phase that each world's last command belonged to, shape ``(nworld,)``,
             int64.
@@ -34,19 +35,17 @@ class Controller(Protocol):
 
 
 class Recorded:
-    """What a controller gave in an episode, to be given again; itself a controller that only
-    repeats.
+    """Joint targets of an episode of another driver, to be given again.
 
-    All worlds are given again at once, on bare steps say, so all are kept: ``steps * nworld * (4 *
-    nu + 2)`` bytes on the device, 0.85 GB for 2,000 steps of 16,384 worlds with six commands. A
-    single world needs no tape: ``job=replay`` plays it from its seed.
+    Memory: ``steps * nworld * (4 * nu + 2)`` bytes on the device, 0.85 GB for 2,000 steps of 16,384
+    worlds with six joint targets. ``job=replay`` needs none of it: it plays a world from its seed.
     """
 
-    def __init__(self, source: Controller, nu: int) -> None:
-        """Allocates for the worlds and steps of a controller; NaN until it is written.
+    def __init__(self, source: Driver, nu: int) -> None:
+        """Allocates for the worlds and steps of a driver; NaN until it is written.
 
         Args:
-            source: The controller.
+            source: The driver.
             nu: Width of its commands.
         """
         self.phases = source.phases
@@ -84,29 +83,29 @@ class Recorded:
 
 
 class OpenLoopDriver:
-    """Plays a command tape once, from the start that it was planned for: every world is in the same
-    phase.
+    """Plays joint trajectories once, from the start that they were planned for: every world is in
+    the same phase.
     """
 
     def __init__(
-        self, tape: JointTrajectory, phases: list[Phase], nworld: int, device: torch.device
+        self, trajectory: JointTrajectory, phases: list[Phase], nworld: int, device: torch.device
     ) -> None:
-        """Takes the tape, which must be on the device."""
-        self.tape = tape
+        """Takes the trajectory, which must be on the device."""
+        self._trajectory = trajectory
         self.phases = phases
-        self.steps = tape.steps
+        self.steps = trajectory.steps
         numbers = [
             number for number, phase in enumerate(phases) for _ in range(phase.start, phase.stop)
         ]
         self._phase_at = torch.tensor(numbers, device=device)
         self._next = torch.zeros(1, dtype=torch.int64, device=device)
         self.phase = torch.zeros(nworld, dtype=torch.int64, device=device)
-        self.error = torch.as_tensor(tape.waypoint_error, device=device)
+        self.error = torch.as_tensor(trajectory.waypoint_error, device=device)
         self.retries = torch.zeros(nworld, dtype=torch.int32, device=device)
 
     def command(self) -> torch.Tensor:
         """Commands of the next step, shape ``(nworld, nu)``."""
-        out = self.tape.command(self._next)
+        out = self._trajectory.command(self._next)
         self.phase.copy_(self._phase_at.index_select(0, self._next).expand_as(self.phase))
         self._next.add_(1).clamp_(max=self.steps - 1)  # past the end the last one holds
         return out

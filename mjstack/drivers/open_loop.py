@@ -1,4 +1,4 @@
-"""The scripted grasp: phases, targets of the grasp point, and the command tape of every world."""
+"""Planning before the episode: targets of the grasp point and joint trajectories of every world."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class JointTrajectory:
         self._offsets = torch.arange(self._k)
 
     def to(self, device: torch.device, dtype: torch.dtype) -> JointTrajectory:
-        """The same tape on a device."""
+        """The same trajectory on a device."""
         moved = copy.copy(self)
         moved._weights, moved._knots = (
             self._weights.to(device, dtype),
@@ -67,7 +67,7 @@ class JointTrajectory:
         """Commands of one step.
 
         Args:
-            step: Its number; or shape ``(1,)``, int64, on the tape's device, for a captured graph.
+            step: Its number; or shape ``(1,)``, int64, on the same device, for a captured graph.
 
         Returns:
             Shape ``(nworld, nu)``.
@@ -86,7 +86,7 @@ class OpenLoopPlanner:
     def __init__(
         self, cfg: Config, *, parallel_from: int = PARALLEL_FROM, processes: int | None = None
     ) -> None:
-        """Plans the nominal layout, from which every other plan starts.
+        """Plans the nominal start, from which every other plan starts.
 
         Args:
             cfg: The configuration.
@@ -153,14 +153,14 @@ class OpenLoopPlanner:
         if len(first) < nworld:
             knots = knots[twin]
             error = error[twin]
-        tape = JointTrajectory(knots, self._weights, self._segments, error)
+        trajectory = JointTrajectory(knots, self._weights, self._segments, error)
         if nworld > 1:
-            self._last = (sources_xy.copy(), tape)
-        return tape
+            self._last = (sources_xy.copy(), trajectory)
+        return trajectory
 
     @property
     def nominal(self) -> np.ndarray:
-        """Commands at the end of each phase in the nominal layout, shape ``(phases, nu)``."""
+        """Commands at the end of each phase of the nominal plan, shape ``(phases, nu)``."""
         assert self._seed is not None
         return self._seed[len(self._nodes) - 1 :: len(self._nodes)]
 
@@ -169,12 +169,12 @@ class OpenLoopPlanner:
         plan.
         """
         nominal = nominal_xy(self._cfg.scene)
-        tape = self.plan(nominal[None])
+        trajectory = self.plan(nominal[None])
         worst = 0.0
         for phase, (start, end, _, _) in zip(self.phases, self._targets(nominal), strict=True):
             for step in range(phase.start, phase.stop):
                 s = _smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
-                at = self.ik.grasp_point(tape.command(step)[0].numpy())
+                at = self.ik.grasp_point(trajectory.command(step)[0].numpy())
                 worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start)))))
         return worst
 

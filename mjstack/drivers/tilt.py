@@ -1,4 +1,4 @@
-"""How the gripper is to lean, so that an object arrives as it stood."""
+"""Approach tilt of a grasp, so that an object arrives upright."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from mjstack.scene.phases import carried_objects
 
 
 class CarryTilt:
-    """Where every world's gripper is to point: when it grasps, as it can at the cube's place; from
-    then on, as it grasped.
+    """Desired approach axis of every world: at the grasp, as the release pose needs it; from then
+    on, as it was at the grasp.
 
-    An arm that grasps near its base can point straight down, and far from it must lean. A cube
-    grasped upright would arrive there tilted by the difference, on an edge, and may fall. So
-    another arm, a thought one, follows the place at which the cube will be let go, a few iterations
-    per step, and says how it leans there. The open hand keeps its tilt until it looks for the next
-    cube, so that it does not turn the one that it lets go.
+    An arm that grasps near its base can point straight down, and far from it must tilt. An object
+    grasped upright would arrive there tilted by the difference, on an edge, and may fall. So a
+    virtual copy of the arm tracks the release pose, a few iterations per step, and gives its tilt.
+    The open gripper keeps its tilt until it observes the next object, so that it does not turn the
+    released one.
 
-    The wish is turned about the vertical with the arm's first joint: it is the angle to the
-    vertical that is kept.
+    The desired axis turns about the vertical with the arm's first joint: its angle to the vertical
+    is kept.
     """
 
     def __init__(
@@ -37,9 +37,9 @@ class CarryTilt:
         Args:
             model: The compiled scene.
             cfg: The configuration; ``controller.approach_gain`` must be positive.
-            ik: The controller's solver.
-            nominal: Commands at the end of each phase in the nominal layout, shape ``(phases,
-                nu)``, float32.
+            ik: The driver's solver.
+            nominal: Commands at the end of each phase of the nominal plan, shape ``(phases, nu)``,
+                float32.
 
         Raises:
             ConfigError: The arm's first joint does not turn about the vertical.
@@ -65,16 +65,16 @@ class CarryTilt:
         self._kept = nominal.new_zeros((ik.nworld, 3))
         self._kept_turn = nominal.new_zeros(ik.nworld)
 
-    def wish(
+    def desired_approach(
         self, command: torch.Tensor, phase: torch.Tensor, there: torch.Tensor, fresh: torch.Tensor
     ) -> torch.Tensor:
-        """Where the approach axis is to point in the next step. Fixed shapes, no host read.
+        """Desired approach axis of the next step. Fixed shapes, no host read.
 
         Args:
             command: What the arm starts from [rad, m], shape ``(nworld, nu)``, float32.
             phase: Number of each world's phase, shape ``(nworld,)``, int64.
-            there: Target of the phase ``place[phase]``, where the next cube or the held one is let
-                go [m], shape ``(nworld, 3)``.
+            there: Target of the phase ``place[phase]``, where the next object or the held one is
+                released [m], shape ``(nworld, 3)``.
             fresh: Worlds that start an episode, shape ``(nworld,)``, bool.
 
         Returns:
@@ -123,8 +123,8 @@ def _keeps(specs: Sequence[PhaseCfg]) -> list[bool]:
 
 
 def _places(cfg: Config) -> list[int]:
-    """For each phase the one at whose target the next cube, or the held one, is let go; after all
-    of them, the last.
+    """Number of the phase at whose target the next object, or the held one, is released, for each
+    phase; after all of them, the last.
     """
     specs = list(cfg.controller.phases.values())
     carries = [number >= 0 for number in carried_objects(cfg)]

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import Backend, Config
-from mjstack.drivers.driver import Controller, Recorded
+from mjstack.drivers.driver import Driver, Recorded
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env
 from mjstack.episodes.observers import (
@@ -269,7 +269,7 @@ class RunContext:
         cfg = self.cfg if seed is None else replace(self.cfg, seed=seed)
         return start_worlds(sim, self.index, cfg, reset, worlds)
 
-    def driver(self, env: Env) -> Controller:
+    def driver(self, env: Env) -> Driver:
         """The configured driver, for worlds that have started."""
         return make_driver(env, self.planner, self.advance)
 

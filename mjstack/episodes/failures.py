@@ -8,7 +8,7 @@ from enum import IntEnum
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.drivers.driver import Controller
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.rollout import Observer
 from mjstack.math import not_finite
@@ -92,7 +92,7 @@ class FailureMonitor(Observer):
         )
         self._releases = _releases(self._tables[1], len(objects))
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """Allocate for the environment's worlds."""
         self._env = env
         self._driver = driver

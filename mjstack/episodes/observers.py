@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjstack.drivers.driver import Controller, Recorded
+from mjstack.drivers.driver import Driver, Recorded
 from mjstack.envs import Env
 from mjstack.episodes.rollout import Advance, Observer, RolloutTiming, State, rollout, snapshot
 from mjstack.sim import Simulation
@@ -38,7 +38,7 @@ class Episode:
 
 def play_episode(
     env: Env,
-    driver: Controller,
+    driver: Driver,
     observers: Sequence[Observer] = (),
     *,
     advance: Advance | None = None,
@@ -74,7 +74,7 @@ class Judge(Observer):
 
     result: CheckResult
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         self._driver = driver
         self._check = make_check(env.cfg)
@@ -100,7 +100,7 @@ class WorldRecorder(Observer):
     qpos: np.ndarray
     phase: np.ndarray
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         self._sim = env.sim
         self._driver = driver
@@ -125,7 +125,7 @@ class Snapshots(Observer):
         self._steps = frozenset(steps)
         self.states: dict[int, State] = {}
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         self._sim = env.sim
 
@@ -144,7 +144,7 @@ class CommandRecorder(Observer):
 
     recorded: Recorded
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         self._env = env
         self._driver = driver
@@ -162,7 +162,7 @@ class Hook(Observer):
         """``function`` gets the step's number and the simulation."""
         self._function = function
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         self._sim = env.sim
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mjstack.drivers.driver import Controller
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.observers import Episode
@@ -44,7 +44,7 @@ class StartRecorder(Observer):
     names: tuple[str, ...]
     poses: np.ndarray
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         self.names = tuple(env.index.objects)
         poses = [pose_w(env, name).double().cpu().numpy() for name in self.names]

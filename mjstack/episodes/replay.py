@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Backend, Config
-from mjstack.drivers.driver import Controller
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Episode, WorldRecorder
@@ -139,7 +139,7 @@ def replay_world(
 class _Trace(Observer):
     """Keeps the start and the state at every step end."""
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         self._sim = env.sim
         self.initial = snapshot(env.sim)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config, TermCfg
-from mjstack.drivers.driver import Controller, OpenLoopDriver
+from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, driven_config
 from mjstack.mdp.geometry import source_xy
@@ -35,7 +35,7 @@ class Observer:
 
     aside: float = 0.0
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """Prepare for an episode. Called once, when every world is at its start."""
 
     def update(self) -> None:
@@ -70,7 +70,7 @@ class RolloutTiming:
 
 def rollout(
     env: Env,
-    driver: Controller,
+    driver: Driver,
     observers: Sequence[Observer] = (),
     *,
     steps: int | None = None,
@@ -181,7 +181,7 @@ def reset_worlds(env: Env, seed: int, worlds: Sequence[int] | None = None) -> En
     return env
 
 
-def make_driver(env: Env, planner: OpenLoopPlanner, advance: Advance | None = None) -> Controller:
+def make_driver(env: Env, planner: OpenLoopPlanner, advance: Advance | None = None) -> Driver:
     """Make the configured driver, for worlds that have started.
 
     Args:

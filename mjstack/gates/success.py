@@ -12,7 +12,7 @@ import numpy as np
 
 from mjstack.config.schema import Config
 from mjstack.config.validate import places_objects, reads_starts_file
-from mjstack.drivers.driver import Controller
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext, needs_episode
 from mjstack.episodes.record import starts_name
@@ -118,7 +118,7 @@ class _StartsWriter(Observer):
         self._path = path
         self._unwritten = unwritten
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         try:
             write_starts(env, self._path)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import CollectJobCfg, Config
-from mjstack.drivers.driver import Controller
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import play_episode
@@ -53,7 +53,7 @@ class StepRecorder(Observer):
         """Takes the block, which is written from its first step on."""
         self.values = values
 
-    def start(self, env: Env, driver: Controller) -> None:
+    def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         self.layout = column_widths(env)
         self._env = env

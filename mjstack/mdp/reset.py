@@ -250,7 +250,7 @@ def _write_object(
     """Moves the masked worlds' object off the position where the simulation's reset has put it."""
     view = pose_w(env, name)
     place = view[:, :3] + torch.stack((dx, dy, torch.zeros_like(dx)), dim=1)
-    # Float64, because a float32 cosine need not be that of any angle, and a file of layouts has the
+    # Float64, because a float32 cosine need not be that of any angle, and a file of starts has the
     # angle.
     _write(view, mask, torch.cat((place, quat_from_yaw(yaw.double()).to(place.dtype)), dim=1))
 

@@ -29,7 +29,7 @@ from mjstack.mdp.starts.reach import out_of_reach
 from mjstack.mdp.starts.table import StartsTable, column_names, read_starts_table
 
 _ROUNDING = 1e-6  # of a range's ends, which float32 does not hold exactly
-# [m], and of a quaternion: how far from standing on the table a cube may be that stands on it
+# [m], and of a quaternion: how far off upright an object on the table may be
 _FLAT = 1e-5
 
 
@@ -333,9 +333,9 @@ def _check_on_table(env: EnvView, file: StartsTable, places: np.ndarray) -> None
             reach[:, number] = thing.footprint
     over = np.abs(places[..., :2] - scene.table_center[:2]) + reach - scene.table_half[:2]
     if over.max() > _ROUNDING:
-        world, cube, axis = np.argwhere(over > _ROUNDING)[0]
-        name = list(env.index.objects)[cube]
-        room = scene.table_half[axis] - reach[world, cube, axis]
+        world, number, axis = np.argwhere(over > _ROUNDING)[0]
+        name = list(env.index.objects)[number]
+        room = scene.table_half[axis] - reach[world, number, axis]
         # Rounded towards the table, so that what is said succeeds.
         low = math.ceil(1e3 * (scene.table_center[axis] - room)) / 1e3
         high = math.floor(1e3 * (scene.table_center[axis] + room)) / 1e3
@@ -343,8 +343,8 @@ def _check_on_table(env: EnvView, file: StartsTable, places: np.ndarray) -> None
             world,
             [_place(name)[axis]],
             f"{low:.3f} to {high:.3f}, so that {name} is on the table, turned as it is;"
-            f" {places[world, cube, axis]:.6g} is {1e3 * over[world, cube, axis]:.1f} mm over the"
-            " edge",
+            f" {places[world, number, axis]:.6g} is {1e3 * over[world, number, axis]:.1f} mm over"
+            " the edge",
             "Move it",
         )
 
@@ -358,10 +358,10 @@ def _check_touching(
     data = mujoco.MjData(model)
     owner = {geom: name for name, geoms in index.geoms.items() for geom in geoms}
     allowed = {model.geom("table").id}
-    for world, (cubes, joints) in enumerate(zip(places, command, strict=True)):
+    for world, (objects, joints) in enumerate(zip(places, command, strict=True)):
         data.qpos[:] = model.qpos0
         data.qpos[index.robot_qpos] = joints
-        for (address, _), (x, y, yaw) in zip(index.objects.values(), cubes, strict=True):
+        for (address, _), (x, y, yaw) in zip(index.objects.values(), objects, strict=True):
             data.qpos[address : address + 2] = x, y
             data.qpos[address + 3 : address + 7] = (
                 math.cos(0.5 * yaw),
