@@ -117,18 +117,18 @@ def test_the_columns_say_what_is_in_the_worlds(robot: str, tmp_path: Path) -> No
     for w, row in enumerate(rows):
         value = {name: float(text) for name, text in row.items()}
         for cube in ("red", "blue"):
-            address = int(m.joint(f"{cube}_cube").qposadr[0])
+            address = int(m.joint(f"{cube}").qposadr[0])
             pose = env.sim.qpos[w, address : address + 7].numpy()
             np.testing.assert_array_equal(pose[:2], [value[f"{cube}_x_m"], value[f"{cube}_y_m"]])
             turned = np.empty(4)
             mujoco.mju_axisAngle2Quat(turned, np.array([0.0, 0.0, 1.0]), value[f"{cube}_yaw_rad"])
             np.testing.assert_allclose(pose[3:], turned, atol=1e-12)
             assert (
-                env.sim.fields["body_mass"][w, m.body(f"{cube}_cube").id]
+                env.sim.fields["body_mass"][w, m.body(f"{cube}").id]
                 == value[f"{cube}_mass_kg"]
             )
             assert (
-                env.sim.fields["geom_friction"][w, m.geom(f"{cube}_cube").id, 0]
+                env.sim.fields["geom_friction"][w, m.geom(f"{cube}").id, 0]
                 == value[f"{cube}_friction"]
             )
         for name in (*env.cfg.robot.arm_joints, *env.cfg.robot.gripper_joints):
@@ -318,13 +318,13 @@ BAD: dict[str, tuple[Callable[[Rows], Rows], str]] = {
     "touching": (
         change(3, blue_x_m="0.33", blue_y_m="-0.09", blue_yaw_rad="0.8"),
         (
-            ", line 5, columns red_x_m, red_y_m, blue_x_m, blue_y_m: expected cubes that touch"
+            ", line 5, columns red_x_m, red_y_m, blue_x_m, blue_y_m: expected objects that touch"
             " nothing but the table; red and blue touch in world 3. Move them apart."
         ),
     ),
     "in the arm": (
         change(2, red_x_m="0.215", red_y_m="0"),
-        ", line 4, columns red_x_m, red_y_m: expected cubes that touch nothing but the table; ",
+        ", line 4, columns red_x_m, red_y_m: expected objects that touch nothing but the table; ",
     ),
     "out of reach": (
         change(1, red_x_m="0.47", red_y_m="-0.2"),

@@ -339,7 +339,7 @@ def _smoothstep(u: torch.Tensor) -> torch.Tensor:
 
 def make_expert(env: Env) -> ClosedLoopDriver:
     """Closed-loop driver of an environment: call ``command()`` once before every
-    ``env.episode_step``.
+    ``env.step``.
 
     Worlds may end and start anew whenever they like; each goes through its own phases from its own
     reset on.
