@@ -123,10 +123,7 @@ def test_the_columns_say_what_is_in_the_worlds(robot: str, tmp_path: Path) -> No
             turned = np.empty(4)
             mujoco.mju_axisAngle2Quat(turned, np.array([0.0, 0.0, 1.0]), value[f"{cube}_yaw_rad"])
             np.testing.assert_allclose(pose[3:], turned, atol=1e-12)
-            assert (
-                env.sim.fields["body_mass"][w, m.body(f"{cube}").id]
-                == value[f"{cube}_mass_kg"]
-            )
+            assert env.sim.fields["body_mass"][w, m.body(f"{cube}").id] == value[f"{cube}_mass_kg"]
             assert (
                 env.sim.fields["geom_friction"][w, m.geom(f"{cube}").id, 0]
                 == value[f"{cube}_friction"]
