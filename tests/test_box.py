@@ -404,7 +404,10 @@ def test_lowest_point_of_a_mesh_is_never_too_high() -> None:
         (["scene.box.wall=-0.006"], ["scene.box.wall=-0.006", "above 0"]),
         (["scene.box.floor_solref=[-4444,1]"], ["scene.box.floor_solref", "time constant"]),
         (["scene.box.friction=[1,0.005]"], ["scene.box.friction", "3 numbers"]),
-        (["scene.places.red_slot.xy=[0.46,0.26]"], ["scene.places.red_slot.xy", "off the walls"]),
+        (
+            ["scene.places.red_slot.xy=[0.46,0.26]"],
+            ["scene.places.red_slot.xy", "a place in the box"],
+        ),
         (["scene.places.red_slot.xy=null"], ["red_slot"]),
         (["scene.objects.blue.xy=[0.35,0.0]"], ["scene.objects.blue.xy", "beside the box"]),
         (["scene.random_xy=[0.1]"], ["scene.random_xy", "2 numbers"]),

@@ -77,7 +77,7 @@ def scripted(robot: str) -> SimpleNamespace:
     )
     (result,) = run_success(context)
     (rec,) = context.recordings
-    rec.result = result
+    rec.gate = result
     return rec
 
 
@@ -110,8 +110,8 @@ def test_scripted_controller_passes_the_success_gate(robot: str) -> None:
     both cubes get there.
     """
     rec = scripted(robot)
-    result = rec.result
-    metrics = rec.result.metrics
+    result = rec.gate
+    metrics = rec.gate.metrics
     assert result.status is Status.passed, result.reason
     assert result.thresholds["success_rate_min"] == 0.97
     assert (

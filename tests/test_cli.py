@@ -300,7 +300,7 @@ def test_baseline_leaves_a_whole_report(folder: Path) -> None:
     (gate,) = report["gates"]
     assert set(gate) >= {"name", "status", "reason", "seconds", "thresholds", "metrics", "notes"}
     assert (gate["name"], gate["status"]) == ("baseline", "pass")
-    assert 0 <= gate["metrics"]["xy_err_m"] <= gate["thresholds"]["xy_err_max_m"]
+    assert 0 <= gate["metrics"]["xy_err_m"] <= gate["thresholds"]["xy_err_m"]
     assert 0.035 <= gate["metrics"]["dz_m"] <= 0.055
     assert all(isinstance(v, float | int) for v in gate["metrics"].values())
     (job,) = {path.parent for path in folder.rglob("report.json")}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import mjstack
@@ -107,6 +109,34 @@ def test_third_party_packages_have_one_home() -> None:
         for name in names
         for top in [name.split(".")[0]]
         if top in HOMES and not file.startswith(HOMES[top])
+    ]
+    assert not wrong
+
+
+OF_TASKS = re.compile(r"(.*_)?(red|blue)(_.*)?|xy_err.*|slot_err.*|dz_m|'(stack|reach)'")
+COLORS = {"jobs/result.py": "red"}  # of the terminal
+
+
+def words(path: Path) -> Iterator[tuple[int, str]]:
+    """Identifiers, strings in quotation marks, and the words of strings that are no sentences, with
+    their lines.
+    """
+    for node in ast.walk(ast.parse(path.read_text())):
+        for key in ("id", "attr", "arg", "name", "value"):
+            text = getattr(node, key, None)
+            if isinstance(text, str) and " " not in text:
+                parts = [text] if key != "value" else [repr(text), *re.findall(r"\w+", text)]
+                yield from ((getattr(node, "lineno", 0), part) for part in parts)
+
+
+def test_only_tasks_know_tasks() -> None:
+    """No other module names an object of a task, a task's measure or a task."""
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line}: {word}"
+        for path in sorted(ROOT.rglob("*.py"))
+        if path.parent.name != "tasks"
+        for line, word in words(path)
+        if OF_TASKS.fullmatch(word) and COLORS.get(str(path.relative_to(ROOT))) != word
     ]
     assert not wrong
 

@@ -1,6 +1,4 @@
-"""One world of a batch played again, alone: its trajectory, and every acceptance rule with what was
-found and wanted.
-"""
+"""One world of a batch played again, alone: its trajectory, and a report on every rule."""
 
 from __future__ import annotations
 
@@ -11,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import Driver
@@ -22,17 +19,17 @@ from mjstack.episodes.record import measured_values
 from mjstack.episodes.rollout import Observer, State, snapshot
 from mjstack.files import write_atomic
 from mjstack.managers.reset import required_fields
-from mjstack.math import lowest_point
-from mjstack.scene import table_top
 from mjstack.sim import Simulation, describe_overflow, make_simulation, resolve_sizes
 from mjstack.sim.sizes import BatchSizes
+from mjstack.tasks.check import make_check
+from mjstack.tasks.view import TaskView
 
 _SHARES = 4  # of the contact pool, for a world that is alone
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RuleFinding:
-    """One acceptance rule of one world: whether it held, what was found, and what it wants."""
+    """One rule of one world: whether it held, what was found, and what it wants."""
 
     rule: str
     text: str
@@ -121,7 +118,7 @@ def replay_world(
         episode = context.play(
             sim, cfg.reset, [trace, *observers, recorder], seed=seed, worlds=[world]
         )
-        steps = _steps(trace.states, recorder, cfg, context)
+        steps = _steps(trace, recorder, cfg, context)
         return ReplayedWorld(
             episode=episode,
             recorder=recorder,
@@ -137,18 +134,31 @@ def replay_world(
 
 
 class _Trace(Observer):
-    """Keeps the start and the state at every step end."""
+    """Keeps the start, the state at every step end, and what the check looks at."""
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         self._sim = env.sim
+        self._check = make_check(env.cfg)
+        self._task = self._check.view(env)
+        self._objects = TaskView(env, list(env.cfg.scene.free))
         self.initial = snapshot(env.sim)
         self.fields = {name: f[0].cpu().numpy().copy() for name, f in env.sim.fields.items()}
         self.states: list[State] = []
+        self.values: dict[str, list[np.ndarray]] = {}
 
     def after_step(self, step: int) -> None:
         """See `Observer`."""
         self.states.append(snapshot(self._sim))
+        objects = self._objects.step()
+        values = {
+            "cube_pos_m": objects.pos,
+            "cube_speed_m_per_s": objects.speed,
+            "cube_height_m": objects.height,
+            **self._check.trace(self._task.step()),
+        }
+        for name, value in values.items():
+            self.values.setdefault(name, []).append(value[0].cpu().numpy().copy())
 
 
 def start_of_world(
@@ -199,39 +209,19 @@ def _sizes_alone(sizes: BatchSizes, nworld: int) -> BatchSizes:
 
 
 def _steps(
-    states: list[State], recorder: WorldRecorder, cfg: Config, context: RunContext
+    trace: _Trace, recorder: WorldRecorder, cfg: Config, context: RunContext
 ) -> dict[str, np.ndarray]:
-    """State and what the check looks at, at step ends; red is 0 and blue is 1."""
-    index = context.index
-    qpos, qvel, ctrl = (
-        np.concatenate([getattr(s, name) for s in states]) for name in ("qpos", "qvel", "ctrl")
-    )
-    pose = torch.from_numpy(np.stack([qpos[:, a : a + 7] for a in index.object_qpos], 1)).float()
-    velocity = np.stack([qvel[:, a : a + 6] for a in index.object_qvel], 1)
-    objects = list(cfg.scene.free.values())
-    low = np.stack(
-        [
-            lowest_point(pose[:, k, :3], pose[:, k, 3:], thing.shape, thing.size).numpy()
-            for k, thing in enumerate(objects)
-        ],
-        axis=1,
-    ) - np.float32(table_top(cfg.scene))
-    radii = np.array([thing.radius for thing in objects])
-    spin = radii * np.linalg.norm(velocity[..., 3:], axis=-1)
-    red = pose[:, 0, :3].numpy()
-    blue = pose[:, 1, :3].numpy()  # float32, as the check computes
+    """State and what the check looks at, at step ends, objects in the scene's order."""
     names = np.array([phase.name for phase in context.planner.phases])
+    states = {
+        name: np.concatenate([getattr(state, name) for state in trace.states])
+        for name in ("qpos", "qvel", "ctrl")
+    }
     return {
-        "time_s": np.arange(1, len(states) + 1) * cfg.timing.step_dt,
+        "time_s": np.arange(1, len(trace.states) + 1) * cfg.timing.step_dt,
         "phase": names[recorder.phase],
-        "qpos": qpos,
-        "qvel": qvel,
-        "ctrl": ctrl,
-        "cube_pos_m": pose[..., :3].numpy(),
-        "xy_err_m": np.linalg.norm(red[:, :2] - blue[:, :2], axis=1),
-        "dz_m": red[:, 2] - blue[:, 2],
-        "cube_speed_m_per_s": np.linalg.norm(velocity[..., :3], axis=-1) + spin,
-        "cube_height_m": low,
+        **states,
+        **{name: np.stack(values) for name, values in trace.values.items()},
     }
 
 

@@ -162,10 +162,8 @@ class BoxCheck(EpisodeCheck):
         self.inside = Inside(self.cfg, t.inside)
         if len(t.places) != len(t.objects):
             raise ConfigError("task.check.places", t.places, "a place for each object")
-        for place in t.places:
-            if place not in self.cfg.scene.places:
-                raise UnknownName("task.check.places: place", place, self.cfg.scene.places)
         self.slots = dict(zip(t.objects, t.places, strict=True))
+        self._check_places()
         phases = self.cfg.controller.phases
         for name in itertools.chain(*self.during(*ROLES)) if phases else ():
             if name not in phases:
@@ -208,11 +206,29 @@ class BoxCheck(EpisodeCheck):
                 self.resting,
                 t.window,
                 measure=self.trace,
+                found=lambda values: (
+                    f"outermost corner {millimetres(values['beyond_m'])} outside, fastest"
+                    f" {values['corner_speed_m_per_s']:.2g} m/s"
+                ),
                 wanted=f"out of the jaws, at most {millimetres(t.inside)} outside, corners below"
                 f" {t.rest_speed:g} m/s",
             ),
             _JawClear(self),
         ]
+
+    def _check_places(self) -> None:
+        """Raises unless every object fits into the box at its place."""
+        box = scene_box(self.cfg)
+        places = self.cfg.scene.places
+        for name, slot in self.slots.items():
+            if slot not in places:
+                raise UnknownName("task.check.places: place", slot, places)
+            if name not in self.cfg.scene.objects:
+                continue  # the base class reports it
+            xy = places[slot].xy
+            half = self.cfg.scene.objects[name].half
+            if not all(abs(xy[i] - box.center[i]) <= box.half[i] - half[i] for i in (0, 1)):
+                raise ConfigError(f"scene.places.{slot}.xy", xy, f"a place in the box for {name}")
 
     def during(self, *roles: str) -> list[list[str]]:
         """Names of each object's phases of some roles."""

@@ -31,7 +31,7 @@ import torch
 from mjstack.config.fields import check_fields, field_range
 from mjstack.config.schema import Config
 from mjstack.config.terms import typed
-from mjstack.errors import ConfigError, TermError
+from mjstack.errors import ConfigError, TermError, UnknownName
 from mjstack.managers.base import EnvView, resolve_func
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED
@@ -216,6 +216,9 @@ class EpisodeCheck(ABC):
             raise ConfigError("task.check.window", self.settle_steps, expected)
         self.objects = list(cfg.scene.objects)
         self._rules = self.build()
+        for name in self.objects:
+            if name not in cfg.scene.objects:
+                raise UnknownName("task.check: object", name, cfg.scene.objects)
         self.rules = Rules(
             {name: text for rule in self._rules for name, text in rule.texts.items()}
         )

@@ -228,7 +228,8 @@ class InWindow(Rule):
         condition: Condition,
         window: int,
         *,
-        measure: Callable[[Step], dict[str, torch.Tensor]] | None = None,
+        measure: Callable[[Step], dict[str, torch.Tensor]] = lambda end: {},
+        found: Callable[[Mapping[str, float]], str] = lambda values: "",
         wanted: str = "",
     ) -> None:
         """Describes the rule; see `Rule`.
@@ -239,12 +240,14 @@ class InWindow(Rule):
             condition: If it has several columns, all have to hold.
             window: How many steps.
             measure: Values at the end of the episode, by name with unit.
+            found: Those of one world in words.
             wanted: The condition in words.
         """
         super().__init__(name, text)
         self._condition = condition
         self._window = window
-        self._measure = measure or (lambda end: {})
+        self._measure = measure
+        self._found = found
         self._wanted = wanted
         self._value = f"{name.lower()}_steps"
 
@@ -267,9 +270,10 @@ class InWindow(Rule):
 
     def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
         """See `Rule`."""
+        found = self._found(values)
         return [
             (
-                f"in the last {values[self._value]:.0f} steps",
+                f"in the last {values[self._value]:.0f} steps{found and '; at the end '}{found}",
                 f"in the last {self._window}{self._wanted and ': '}{self._wanted}",
             )
         ]

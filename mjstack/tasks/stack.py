@@ -122,6 +122,7 @@ class StackCheck(EpisodeCheck):
                 self.stacked,
                 t.window,
                 measure=self.trace,
+                found=self.headline,
                 wanted=f"xy_err at most {millimetres(t.xy_err)}, dz {1e3 * t.dz_min:g} to"
                 f" {millimetres(t.dz_max)}",
             ),

@@ -1,0 +1,226 @@
+"""A check of one's own, made of parts; thresholds; and judging without phases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from check_cases import rules_of
+from test_box_check import planned, scripted
+from test_stack_check import World as StackWorld
+from test_stack_check import feed as feed_stack
+
+from mjstack.config import load_config
+from mjstack.config.fields import spec
+from mjstack.config.schema import Backend
+from mjstack.config.schema.scene import PlaceCfg
+from mjstack.episodes.rollout import NOMINAL, start_worlds
+from mjstack.errors import MjstackError
+from mjstack.scene import SceneIndex, build_model
+from mjstack.sim import make_simulation
+from mjstack.tasks.check import EpisodeCheck, Rule, make_check
+from mjstack.tasks.parts import AtRest, InWindow, Streak, at_place, in_hand
+from mjstack.tasks.view import Step
+
+
+class PutCheck(EpisodeCheck):
+    """An object has been in the hand, and rests at a place."""
+
+    @dataclass(kw_only=True, slots=True)
+    class Thresholds:
+        object: str = spec()
+        place: str = spec()
+        grasp_steps: int = spec(unit="steps", ge=1)
+        distance: float = spec(unit="m", gt=0.0)
+        window: int = spec(unit="steps", ge=2)
+
+    def build(self) -> list[Rule]:
+        t = self.t
+        self.objects = [t.object]
+        self.there = at_place(t.object, t.place, distance=t.distance)
+        return [
+            Streak(
+                "GRASP",
+                "{object} not grasped",
+                self.objects,
+                in_hand(t.object),
+                t.grasp_steps,
+                phases=[["grasp"]],
+                doing="between both jaws",
+            ),
+            InWindow("AT_PLACE", f"{t.object} not at {t.place}", self.there, t.window),
+            AtRest(t.window, speed=0.05, position=0.005, rotation_deg=3.0),
+        ]
+
+    def placed(self, step: Step) -> torch.Tensor:
+        return self.there(step)[:, None]
+
+
+def test_a_check_of_ones_own_judges_native_worlds() -> None:
+    """World 0: blue stands at the place. 1: beside it. 2: at it, but both jaws have pressed on it
+    before.
+    """
+    cfg = load_config(["sim=native"])
+    own = {"object": "blue", "place": "goal", "grasp_steps": 3, "distance": 0.01, "window": 10}
+    task = replace(cfg.task, check={"func": f"{__name__}.PutCheck", **own})
+    scene = replace(cfg.scene, places={"goal": PlaceCfg(xy=[0.33, 0.15])})
+    cfg = replace(cfg, task=task, scene=scene)
+    model = build_model(cfg)
+    index = SceneIndex(model, cfg.robot, cfg.scene)
+    sim = make_simulation(model, cfg, 3, backend=Backend.native, device="cpu")
+    env = start_worlds(sim, index, cfg, NOMINAL)
+    address, _ = index.object_address("blue")
+    sim.qpos[:, address : address + 2] = torch.tensor([[0.33, 0.15], [0.33, 0.18], [0.33, 0.15]])
+    check = make_check(cfg)
+    assert list(check.rules)[3:] == [
+        *("GRASP", "AT_PLACE", "REST_SPEED", "REST_POSITION", "REST_ROTATION")
+    ]
+    assert check.thresholds() == {"grasp_steps": 3, "distance_m": 0.01, "window_steps": 10}
+    check.start(env, 20)
+    for step in range(20):
+        sim.step(cfg.timing.decimation)
+        for jaw in index.jaw_force["blue"]:
+            sim.sensordata[:, jaw] = 0.0
+            sim.sensordata[2, jaw] = 1.0 if step < 5 else 0.0
+        check.update()
+    result = check.result()
+    broken = [check.rules.broken(int(bits)) for bits in result.failed]
+    assert broken == [["GRASP"], ["GRASP", "AT_PLACE"], []]
+    assert result.values["grasp_steps"].tolist() == [0.0, 0.0, 5.0]
+    assert check.placed(check.view(env).step())[:, 0].tolist() == [True, False, True]
+    told = check.report({name: float(value[1]) for name, value in result.values.items()})
+    assert told["GRASP"] == ("0 steps between both jaws in a row", "at least 3 in grasp")
+    assert told["AT_PLACE"] == ("in the last 0 steps", "in the last 10")
+    sim.close()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "parts"),
+    [
+        (["+task.check.xy_er=1"], ["task.check: key", "xy_er", "Did you mean 'xy_err'?"]),
+        (["task.check.xy_err=wide"], ["task.check.xy_err=wide", "float"]),
+        (["task.check.lift_steps=2.5"], ["task.check.lift_steps=2.5", "int"]),
+        (["task.check.rest_speed=0"], ["task.check.rest_speed=0", "above 0 [m/s]"]),
+        (["task.check.window=601"], ["task.check.window=601", "600 steps"]),
+        (["task.check.object=green"], ["task.check: object", "green", "red"]),
+        (["task.check.func=mjstack.tasks.stack.StackChek"], ["task.check.func", "StackCheck"]),
+        (["task.check.func=mjstack.tasks.stack.StackSuccess"], ["a subclass of", "EpisodeCheck"]),
+        (["task.check=null"], ["task.check=null", "trained, not verified"]),
+        (["task=reach"], ["task.check=null", "task reach"]),
+        (["task=box", "task.check.places=[red_slot]"], ["task.check.places", "each object"]),
+        (["task=box", "task.check.places=[red_slot,lid]"], ["task.check.places", "lid"]),
+    ],
+)
+def test_thresholds_are_checked(overrides: list[str], parts: list[str]) -> None:
+    with pytest.raises(MjstackError) as caught:
+        make_check(load_config(overrides))
+    assert caught.value.exit_code == 2
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+# Without phases
+
+
+def stack_worlds(rec: SimpleNamespace) -> list[StackWorld]:
+    return [
+        StackWorld(pose.copy(), velocity.copy(), force.copy(), int(count), rec)
+        for pose, velocity, force, count in zip(
+            rec.pose, rec.velocity, rec.force, rec.step_count, strict=True
+        )
+    ]
+
+
+def test_expert_episodes_of_the_stack_pass_without_phases(
+    robot: str, recorded: Callable[[str], SimpleNamespace]
+) -> None:
+    rec = recorded(robot)
+    assert feed_stack(stack_worlds(rec), rec, phased=False).failed.tolist() == [0] * 4
+
+
+def test_a_throw_and_a_push_lift_and_carry_nothing(
+    recorded: Callable[[str], SimpleNamespace],
+) -> None:
+    """World 0: one jaw alone presses. 1: both press, but let go every ninth step. 2: the cube only
+    slides. 3: the jaws hold it in the air where it is and put it down, then it is thrown.
+    """
+    rec = recorded("so101")
+    worlds = stack_worlds(rec)
+    red = rec.jaw_force["red"]
+    worlds[0].force[:, red[0] : red[0] + 3] = 0.0
+    for jaw in red:
+        worlds[1].force[::9, jaw : jaw + 3] = 0.0
+    flight = slice(worlds[2].steps("lift_red").start, worlds[2].steps("release").stop)
+    worlds[2].pose[flight, 0, 2] = worlds[2].pose[0, 0, 2]
+    for jaw in red:
+        worlds[3].force[worlds[3].steps("above_blue").start :, jaw : jaw + 3] = 0.0
+    result = feed_stack(worlds, rec, phased=False)
+    rules = rules_of("stack")
+    assert [rules.broken(int(bits)) for bits in result.failed] == [
+        *[["LIFT", "CARRY"]] * 3,
+        ["CARRY"],
+    ]
+    # With phases the jaws do not count.
+    assert feed_stack(worlds, rec).failed.tolist()[:2] == [0, 0]
+
+
+def test_a_lift_in_the_settled_window_comes_too_late(
+    recorded: Callable[[str], SimpleNamespace],
+) -> None:
+    """The same flight, shifted so that all of it but the last step before the window is in it."""
+    rec = recorded("so101")
+    world = stack_worlds(rec)[0]
+    first = np.flatnonzero((world.force[:, rec.jaw_force["red"][0] :][:, :3] != 0.0).any(1))[0]
+    late = len(world.pose) - world.t.window - 9
+    for name in ("pose", "force"):
+        values = getattr(world, name)
+        shifted = np.roll(values, late - first, axis=0)
+        shifted[:late] = values[0]
+        setattr(world, name, shifted)
+    broken = rules_of("stack").broken(int(feed_stack([world], rec, phased=False).failed[0]))
+    assert {"LIFT", "CARRY"} <= set(broken)
+
+
+def test_expert_episodes_of_the_box_pass_without_phases(robot: str) -> None:
+    """Those that succeeded with phases; the world whose cube fell beside the box has dropped it."""
+    from box_recordings import World, feed
+
+    worlds = [World.of(rec, k) for rec in (planned(robot), scripted(robot)) for k in range(2)]
+    result = feed(worlds, torch.float32, phased=False)
+    rules = rules_of("box")
+    broken = [set(rules.broken(int(bits))) for bits in result.failed]
+    assert [broken[k] for k in (0, 2, 3)] == [set()] * 3
+    assert {"DROP_RED", "SETTLED_RED", "INSIDE"} <= broken[1]
+    assert not any(name.endswith("_BLUE") for name in broken[1])
+
+
+def test_the_box_without_phases_knows_what_was_not_done() -> None:
+    from box_recordings import World, feed
+
+    rec = planned("so101")
+    names = ("no_grasp", "early_blue", "never_open", "moving_at_the_end", "touched")
+    worlds = {name: World.of(rec) for name in names}
+    worlds["no_grasp"].jaw(0, 0)[:] = 0.0
+    for jaw in (0, 1):
+        worlds["early_blue"].jaw(1, jaw)[worlds["early_blue"].steps("hold_red")[-1]] = 1.0
+    gripper = worlds["never_open"].gripper
+    gripper[:] = np.minimum(gripper, gripper.min() + 0.5 * (gripper.max() - gripper.min()))
+    worlds["moving_at_the_end"].velocity(1)[-1, 0] = 0.05
+    worlds["touched"].jaw(0, 1)[worlds["touched"].steps("open_blue")] = 1.0
+    result = feed(list(worlds.values()), phased=False)
+    rules = rules_of("box")
+    broken = {
+        name: set(rules.broken(int(bits))) for name, bits in zip(names, result.failed, strict=True)
+    }
+    red = {f"{rule}_RED" for rule in ("GRASP", "LIFT", "CARRY", "RELEASE", "SETTLED")}
+    assert broken["no_grasp"] == red | {"ORDER"}
+    assert broken["early_blue"] == {"ORDER"}
+    assert broken["never_open"] >= {"RELEASE_RED", "RELEASE_BLUE", "ORDER"}
+    assert broken["moving_at_the_end"] == {"INSIDE"}
+    assert broken["touched"] == set()
