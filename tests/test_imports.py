@@ -39,12 +39,7 @@ HOMES = {
     "mujoco_menagerie": ("robots/source.py",),
     "hydra": ("config/", "cli.py"),
     "omegaconf": ("config/", "cli.py", "jobs/"),
-    "matplotlib": (
-        "report/picture.py",
-        "report/curves.py",
-        "report/reachability.py",
-        "report/success.py",
-    ),
+    "matplotlib": ("report/",),
     "imageio_ffmpeg": ("report/picture.py",),
     "pynvml": ("bench/power.py",),
     "gymnasium": ("adapters/",),

@@ -36,9 +36,9 @@ from mjstack.bench.timing import (
 )
 from mjstack.envs import Env
 from mjstack.episodes.rollout import State, restore, snapshot
+from mjstack.managers.base import resolve_func
 
 _COST = 4.0  # of a repetition over that of its whole steps from the start, when fewer things touch
-_LOSSES = ("mjstack.mdp.termination.overflow", "mjstack.mdp.termination.non_finite")
 
 
 class Baseline(Protocol):
@@ -273,7 +273,7 @@ class _Parts:
 
     def _find_losses(self, counted: dict[str, float]) -> None:
         terms = self._env.cfg.termination.items()
-        losses = [name for name, term in terms if term.func in _LOSSES]
+        losses = [n for n, term in terms if hasattr(resolve_func(n, term.func), "ends_on")]
         ended = [name for name in losses if counted.get(f"termination/{name}", 0.0) > 0.0]
         if ended:
             self.problem = (

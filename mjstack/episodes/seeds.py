@@ -39,7 +39,7 @@ def play_seeds(
     cfg = context.cfg
     tally = EpisodeTally(gate=gate, noun=noun, several=count > 1, rules=context.check.rules)
     sim = context.batch_simulation(cfg.nworld)
-    sizes = getattr(sim, "sizes", None)
+    sizes = sim.sizes
     tally.notes = {
         "backend": sim.description,
         "sizes": (

@@ -53,7 +53,7 @@ def run_parity(context: RunContext) -> list[GateResult]:
             f"{describe_overflow(int(mjwarp.overflow[0]))} overflow: raise batch.njmax or"
             " batch.nconmax"
         )
-    limits = getattr(mjwarp, "solver_limits", None)
+    limits = mjwarp.solver_limits
     found.metrics |= judged | {
         "peak_contacts": int(mjwarp.peak_contacts[0]),
         "peak_constraint_rows": int(mjwarp.peak_constraints[0]),

@@ -107,7 +107,7 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
         facts={
             "worlds": cfg.nworld,
             "cpu_count": os.cpu_count() or 1,
-            "max_seconds_per_measurement": seconds,
+            "time_budget_s": seconds,
         },
     )
 

@@ -1,5 +1,6 @@
-"""Job *study*: what settings of the solver cost, and whether every world is still succeeded. It
-informs, and gates nothing.
+"""Job *study*: the cost of solver settings, and whether every world still succeeds.
+
+It informs, and gates nothing.
 """
 
 from __future__ import annotations
@@ -7,17 +8,15 @@ from __future__ import annotations
 import logging
 import statistics
 import time
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from enum import Enum
 from pathlib import Path
 from typing import cast
 
-import numpy as np
-import torch
-
+from mjstack.bench.physics import HeldPhysics
+from mjstack.bench.timing import describe_lost, steps_that_fit
 from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
 from mjstack.episodes.context import RunContext, Stage, play_to, require_episode
-from mjstack.episodes.rollout import State, restore
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.gates import check_machine
@@ -26,30 +25,13 @@ from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, run_reported
 from mjstack.managers.reset import required_fields
-from mjstack.report.picture import save_study
 from mjstack.report.record import GateResult, Status
-from mjstack.report.study import COLUMNS, StudyRow, to_markdown
-from mjstack.sim import LOST_PHYSICS, Simulation, SolverLimit, make_simulation
+from mjstack.report.study import COLUMNS, Row, save_study, to_markdown
+from mjstack.report.write import safely_draw
+from mjstack.sim import Simulation, SolverLimit, make_simulation
 from mjstack.sim.sizes import resolve_measuring_sizes
 
 log = logging.getLogger(__name__)
-
-_WARM_CALLS = 3  # one compiles, one captures, one replays
-
-
-@dataclass(eq=False, slots=True)
-class _Base:
-    """The configured solver, kept beside every variant so that both are timed in turns.
-
-    Attributes:
-        sim: Its worlds.
-        state: Cube in hand: where every timed repetition of every variant starts.
-        steps: Steps of a repetition.
-    """
-
-    sim: Simulation
-    state: State
-    steps: int
 
 
 def check_study(cfg: Config) -> RunContext:
@@ -78,26 +60,21 @@ def run_study_job(context: RunContext, folder: Path, overrides: list[str]) -> Jo
     job = cast(StudyJobCfg, cfg.job)
 
     def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
-        rows: list[StudyRow] = []
+        rows: list[Row] = []
         bar.start("base")
         try:
-            base = _prepare(context, job)
+            base, steps = _prepare(context, job)
         except Exception as error:  # nothing can be compared with it
             log.exception("the configured solver broke")
-            reason = (str(error) or type(error).__name__).splitlines()[0]
-            record(
-                GateResult(
-                    name="base",
-                    status=Status.failed,
-                    reason=f"the configured solver cannot be timed: {reason}",
-                )
-            )
+            first = (str(error) or type(error).__name__).splitlines()[0]
+            reason = f"the configured solver cannot be timed: {first}"
+            record(GateResult(name="base", status=Status.failed, reason=reason))
             return
         try:
             for name, solver in job.variants.items():
                 bar.start(name)
                 began = time.perf_counter()
-                row = _guarded(context, job, base, name, solver)
+                row = _guarded(context, base, steps, name, solver)
                 rows.append(row)
                 _write_tables(context, folder, rows)
                 record(_as_result(row, time.perf_counter() - began))
@@ -112,38 +89,34 @@ def run_study_job(context: RunContext, folder: Path, overrides: list[str]) -> Jo
     return run_reported(context, folder, overrides, title, work)
 
 
-def _prepare(context: RunContext, job: StudyJobCfg) -> _Base:
-    """The configured solver's worlds, played up to where they hold the cube."""
-    cfg = context.cfg
+def _prepare(context: RunContext, job: StudyJobCfg) -> tuple[HeldPhysics, int]:
+    """The configured solver's worlds with the object in hand, and the steps of a repetition.
+
+    They are kept beside every variant, so that the repetitions of both are interleaved and start
+    from one state.
+    """
     sim = _simulation(context)
-    state = play_to(context, sim, cfg.gate.throughput.from_phase)
-    restore(sim, state)
-    _play(sim, cfg, _WARM_CALLS)
-    seconds = _play(sim, cfg, 1)
-    return _Base(sim, state, max(1, min(job.steps, int(job.max_seconds / seconds))))
+    state = play_to(context, sim, context.cfg.gate.throughput.from_phase)
+    base = HeldPhysics(sim, state, context.cfg.timing.decimation)
+    return base, steps_that_fit(job.steps, job.max_seconds, base.warm_up())
 
 
 def _guarded(
-    context: RunContext, job: StudyJobCfg, base: _Base, name: str, solver: SolverCfg
-) -> StudyRow:
+    context: RunContext, base: HeldPhysics, steps: int, name: str, solver: SolverCfg
+) -> Row:
     """One variant; if it breaks, the others still run."""
-    cfg = context.cfg
-    changes = _changes(cfg.solver, solver)
-    row = StudyRow(variant=name, changes=changes or "nothing")
+    changes = _changes(context.cfg.solver, solver)
+    row = {"variant": name, "changes": changes or "nothing", "status": "fail", "reason": ""}
     if not changes and name != "base":
-        row.status = Status.skipped.value
-        row.reason = "the same as base"
-        return row
+        return row | {"status": "skip", "reason": "the same as base"}
     try:
-        _measure(_variant(context, solver), job, base, row)
+        row |= _measure(_variant(context, solver), base, steps)
     except MjstackError as error:
-        row.reason = str(error)
+        row["reason"] = str(error)
     except Exception as error:
         log.exception("variant %s broke", name)
-        row.reason = (
-            f"{type(error).__name__}: {(str(error) or 'no message').splitlines()[0]} (run.log has"
-            " the traceback)"
-        )
+        first = (str(error) or "no message").splitlines()[0]
+        row["reason"] = f"{type(error).__name__}: {first} (run.log has the traceback)"
     return row
 
 
@@ -157,57 +130,59 @@ def _variant(context: RunContext, solver: SolverCfg) -> RunContext:
     return replace(context, cfg=cfg, stage=stage)
 
 
-def _measure(context: RunContext, job: StudyJobCfg, base: _Base, row: StudyRow) -> None:
-    """The whole episode, judged; then turns of some steps with the base, from the base's state with
-    the cube in hand.
+def _measure(context: RunContext, base: HeldPhysics, steps: int) -> Row:
+    """Play the whole judged episode, then repetitions with the object in hand beside the base's.
+
+    Raises:
+        MjstackError: Worlds lost physics, so that their time is void.
     """
     cfg = context.cfg
-    advance = context.advance
+    job = cast(StudyJobCfg, cfg.job)
     sim = _simulation(context)
     try:
+        # The episode
         result = context.play(sim, cfg.reset).result
         failed = result.failed.cpu().numpy()
-        row.worlds = sim.nworld
-        row.succeeded = int((failed == 0).sum())
         rules = context.check.rules
-        row.broken_rules = ", ".join(
-            f"{rules.texts[name]} in {len(worlds)}"
-            for name, worlds in rules.failing(failed).items()
-        )
-        row.peak_rows = int(sim.peak_constraints.max())
-        row.values = {
-            metric: float(getattr(result.values[value], side)())
-            for metric, (value, side) in context.check.summaries.items()
+        row: Row = {
+            "worlds": sim.nworld,
+            "succeeded": int((failed == 0).sum()),
+            "broken_rules": ", ".join(
+                f"{rules.texts[name]} in {len(worlds)}"
+                for name, worlds in rules.failing(failed).items()
+            ),
+            "peak_rows": int(sim.peak_constraints.max()),
         }
-        limits: torch.Tensor | None = getattr(
-            sim, "solver_limits", None
-        )  # native MuJoCo does not tell
-        if limits is not None:
-            row.iteration_limit_worlds = int((limits & SolverLimit.ITERATIONS != 0).sum())
-            row.line_search_limit_worlds = int((limits & SolverLimit.LS_ITERATIONS != 0).sum())
-        times: dict[Simulation, list[float]] = {base.sim: [], sim: []}
-        restore(sim, base.state)
-        _play(sim, cfg, _WARM_CALLS)
+        for metric, (value, side) in context.check.summaries.items():
+            row[metric] = float(getattr(result.values[value], side)())
+        if (limits := sim.solver_limits) is not None:
+            for column, bit in (
+                ("iteration_limit_worlds", SolverLimit.ITERATIONS),
+                ("line_search_limit_worlds", SolverLimit.LS_ITERATIONS),
+            ):
+                row[column] = int((limits & bit != 0).sum())
+
+        # The repetitions; each goes first in turn: what drifts, drifts for both.
+        ours = HeldPhysics(sim, base.state, base.decimation)
+        ours.warm_up()
+        times: dict[HeldPhysics, list[float]] = {base: [], ours: []}
         for repetition in range(job.repetitions):
-            # Each goes first in turn: what drifts, drifts for both.
             for one in list(times)[:: 1 if repetition % 2 else -1]:
-                restore(one, base.state)
-                times[one].append(_play(one, cfg, base.steps))
-                _require_sound(one, base.steps * cfg.timing.decimation)
-            if advance is not None:
-                advance("repetitions", repetition + 1, job.repetitions)
+                times[one].append(1e3 * one.play(steps) / (steps * base.decimation))
+                if problem := describe_lost(one.lost):
+                    raise MjstackError(f"no time: {problem} (of {sim.nworld}).")
+            context.tell("repetitions", repetition + 1, job.repetitions)
     finally:
         sim.close()
-    per_step = 1e3 / (base.steps * cfg.timing.decimation)
-    ratios = [ours / theirs for ours, theirs in zip(times[sim], times[base.sim], strict=True)]
-    row.ms_per_batched_step = per_step * statistics.median(times[sim])
-    row.ms_min = per_step * min(times[sim])
-    row.ms_max = per_step * max(times[sim])
-    row.base_ms = per_step * statistics.median(times[base.sim])
-    row.ratio = statistics.median(ratios)
-    row.ratio_min = min(ratios)
-    row.ratio_max = max(ratios)
-    row.status = Status.passed.value
+    ratios = [a / b for a, b in zip(times[ours], times[base], strict=True)]
+    for name, values in (("ms", times[ours]), ("ratio", ratios)):
+        row |= {f"{name}_min": min(values), f"{name}_max": max(values)}
+    return row | {
+        "ms_per_batched_step": statistics.median(times[ours]),
+        "base_ms": statistics.median(times[base]),
+        "ratio": statistics.median(ratios),
+        "status": "pass",
+    }
 
 
 def _simulation(context: RunContext) -> Simulation:
@@ -218,31 +193,6 @@ def _simulation(context: RunContext) -> Simulation:
     return make_simulation(
         context.model, cfg, cfg.nworld, backend=backend, device=device, fields=fields, sizes=sizes
     )
-
-
-def _play(sim: Simulation, cfg: Config, steps: int) -> float:
-    """Seconds that some steps take under the held command, the device idle at both ends."""
-    sim.synchronize()
-    began = time.perf_counter()
-    for _ in range(steps):
-        sim.step(cfg.timing.decimation)
-    sim.synchronize()
-    return time.perf_counter() - began
-
-
-def _require_sound(sim: Simulation, steps: int) -> None:
-    """Refuses the time of worlds that lost physics or were not stepped.
-
-    Raises:
-        MjstackError: Some did.
-    """
-    bad = (sim.overflow & LOST_PHYSICS) != 0
-    bad |= ~(torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1))
-    bad |= sim.step_count != steps
-    if count := int(bad.sum()):
-        raise MjstackError(
-            f"no time: {count} of {sim.nworld} worlds overflowed, diverged or were not stepped."
-        )
 
 
 def _changes(base: SolverCfg, solver: SolverCfg) -> str:
@@ -262,24 +212,22 @@ def _text(value: object) -> str:
     )
 
 
-def _as_result(row: StudyRow, seconds: float) -> GateResult:
+def _as_result(row: Row, seconds: float) -> GateResult:
     """A row as a result of the report."""
-    values = (asdict(row) | row.values).items()
-    metrics = {key: value for key, value in values if isinstance(value, float | int)}
-    reason = row.reason
-    if row.status == Status.passed.value:
+    reason = row["reason"]
+    if row["status"] == "pass":
         reason = (
-            f"{row.ms_per_batched_step:.3g} ms per step, {row.ratio:.2f} of base, {row.succeeded}"
-            f" of {row.worlds} succeeded"
+            f"{row['ms_per_batched_step']:.3g} ms per step, {row['ratio']:.2f} of base,"
+            f" {row['succeeded']} of {row['worlds']} succeeded"
         )
-        reason += f" ({row.broken_rules})" if row.broken_rules else ""
+        reason += f" ({row['broken_rules']})" if row["broken_rules"] else ""
     return GateResult(
-        name=row.variant,
-        status=Status(row.status),
+        name=row["variant"],
+        status=Status(row["status"]),
         reason=reason,
         seconds=seconds,
-        metrics=metrics,
-        notes={"changes": row.changes},
+        metrics={key: value for key, value in row.items() if not isinstance(value, str)},
+        notes={"changes": row["changes"]},
     )
 
 
@@ -295,9 +243,9 @@ def _notes(context: RunContext) -> list[str]:
     notes = [
         f"base: {', '.join(f'{name}={_text(value)}' for name, value in base.items())}",
         (
-            f"{backend.value} on {device}. Times: cube in hand, command held; medians of"
-            f" {job.repetitions} repetitions, in turns with base. A ratio is that of two"
-            " neighbouring turns; in brackets the smallest and the largest."
+            f"{backend.value} on {device}. Times: object in hand, joint target held; medians"
+            f" of {job.repetitions} repetitions, interleaved with those of base. A ratio is that of"
+            " two neighbouring repetitions; in brackets the smallest and the largest."
         ),
         "base as a variant is a second copy of it: its ratio shows how far equal runs differ.",
     ]
@@ -306,31 +254,20 @@ def _notes(context: RunContext) -> list[str]:
     return notes
 
 
-def _write_tables(
-    context: RunContext, folder: Path, rows: list[StudyRow], picture: str = ""
-) -> None:
-    columns = [*COLUMNS, *context.check.summaries]
-    write_atomic(folder / "study.csv", to_csv(columns, [asdict(row) | row.values for row in rows]))
+def _write_tables(context: RunContext, folder: Path, rows: list[Row], picture: str = "") -> None:
+    write_atomic(folder / "study.csv", to_csv([*COLUMNS, *context.check.summaries], rows))
     write_atomic(folder / "study.md", to_markdown(rows, _title(context), _notes(context), picture))
 
 
-def _draw(context: RunContext, folder: Path, rows: list[StudyRow]) -> None:
-    """The picture of what was measured. Its failure takes nothing back."""
-    done = [row for row in rows if row.status == Status.passed.value]
+def _draw(context: RunContext, folder: Path, rows: list[Row]) -> None:
+    """Draw the variants that were measured."""
+    done = [row for row in rows if row["status"] == "pass"]
     if not done:
         return
-    ratios = np.array([[row.ratio, row.ratio_min, row.ratio_max] for row in done], dtype=float)
-    labels = [row.variant for row in done]
-    try:
-        succeeded = [row.succeeded or 0 for row in done]
-        save_study(
-            folder / "study.png", labels, ratios, succeeded, context.cfg.nworld, _title(context)
-        )
-    except Exception as error:
-        log.exception("drawing failed")
-        context.say(f"no picture: {str(error) or type(error).__name__}")
-        return
-    _write_tables(context, folder, rows, "study.png")
+    if problem := safely_draw(folder / "study.png", save_study, done, _title(context)):
+        context.say(problem)
+    else:
+        _write_tables(context, folder, rows, "study.png")
 
 
 JOB = Job(check_study, run_study_job)

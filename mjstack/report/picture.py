@@ -199,38 +199,3 @@ def _plot_scene(
     axes.set_aspect("equal")
     figure.savefig(path, dpi=110)
     plt.close(figure)
-
-
-def save_study(
-    path: Path, names: list[str], ratios: np.ndarray, succeeded: list[int], nworld: int, title: str
-) -> None:
-    """Writes a bar per variant: its time over that of the base, and the worlds that succeeded.
-
-    Args:
-        path: The file.
-        names: The variants.
-        ratios: Median, smallest and largest ratio of each, shape ``(n, 3)``.
-        succeeded: Succeeded worlds of each.
-        nworld: Of how many.
-        title: What is shown.
-    """
-    figure, (time, worlds) = plt.subplots(
-        1, 2, figsize=(11, 1.5 + 0.3 * len(names)), layout="constrained", sharey=True
-    )
-    rows = np.arange(len(names))
-    colors = ["#2457c7" if count == nworld else "#cc2a24" for count in succeeded]
-    middle, low, high = ratios.T
-    time.barh(
-        rows, middle, xerr=(middle - low, high - middle), color=colors, ecolor="0.4", capsize=2
-    )
-    time.axvline(1.0, color="0.3", linewidth=1.0)
-    time.set(xlabel="time per step over that of base (whiskers: all repetitions)")
-    time.set_yticks(rows, names)
-    time.invert_yaxis()
-    worlds.barh(rows, succeeded, color=colors)
-    worlds.set(xlabel=f"succeeded of {nworld} worlds (red: not all)", xlim=(0, nworld))
-    for axes in (time, worlds):
-        axes.grid(alpha=0.3, axis="x")
-    figure.suptitle(title)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)

@@ -1,84 +1,96 @@
-"""The solver study as a table."""
+"""The solver study as a table and as a picture."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
 
 from mjstack.report.markdown import format_value
 from mjstack.report.table import Table, to_document
 
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
 
-@dataclass(kw_only=True, slots=True)
-class StudyRow:
-    """One variant of the solver. Figures are None where there are none.
+Row = dict[str, Any]
+"""One variant of the solver by the names of `COLUMNS`; columns without a value may be left out."""
 
-    Attributes:
-        variant: Its name.
-        changes: What it changes.
-        status: ``pass`` if it was measured, ``fail`` with its reason, ``skip`` if it changes
-            nothing.
-        reason: Why.
-        ms_per_batched_step: Median time of one step of all worlds, cube in hand [ms].
-        ms_min: Shortest of the repetitions [ms].
-        ms_max: Longest [ms].
-        base_ms: Median of the configured solver in the same run, in turns with it [ms].
-        ratio: Median of the ratios of neighbouring turns.
-        ratio_min: Smallest.
-        ratio_max: Largest.
-        worlds: Number of worlds.
-        succeeded: Worlds that the check of the whole episode passed.
-        broken_rules: Which rules the others broke, and how many each.
-        iteration_limit_worlds: Worlds whose solver stopped at its iteration limit in some step of
-            the episode.
-        line_search_limit_worlds: Likewise at the limit of the line search.
-        peak_rows: Most constraint rows of a world.
-        values: Extremes of what the task's check measured, by name with unit.
-    """
-
-    variant: str
-    changes: str
-    status: str = "fail"
-    reason: str = ""
-    ms_per_batched_step: float | None = None
-    ms_min: float | None = None
-    ms_max: float | None = None
-    base_ms: float | None = None
-    ratio: float | None = None
-    ratio_min: float | None = None
-    ratio_max: float | None = None
-    worlds: int | None = None
-    succeeded: int | None = None
-    broken_rules: str = ""
-    iteration_limit_worlds: int | None = None
-    line_search_limit_worlds: int | None = None
-    peak_rows: int | None = None
-    values: dict[str, float] = field(default_factory=dict)
+COLUMNS = (
+    "variant",
+    "changes",
+    "status",  # pass: it was measured; fail, with its reason; skip: it changes nothing
+    "reason",
+    "ms_per_batched_step",  # one step of all worlds, object in hand: median of the repetitions
+    "ms_min",
+    "ms_max",
+    "base_ms",  # the configured solver's in the same interleaved repetitions
+    "ratio",  # of a repetition to the base's beside it: median
+    "ratio_min",
+    "ratio_max",
+    "worlds",
+    "succeeded",  # worlds, in the whole episode
+    "broken_rules",  # by the others, and by how many each
+    "iteration_limit_worlds",  # worlds whose solver stopped at its limit in some step
+    "line_search_limit_worlds",
+    "peak_rows",  # most constraint rows of a world
+)
+"""Columns of study.csv, before those of the task's check."""
 
 
-COLUMNS = tuple(f.name for f in fields(StudyRow) if f.name != "values")
-
-
-def to_markdown(
-    rows: Sequence[StudyRow], title: str, notes: Sequence[str], picture: str = ""
-) -> str:
+def to_markdown(rows: Sequence[Row], title: str, notes: Sequence[str], picture: str = "") -> str:
     """The columns that a reader compares."""
     return to_document(title, [Table.of("", _SHOWN, rows)], notes, picture)
 
 
-def _ratio(row: StudyRow) -> str:
-    if row.ratio is None:
+def save_study(path: Path, rows: Sequence[Row], title: str) -> None:
+    """Draw a bar per variant: its time over that of the base, and the worlds that succeeded.
+
+    Args:
+        path: The picture.
+        rows: The variants that were measured.
+        title: What is shown.
+    """
+    nworld = rows[0]["worlds"]
+    figure, (time, worlds) = plt.subplots(
+        1, 2, figsize=(11, 1.5 + 0.3 * len(rows)), layout="constrained", sharey=True
+    )
+    places = np.arange(len(rows))
+    succeeded = [row["succeeded"] for row in rows]
+    colors = ["#2457c7" if count == nworld else "#cc2a24" for count in succeeded]
+    middle, low, high = (
+        np.array([row[key] for row in rows]) for key in ("ratio", "ratio_min", "ratio_max")
+    )
+    whiskers = (middle - low, high - middle)
+    time.barh(places, middle, xerr=whiskers, color=colors, ecolor="0.4", capsize=2)
+    time.axvline(1.0, color="0.3", linewidth=1.0)
+    time.set(xlabel="time per step over that of base (whiskers: all repetitions)")
+    time.set_yticks(places, [row["variant"] for row in rows])
+    time.invert_yaxis()
+    worlds.barh(places, succeeded, color=colors)
+    worlds.set(xlabel=f"succeeded of {nworld} worlds (red: not all)", xlim=(0, nworld))
+    for axes in (time, worlds):
+        axes.grid(alpha=0.3, axis="x")
+    figure.suptitle(title)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def _ratio(row: Row) -> str:
+    if "ratio" not in row:
         return ""
-    return f"{row.ratio:.2f} ({row.ratio_min:.2f} to {row.ratio_max:.2f})"
+    return f"{row['ratio']:.2f} ({row['ratio_min']:.2f} to {row['ratio_max']:.2f})"
 
 
-_SHOWN: dict[str, Callable[[StudyRow], str]] = {
-    "variant": lambda row: row.variant,
-    "changes": lambda row: row.changes,
-    "ms per step": lambda row: format_value(row.ms_per_batched_step),
+_SHOWN: dict[str, Callable[[Row], str]] = {
+    "variant": lambda row: row["variant"],
+    "changes": lambda row: row["changes"],
+    "ms per step": lambda row: format_value(row.get("ms_per_batched_step")),
     "ratio to base": _ratio,
-    "succeeded": lambda row: "" if row.succeeded is None else f"{row.succeeded} of {row.worlds}",
-    "iteration limit": lambda row: format_value(row.iteration_limit_worlds),
-    "line-search limit": lambda row: format_value(row.line_search_limit_worlds),
-    "notes": lambda row: "; ".join(text for text in (row.broken_rules, row.reason) if text),
+    "succeeded": lambda row: f"{row['succeeded']} of {row['worlds']}" if "worlds" in row else "",
+    "iteration limit": lambda row: format_value(row.get("iteration_limit_worlds")),
+    "line-search limit": lambda row: format_value(row.get("line_search_limit_worlds")),
+    "notes": lambda row: "; ".join(filter(None, (row.get("broken_rules"), row["reason"]))),
 }
