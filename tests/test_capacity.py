@@ -548,15 +548,21 @@ def test_convex_pairs_and_whole_pools_are_held_against_their_keys() -> None:
     cfg = load_config(["nworld=4", "batch.naconmax=60", "batch.naccdmax=12"])
     seen = peaks(nworld=4, contacts=20, pool_ccd_pairs=40)
     wanted = recommend_sizes(seen, 1.25, "")
-    found = [
-        shortage.text
-        for shortage in capacity_module._shortages(cfg, seen, resolve_sizes(cfg), wanted)
-    ]
+    group = capacity_module._Group(
+        title="",
+        prefix="",
+        runs={},
+        peaks=seen,
+        sizes=resolve_sizes(cfg),
+        wanted=wanted,
+        lost="",
+    )
+    found = [shortage.text for shortage in capacity_module._shortages(cfg, group)]
     assert any("contact pool overflow" in text and "batch.naconmax=128" in text for text in found)
     assert any("convex pairs overflow" in text and "batch.naccdmax=64" in text for text in found)
     pasted = capacity_module._overrides(cfg, wanted)
-    cured = resolve_sizes(load_config(["nworld=4", *pasted.split()]))
-    assert capacity_module._shortages(cfg, seen, cured, wanted) == []
+    group.sizes = resolve_sizes(load_config(["nworld=4", *pasted.split()]))
+    assert capacity_module._shortages(cfg, group) == []
 
 
 # batch=auto
@@ -637,7 +643,7 @@ def test_batch_uses_what_capacity_measured(new_context: NewContext) -> None:
     context.artifacts.env_sizes = BatchSizes(nconmax=64, njmax=400)
     assert context.env_sizes == BatchSizes(nconmax=48, njmax=400)
     plain = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2")
-    plain.measured = plain.measured_env = BatchSizes(nconmax=8, njmax=8)
+    plain.artifacts.sizes = plain.artifacts.env_sizes = BatchSizes(nconmax=8, njmax=8)
     assert (plain.sizes, plain.env_sizes) == (BatchSizes(nconmax=128, njmax=300), None)
 
 

@@ -49,158 +49,193 @@ class _Trial:
     remark: str = ""
 
 
+@dataclass(kw_only=True, slots=True)
+class _Group:
+    """Workloads whose worlds have the same buffer sizes.
+
+    Attributes:
+        title: The workloads in words.
+        prefix: Of the metrics of the recommended sizes.
+        runs: Each with room to spare, by name.
+        peaks: The most that any of them used.
+        sizes: In force.
+        wanted: Recommended.
+        lost: Physics that was lost with room to spare; nothing may be sized from it then.
+    """
+
+    title: str
+    prefix: str
+    runs: dict[str, Workload]
+    peaks: Peaks
+    sizes: BatchSizes
+    wanted: BatchSizes
+    lost: str
+
+
 @needs_episode
 def run_capacity(context: RunContext) -> list[GateResult]:
-    """Finds what the scripted task, randomised starts and random actions need, and tries the sizes
-    that it recommends.
+    """Find the buffer sizes that the driven task, randomised starts and random actions need, and
+    try them.
 
-    Peaks are over all decimation and all worlds, in worlds with room to spare: one that has lost
-    physics moves differently.
+    Peaks are over all steps and all worlds, in worlds with room to spare: one that has lost physics
+    moves differently.
     """
     cfg = context.cfg
-    margin = context.cfg.gate.capacity.margin
-    exact = not context.backend[1].startswith("cuda")
+    t = cfg.gate.capacity
     nworld = measuring_worlds(context)
-    how = (
-        f"batch=auto: gate capacity, {nworld} worlds, times {margin:g}"
-        if cfg.batch.auto
-        else "gate capacity"
-    )
+    how = f"batch=auto: gate capacity, {nworld} worlds, times {t.margin:g}"
+    how = how if cfg.batch.auto else "gate capacity"
     details: list[str] = []
-    trials: list[_Trial] = []
+    problems: list[str] = []
 
-    # Each start is planned once, for both of its runs, and the task last: its plan is kept for the
-    # gates that follow.
-    random = measure_random(context)
-    randomized = None
+    # Environments. Each start is planned once, for both of its runs, and the task's last: its plan
+    # is kept for the gates that follow.
+    runs = {"random_actions": measure_random(context)}
     try:
-        randomized = measure_task(context, cfg.gate.capacity.reset)
-    except Unreachable as error:  # somebody's own layout; the other two workloads stand
+        runs["randomized"] = measure_task(context, t.reset)
+    except Unreachable as error:  # starts of the user's own; the other workloads stand
         details.append(f"randomised starts: not measured: {error}")
-    env_runs = [random] if randomized is None else [random, randomized]
-    env_peaks = reduce(join_peaks, (run.peaks for run in env_runs))
-    env_wanted = recommend_sizes(env_peaks, margin, how)
-    env_lost = _lost(*env_runs)
-    if random.sizes is not None and not env_lost:
-        if randomized is not None:
-            again = play_task(context, cfg.gate.capacity.reset, env_wanted)
-            trials.append(_compare("randomized", randomized, again, judged=True, exact=exact))
-        again = play_random(context, env_wanted)
-        trials.append(_compare("random_actions", random, again, judged=False, exact=exact))
+    title = "environments (random actions, randomised starts)"
+    env = _group(cfg, title, "recommended_env", runs, resolve_env_sizes(cfg), how)
+    trials = _try(context, env)
 
-    task = measure_task(context, cfg.reset)
-    peaks = task.peaks
-    wanted = recommend_sizes(peaks, margin, how)
-    task_lost = _lost(task)
-    if task.sizes is not None and not task_lost:
-        trials.append(
-            _compare("task", task, play_task(context, cfg.reset, wanted), judged=True, exact=exact)
-        )
-    runs = {"": task, "random_actions.": random} | (
-        {} if randomized is None else {"randomized.": randomized}
-    )
+    # The driven task
+    task_run = measure_task(context, cfg.reset)
+    task = _group(cfg, "scripted task", "recommended", {"task": task_run}, resolve_sizes(cfg), how)
+    trials += _try(context, task)
 
-    # Motion that lost physics sizes nothing that follows.
-    context.artifacts.sizes = None if task_lost else wanted
-    context.artifacts.env_sizes = None if env_lost else env_wanted
-    sizes = resolve_sizes(cfg)
-    env_sizes = resolve_env_sizes(cfg)
-    if cfg.batch.auto:
-        sizes = apply_configured(cfg, wanted)
-        env_sizes = apply_configured(cfg, env_wanted)
-
-    problems = (
-        [task_lost]
-        if task_lost
-        else [shortage.text for shortage in _shortages(cfg, peaks, sizes, wanted)]
-    )
-    if env_lost:
-        problems.append(f"environments: {env_lost}")
-    for shortage in [] if env_lost else _shortages(cfg, env_peaks, env_sizes, env_wanted):
+    # Problems. Motion that lost physics sizes nothing that follows.
+    context.artifacts.sizes = None if task.lost else task.wanted
+    context.artifacts.env_sizes = None if env.lost else env.wanted
+    problems += [task.lost] if task.lost else [found.text for found in _shortages(cfg, task)]
+    problems += [f"environments: {env.lost}"] if env.lost else []
+    for shortage in [] if env.lost else _shortages(cfg, env):
         # Sizes that were set may be meant for the batch alone; those of the robot's profile should
         # do for both.
         chosen = any(getattr(cfg.batch, key) is not None for key in shortage.keys)
         (details if chosen else problems).append(f"environments: {shortage.text}")
     problems += [trial.problem for trial in trials if trial.problem]
     details += [trial.remark for trial in trials if trial.remark]
-
-    metrics: dict[str, float] = {"worlds": nworld}
-    notes = {"backend": task.description, "sizes_from": sizes.source}
-    for prefix, run in runs.items():
-        metrics |= _peak_metrics(prefix, run)
-        if run.peaks.pool_pairs is None or run.peaks.pool_ccd_pairs is None:
-            who = " by native MuJoCo" if run.sizes is None else ""
-            notes[f"{prefix}pool_pairs"] = f"pairs are not all counted{who}"
-    known = {
-        name: (current, found)
-        for name, current, found, lost in (
-            ("task", sizes, wanted, task_lost),
-            ("env", env_sizes, env_wanted, env_lost),
-        )
-        if not lost
-    }
-    for name, (_, found) in known.items():
-        prefix = "recommended" if name == "task" else f"recommended_{name}"
-        metrics |= {
-            f"{prefix}.nconmax": found.nconmax,
-            f"{prefix}.naconmax": found.contact_pool(cfg.nworld),
-        }
-        metrics |= {
-            f"{prefix}.njmax": found.njmax,
-        }
-        if found.nccdmax:
-            metrics[f"{prefix}.nccdmax"] = found.nccdmax
-        else:
-            notes[f"{prefix}.nccdmax"] = "not counted: MJWarp's default"
-    lines = []
-    for name, title in (
-        ("task", "scripted task"),
-        ("env", "environments (random actions, randomised starts)"),
-    ):
-        sizes_text = (
-            _overrides(cfg, known[name][1]) if name in known else "not known, physics was lost"
-        )
-        lines.append(f"{title}: {sizes_text}")
-    if task.sizes is None:
-        lines[0] += (
-            " (contacts alone: native MuJoCo does not count the collision pairs that share their"
-            " pool)"
-        )
-        notes["rerun"] = f"sizes were not tried: {_NATIVE}"
-        notes["memory"] = f"not reported: {_NATIVE}"
-    else:
-        if len(known) < 2:
-            notes["rerun"] = "sizes were not tried where peaks are not known"
-        for trial in trials:
-            metrics |= trial.metrics
-            notes |= trial.notes
-        metrics |= _memory_metrics(context, known)
-    for line in lines:
-        context.say(line)
     if nworld < cfg.nworld:
         details.append(
             f"from {nworld} worlds: more of them meet rarer peaks, above all under random actions"
         )
-    share = sizes.contact_pool(cfg.nworld) / cfg.nworld
-    summary = "; ".join(problems) or (
-        f"{peaks.contacts.max()} of {share:g} contacts, {peaks.rows.max()} of {sizes.njmax} rows,"
-        f" at most, in {nworld} worlds"
+
+    # Report
+    share = task.sizes.contact_pool(cfg.nworld) / cfg.nworld
+    peaks = task.peaks
+    result = GateResult(
+        name="capacity",
+        status=Status.failed if problems else Status.passed,
+        reason="; ".join(problems)
+        or (
+            f"{peaks.contacts.max()} of {share:g} contacts, {peaks.rows.max()} of"
+            f" {task.sizes.njmax} rows, at most, in {nworld} worlds"
+        ),
+        thresholds={"contacts_per_world": share, "njmax": task.sizes.njmax, "margin": t.margin},
+        metrics={"worlds": nworld},
+        notes={"backend": task_run.description, "sizes_from": task.sizes.source},
     )
-    return [
-        GateResult(
-            name="capacity",
-            status=Status.failed if problems else Status.passed,
-            reason=summary,
-            thresholds={"contacts_per_world": share, "njmax": sizes.njmax, "margin": margin},
-            metrics=metrics,
-            notes=notes,
-            details=lines + details,
+    for group in (task, env):
+        _report(context, group, result)
+    for trial in trials:
+        result.metrics |= trial.metrics
+        result.notes |= trial.notes
+    if task_run.sizes is None:
+        result.notes["rerun"] = f"sizes were not tried: {_NATIVE}"
+        result.notes["memory"] = f"not reported: {_NATIVE}"
+    elif task.lost or env.lost:
+        result.notes["rerun"] = "sizes were not tried where peaks are not known"
+    result.details += details
+    return [result]
+
+
+def _group(
+    cfg: Config,
+    title: str,
+    prefix: str,
+    runs: dict[str, Workload],
+    configured: BatchSizes,
+    source: str,
+) -> _Group:
+    """Join the peaks of some workloads, and recommend sizes for them."""
+    peaks = reduce(join_peaks, (run.peaks for run in runs.values()))
+    wanted = recommend_sizes(peaks, cfg.gate.capacity.margin, source)
+    losses = [describe_loss(run.peaks.overflow, run.sizes) for run in runs.values() if run.sizes]
+    return _Group(
+        title=title,
+        prefix=prefix,
+        runs=runs,
+        peaks=peaks,
+        sizes=apply_configured(cfg, wanted) if cfg.batch.auto else configured,
+        wanted=wanted,
+        lost="; ".join(f"{loss}. {fix}" for loss, fix in losses if loss),
+    )
+
+
+def _try(context: RunContext, group: _Group) -> list[_Trial]:
+    """Play the workloads again at exactly the recommended sizes, on MJWarp."""
+    cfg = context.cfg
+    exact = not context.backend[1].startswith("cuda")
+    starts = {"task": cfg.reset, "randomized": cfg.gate.capacity.reset}
+    trials = []
+    for name, first in reversed(group.runs.items()):
+        if first.sizes is None or group.lost:
+            continue
+        if name in starts:
+            again = play_task(context, starts[name], group.wanted)
+        else:
+            again = play_random(context, group.wanted)
+        trials.append(_compare(name, first, again, judged=name in starts, exact=exact))
+    return trials
+
+
+def _report(context: RunContext, group: _Group, result: GateResult) -> None:
+    """Add a group's peaks, recommended sizes and memory to the result."""
+    cfg = context.cfg
+    native = any(run.sizes is None for run in group.runs.values())
+    for name, run in group.runs.items():
+        prefix = "" if name == "task" else f"{name}."
+        result.metrics |= _peak_metrics(prefix, run)
+        if run.peaks.pool_pairs is None or run.peaks.pool_ccd_pairs is None:
+            who = " by native MuJoCo" if native else ""
+            result.notes[f"{prefix}pool_pairs"] = f"pairs are not all counted{who}"
+    line = f"{group.title}: {_overrides(cfg, group.wanted)}"
+    if group.lost:
+        line = f"{group.title}: not known, physics was lost"
+    elif native and "task" in group.runs:
+        line += (
+            " (contacts alone: native MuJoCo does not count the collision pairs that share their"
+            " pool)"
         )
-    ]
+    context.say(line)
+    result.details.append(line)
+    if group.lost:
+        return
+    wanted = group.wanted
+    result.metrics |= {
+        f"{group.prefix}.nconmax": wanted.nconmax,
+        f"{group.prefix}.naconmax": wanted.contact_pool(cfg.nworld),
+        f"{group.prefix}.njmax": wanted.njmax,
+    }
+    if wanted.nccdmax:
+        result.metrics[f"{group.prefix}.nccdmax"] = wanted.nccdmax
+    else:
+        result.notes[f"{group.prefix}.nccdmax"] = "not counted: MJWarp's default"
+    if not native:
+        from mjstack.sim.memory import data_bytes  # loads Warp, which native runs do not need
+
+        key = "task" if "task" in group.runs else "env"
+        for which, sizes in (("current", group.sizes), ("recommended", wanted)):
+            size = data_bytes(context.model, cfg.nworld, sizes)
+            result.metrics[f"memory.{key}.{which}_mb"] = size / 1e6
 
 
-def _shortages(cfg: Config, peaks: Peaks, sizes: BatchSizes, wanted: BatchSizes) -> list[_Shortage]:
-    """What does not fit into some sizes. Exactly at capacity fits."""
+def _shortages(cfg: Config, group: _Group) -> list[_Shortage]:
+    """Buffers in force that are too small for a group's peaks. Exactly at capacity fits."""
+    peaks = group.peaks
+    sizes = group.sizes
+    wanted = group.wanted
     nworld = peaks.nworld
     out = []
     over = np.flatnonzero(peaks.rows > sizes.njmax).tolist()
@@ -242,14 +277,6 @@ def _shortages(cfg: Config, peaks: Peaks, sizes: BatchSizes, wanted: BatchSizes)
             )
         )
     return out
-
-
-def _lost(*runs: Workload) -> str:
-    """Physics that was lost although there was room to spare. Native MuJoCo has no such room."""
-    if runs[0].sizes is None:
-        return ""
-    losses = [describe_loss(run.peaks.overflow, run.sizes) for run in runs]
-    return "; ".join(f"{loss}. {fix}" for loss, fix in losses if loss)
 
 
 def _compare(name: str, first: Workload, again: Workload, *, judged: bool, exact: bool) -> _Trial:
@@ -309,23 +336,6 @@ def _compare(name: str, first: Workload, again: Workload, *, judged: bool, exact
             if size is not None:
                 trial.metrics[f"memory.{name}.{part}.{what}_mb"] = size / 1e6
     return trial
-
-
-def _memory_metrics(
-    context: RunContext, pairs: dict[str, tuple[BatchSizes, BatchSizes]]
-) -> dict[str, float]:
-    """What MJWarp's arrays take for the whole batch, with the sizes in force and with the
-    recommended ones.
-    """
-    from mjstack.sim.memory import data_bytes  # loads Warp, which native runs do not need
-
-    out: dict[str, float] = {}
-    for name, (current, wanted) in pairs.items():
-        for which, sizes in (("current", current), ("recommended", wanted)):
-            out[f"memory.{name}.{which}_mb"] = (
-                data_bytes(context.model, context.cfg.nworld, sizes) / 1e6
-            )
-    return out
 
 
 def _peak_metrics(prefix: str, run: Workload) -> dict[str, float]:
