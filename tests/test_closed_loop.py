@@ -270,7 +270,7 @@ def test_captured_commands_are_the_eager_ones() -> None:
         expert = make_expert(env)
 
         def work(env: Env = env, expert: ClosedLoopDriver = expert) -> None:
-            env.action_manager.take(expert.command())
+            env.action_manager.process(expert.command())
             env.advance()
 
         play = env.captured(work, "a step with its controller")

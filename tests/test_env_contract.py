@@ -77,7 +77,7 @@ def test_a_masked_reset_touches_nobody_else(backend: str, task: str, robot: str)
     for name, value in start.items():
         assert torch.equal(value[others], before_reset[-1][name][others]), name
     assert after["episode"].tolist() == [0, 1, 0, 1]
-    assert after["step"].tolist() == [6, 0, 6, 0]
+    assert after["episode_step"].tolist() == [6, 0, 6, 0]
     assert before["action"][chosen].any()
     for name in (
         "action",

@@ -579,7 +579,7 @@ def test_randomisation_that_leaves_no_free_place(xy: list[float]) -> None:
         ConfigError,
         lambda: build(cfg),
         "reset.cubes.params.xy",
-        "free place",
+        "free position",
         "20000 trials",
         "smaller",
     )

@@ -15,7 +15,7 @@ import mjstack
 from mjstack.config.schema import GraphMode
 from mjstack.envs import Env
 from mjstack.errors import CaptureError
-from mjstack.managers.base import EnvView
+from mjstack.managers.view import EnvView
 from mjstack.rng import uniform
 from mjstack.sim.draws import draw_uniform
 from mjstack.sim.graph import StepGraph

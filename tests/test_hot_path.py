@@ -21,21 +21,21 @@ PATHS: dict[str, list[str] | None] = {
         f"Env.{n}"
         for n in (
             "advance",
-            "_command",
-            "_move",
-            "_judge",
+            "_apply_action",
+            "_step_physics",
+            "_evaluate",
             "_reset_ended",
-            "_write_start",
-            "_forget",
-            "_side_by_side",
+            "_start_worlds",
+            "_reset_managers",
         )
     ],
-    "envs/faults.py": ["FaultLatch.latch"],
+    "envs/faults.py": ["FaultLatch.record"],
     "envs/statistics.py": ["EpisodeStatistics.update"],
-    "envs/outputs.py": ["Outputs.copy", "Outputs._views"],
-    "managers/action.py": [
-        f"ActionManager.{n}" for n in ("take", "accept", "write_commands", "reset")
+    "envs/outputs.py": [
+        f"Outputs.{n}"
+        for n in ("copy", "_views", "write_final", "restore_observations", "returned")
     ],
+    "managers/action.py": [f"ActionManager.{n}" for n in ("process", "apply", "reset")],
     "managers/observation.py": [
         *(f"_Group.{n}" for n in ("compute", "append", "restart")),
         "ObservationManager.compute",
@@ -44,7 +44,8 @@ PATHS: dict[str, list[str] | None] = {
     "managers/reward.py": ["RewardManager.compute", "RewardManager.reset"],
     "managers/termination.py": ["TerminationManager.compute", "TerminationManager.reset"],
     "managers/reset.py": ["ResetManager.reset"],
-    "managers/base.py": ["random_uniform", "shared", "Term.__call__", "Term.reset"],
+    "managers/view.py": ["random_uniform"],
+    "managers/term.py": ["shared", "Term.__call__", "Term.reset"],
     "mdp/observation.py": None,
     "mdp/reward.py": None,
     "mdp/geometry.py": None,
@@ -156,6 +157,7 @@ PATHS: dict[str, list[str] | None] = {
     ],
     "sim/substep.py": ["rearranged_step"],
     "sim/graph.py": ["side_by_side"],
+    "sim/repeated.py": ["in_parallel"],
     "sim/draws.py": ["draw_uniform"],
     "math.py": None,
 }

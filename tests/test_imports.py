@@ -46,7 +46,7 @@ HOMES = {
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),
     "pyarrow": ("datasets/",),
-    "rich": ("jobs/", "cli.py", "bench/", "report/table.py", "managers/base.py"),
+    "rich": ("jobs/", "cli.py", "bench/", "report/table.py", "managers/term.py"),
 }
 
 

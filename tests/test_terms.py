@@ -28,7 +28,7 @@ from mjstack.managers import (
     RewardManager,
     TerminationManager,
 )
-from mjstack.managers.base import Term
+from mjstack.managers.term import Term
 from mjstack.mdp import observation as observation_terms
 from mjstack.mdp import reset as reset_terms
 from mjstack.mdp import reward as reward_terms
@@ -835,7 +835,7 @@ def test_managers_work_on_any_object_of_that_shape(kind: str) -> None:
         assert torch.equal(value, start[f"obs.{group}"])
     for move, row in zip(moves, expected, strict=True):
         bench.actions.process(move)
-        bench.actions.write_commands()
+        bench.actions.apply()
         bench.sim.step(cfg.timing.decimation, kinematics=True)
         bench.episode_step += 1
         ends.compute()

@@ -36,7 +36,7 @@ from mjstack.bench.timing import (
 )
 from mjstack.envs import Env
 from mjstack.episodes.rollout import State, restore, snapshot
-from mjstack.managers.base import resolve_func
+from mjstack.managers.term import resolve_func
 
 _COST = 4.0  # of a repetition over that of its whole steps from the start, when fewer things touch
 
@@ -182,7 +182,7 @@ class _Parts:
         ages = torch.randint(env.max_episode_steps, (env.nworld,), generator=self._generator)
         env.episode_step.copy_(ages)
         seconds = [timed(env.sim, partial(env.step, action)) for action in self._actions(WARM_UP)]
-        self._halves = env.parts()
+        self._halves = env.halves()
         if self.on_cuda:  # a repetition may be too short to warm them up
             for half in (self._halves.physics, self._halves.managers):
                 for _ in range(WARM_UP):

@@ -15,7 +15,7 @@ from mjstack.drivers.tilt import CarryTilt
 from mjstack.envs import Env
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
-from mjstack.managers.base import EnvView
+from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import objects_in_hand, place_xy, pose_w, robot
 from mjstack.scene.phases import build_phases, build_targets, grasped_objects, source_names
 from mjstack.tasks.check import make_check

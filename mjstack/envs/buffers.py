@@ -17,8 +17,8 @@ import torch
 from mjstack.config.schema import Backend, Config
 from mjstack.envs.env import Env
 from mjstack.errors import FaultError, name_worlds
-from mjstack.managers.base import random_uniform
 from mjstack.managers.reset import required_fields
+from mjstack.managers.view import random_uniform
 from mjstack.scene import SceneIndex
 from mjstack.sim import (
     LOST_PHYSICS,

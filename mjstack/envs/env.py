@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable
 from typing import Any
 
 import torch
 
 from mjstack.config.schema import Config
+from mjstack.envs.arguments import check_mask, check_seed
 from mjstack.envs.faults import FaultLatch, count_start
 from mjstack.envs.halves import StepHalves
 from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
-from mjstack.managers.base import Term, current_term, first_value, step_cache
 from mjstack.managers.observation import ObservationManager
 from mjstack.managers.reset import ResetManager
 from mjstack.managers.reward import RewardManager
+from mjstack.managers.term import Term, current_term, first_value, step_cache
 from mjstack.managers.termination import TerminationManager
 from mjstack.math import not_finite
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
-from mjstack.sim.repeated import Eager, Repeated
+from mjstack.sim.repeated import Repeated, as_graph, in_parallel
 
-FAULT_WINDOW = (
-    200  # steps between two looks at the faults on CUDA; on the CPU looking costs nothing
-)
+FAULT_WINDOW = 200  # steps between two reads of the faults on CUDA; on the CPU each step reads
 
 
 class Env:
@@ -61,7 +59,7 @@ class Env:
         key: The same on the device, shape ``(1,)``, int64.
         world: Number of each world, shape ``(nworld,)``, int64.
         episode: Episode of each world, shape ``(nworld,)``, int64.
-        step: Steps since each world's last reset, shape ``(nworld,)``, int64.
+        episode_step: Steps since each world's last reset, shape ``(nworld,)``, int64.
         success: Whether the task is achieved, shape ``(nworld,)``, bool.
         action_manager: Actions; ``action_dim`` is the policy's output.
         observation_manager: Observation groups; ``group_dims`` are the policy's inputs.
@@ -100,7 +98,7 @@ class Env:
         self.episode_step = torch.zeros_like(self.world)
         self.given_places: dict[str, torch.Tensor] = {}
         self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
-        self._everyone = torch.ones_like(self.success)
+        self._all_worlds = torch.ones_like(self.success)
         self._steps = self._version = 0
         self._check_faults = check_faults
         self._started = self._closed = False
@@ -109,12 +107,11 @@ class Env:
         # Terms are checked on worlds that have started, because a term may read anything.
         self.reset_manager = ResetManager(self, cfg.reset)
         self.episode.zero_()
-        self._write_start(self._everyone)
+        self._start_worlds(self._all_worlds)
         self.action_manager = ActionManager(self, cfg.action)
-        self._success = (
-            None if cfg.task.success is None else Term("task.success", cfg.task.success, self)
-        )
-        if self._success is not None:
+        self._success: Term | None = None
+        if cfg.task.success is not None:
+            self._success = Term("task.success", cfg.task.success, self)
             first_value(self._success, self, dims=(1,), boolean=True)
         self.termination_manager = TerminationManager(self, cfg.termination)
         self.reward_manager = RewardManager(self, cfg.reward)
@@ -122,10 +119,18 @@ class Env:
         self.statistics = EpisodeStatistics(
             self.reward_manager.names, self.termination_manager.names, sim.device
         )
-        self._forget(self._everyone)
+        self._reset_managers(self._all_worlds)
         self.episode.fill_(-1)
-        self._bind_outputs()
-        self._faults = FaultLatch(self)
+        self._outputs = Outputs(
+            self.reward_manager, self.termination_manager, self.observation_manager, self.success
+        )
+        self._faults = FaultLatch(
+            sim,
+            self.action_manager,
+            self.reward_manager,
+            self.observation_manager,
+            cfg.termination,
+        )
         self.graph = self.captured(self.advance, "env.step")
 
     @property
@@ -178,36 +183,26 @@ class Env:
             FaultError: The start does not fit the batch sizes.
         """
         if self._closed:
-            raise ArgumentError(
-                "env", "reset() after close()", "an open environment", "Make a new one"
-            )
-        mask = self._everyone if mask is None else self._check_mask(mask)
+            found = "reset() after close()"
+            raise ArgumentError("env", found, "an open environment", "Make a new one")
+        if mask is not None:
+            check_mask(mask, self.nworld, self.device, started=self._started)
         if seed is not None:
-            if mask is not self._everyone:
-                raise ArgumentError(
-                    "seed",
-                    str(seed),
-                    "no mask beside it, because a seed starts every world anew",
-                    "Leave one out",
-                )
-            if (
-                isinstance(seed, bool)
-                or not hasattr(seed, "__index__")
-                or not 0 <= operator.index(seed) < 1 << 32
-            ):
-                raise ArgumentError("seed", repr(seed), "an integer from 0 to 4294967295")
-            self.seed = operator.index(seed)
+            self.seed = check_seed(seed, masked=mask is not None)
             self.episode.fill_(-1)
+        everywhere = mask is None
+        mask = self._all_worlds if mask is None else mask
         self.episode += mask
         self.episode_step.masked_fill_(mask, 0)
-        self._write_start(mask)
-        if mask is self._everyone:
+        self._start_worlds(mask)
+        if everywhere:
             if count_start(self.sim):
-                self._write_start(self._everyone)  # as if nobody had looked
+                self._start_worlds(self._all_worlds)  # as if nobody had looked
             self._faults.clear()
             self._started = True
-        self._forget(mask)
-        return _copies(self.observation_manager.refresh(mask)), {}
+        self._reset_managers(mask)
+        observed = self.observation_manager.refresh(mask)
+        return {name: group.clone() for name, group in observed.items()}, {}
 
     def step(
         self, action: torch.Tensor
@@ -224,8 +219,7 @@ class Env:
             ``terminated``: ended by what happened, ``(nworld,)``, bool.
             ``truncated``: ended by the clock alone, ``(nworld,)``, bool.
             ``extras``: ``final_obs`` (as ``obs``, before the reset: valid where an episode ended)
-                and ``success`` (at the
-            end of this step, before the reset).
+                and ``success`` (at the end of this step, before the reset).
 
         All of them are the caller's to keep.
 
@@ -235,51 +229,34 @@ class Env:
                 200 steps.
         """
         if not self._started:
-            raise ArgumentError(
-                "env",
-                "step() before reset(), or after close()",
-                "reset() first",
-                "Call env.reset()",
-            )
-        self.action_manager.take(action)
+            found = "step() before reset(), or after close()"
+            raise ArgumentError("env", found, "reset() first", "Call env.reset()")
+        self.action_manager.process(action)
         self.graph()
         self._steps += 1
-        if self._check_faults and self._everyone.is_cuda and self._steps % FAULT_WINDOW == 0:
+        if self._check_faults and self._all_worlds.is_cuda and self._steps % FAULT_WINDOW == 0:
             self.raise_faults()
-        out = self._outputs.copy()
-        obs = {name: out[f"obs/{name}"] for name in self.observation_manager.groups}
-        final = {name: out[f"final/{name}"] for name in self.observation_manager.groups}
-        return (
-            obs,
-            out["reward"],
-            out["terminated"],
-            out["truncated"],
-            {"final_obs": final, "success": out["success"]},
-        )
+        return self._outputs.returned()
 
     def advance(self) -> None:
-        """The part of `step` that is the same at every step: it acts on the action that was taken
-        in, and returns nothing.
+        """The part of `step` that is the same at every step: it acts on the action that was
+        processed last, and returns nothing.
 
         On CUDA it has fixed shapes and no host read, so that a larger graph may hold it.
         """
-        self._command()
-        self._move()
-        self._judge()
+        self._apply_action()
+        self._step_physics()
+        self._evaluate()
         current_term.label = ""
 
     def captured(self, work: Callable[[], None], name: str) -> Repeated:
         """Work of this environment as a graph on CUDA; elsewhere as it is.
 
         Args:
-            work: `advance`, and whatever is to be captured along with it.
-            name: What it is called in messages.
+            work: `advance`, and everything that is to be captured along with it.
+            name: Its name in messages.
         """
-        if self.device.type != "cuda":
-            return Eager(work)
-        from mjstack.sim.graph import StepGraph  # loads Warp, which native runs do not need
-
-        return StepGraph(
+        return as_graph(
             work,
             self.device,
             self.cfg.graph,
@@ -294,16 +271,15 @@ class Env:
         """
         self._version += 1
 
-    def parts(self) -> StepHalves:
+    def halves(self) -> StepHalves:
         """A step taken apart, for measurements."""
 
         def managers() -> None:
-            self._command()
-            self._judge()
+            self._apply_action()
+            self._evaluate()
 
-        return StepHalves(
-            self.captured(self._move, "the physics"), self.captured(managers, "the managers")
-        )
+        physics = self.captured(self._step_physics, "the physics")
+        return StepHalves(physics, self.captured(managers, "the managers"))
 
     def read_statistics(self) -> dict[str, float]:
         """Means over the episodes that ended since the last call; see `EpisodeStatistics.read`.
@@ -318,7 +294,7 @@ class Env:
         Raises:
             FaultError: Something did; names the worlds and what to do.
         """
-        self._faults.raise_any()
+        self._faults.raise_first()
 
     def close(self) -> None:
         """Gives the simulation's threads and buffers back. Nothing can be stepped afterwards."""
@@ -342,37 +318,16 @@ class Env:
         )
         return "\n".join((head, *(str(manager) for manager in managers)))
 
-    def _bind_outputs(self) -> None:
-        """Moves what `step` returns side by side."""
-        rewards = self.reward_manager
-        ends = self.termination_manager
-        observations = self.observation_manager
-        returned = {f"obs/{name}": group for name, group in observations.groups.items()}
-        returned |= {f"final/{name}": group for name, group in observations.groups.items()}
-        returned |= {
-            "reward": rewards.reward,
-            "terminated": ends.terminated,
-            "truncated": ends.truncated,
-        }
-        self._outputs = Outputs(returned | {"success": self.success}, self.device)
-        out = self._outputs.tensors
-        rewards.reward = out["reward"]
-        ends.terminated = out["terminated"]
-        ends.truncated = out["truncated"]
-        for name in observations.groups:
-            observations.groups[name] = out[f"obs/{name}"]
-
-    def _command(self) -> None:
+    def _apply_action(self) -> None:
         current_term.label = ""
-        self.action_manager.accept()
-        self.action_manager.write_commands()
+        self.action_manager.apply()
 
-    def _move(self) -> None:
+    def _step_physics(self) -> None:
         current_term.label = ""
         self.sim.step(self._decimation, kinematics=True)
 
-    def _judge(self) -> None:
-        """What looks at the new state, and the resets."""
+    def _evaluate(self) -> None:
+        """Success, terminations, rewards and observations of the new state, and the resets."""
         self.episode_step += 1
         broken = not_finite(self.sim.qpos, self.sim.qvel)
         if self._success is not None:
@@ -387,11 +342,11 @@ class Env:
             with step_cache():
                 self.observation_manager.compute()
 
-        self._side_by_side(reward, observe)
+        in_parallel(self.device, reward, observe)
         current_term.label = ""
         if self._check_faults and not broken.is_cuda:
-            self._faults.latch(broken)
-            self._faults.raise_any()
+            self._faults.record(broken)
+            self._faults.raise_first()
         self._reset_ended(broken)
 
     def _reset_ended(self, broken: torch.Tensor) -> None:
@@ -400,23 +355,14 @@ class Env:
         """
         ends = self.termination_manager
         rewards = self.reward_manager
-        out = self._outputs.tensors
         on_cuda = broken.is_cuda
         done = ends.terminated | ends.truncated
         # On CUDA, where looking would stop the device, worlds are always reset: those of an empty
         # mask, if need be.
         ending = len(ends.names) > 0 and (on_cuda or bool(done.any()))
 
-        def hand_out() -> None:
-            out["success"].copy_(self.success)
-            # What a diverged world saw last is 0, not NaN, which a value times 0 would hand on.
-            for name, group in self.observation_manager.groups.items():
-                torch.where(
-                    broken[:, None],
-                    group.nan_to_num(0.0, 0.0, 0.0),
-                    group,
-                    out=out[f"final/{name}"],
-                )
+        def keep() -> None:
+            self._outputs.write_final(self.success, broken)
 
         def count() -> None:
             if ending:
@@ -424,64 +370,31 @@ class Env:
                     done, self.episode_step, self.success, rewards.episode_sums, ends.values
                 )
 
-        def latch() -> None:
+        def record() -> None:
             if on_cuda and self._check_faults:
-                self._faults.latch(broken)
+                self._faults.record(broken)
 
-        self._side_by_side(hand_out, count, latch)
+        in_parallel(self.device, keep, count, record)
         if ending:
             self.episode += done
             self.episode_step.masked_fill_(done, 0)
-            self._write_start(done)
-            self._forget(done)
+            self._start_worlds(done)
+            self._reset_managers(done)
             with step_cache():
                 self.observation_manager.refresh(done)
         elif on_cuda or bool(broken.any()):
-            for name, group in self.observation_manager.groups.items():
-                group.copy_(out[f"final/{name}"])
+            self._outputs.restore_observations()
 
-    def _side_by_side(self, *works: Callable[[], None]) -> None:
-        """Independent works; parallel branches where a graph is captured."""
-        if self.device.type == "cuda":
-            from mjstack.sim.graph import side_by_side
-
-            side_by_side(self.device, *works)
-        else:
-            for work in works:
-                work()
-
-    def _write_start(self, mask: torch.Tensor) -> None:
+    def _start_worlds(self, mask: torch.Tensor) -> None:
         """Start states of the masked worlds; a function of seed, world and episode alone."""
         self.reset_manager.reset(mask)
         self.sim.kinematics(mask)
 
-    def _forget(self, mask: torch.Tensor) -> None:
-        """Whatever is kept from step to step starts anew."""
+    def _reset_managers(self, mask: torch.Tensor) -> None:
+        """Clear what managers keep from step to step."""
         self.action_manager.reset(mask)
         self.termination_manager.reset(mask)
         self.reward_manager.reset(mask)
         self.success.masked_fill_(mask, False)
         if self._success is not None:
             self._success.reset(mask)
-
-    def _check_mask(self, mask: torch.Tensor) -> torch.Tensor:
-        expected = f"a bool tensor of shape ({self.nworld},) on {self.device}"
-        if not isinstance(mask, torch.Tensor):
-            raise ArgumentError("mask", type(mask).__name__, expected)
-        if (
-            tuple(mask.shape) != (self.nworld,)
-            or mask.dtype is not torch.bool
-            or mask.device != self.device
-        ):
-            raise ArgumentError(
-                "mask", f"{mask.dtype} of shape {tuple(mask.shape)} on {mask.device}", expected
-            )
-        if not self._started:
-            raise ArgumentError(
-                "mask", "a part of the worlds", "none at the first reset", "Call env.reset()"
-            )
-        return mask
-
-
-def _copies(groups: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {name: group.clone() for name, group in groups.items()}

@@ -4,25 +4,26 @@ whoever looks.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import Enum
-from typing import TYPE_CHECKING
 
 import torch
 
+from mjstack.config.schema import TerminationTermCfg
 from mjstack.errors import FaultError, name_worlds
-from mjstack.managers.base import resolve_func
+from mjstack.managers.action import ActionManager
+from mjstack.managers.observation import ObservationManager
+from mjstack.managers.reward import RewardManager
+from mjstack.managers.term import resolve_func
 from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS, Overflow, Simulation, describe_overflow
-
-if TYPE_CHECKING:
-    from mjstack.envs.env import Env
 
 _POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
 
 
 class Fault(Enum):
     """What went wrong in a world, latched until the host looks; in the order in which
-    `FaultLatch.latch` stacks them.
+    `FaultLatch.record` stacks them.
     """
 
     ACTION = "actions were not finite"
@@ -42,46 +43,57 @@ _FIXES = {
 class FaultLatch:
     """Keeps the faults of every world of an environment until it is cleared."""
 
-    def __init__(self, env: Env) -> None:
-        """Allocates for the environment's worlds; its managers must be there."""
-        self._env = env
-        self._faults = torch.zeros((env.nworld, len(Fault)), dtype=torch.bool, device=env.device)
-        self._overflow = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
-        self._nobody = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
+    def __init__(
+        self,
+        sim: Simulation,
+        actions: ActionManager,
+        rewards: RewardManager,
+        observations: ObservationManager,
+        termination: Mapping[str, TerminationTermCfg],
+    ) -> None:
+        """Allocate for the worlds of a simulation, whose managers are there."""
+        self._sim = sim
+        self._actions = actions
+        self._rewards = rewards
+        self._observations = observations
+        self._faults = torch.zeros((sim.nworld, len(Fault)), dtype=torch.bool, device=sim.device)
+        self._overflow = torch.zeros(sim.nworld, dtype=torch.int32, device=sim.device)
+        self._none = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
+        funcs = [resolve_func(f"termination.{n}", cfg.func) for n, cfg in termination.items()]
+        ends_on = {getattr(func, "ends_on", None) for func in funcs}
         # A world's own overflow may end its episode; that of the shared pool voids the whole batch.
-        self._lost = _POOL if self._ends_on("overflow") else LOST_PHYSICS
-        self._state_ends = self._ends_on("non_finite")
+        self._lost = _POOL if "overflow" in ends_on else LOST_PHYSICS
+        self._state_ends = "non_finite" in ends_on
 
-    def latch(self, broken: torch.Tensor) -> None:
-        """Takes in a step, before a reset can erase what went wrong.
+    def record(self, broken: torch.Tensor) -> None:
+        """Add the faults of a step, before a reset can erase them.
 
         Args:
             broken: Worlds whose state is not finite, shape ``(nworld,)``, bool.
         """
-        env = self._env
-        self._overflow |= env.sim.overflow & self._lost
-        bad_action = env.action_manager.not_finite
-        reward = env.reward_manager.reward
-        groups = env.observation_manager.groups.values()
-        seen = not_finite(*groups) if groups else self._nobody
-        state = self._nobody if self._state_ends else broken
+        self._overflow |= self._sim.overflow & self._lost
+        bad_action = self._actions.not_finite
+        reward = self._rewards.reward
+        groups = self._observations.groups.values()
+        seen = not_finite(*groups) if groups else self._none
+        state = self._none if self._state_ends else broken
         self._faults |= torch.stack((bad_action, state, reward * 0.0 != 0.0, seen & ~broken), dim=1)
         bad_action.zero_()
 
     def clear(self) -> None:
-        """Forgets all of it."""
+        """Clear every fault."""
         self._faults.zero_()
         self._overflow.zero_()
 
-    def raise_any(self) -> None:
-        """Looks. Waits for the device.
+    def raise_first(self) -> None:
+        """Read the faults from the device, and wait for it.
 
         Raises:
             FaultError: Something went wrong; names the worlds and what to do.
         """
         if not bool(self._faults.any() | (self._overflow != 0).any()):
             return
-        nworld = self._env.nworld
+        nworld = self._sim.nworld
         overflow = self._overflow.tolist()
         lost = [w for w, bits in enumerate(overflow) if bits]
         if lost:
@@ -89,29 +101,22 @@ class FaultLatch:
             for w in lost:
                 bits |= overflow[w]
             what = f"{describe_overflow(bits)} overflow in {name_worlds(lost, nworld)}"
-            raise FaultError(what, _capacity_hint(self._env.sim, bits))
+            raise FaultError(what, _capacity_hint(self._sim, bits))
         for column, fault in enumerate(Fault):
             worlds = self._faults[:, column].nonzero()[:, 0].tolist()
             if worlds:
                 where = f"{name_worlds(worlds, nworld)}{self._culprits(fault, worlds[0])}"
                 raise FaultError(f"{fault.value} in {where}", _FIXES[fault])
 
-    def _ends_on(self, fault: str) -> bool:
-        """Whether a termination ends worlds with this fault."""
-        return any(
-            getattr(resolve_func(name, cfg.func), "ends_on", None) == fault
-            for name, cfg in self._env.cfg.termination.items()
-        )
-
     def _culprits(self, fault: Fault, world: int) -> str:
         """Names the terms behind a number that is not finite, as far as their last values tell."""
-        rewards = self._env.reward_manager
+        rewards = self._rewards
         if fault is Fault.REWARD:
             bad = ~torch.isfinite(rewards.values[world])
             names = [n for n, is_bad in zip(rewards.names, bad.tolist(), strict=True) if is_bad]
             return f", from reward.{', reward.'.join(names)}" if names else ""
         if fault is Fault.OBSERVATION:
-            terms = self._env.observation_manager.not_finite_terms(world)
+            terms = self._observations.not_finite_terms(world)
             return f", from {', '.join(terms)}" if terms else ""
         return ""
 

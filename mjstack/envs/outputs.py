@@ -7,27 +7,79 @@ tensor of its own.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
+
+from mjstack.managers.observation import ObservationManager
+from mjstack.managers.reward import RewardManager
+from mjstack.managers.termination import TerminationManager
 
 _ALIGNMENT = 16  # bytes
 
 
 class Outputs:
-    """Tensors in one block of memory."""
+    """What `Env.step` returns, in one block of memory. Rewards, ends and observations are computed
+    right into it.
+    """
 
-    def __init__(self, like: dict[str, torch.Tensor], device: torch.device) -> None:
-        """Allocates room for tensors of the same shapes and types, and takes their values."""
+    def __init__(
+        self,
+        rewards: RewardManager,
+        ends: TerminationManager,
+        observations: ObservationManager,
+        success: torch.Tensor,
+    ) -> None:
+        """Allocate the block, and move the managers' results into it."""
+        self._groups = list(observations.groups)
+        like = {f"obs/{name}": group for name, group in observations.groups.items()}
+        like |= {f"final/{name}": group for name, group in observations.groups.items()}
+        like |= {"reward": rewards.reward, "terminated": ends.terminated}
+        like |= {"truncated": ends.truncated, "success": success}
         self._layout: dict[str, tuple[int, torch.dtype, torch.Size]] = {}
         size = 0
         for name, tensor in like.items():
             length = tensor.numel() * tensor.element_size()
             self._layout[name] = (size, tensor.dtype, tensor.shape)
             size = _ALIGNMENT * math.ceil((size + length) / _ALIGNMENT)
-        self._memory = torch.zeros(size, dtype=torch.uint8, device=device)
+        self._memory = torch.zeros(size, dtype=torch.uint8, device=success.device)
         self.tensors = self._views(self._memory)
         for name, tensor in like.items():
             self.tensors[name].copy_(tensor)
+        rewards.reward = self.tensors["reward"]
+        ends.terminated = self.tensors["terminated"]
+        ends.truncated = self.tensors["truncated"]
+        for name in self._groups:
+            observations.groups[name] = self.tensors[f"obs/{name}"]
+
+    def write_final(self, success: torch.Tensor, broken: torch.Tensor) -> None:
+        """Keep success and the observations of this step, before a reset changes them.
+
+        Args:
+            success: Shape ``(nworld,)``, bool.
+            broken: Worlds whose state is not finite, shape ``(nworld,)``, bool. Their last
+                observation is 0 where it is NaN, which a value times 0 would hand on.
+        """
+        self.tensors["success"].copy_(success)
+        for name in self._groups:
+            group = self.tensors[f"obs/{name}"]
+            finite = group.nan_to_num(0.0, 0.0, 0.0)
+            torch.where(broken[:, None], finite, group, out=self.tensors[f"final/{name}"])
+
+    def restore_observations(self) -> None:
+        """Make the final observations the current ones, where no world is reset."""
+        for name in self._groups:
+            self.tensors[f"obs/{name}"].copy_(self.tensors[f"final/{name}"])
+
+    def returned(
+        self,
+    ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Copies, as `Env.step` returns them."""
+        out = self.copy()
+        obs = {name: out[f"obs/{name}"] for name in self._groups}
+        final = {name: out[f"final/{name}"] for name in self._groups}
+        extras = {"final_obs": final, "success": out["success"]}
+        return obs, out["reward"], out["terminated"], out["truncated"], extras
 
     def copy(self) -> dict[str, torch.Tensor]:
         """Copies of all tensors."""

@@ -96,7 +96,7 @@ def rollout(
         observer.start(env, driver)
 
     def work() -> None:
-        env.action_manager.take(driver.command())
+        env.action_manager.process(driver.command())
         env.advance()
         for observer in observers:
             observer.update()

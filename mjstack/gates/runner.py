@@ -12,7 +12,7 @@ from mjstack.config.schema import Config
 from mjstack.config.terms import typed
 from mjstack.episodes.context import RunContext, lacks_episode
 from mjstack.errors import MjstackError, is_out_of_memory
-from mjstack.managers.base import resolve_func
+from mjstack.managers.term import resolve_func
 from mjstack.report.record import GateResult, Status
 
 log = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from mjstack.datasets import DatasetSpec, Feature
 from mjstack.envs import Env
 from mjstack.errors import ConfigError
 from mjstack.jobs.demonstration import ACTION, REWARD, STATE
-from mjstack.managers.base import resolve_func
+from mjstack.managers.term import resolve_func
 from mjstack.sim import resolve_backend
 
 # Changing one of these changes no episode. The action terms are the controller's, and nothing ends

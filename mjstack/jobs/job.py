@@ -11,7 +11,7 @@ from typing import Any
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
 from mjstack.jobs.result import JobResult
-from mjstack.managers.base import find_object
+from mjstack.managers.term import find_object
 
 
 @dataclass(frozen=True, slots=True)

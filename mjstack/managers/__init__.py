@@ -3,11 +3,11 @@ at once.
 """
 
 from mjstack.managers.action import ActionManager, ActionTerm
-from mjstack.managers.base import EnvView, episode_draw, offers, random_uniform, uses_fields
 from mjstack.managers.observation import ObservationManager
 from mjstack.managers.reset import ResetManager, required_fields
 from mjstack.managers.reward import RewardManager
 from mjstack.managers.termination import TerminationManager
+from mjstack.managers.view import EnvView, episode_draw, offers, random_uniform, uses_fields
 
 __all__ = [
     "ActionManager",

@@ -11,8 +11,7 @@ import torch
 
 from mjstack.config.schema import ActionTermCfg
 from mjstack.errors import ArgumentError, TermError
-from mjstack.managers.base import (
-    EnvView,
+from mjstack.managers.term import (
     build_instance,
     check_params,
     current_term,
@@ -20,6 +19,7 @@ from mjstack.managers.base import (
     resolve_func,
     show_params,
 )
+from mjstack.managers.view import EnvView
 
 
 class ActionTerm(ABC):
@@ -46,7 +46,7 @@ class ActionTerm(ABC):
 
 
 class ActionManager:
-    """Takes the policy's action, keeps the last two, and writes the commands.
+    """Processes the policy's action, keeps the last two, and applies it.
 
     Attributes:
         action_dim: Width of the whole action.
@@ -97,14 +97,14 @@ class ActionManager:
         zeros = torch.zeros((env.nworld, start), dtype=env.sim.qpos.dtype, device=env.device)
         self.action = zeros
         self.previous_action = zeros.clone()
-        self._taken = zeros.clone()
+        self._processed = zeros.clone()
         bounds = [(term.low, term.high) for term, _ in self._slices]
         self.low = torch.cat([low for low, _ in bounds]) if bounds else zeros[0]
         self.high = torch.cat([high for _, high in bounds]) if bounds else zeros[0]
         self.not_finite = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
 
     def process(self, action: torch.Tensor) -> None:
-        """Takes in an action: `take`, which checks it, and `accept`.
+        """Check an action and keep it for `apply`.
 
         A value that is not finite is an error at once on the CPU. On CUDA, where looking would stop
         the device, it counts as 0 and its world is marked in ``not_finite``.
@@ -115,11 +115,6 @@ class ActionManager:
         Raises:
             ArgumentError: Wrong shape, dtype or device, or values that are not finite.
         """
-        self.take(action)
-        self.accept()
-
-    def take(self, action: torch.Tensor) -> None:
-        """Checks an action and copies it to where `accept` finds it."""
         self.check(action)
         action = action.detach()  # physics has no gradient, and a buffer must not acquire one
         if not action.is_cuda and not bool(torch.isfinite(action).all()):
@@ -130,13 +125,18 @@ class ActionManager:
                 "finite numbers",
                 "Check what the policy returns",
             )
-        self._taken.copy_(action)
+        self._processed.copy_(action)
 
-    def accept(self) -> None:
-        """Makes the action that was taken the current one, and the current one the previous one."""
+    def apply(self) -> None:
+        """Make the processed action the current one and the current one the previous one, and write
+        ``sim.ctrl`` in all worlds, term by term.
+        """
         self.previous_action.copy_(self.action)
-        torch.nan_to_num(self._taken, 0.0, 0.0, 0.0, out=self.action)
-        self.not_finite |= (self.action != self._taken).any(1)
+        torch.nan_to_num(self._processed, 0.0, 0.0, 0.0, out=self.action)
+        self.not_finite |= (self.action != self._processed).any(1)
+        for (name, term), (_, part) in zip(self.terms.items(), self._slices, strict=True):
+            current_term.label = f"action.{name}"
+            term.write_commands(self.action[:, part])
 
     def check(self, action: torch.Tensor) -> None:
         """Raises an `ArgumentError` for an action of wrong type, shape, dtype or device."""
@@ -153,14 +153,8 @@ class ActionManager:
         if action.device != self._env.device:
             raise ArgumentError("action", f"device {action.device}", expected)
 
-    def write_commands(self) -> None:
-        """Writes ``sim.ctrl`` in all worlds, term by term."""
-        for (name, term), (_, part) in zip(self.terms.items(), self._slices, strict=True):
-            current_term.label = f"action.{name}"
-            term.write_commands(self.action[:, part])
-
     def reset(self, mask: torch.Tensor) -> None:
-        """Forgets the actions of the masked worlds."""
+        """Zero the actions of the masked worlds."""
         self.action.masked_fill_(mask[:, None], 0.0)
         self.previous_action.masked_fill_(mask[:, None], 0.0)
 

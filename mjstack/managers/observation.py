@@ -11,14 +11,8 @@ import torch
 
 from mjstack.config.schema import ObservationGroupCfg, ObservationTermCfg
 from mjstack.errors import TermError
-from mjstack.managers.base import (
-    EnvView,
-    Term,
-    first_value,
-    random_uniform,
-    render_table,
-    show_params,
-)
+from mjstack.managers.term import Term, first_value, render_table, show_params
+from mjstack.managers.view import EnvView, random_uniform
 
 
 class _Part:

@@ -8,7 +8,8 @@ import torch
 
 from mjstack.config.schema import TermCfg
 from mjstack.errors import MjstackError, TermError
-from mjstack.managers.base import EnvView, Term, render_table, resolve_func, show_params
+from mjstack.managers.term import Term, render_table, resolve_func, show_params
+from mjstack.managers.view import EnvView
 
 
 class ResetManager:

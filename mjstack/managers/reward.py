@@ -9,7 +9,8 @@ import torch
 
 from mjstack.config.schema import RewardTermCfg
 from mjstack.errors import TermError
-from mjstack.managers.base import EnvView, Term, first_value, render_table, show_params
+from mjstack.managers.term import Term, first_value, render_table, show_params
+from mjstack.managers.view import EnvView
 
 
 class RewardManager:

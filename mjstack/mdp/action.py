@@ -8,7 +8,7 @@ import torch
 
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
-from mjstack.managers.base import EnvView
+from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import named_pose, robot
 from mjstack.scene.index import Columns
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 import torch
 
 from mjstack.errors import ParameterError, UnknownName
-from mjstack.managers.base import EnvView, episode_draw, shared
+from mjstack.managers.term import shared
+from mjstack.managers.view import EnvView, episode_draw
 from mjstack.math import lowest_point
 from mjstack.scene import table_top
 from mjstack.scene.index import RobotTensors, SceneIndex

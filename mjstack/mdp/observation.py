@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from mjstack.managers.base import EnvView, offers
+from mjstack.managers.view import EnvView, offers
 from mjstack.mdp.geometry import (
     grasp_point,
     jaw_forces,

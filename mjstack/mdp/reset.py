@@ -10,7 +10,8 @@ from collections.abc import Sequence
 import torch
 
 from mjstack.errors import ParameterError
-from mjstack.managers.base import EnvView, offers, random_uniform, resolve_func, uses_fields
+from mjstack.managers.term import resolve_func
+from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import named_pose, pose_w, robot
 from mjstack.mdp.starts.placement import Placement

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from mjstack.managers.base import EnvView, require_positive
+from mjstack.managers.term import require_positive
+from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import (
     above_table,
     grasp_point,

@@ -7,7 +7,7 @@ import math
 import torch
 
 from mjstack.errors import ParameterError
-from mjstack.managers.base import EnvView, offers
+from mjstack.managers.view import EnvView, offers
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import joint_positions, pose_w, robot
 from mjstack.scene import table_top

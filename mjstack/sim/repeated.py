@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
+import torch
+
+from mjstack.config.schema import GraphMode
+
 
 class Repeated(Protocol):
     """Work that is the same at every call.
@@ -47,3 +51,31 @@ class Eager:
 
     def drop(self) -> None:
         """There is nothing to free."""
+
+
+def as_graph(
+    work: Callable[[], None],
+    device: torch.device,
+    mode: GraphMode,
+    *,
+    name: str,
+    version: Callable[[], int],
+    culprit: Callable[[], str],
+) -> Repeated:
+    """Work as a `StepGraph` on CUDA, whose arguments these are; elsewhere as it is."""
+    if device.type != "cuda":
+        return Eager(work)
+    from mjstack.sim.graph import StepGraph  # loads Warp, which native runs do not need
+
+    return StepGraph(work, device, mode, name=name, version=version, culprit=culprit)
+
+
+def in_parallel(device: torch.device, *works: Callable[[], None]) -> None:
+    """Do independent works; they are parallel branches where a CUDA graph is captured."""
+    if device.type == "cuda":
+        from mjstack.sim.graph import side_by_side  # loads Warp, which native runs do not need
+
+        side_by_side(device, *works)
+        return
+    for work in works:
+        work()

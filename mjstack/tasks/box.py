@@ -11,7 +11,7 @@ import torch
 from mjstack.config.fields import spec
 from mjstack.config.schema import BoxCfg, Config
 from mjstack.errors import ConfigError, ParameterError, UnknownName
-from mjstack.managers.base import EnvView
+from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import gripper_opening
 from mjstack.scene import LowestPoint, table_top
 from mjstack.tasks.check import EpisodeCheck, Rule

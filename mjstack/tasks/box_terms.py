@@ -9,7 +9,8 @@ import math
 import torch
 
 from mjstack.errors import ParameterError, UnknownName
-from mjstack.managers.base import EnvView, offers, require_positive, shared
+from mjstack.managers.term import require_positive, shared
+from mjstack.managers.view import EnvView, offers
 from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, place_xy, pose_w
 from mjstack.scene import table_top
 from mjstack.tasks.box import BoxCheck, scene_box

@@ -32,7 +32,8 @@ from mjstack.config.fields import check_fields, field_range
 from mjstack.config.schema import Config
 from mjstack.config.terms import typed
 from mjstack.errors import ConfigError, TermError, UnknownName
-from mjstack.managers.base import EnvView, resolve_func
+from mjstack.managers.term import resolve_func
+from mjstack.managers.view import EnvView
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED
 from mjstack.scene.phases import Phase

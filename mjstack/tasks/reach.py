@@ -7,7 +7,7 @@ import math
 import torch
 
 from mjstack.errors import ParameterError
-from mjstack.managers.base import EnvView
+from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import grasp_point, pose_w
 
 

@@ -9,7 +9,7 @@ import torch
 
 from mjstack.config.fields import spec
 from mjstack.errors import ParameterError, UnknownName
-from mjstack.managers.base import EnvView
+from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import gripper_opening
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import (

@@ -10,7 +10,7 @@ from functools import cached_property
 import torch
 
 from mjstack.errors import UnknownName
-from mjstack.managers.base import EnvView
+from mjstack.managers.view import EnvView
 from mjstack.math import lowest_point, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, pose_w
 from mjstack.scene import table_top

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import torch
 
 from mjstack.errors import ParameterError
-from mjstack.managers.base import EnvView
+from mjstack.managers.view import EnvView
 from mjstack.scene.index import Columns
 
 MASS_FIELDS = ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")

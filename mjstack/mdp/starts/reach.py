@@ -9,7 +9,7 @@ import numpy as np
 
 from mjstack.errors import ParameterError
 from mjstack.kinematics.reach import PointReach
-from mjstack.managers.base import EnvView
+from mjstack.managers.view import EnvView
 from mjstack.scene.phases import ObjectTarget, nominal_xy, object_targets, source_names, target_xy
 
 _GRID = 0.02  # [m] between the positions whose reach is tried

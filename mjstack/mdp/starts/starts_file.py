@@ -14,7 +14,7 @@ import torch
 
 from mjstack.errors import ArgumentError, ConfigError, ParameterError
 from mjstack.files import write_atomic
-from mjstack.managers.base import EnvView, offers, uses_fields
+from mjstack.managers.view import EnvView, offers, uses_fields
 from mjstack.mdp.geometry import joint_positions, named_pose, place_xy, pose_w, robot
 from mjstack.mdp.starts.randomization import (
     FRICTION_FIELDS,

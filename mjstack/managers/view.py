@@ -1,0 +1,158 @@
+"""The environment as terms see it, and what a term may ask of it or say of itself."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import torch
+
+from mjstack.config.schema import Config
+from mjstack.rng import uniform
+from mjstack.scene import SceneIndex
+from mjstack.sim import Simulation
+
+
+class EnvView(Protocol):
+    """What a term may read of an environment. Any object with these attributes can have managers.
+
+    Attributes:
+        sim: The worlds. Terms read its views; reset terms and actions write into them.
+        index: Where names lie in those views.
+        cfg: The configuration.
+        nworld: Number of worlds.
+        device: Where tensors live.
+        seed: Seed of every random number.
+        key: The same on the device, shape ``(1,)``, int64: what a captured step reads.
+        world: Number of each world, shape ``(nworld,)``, int64.
+        episode: Episode of each world, shape ``(nworld,)``, int64.
+        episode_step: Control steps since each world's last reset, shape ``(nworld,)``, int64.
+        action: The policy's last action, shape ``(nworld, action_dim)``.
+        previous_action: The one before.
+        success: Whether the task is achieved, shape ``(nworld,)``, bool.
+        given_places: Positions [m] of places that a file of starts gives instead of the draw, by
+            name, shape ``(rows, 2)``; world w has row w.
+    """
+
+    sim: Simulation
+    index: SceneIndex
+    cfg: Config
+    nworld: int
+    device: torch.device
+    seed: int
+    key: torch.Tensor
+    world: torch.Tensor
+    episode: torch.Tensor
+    episode_step: torch.Tensor
+    given_places: dict[str, torch.Tensor]
+
+    @property
+    def action(self) -> torch.Tensor:
+        """The policy's last action."""
+
+    @property
+    def previous_action(self) -> torch.Tensor:
+        """The one before."""
+
+    @property
+    def success(self) -> torch.Tensor:
+        """Whether the task is achieved."""
+
+
+def uses_fields(*names: str) -> Callable[[Any], Any]:
+    """Marks a reset term that writes per-world model fields, so that the simulation is built with
+    them.
+    """
+
+    def mark(term: Any) -> Any:
+        term.model_fields = names
+        return term
+
+    return mark
+
+
+def offers(**attributes: Any) -> Callable[[Any], Any]:
+    """Marks a term with what others may ask of it.
+
+    Known attributes: ``unit`` of an observation (one, or one per number; ``joint`` and ``joint/s``
+    are those of the robot's joints); ``ends_on`` of a termination, ``overflow`` or ``non_finite``,
+    where it ends such worlds; of a reset term ``reads_file``, where its parameter ``path`` names a
+    file of starts, ``places_objects``, where its parameter ``xy`` is a region, and ``joint_noise``,
+    where its parameter ``arm`` moves the arm's joints.
+
+    Example:
+        >>> @offers(unit="m")
+        ... def tip_height(env): ...
+    """
+
+    def mark(term: Any) -> Any:
+        for name, value in attributes.items():
+            setattr(term, name, value)
+        return term
+
+    return mark
+
+
+def random_uniform(
+    env: EnvView,
+    name: str,
+    size: int,
+    low: float = -1.0,
+    high: float = 1.0,
+    step: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Random numbers of every world's current episode, the same whatever nworld is and whichever
+    worlds reset.
+
+    Args:
+        env: The environment.
+        name: Whose numbers they are; two consumers with different names never share a draw.
+        size: Numbers per world.
+        low: Smallest value.
+        high: Upper bound.
+        step: Step within the episode, shape ``(nworld,)``; 0 if None, which is right for resets.
+
+    Returns:
+        Shape ``(nworld, size)``, in the type of the simulation's floats.
+    """
+    stream = zlib.crc32(name.encode())
+    if env.device.type == "cuda":
+        from mjstack.sim.draws import (
+            draw_uniform,
+        )  # one kernel; loads Warp, which native runs do not need
+
+        return draw_uniform(
+            key=env.key,
+            stream=stream,
+            world=env.world,
+            episode=env.episode,
+            step=step,
+            size=size,
+            low=low,
+            high=high,
+        )
+    step = torch.zeros_like(env.world) if step is None else step
+    draw = uniform(
+        seed=env.seed, world=env.world, episode=env.episode, step=step, stream=stream, size=size
+    )
+    return low + 0.5 * (high - low) * (draw.to(env.sim.qpos.dtype) + 1.0)
+
+
+def episode_draw(
+    env: EnvView, name: str, size: int, low: float = -1.0, high: float = 1.0
+) -> torch.Tensor:
+    """Random numbers of every world that stay the same all episode: every term that names them sees
+    the same, and the next episode has others.
+
+    Args:
+        env: The environment.
+        name: Whose numbers they are, such as ``goal``.
+        size: Numbers per world.
+        low: Smallest value.
+        high: Upper bound.
+
+    Returns:
+        Shape ``(nworld, size)``, in the type of the simulation's floats.
+    """
+    return random_uniform(env, f"episode.{name}", size, low, high)
