@@ -90,7 +90,7 @@ def test_the_first_unreachable_world_is_named(stage: Stage, workers: Workers) ->
     """World 12 fails in a worker after 17 has failed here."""
     context = stage("so101")
     xy = layouts(context, 40)
-    xy[[12, 15, 17, 30], :2] = FAR
+    xy[[12, 15, 17, 30], 0] = FAR
     planner = PatientPlanner(context.cfg, workers, processes=2)
     with pytest.raises(Unreachable) as shared:
         planner.plan(xy)
