@@ -102,7 +102,7 @@ def test_a_check_of_ones_own_judges_native_worlds() -> None:
     ("overrides", "parts"),
     [
         (["+task.check.xy_er=1"], ["task.check: key", "xy_er", "Did you mean 'xy_err'?"]),
-        (["task.check.xy_err=wide"], ["task.check.xy_err=wide", "float"]),
+        (["task.check.xy_err=wide"], ["task.check.xy_err=wide", "a number above 0 [m]"]),
         (["task.check.lift_steps=2.5"], ["task.check.lift_steps=2.5", "int"]),
         (["task.check.rest_speed=0"], ["task.check.rest_speed=0", "above 0 [m/s]"]),
         (["task.check.window=601"], ["task.check.window=601", "600 steps"]),

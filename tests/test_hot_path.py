@@ -149,12 +149,12 @@ PATHS: dict[str, list[str] | None] = {
             "reset",
             "kinematics",
             "_decimation",
-            "_keep_peaks",
             "_count",
             "_pose",
             "_place",
         )
     ],
+    "sim/usage.py": ["Usage.count", "Usage.select"],
     "sim/substep.py": ["rearranged_step"],
     "sim/graph.py": ["side_by_side"],
     "sim/repeated.py": ["in_parallel"],

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from check_cases import limits, rules_of
+from check_cases import rules_of
 from environments import brisk, rushed
 from omegaconf import OmegaConf
 
@@ -197,7 +197,7 @@ def test_saved_configuration_is_the_runs_own(
         ]
     )
     played = OmegaConf.load(out / "replayed_config.yaml")
-    assert (played.seed, limits(played).xy_err) == (1, 0.0015)
+    assert (played.seed, played.task.check.xy_err) == (1, 0.0015)
 
 
 def test_another_verdict_is_said(
@@ -395,7 +395,7 @@ def test_a_run_from_a_file_replays_from_its_own_copy(
         (
             lambda copy: copy.unlink(),
             (
-                "has no starts_played.csv, expected a copy of the layout file that it started from,"
+                "has no starts_played.csv, expected a copy of the starts file that it started from,"
                 " carry"
             ),
         ),

@@ -220,7 +220,7 @@ BAD = [
     (["job=study", "+job.variants.mine={iteration: 3}"], "Did you mean 'iterations'?"),
     (["job=study", "+job.variants.mine={iterations: 0}"], "job.variants.mine.iterations=0"),
     (["job=study", "+job.variants.mine={iterations: few}"], "job.variants.mine.iterations=few"),
-    (["job=study", "+job.variants.mine={cone: round}"], "elliptic or pyramidal"),
+    (["job=study", "+job.variants.mine={cone: round}"], "one of elliptic, pyramidal"),
     (
         ["job=study", "job.variants.condim_3.gripper_condim=5"],
         "job.variants.condim_3.gripper_condim=5",

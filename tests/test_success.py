@@ -22,7 +22,6 @@ from environments import brisk, configure, rushed
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.episodes import context as gate_module
-from mjstack.episodes import failures as watch_module
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.observers import Episode, Hook, play_episode
@@ -304,7 +303,7 @@ def test_replay_refuses_worlds_that_were_not(
 BAD = [
     (
         ["gate.success.region=[0.5,0.02]"],
-        "gate.success.region=[0.5, 0.02]: expected half-widths that leave both cubes on",
+        "gate.success.region=[0.5, 0.02]: expected half-widths that leave every object on",
     ),
     (
         ["gate.success.region=[0.1,0.1]"],
@@ -317,7 +316,7 @@ BAD = [
         "no term of gate.success.reset has a region",
     ),
     (["gate.success.reset.cubes.params.gap=0.3"], "gate.success.reset.cubes.params.xy"),
-    (["gate.success.rate=1.01"], "gate.success.rate=1.01: expected a share from 0 to 1"),
+    (["gate.success.rate=1.01"], "gate.success.rate=1.01: expected a number from 0 to 1"),
     (["gate.success.rate=nan"], "gate.success.rate=nan"),
     (["gate.success.seeds=0"], "gate.success.seeds=0: expected an integer of at least 1"),
     (["gate.success.seeds=2", "seed=4294967295"], "seeds are 32-bit"),
@@ -460,11 +459,12 @@ def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> Non
     )
     env = SimpleNamespace(nworld=n, device=device, sim=sim, index=None, cfg=cfg)
     controller = SimpleNamespace(phase=torch.zeros(n, dtype=torch.int64), phases=None)
-    check = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.step]))
-    monkeypatch.setattr(
-        watch_module, "objects_in_hand", lambda *_: torch.from_numpy(forces[now.step] > 0.0).all(2)
+    pretend(
+        watch,
+        monkeypatch,
+        in_hand=lambda: torch.from_numpy(forces[now.step] > 0.0).all(2),
+        placed=lambda: torch.from_numpy(placed[now.step]),
     )
-    monkeypatch.setattr(watch_module, "check_class", lambda _: lambda *_: check)
     watch.start(env, controller)
     for step in range(total):
         now.step = step
@@ -487,6 +487,19 @@ def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> Non
     assert {sign for sign, _, _ in wanted} == {
         int(sign) for sign in Sign
     }  # else this would show less than it seems to
+
+
+def pretend(
+    watch: FailureMonitor,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    in_hand: Callable[[], torch.Tensor],
+    placed: Callable[[], torch.Tensor],
+) -> None:
+    """Give the monitor a check that says what the test made up."""
+    view = SimpleNamespace(step=lambda: SimpleNamespace(in_hand=in_hand()))
+    check = SimpleNamespace(view=lambda _: view, placed=lambda _: placed())
+    monkeypatch.setattr(watch, "_check", check)
 
 
 def recount(
@@ -577,11 +590,12 @@ def test_each_cube_of_the_box_has_its_own_release(monkeypatch: pytest.MonkeyPatc
     )
     env = SimpleNamespace(nworld=5, device=torch.device("cpu"), sim=sim, index=None, cfg=cfg)
     controller = SimpleNamespace(phase=torch.zeros(5, dtype=torch.int64), phases=None)
-    check = SimpleNamespace(placed=lambda _: torch.from_numpy(placed[now.step]))
-    monkeypatch.setattr(
-        watch_module, "objects_in_hand", lambda *_: torch.ones(5, 2, dtype=torch.bool)
+    pretend(
+        watch,
+        monkeypatch,
+        in_hand=lambda: torch.ones(5, 2, dtype=torch.bool),
+        placed=lambda: torch.from_numpy(placed[now.step]),
     )
-    monkeypatch.setattr(watch_module, "check_class", lambda _: lambda *_: check)
     watch.start(env, controller)
     for step in range(len(placed)):
         now.step = step
