@@ -338,8 +338,9 @@ def test_sizes_were_tried_with_the_same_outcome(
         m[f"rerun.{name}.same_final_state"] is True
         for name in ("task", "random_actions", "randomized")
     )
-    assert m["rerun.randomized.sizes"] == m["rerun.random_actions.sizes"]
-    assert m["rerun.task.sizes"].startswith(
+    notes = too_small[1].notes
+    assert notes["rerun.randomized.sizes"] == notes["rerun.random_actions.sizes"]
+    assert notes["rerun.task.sizes"].startswith(
         f"batch.nconmax={m['recommended.nconmax']} batch.njmax={m['recommended.njmax']}"
     )
     assert m["rerun.task.peak_constraint_rows_per_world"] == m["peak_constraint_rows_per_world"]

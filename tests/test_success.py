@@ -681,7 +681,7 @@ def test_steps_with_the_tracker_are_one_graph(
     sim = context.batch_simulation(64)
     watch = FailureMonitor(context.cfg)
     episode = context.play(sim, context.cfg.reset, [watch])
-    assert episode.captured
+    assert episode.timing.captured
     failed = episode.result.failed != 0
     assert int(failed.sum()) <= 3
     assert not bool(((watch.sign != 0) & ~failed).sum() > 3)

@@ -16,6 +16,7 @@ from rich.markup import escape
 
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.schema import Backend, Config, ScalingJobCfg
+from mjstack.episodes.context import require_episode
 from mjstack.errors import ConfigError
 from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.gates import check_machine
@@ -64,6 +65,7 @@ def check_scaling(cfg: Config) -> None:
             raise ConfigError(
                 key, "true", "false with job=scaling, which shows no world", "Leave it out"
             )
+    require_episode(cfg)
     backends = _backends(cfg)
     if "mjwarp" in backends:
         resolve_device(cfg.sim.device)
