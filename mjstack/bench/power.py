@@ -16,14 +16,14 @@ SHORTEST = 0.5  # s, of a stretch of work on average: the counter moves some ten
 
 class EnergyMeter:
     """Adds up what the GPU's energy counter moves from `start` to `stop`. It counts the whole GPU,
-    whoever uses it.
+    for every process on it.
 
     Attributes:
         reason: Why there is no figure; empty where there is one.
     """
 
     def __init__(self, device: str) -> None:
-        """Opens the counter.
+        """Open the counter.
 
         Args:
             device: ``cpu`` or ``cuda:N``.
@@ -51,17 +51,17 @@ class EnergyMeter:
         self._nvml = pynvml
 
     def clear(self) -> None:
-        """Forgets what was added up."""
+        """Clear what was added up."""
         self._joules = self._seconds = 0.0
         self._stretches = 0
 
     def start(self) -> None:
-        """Begins a stretch of work, the device idle."""
+        """Begin a stretch of work, the device idle."""
         self._read_first = self._read()
         self._began = time.perf_counter()
 
     def stop(self) -> None:
-        """Ends it, the device idle again, and adds it."""
+        """End it, the device idle again, and adds it."""
         self._seconds += time.perf_counter() - self._began
         self._joules += self._read() - self._read_first
         self._stretches += 1

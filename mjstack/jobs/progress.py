@@ -48,11 +48,11 @@ class ProgressBar:
         self._progress.stop()
 
     def say(self, line: str) -> None:
-        """Prints a line above the bar."""
+        """Print a line above the bar."""
         self._progress.console.print(line, soft_wrap=True)
 
     def start(self, gate: str) -> None:
-        """Begins something with a name."""
+        """Begin something with a name."""
         self._gate = gate
         self._drop()
         self._task = self._progress.add_task(
@@ -61,7 +61,7 @@ class ProgressBar:
         self._spoke = time.monotonic()
 
     def advance(self, unit: str, done: int, total: int) -> None:
-        """Shows how much of something is done."""
+        """Show how much of something is done."""
         now = time.monotonic()
         if unit != self._unit or done <= 1 or self._task is None:
             self._drop()
@@ -78,7 +78,7 @@ class ProgressBar:
             self.say(f"{self._gate}: {unit} {done}/{total}, {rate}, {left:.0f} s left")
 
     def finish(self, result: GateResult) -> None:
-        """Prints a gate's result."""
+        """Print a gate's result."""
         self._drop()
         color = STATUS_COLOR[result.status]
         self.say(

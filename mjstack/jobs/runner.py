@@ -1,6 +1,4 @@
-"""What jobs share whose outcome is a report: written from the first moment on, kept current, never
-lost.
-"""
+"""The runner of jobs that leave a report, which is written after each result."""
 
 from __future__ import annotations
 
@@ -39,7 +37,7 @@ Work = Callable[[RunContext, ProgressBar, Record], None]
 
 
 def check_showing(cfg: Config) -> None:
-    """Raises if this machine cannot show an episode as ``view`` or ``video`` ask for."""
+    """Raise if this machine cannot show an episode as ``view`` or ``video`` ask for."""
     if (
         cfg.view
         and sys.platform.startswith("linux")
@@ -59,80 +57,60 @@ def check_showing(cfg: Config) -> None:
 def run_reported(
     context: RunContext, folder: Path, overrides: list[str], title: str, work: Work
 ) -> JobResult:
-    """Does some work and writes its report after each result.
+    """Do some work and write its report after each result.
 
     Args:
         context: The configuration, and what its check built.
         folder: Where report.json, report.md, pictures and logs go.
-        overrides: What was asked for on the command line.
-        title: What is done, in one line.
+        overrides: The command line.
+        title: The work in one line.
         work: Does it. Hands over each result as soon as there is one.
 
     Returns:
         How it ended. Ctrl-C is an outcome, not an exception: the finished results are in the
         report.
     """
-    console = Console(highlight=False)
+    console = Console(highlight=False, soft_wrap=True)
+    errors = Console(stderr=True, soft_wrap=True, markup=False)
     context = replace(context, folder=folder, artifacts=Artifacts())
     cfg = context.cfg
-    report: Report | None = None
-    outcome = JobResult(status=Status.interrupted, folder=folder, overrides=overrides)
+    report = Report(provenance={})
+
+    def record(result: GateResult) -> None:
+        report.gates.append(result)
+        write_report(report, folder)
+        bar.finish(result)
+
     try:
-        console.print(
-            f"[bold]{cfg.robot.title}[/], {escape(title)} -> {escape(str(folder))}", soft_wrap=True
-        )
-        report = Report(provenance=run_provenance(cfg, context))
+        console.print(f"[bold]{cfg.robot.title}[/], {escape(title)} -> {escape(str(folder))}")
+        report.provenance = run_provenance(cfg, context)
         write_report(report, folder)
         with ProgressBar(console) as bar:
             viewer = _viewer(context) if cfg.view else None
             context = replace(context, say=bar.say, advance=bar.advance, on_step=viewer)
-            work(context, bar, lambda result: _record(report, result, folder, bar))
+            work(context, bar, record)
         report.conclude()
-        outcome.status = report.status
         write_report(report, folder)
-        _draw(context, report, folder, console)
-        report.pictures += context.artifacts.pictures
+        report.pictures = [*_draw(context, folder, console), *context.artifacts.pictures]
         write_report(report, folder)
+    # However it ends, the finished results are in the report.
     except KeyboardInterrupt:
-        outcome.status = Status.interrupted
-        if report is not None:
-            report.status = Status.interrupted
-            write_report(report, folder)
-        kept = (
-            "the finished gates are in the report"
-            if report is not None
-            else "nothing had been finished"
-        )
-        console.print(f"interrupted; {kept}")
+        report.status = Status.interrupted
+        console.print("interrupted; the finished gates are in the report")
     except OSError as error:
-        outcome.status = _mark_failed(report)
-        Console(stderr=True).print(
+        report.status = Status.failed
+        errors.print(
             f"mjstack: {folder} cannot be written: {error.strerror}. Free space, or set"
             " hydra.run.dir."
         )
     except MjstackError as error:
-        outcome.status = _mark_failed(report)
-        with contextlib.suppress(OSError):
-            if report is not None:
-                write_report(report, folder)
-        log.error("%s", error)
-        Console(stderr=True, soft_wrap=True).print(f"mjstack: {escape(str(error))}")
-    if report is not None:
-        outcome.gates = report.gates
-        _print_summary(console, report, folder)
-    return outcome
-
-
-def _mark_failed(report: Report | None) -> Status:
-    if report is not None:
         report.status = Status.failed
-    return Status.failed
-
-
-def _record(report: Report, result: GateResult, folder: Path, bar: ProgressBar) -> None:
-    report.gates.append(result)
-    write_report(report, folder)
-    bar.finish(result)
+        log.error("%s", error)
+        errors.print(f"mjstack: {error}")
+    with contextlib.suppress(OSError):
+        write_report(report, folder)
+    _print_summary(console, report, folder)
+    return JobResult(status=report.status, folder=folder, overrides=overrides, gates=report.gates)
 
 
 def run_provenance(cfg: Config, context: RunContext) -> dict:
@@ -162,14 +140,12 @@ def model_text(model: mujoco.MjModel) -> str:
     return buffer.tobytes().hex()
 
 
-def _draw(context: RunContext, report: Report, folder: Path, console: Console) -> None:
-    """Pictures and video of the one-world episode, if there was one. Their failure fails
-    no gate.
-    """
+def _draw(context: RunContext, folder: Path, console: Console) -> list[str]:
+    """Draw the one-world episode, if there was one; return the pictures' file names."""
     episode = context.artifacts.shown
     cfg = context.cfg
     if episode is None:
-        return
+        return []
     objects = {name: (thing.half, thing.color) for name, thing in cfg.scene.free.items()}
     positions = np.stack([episode.qpos[:, a : a + 3] for a in context.index.object_qpos], axis=1)
     title = f"{cfg.robot.title}, {cfg.task.name}: {context.artifacts.shown_by}"
@@ -180,18 +156,19 @@ def _draw(context: RunContext, report: Report, folder: Path, console: Console) -
     }
     if cfg.video:
         drawn["episode.mp4"] = (save_video, (model, episode.qpos, cfg.timing.step_dt))
+    pictures = []
     for name, (draw, args) in drawn.items():
-        problem = safely_draw(folder / name, draw, *args)
-        if problem:
-            console.print(escape(problem), soft_wrap=True)
+        if problem := safely_draw(folder / name, draw, *args):
+            console.print(escape(problem))
         elif name.endswith(".png"):
-            report.pictures.append(name)
+            pictures.append(name)
         else:
-            console.print(f"video: {folder}/{name}", soft_wrap=True)
+            console.print(f"video: {folder}/{name}")
+    return pictures
 
 
 def _viewer(context: RunContext) -> StepHook:
-    """Shows a one-world episode in MuJoCo's viewer, in real time; closing the window lets the run
+    """Show a one-world episode in MuJoCo's viewer, in real time; closing the window lets the run
     go on.
     """
     import mujoco.viewer
@@ -215,8 +192,8 @@ def _viewer(context: RunContext) -> StepHook:
 def _print_summary(console: Console, report: Report, folder: Path) -> None:
     colors = {status.value: color for status, color in STATUS_COLOR.items()}
     console.print(summarize(report).to_console(colors))
-    console.print(f"report: {escape(str(folder))}/report.md", soft_wrap=True)
+    console.print(f"report: {escape(str(folder))}/report.md")
     for gate in report.gates:
         if gate.status is Status.skipped:
-            console.print(f"skipped: {gate.name}: {escape(gate.reason)}", soft_wrap=True)
+            console.print(f"skipped: {gate.name}: {escape(gate.reason)}")
     console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status.value}[/]")

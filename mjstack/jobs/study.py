@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 def check_study(cfg: Config) -> RunContext:
-    """Raises for what this machine cannot do, before anything is written."""
+    """Raise for what this machine cannot do, before anything is written."""
     for key in ("view", "video"):
         if getattr(cfg, key):
             raise ConfigError(
@@ -196,7 +196,7 @@ def _simulation(context: RunContext) -> Simulation:
 
 
 def _changes(base: SolverCfg, solver: SolverCfg) -> str:
-    """What differs: ``iterations=5``."""
+    """The settings that differ, such as ``iterations=5``."""
     pairs = (
         (field.name, getattr(base, field.name), getattr(solver, field.name))
         for field in fields(SolverCfg)

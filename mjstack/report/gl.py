@@ -10,7 +10,7 @@ _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 
 
 def choose_gl() -> None:
-    """Sets ``MUJOCO_GL`` on Linux: the user's choice if its library is there, else what this
+    """Set ``MUJOCO_GL`` on Linux: the user's choice if its library is there, else what this
     machine has.
 
     A choice whose library is missing would break the import of mujoco itself; then pictures are

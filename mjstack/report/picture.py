@@ -26,7 +26,7 @@ class SceneCamera:
     """Draws a model offscreen."""
 
     def __init__(self, model: mujoco.MjModel, width: int = 960, height: int = 720) -> None:
-        """Opens a renderer.
+        """Open a renderer.
 
         Raises:
             MjstackError: This machine cannot draw offscreen.
@@ -58,7 +58,7 @@ class SceneCamera:
         return self._renderer.render()
 
     def close(self) -> None:
-        """Frees the renderer."""
+        """Free the renderer."""
         self._renderer.close()
 
 
@@ -91,7 +91,7 @@ def save_scene(
 
 
 def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, step_dt: float) -> None:
-    """Writes an mp4 of an episode in real time.
+    """Write an mp4 of an episode in real time.
 
     Args:
         path: The file.

@@ -18,7 +18,7 @@ PACKAGES = ("mjstack", "mujoco", "mujoco-warp", "warp-lang", "torch", "mink", "h
 def collect_provenance(
     *, config_yaml: str, model_text: str, device: str, driver: str
 ) -> Provenance:
-    """Collects what is needed to judge and to repeat a run.
+    """Collect what is needed to judge and to repeat a run.
 
     Args:
         config_yaml: The whole configuration as text.

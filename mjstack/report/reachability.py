@@ -1,4 +1,4 @@
-"""What the arm reaches, as a table, as text and as a picture."""
+"""The reach of the arm as a table, as text and as a picture."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class ObjectRegion:
         configured: Half-widths of ``reset=randomized`` [m].
         square: Largest half-width of a square around the place that is reached with the margin [m];
             0 where none is.
-        largest: Half-widths of the largest rectangle likewise [m].
+        largest: Half-widths of the largest rectangle that is reached with the margin [m].
         tilt: Largest of the smallest tilts in the configured region at the grasp [rad]; NaN where
             some is not reached.
         reached: Whether the configured region is, with the margin.
@@ -171,7 +171,7 @@ _LEVEL: dict[str, Callable[[ReachLevel], str]] = {
 
 
 def save_map(path: Path, found: ReachMap) -> None:
-    """Draws a panel per level: the tilt as colour, hatched where the arm does not get to, table,
+    """Draw a panel per level: the tilt as colour, hatched where the arm does not get to, table,
     objects and regions.
     """
     width = found.x[-1] - found.x[0]

@@ -1,4 +1,4 @@
-"""What a run found, as data: gate results and provenance."""
+"""Results of a run as data: gates and provenance."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def save_places(
     title: str,
     colors: Mapping[str, Sequence[float]],
 ) -> None:
-    """Draws every start as a dot per object; a failed one as crosses on its objects, joined by a
+    """Draw every start as a dot per object; a failed one as crosses on its objects, joined by a
     line.
 
     Args:

@@ -63,7 +63,7 @@ def make_simulation(
     fields: Sequence[str] = (),
     sizes: BatchSizes | None = None,
 ) -> Simulation:
-    """Builds a simulation.
+    """Build a simulation.
 
     Args:
         model: The compiled model, its timestep set.

@@ -68,7 +68,7 @@ class StepGraph:
         culprit: Callable[[], str] = lambda: "",
         scratch: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Takes the work without running it.
+        """Keep the work without running it.
 
         Args:
             work: What is captured.
@@ -99,7 +99,7 @@ class StepGraph:
         return self._replay is not None and self._version() == self._seen
 
     def __call__(self) -> None:
-        """Does the work, in one way or another."""
+        """Do the work, in one way or another."""
         if self._version() != self._seen:
             self.drop()
         if self._mode is GraphMode.off or self._failed:
@@ -115,7 +115,7 @@ class StepGraph:
             self._work()
 
     def drop(self) -> None:
-        """Forgets the capture: the next call runs eagerly again, and the one after it captures."""
+        """Clear the capture: the next call runs eagerly again, and the one after it captures."""
         self._replay = None
         self._memory = None
         self._warm = False
@@ -133,7 +133,7 @@ class StepGraph:
         self.warm_up_seconds = time.perf_counter() - began
 
     def _capture(self) -> bool:
-        """Captures the work; Python's collector waits, so that nothing is freed in the middle of
+        """Capture the work; Python's collector waits, so that nothing is freed in the middle of
         it.
         """
         began = time.perf_counter()
@@ -169,7 +169,7 @@ class StepGraph:
         graph = torch.cuda.CUDAGraph()
         # A conditional node makes Warp interrupt the capture, and what goes on after it has another
         # number. By that number torch knows what to allocate from the graph's own memory, which
-        # nobody else gets. So there is a second such pool.
+        # no one else gets. So there is a second such pool.
         memory = torch.cuda.MemPool()
         pool = torch.cuda.graph_pool_handle()
         scratch = Scratch(self._device) if self._scratch() else None
@@ -203,7 +203,7 @@ class StepGraph:
 
 
 def side_by_side(device: torch.device, *works: Callable[[], None], branches: bool = True) -> None:
-    """Does independent works: in a CUDA graph that is being captured as parallel branches, else one
+    """Do independent works: in a CUDA graph that is being captured as parallel branches, else one
     after the other.
 
     Args:
@@ -235,7 +235,7 @@ def side_by_side(device: torch.device, *works: Callable[[], None], branches: boo
 
 
 def _recover(device: wp.Device) -> None:
-    """Clears the error that a broken capture leaves, so that eager work can go on."""
+    """Clear the error that a broken capture leaves, so that eager work can go on."""
     try:
         torch.cuda.synchronize(wp.device_to_torch(device))
     except RuntimeError:

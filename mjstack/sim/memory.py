@@ -36,7 +36,7 @@ def keep_arrays(fresh: object, old: object) -> None:
 
 
 def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
-    """What `MjwarpSimulation.memory_bytes` would be for these sizes, without allocating it.
+    """Compute `MjwarpSimulation.memory_bytes` for these sizes, without allocating it.
 
     Every array is as long as nworld, as the contact pool, or constant. So two small ones on the CPU
     tell the rest.

@@ -53,7 +53,7 @@ class MjwarpSimulation(FixedViews):
         *,
         fields: Sequence[str] = (),
     ) -> None:
-        """Uploads the model and allocates nworld worlds at qpos0.
+        """Upload the model and allocates nworld worlds at qpos0.
 
         Args:
             model: The compiled model.
@@ -124,7 +124,7 @@ class MjwarpSimulation(FixedViews):
         self._warm_up()
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
-        """Advances every world by n physics steps under the current ctrl; the poses follow with
+        """Advance every world by n physics steps under the current ctrl; the poses follow with
         kinematics.
         """
         with torch_stream_scope(self._device):
@@ -134,21 +134,21 @@ class MjwarpSimulation(FixedViews):
                 self._graph(n, kinematics)()
 
     def forward(self) -> None:
-        """Computes everything that derives from the state, without advancing time."""
+        """Compute everything that derives from the state, without advancing time."""
         with torch_stream_scope(self._device):
             self._place()
             mjw.forward(self._m, self._d)
             self._count(steps=0)
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
-        """Brings the poses of all worlds up to the current qpos: a mask would save nothing."""
+        """Bring the poses of all worlds up to the current qpos: a mask would save nothing."""
         if mask is not None:
             check_mask(mask, self.nworld, self.device)
         with torch_stream_scope(self._device):
             self._pose()
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Puts the masked worlds back to qpos0, at rest, and clears their counters and overflow
+        """Put the masked worlds back to qpos0, at rest, and clears their counters and overflow
         bits.
         """
         if mask is not None:
@@ -224,12 +224,12 @@ class MjwarpSimulation(FixedViews):
         return self._graph(n, kinematics)
 
     def latch(self) -> None:
-        """Takes in what the worlds use and have lost by now; `step` does it by itself."""
+        """Record what the worlds use and have lost by now; `step` does it by itself."""
         with torch_stream_scope(self._device):
             self._count(steps=0)
 
     def resize(self, sizes: BatchSizes) -> None:
-        """Gives the worlds other buffer sizes. Their state and every view stay; contacts and rows
+        """Give the worlds other buffer sizes. Their state and every view stay; contacts and rows
         are empty until a step.
 
         Args:
@@ -247,7 +247,7 @@ class MjwarpSimulation(FixedViews):
         self.version += 1
 
     def arrange(self, arrangement: Arrangement) -> None:
-        """Chooses how a captured step is arranged; for measurements, because the numbers stay the
+        """Choose how a captured step is arranged; for measurements, because the numbers stay the
         same.
         """
         self.arrangement = arrangement
@@ -261,7 +261,7 @@ class MjwarpSimulation(FixedViews):
         tolerance: float | None = None,
         impratio: float | None = None,
     ) -> None:
-        """Changes the constraint solver's limits; graphs, which have them baked in, are captured
+        """Change the constraint solver's limits; graphs, which have them baked in, are captured
         anew.
 
         Args:
@@ -280,11 +280,11 @@ class MjwarpSimulation(FixedViews):
         self.version += 1
 
     def synchronize(self) -> None:
-        """Waits for the device."""
+        """Wait for the device."""
         wp.synchronize_device(self._device)
 
     def close(self) -> None:
-        """Drops the graphs; buffers go with the object."""
+        """Drop the graphs; buffers go with the object."""
         self._graphs.clear()
 
     def _decimation(self, n: int, kinematics: bool) -> None:
@@ -326,7 +326,7 @@ class MjwarpSimulation(FixedViews):
         self._place(posed=True)
 
     def _place(self, *, posed: bool = False) -> None:
-        """Puts the geoms that never move where the fields say: MJWarp does it once, when it makes
+        """Put the geoms that never move where the fields say: MJWarp does it once, when it makes
         the data.
         """
         if not self._placing:
@@ -356,7 +356,7 @@ class MjwarpSimulation(FixedViews):
         self._usage.count(self._m, self._d, steps)
 
     def _warm_up(self) -> None:
-        """Compiles and loads every kernel, then leaves the worlds as new."""
+        """Compile and loads every kernel, then leaves the worlds as new."""
         with torch_stream_scope(self._device):
             self._decimation(1, kinematics=True)
         self.synchronize()

@@ -105,7 +105,7 @@ class SimpleBodies:
     def __init__(
         self, model: mujoco.MjModel, fields: Mapping[str, np.ndarray], nworld: int
     ) -> None:
-        """Finds the degrees of freedom and what their inertia is made of.
+        """Find the degrees of freedom and what their inertia is made of.
 
         Args:
             model: The compiled model.
@@ -138,7 +138,7 @@ class SimpleBodies:
                 self._b[i, k % 3] = 1.0
 
     def update(self) -> None:
-        """Computes dof_M0 from what the fields hold now."""
+        """Compute dof_M0 from what the fields hold now."""
         mass, inertia, armature = self._sources
         spin = (inertia[:, self._bodies] * self._b).sum(-1)
         self.dof_M0[:, self._dofs] = (

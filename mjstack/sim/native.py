@@ -90,7 +90,7 @@ class NativeSimulation(FixedViews):
         fields: Sequence[str] = (),
         nthread: int | None = None,
     ) -> None:
-        """Allocates nworld worlds at qpos0.
+        """Allocate nworld worlds at qpos0.
 
         Args:
             model: The compiled model.
@@ -169,7 +169,7 @@ class NativeSimulation(FixedViews):
         self.reset()
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
-        """Advances every world by n physics steps under the current ctrl; the poses follow with
+        """Advance every world by n physics steps under the current ctrl; the poses follow with
         kinematics.
         """
         if n == 0:
@@ -184,7 +184,7 @@ class NativeSimulation(FixedViews):
             self._finite_worlds(self._poses)
 
     def forward(self) -> None:
-        """Computes everything that derives from the state, without advancing time; warm starts stay
+        """Compute everything that derives from the state, without advancing time; warm starts stay
         as they are.
         """
         self._visit(
@@ -193,14 +193,14 @@ class NativeSimulation(FixedViews):
         )
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
-        """Brings the poses of the masked worlds up to the current qpos; the other worlds are not
+        """Bring the poses of the masked worlds up to the current qpos; the other worlds are not
         visited.
         """
         rows = self._rows(mask)
         self._visit(self._pose, self._finite_worlds(self._poses, rows=rows))
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Puts the masked worlds back to qpos0, at rest."""
+        """Put the masked worlds back to qpos0, at rest."""
         rows = self._rows(mask)
         self._state[rows] = self._initial
         if "qpos0" in self._fields:
@@ -248,7 +248,7 @@ class NativeSimulation(FixedViews):
         tolerance: float | None = None,
         impratio: float | None = None,
     ) -> None:
-        """Changes the constraint solver's limits."""
+        """Change the constraint solver's limits."""
         given = {
             "iterations": iterations,
             "ls_iterations": ls_iterations,
@@ -264,7 +264,7 @@ class NativeSimulation(FixedViews):
         """Nothing to wait for: `step` returns when every thread has."""
 
     def close(self) -> None:
-        """Stops the threads."""
+        """Stop the threads."""
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
@@ -318,7 +318,7 @@ class NativeSimulation(FixedViews):
         return np.flatnonzero(chosen & finite).tolist()
 
     def _visit(self, work: Callable[[_Worker, Iterable[int]], None], worlds: list[int]) -> None:
-        """Shares worlds out among the threads."""
+        """Share worlds out among the threads."""
         if self._simple is not None:
             self._simple.update()
         if self._pool is None or len(worlds) < 2:
@@ -331,7 +331,7 @@ class NativeSimulation(FixedViews):
         jobs = [self._pool.submit(work, worker, queue) for worker in self._workers]
         try:
             wait(jobs)
-        # Ctrl-C: nobody may write into the state, or use a thread's data, after this call has ended
+        # Ctrl-C: no thread may write into the state, or use its data, after this call has ended.
         except BaseException:
             for _ in queue:
                 pass
@@ -341,7 +341,7 @@ class NativeSimulation(FixedViews):
             job.result()
 
     def _load(self, worker: _Worker, w: int) -> None:
-        """Makes a thread's model and data those of world w."""
+        """Make a thread's model and data those of world w."""
         for values, field in worker.fields:
             field[:] = values[w]
         mujoco.mj_setState(worker.model, worker.data, self._state[w], _SPEC)
@@ -383,7 +383,7 @@ class NativeSimulation(FixedViews):
                 self._write_poses(worker, w)
 
     def _pose(self, worker: _Worker, worlds: Iterable[int]) -> None:
-        """Brings the poses of some worlds up to date on one thread."""
+        """Bring the poses of some worlds up to date on one thread."""
         for w in worlds:
             self._load(worker, w)
             self._write_poses(worker, w)

@@ -25,7 +25,7 @@ class Scratch:
     deallocate_requires_context_guard = False
 
     def __init__(self, device: wp.Device) -> None:
-        """Starts empty."""
+        """Start empty."""
         self._device = device
         self._torch_device = torch.device(wp.device_to_torch(device))
         self._free: dict[tuple[int, int], list[int]] = defaultdict(list)
@@ -45,7 +45,7 @@ class Scratch:
         return block.data_ptr()
 
     def deallocate(self, ptr: int, size_in_bytes: int) -> None:
-        """Takes a block back. The memory itself stays, because a graph may write to it at every
+        """Take a block back. The memory itself stays, because a graph may write to it at every
         replay.
         """
         size = -(-size_in_bytes // _ALIGNMENT) * _ALIGNMENT

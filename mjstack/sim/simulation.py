@@ -1,6 +1,4 @@
-"""What every physics backend offers: torch views of batched state, `step`, `forward`, `reset` and
-what was lost on the way.
-"""
+"""The protocol of every physics backend: torch views of batched state, and how to step it."""
 
 from __future__ import annotations
 
@@ -16,7 +14,9 @@ from mjstack.sim.sizes import BatchSizes
 
 
 class Overflow(IntFlag):
-    """What a world lost because a buffer was too small. The values are MJWarp's ``OverflowType``.
+    """Physics that a world lost because a buffer was too small.
+
+    The values are MJWarp's ``OverflowType``.
 
     Iteration limits are not here: they say how far the solver converged, not that physics was
     dropped.
@@ -93,18 +93,18 @@ class Simulation(Protocol):
             (a free cube), because such a body's mass matrix is diagonal by construction. `reset`
             leaves fields alone, and starts a world from its ``qpos0`` if that is one.
         contact_count: Contacts found by the last step or forward, shape ``(nworld,)``, int32.
-        constraint_count: Constraint rows likewise, shape ``(nworld,)``, int32.
+        constraint_count: Constraint rows of the last step or forward, shape ``(nworld,)``, int32.
         step_count: Physics steps since the world's last reset, shape ``(nworld,)``, int64.
         overflow: Bits of `Overflow` raised by `step`, sticky until the world is reset, shape
             ``(nworld,)``, int32. `forward` alone raises none on MJWarp.
         peak_contacts: Largest contact_count over all decimation since the world's last reset, shape
             ``(nworld,)``, int32.
-        peak_constraints: Largest constraint_count likewise, shape ``(nworld,)``, int32.
+        peak_constraints: Largest constraint_count over the same time, shape ``(nworld,)``, int32.
         most_contacts: Largest contact_count since the last full reset (one without a mask), shape
             ``(nworld,)``, int32. Masked resets leave it alone, so it is the peak of a run in which
             worlds end and start anew. Computed when it is read.
-        most_constraints: Largest constraint_count likewise, shape ``(nworld,)``, int32.
-        overflow_ever: Bits of `Overflow` raised since the last full reset likewise, shape
+        most_constraints: Largest constraint_count over the same time, shape ``(nworld,)``, int32.
+        overflow_ever: Bits of `Overflow` raised since the last full reset, shape
             ``(nworld,)``, int32.
         version: Grows when something changes that a captured graph has baked in.
         sizes: Sizes of fixed buffers; None where there are none, as in native MuJoCo.
@@ -164,7 +164,7 @@ class Simulation(Protocol):
         """See above."""
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
-        """Advances every world by n physics steps under the current ctrl.
+        """Advance every world by n physics steps under the current ctrl.
 
         Args:
             n: Number of steps.
@@ -173,19 +173,19 @@ class Simulation(Protocol):
         """
 
     def forward(self) -> None:
-        """Computes everything that derives from qpos, qvel, act and ctrl, without
+        """Compute everything that derives from qpos, qvel, act and ctrl, without
         advancing time.
         """
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
-        """Brings the poses up to the current qpos, without advancing time.
+        """Bring the poses up to the current qpos, without advancing time.
 
         Args:
             mask: Worlds that need it (None: all). Others may be brought up to date too.
         """
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Puts worlds back to the model's qpos0, at rest: act, ctrl, sensordata, counters and
+        """Put worlds back to the model's qpos0, at rest: act, ctrl, sensordata, counters and
         overflow bits become zero.
 
         Args:
@@ -216,10 +216,10 @@ class Simulation(Protocol):
         tolerance: float | None = None,
         impratio: float | None = None,
     ) -> None:
-        """Changes the constraint solver's limits in all worlds, from the next step on."""
+        """Change the constraint solver's limits in all worlds, from the next step on."""
 
     def synchronize(self) -> None:
-        """Waits for the device."""
+        """Wait for the device."""
 
     def close(self) -> None:
-        """Gives threads and buffers back."""
+        """Give threads and buffers back."""

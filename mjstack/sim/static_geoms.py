@@ -17,7 +17,7 @@ def place_static_geoms(
     geom_xpos: wp.array2d[wp.vec3],
     geom_xmat: wp.array2d[wp.mat33],
 ) -> None:
-    """Writes the poses of exactly those geoms that MJWarp's kinematics leaves out. Warp's own
+    """Write the poses of exactly those geoms that MJWarp's kinematics leaves out. Warp's own
     quaternions are xyzw.
     """
     world, geom = wp.tid()  # type: ignore[misc]

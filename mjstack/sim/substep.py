@@ -14,13 +14,13 @@ from mjstack.sim.graph import side_by_side
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Arrangement:
-    """What is done to make a captured step faster than MJWarp's own. All of it leaves the numbers
+    """Measures that make a captured step faster than MJWarp's own. All of it leaves the numbers
     as they are.
 
     Attributes:
         branches: Contacts beside smooth dynamics, there inertia beside forces, and counting beside
             the next step's kinematics, as parallel branches.
-        sensors_once: Sensors in the last of several steps alone: nobody sees the others'.
+        sensors_once: Sensors in the last of several steps alone: no one sees the others'.
         own_stages: Only the stages that the model needs: no cameras, lights, tendons, flexes or
             energy.
         scratch: Temporaries at fixed addresses (`Scratch`), not allocated and freed by the graph.

@@ -11,16 +11,16 @@ from mjstack.sim.simulation import LOST_PHYSICS
 
 
 class Usage:
-    """What each world uses now, the most that it has used, and what was lost.
+    """The use of buffers by each world, now and at most, and the physics that was lost.
 
     Attributes:
         contacts: Contacts of the last step or forward, shape ``(nworld,)``, int32.
-        peak_contacts: The most since the world's last reset, likewise.
-        peak_rows: Most constraint rows, likewise.
+        peak_contacts: The most since the world's last reset, shape ``(nworld,)``, int32.
+        peak_rows: Most constraint rows since then, shape ``(nworld,)``, int32.
         peak_pool: Most contacts, broad-phase pairs and contacts of one kind of convex collision, of
             all worlds at once since the last full reset, shape ``(3,)``, int32.
         overflow: Bits of `Overflow` since the world's last reset, shape ``(nworld,)``, int32.
-        limits: Bits of `SolverLimit`, likewise.
+        limits: Bits of `SolverLimit`, the same.
         steps: Physics steps since the world's last reset, shape ``(nworld,)``, int64.
         most: Peak contacts, peak rows and overflow bits that masked resets have erased since the
             last full one. They are taken in just before such a reset, and not in every substep:
@@ -175,7 +175,7 @@ def record_usage(
     limits: wp.array[int],
     steps: wp.array[wp.int64],
 ) -> None:
-    """Counts each world's contacts, and keeps the largest counters and every overflow bit seen so
+    """Count each world's contacts, and keeps the largest counters and every overflow bit seen so
     far.
 
     ``contacts`` is zero before. The packed list may claim more contacts than it holds after an
@@ -206,7 +206,7 @@ def record_convex_contacts(
     counts: wp.array[int],
     peak_pool: wp.array[int],
 ) -> None:
-    """Keeps the most contacts that convex collision found for one combination of geom types;
+    """Keep the most contacts that convex collision found for one combination of geom types;
     ``counts`` is zero before.
 
     MJWarp has room for naccdmax penetrating pairs of each combination, and each such pair gives at
@@ -230,7 +230,7 @@ def clear_counters(
     limits: wp.array[int],
     steps: wp.array[wp.int64],
 ) -> None:
-    """Starts the counters of the masked worlds anew."""
+    """Start the counters of the masked worlds anew."""
     w = wp.tid()
     if mask[w]:
         peak_contacts[w] = 0

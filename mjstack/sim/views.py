@@ -45,7 +45,7 @@ class FixedViews:
 
 
 def check_mask(mask: torch.Tensor, nworld: int, device: torch.device) -> None:
-    """Checks what can be known of a mask without reading it.
+    """Check what can be known of a mask without reading it.
 
     Args:
         mask: Selects worlds, shape ``(nworld,)``, bool, on the simulation's device.

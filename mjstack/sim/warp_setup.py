@@ -18,7 +18,7 @@ def torch_stream_scope(device: wp.Device) -> wp.ScopedStream | wp.ScopedDevice:
     """A context in which Warp's work on a device goes to torch's current stream there.
 
     Reads and writes of shared memory by torch, before and after, are then ordered with it, and
-    nobody waits. On Warp's CPU device, which has no streams, it only makes the device the current
+    neither waits. On Warp's CPU device, which has no streams, it only makes the device the current
     one.
 
     Args:
