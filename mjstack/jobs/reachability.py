@@ -4,7 +4,6 @@ positions the objects may stand.
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -32,11 +31,10 @@ from mjstack.report.reachability import (
     to_npz,
 )
 from mjstack.report.record import GateResult, Status
+from mjstack.report.write import safely_draw
 from mjstack.scene import table_top
 from mjstack.scene.phases import object_targets
 from mjstack.sim import resolve_backend
-
-log = logging.getLogger(__name__)
 
 _MOST_POINTS = 100_000
 _SHARE = 500  # points between two looks at the clock
@@ -329,14 +327,12 @@ def _write(
 def _draw(
     context: RunContext, folder: Path, levels: list[ReachLevel], regions: list[ObjectRegion]
 ) -> None:
-    """The picture. Its failure takes nothing back."""
-    try:
-        save_map(folder / "reachability.png", _map(context, levels, regions))
-    except Exception as error:
-        log.exception("drawing failed")
-        context.say(f"no picture: {str(error) or type(error).__name__}")
-        return
-    _write(context, folder, levels, regions, "reachability.png")
+    """Draw the map."""
+    found = _map(context, levels, regions)
+    if problem := safely_draw(folder / "reachability.png", save_map, found):
+        context.say(problem)
+    else:
+        _write(context, folder, levels, regions, "reachability.png")
 
 
 JOB = Job(check_reachability, run_reachability_job)
