@@ -3,7 +3,6 @@ verified in gates.
 """
 
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjstack.errors import MjstackError
@@ -12,12 +11,6 @@ from mjstack.report.gl import choose_gl
 if TYPE_CHECKING:
     from mjstack.config import Config, load_config
     from mjstack.envs import Env, make_env
-
-# The configuration lies at the top of a checkout and inside an installed package. This makes
-# `mjstack.conf` mean the first one in a checkout that is on the path without being installed.
-_CHECKOUT = Path(__file__).resolve().parent.parent
-if (_CHECKOUT / "conf" / "config.yaml").is_file():
-    __path__.append(str(_CHECKOUT))
 
 choose_gl()
 

@@ -13,14 +13,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-import mjstack.conf
 import pytest
 
 from mjstack import __version__
 from mjstack.cli import run
 from mjstack.config import load_config
+from mjstack.config.session import CONFIG_FOLDER
 
-CONF = Path(next(iter(mjstack.conf.__path__)))
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
 PROVENANCE = {
     "versions",
@@ -252,7 +251,7 @@ def test_help_says_what_there_is_to_choose(
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 79
     said = " ".join(out.split())
-    for group in CONF.iterdir():
+    for group in CONFIG_FOLDER.iterdir():
         for choice in group.glob("*.yaml"):
             assert re.search(rf" {group.name} [^:]*: .*\b{choice.stem}\b", said), (
                 group.name,

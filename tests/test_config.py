@@ -6,27 +6,26 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mjstack.conf
 import pytest
 from check_cases import limits
 
 from mjstack.config import load_config
 from mjstack.config.help import list_keys, reference_markdown
 from mjstack.config.schema import Backend, Config, RobotSource
+from mjstack.config.session import CONFIG_FOLDER
 from mjstack.errors import MjstackError
 from mjstack.jobs.gates import check_machine
 from mjstack.tasks.check import make_check
 
-CONF = Path(next(iter(mjstack.conf.__path__)))
 BELONGS = {"phases=box": ["task=box"]}  # choices that only another one makes sense of
-GATE_FILES = sorted(path.stem for path in (CONF / "gate").glob("*.yaml"))
+GATE_FILES = sorted(path.stem for path in (CONFIG_FOLDER / "gate").glob("*.yaml"))
 
 
 def choices() -> list[str]:
     """``group=choice`` for every file in the configuration groups."""
     out = []
-    for path in sorted(CONF.rglob("*.yaml")):
-        group = path.parent.relative_to(CONF).as_posix()
+    for path in sorted(CONFIG_FOLDER.rglob("*.yaml")):
+        group = path.parent.relative_to(CONFIG_FOLDER).as_posix()
         if group == ".":
             continue
         if group.startswith("hydra"):
@@ -60,11 +59,6 @@ def test_walk_found_the_groups() -> None:
         "success",
         "throughput",
     ]
-
-
-def test_every_group_has_an_init_so_that_it_ships() -> None:
-    for path in CONF.rglob("*.yaml"):
-        assert (path.parent / "__init__.py").is_file(), path.parent
 
 
 def test_defaults(so101_cfg: Config) -> None:

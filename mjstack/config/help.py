@@ -11,14 +11,12 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
-from importlib.resources import files
 
 from mjstack.config.fields import accepted, field_docs
 from mjstack.config.schema import JOB_SCHEMAS, Config
-from mjstack.config.session import list_choices
+from mjstack.config.session import CONFIG_FOLDER, list_choices
 from mjstack.errors import UnknownName
 
-_CONF = files("mjstack.conf")
 _GROUP = re.compile(r"  - (?P<name>\w+): (?P<default>\[.*\]|\S+) # (?P<words>.+)")
 _EXAMPLES = (
     ("robot=rebot nworld=64", "all gates this machine can run"),
@@ -93,7 +91,7 @@ class Key:
 def list_groups() -> list[Group]:
     """The groups of the whole search path, mjstack's in the order of composition first."""
     choices = list_choices()
-    lines = _CONF.joinpath("config.yaml").read_text(encoding="utf-8").splitlines()
+    lines = (CONFIG_FOLDER / "config.yaml").read_text(encoding="utf-8").splitlines()
     found = [match for line in lines if (match := _GROUP.fullmatch(line))]
     known = {match["name"]: (match["default"], match["words"]) for match in found}
     groups = []

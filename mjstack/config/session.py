@@ -30,7 +30,13 @@ from omegaconf import DictConfig, open_dict
 
 from mjstack.errors import CompositionError
 
-CONFIG_MODULE = "mjstack.conf"
+_PACKAGE_FOLDER = Path(__file__).parents[1]
+# In a checkout the configuration lies beside the package, in a wheel inside of it.
+CONFIG_FOLDER = next(
+    folder
+    for folder in (_PACKAGE_FOLDER.parent / "conf", _PACKAGE_FOLDER / "conf")
+    if (folder / "config.yaml").is_file()
+)
 CONFIG_NAME = "config"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
@@ -117,7 +123,7 @@ def hydra_session() -> Iterator[Hydra]:
     GlobalHydra.instance().clear()
     try:
         setbase("1.3")
-        path = create_config_search_path(f"{_PACKAGE}{CONFIG_MODULE}")
+        path = create_config_search_path(f"{_FILE}{CONFIG_FOLDER}")
         path.get_path().pop()  # the schema, which Hydra wants last
         for entry in _entries():
             path.append(PROVIDER, entry)
@@ -201,13 +207,11 @@ def _entry(text: str) -> str:
             f"configuration folder {folder}: there is no such folder, expected one with YAML files"
             " in folders such as task/. Name an existing one."
         )
-    own = find_spec(CONFIG_MODULE)
-    for built_in in own.submodule_search_locations or () if own else ():
-        for path in sorted(folder.rglob("*.yaml")):
-            name = path.relative_to(folder)
-            if (Path(built_in) / name).exists():
-                raise CompositionError(
-                    f"{path}: {name} is mjstack's own, expected a name that mjstack does not have."
-                    " Rename the file."
-                )
+    for path in sorted(folder.rglob("*.yaml")):
+        name = path.relative_to(folder)
+        if (CONFIG_FOLDER / name).exists():
+            raise CompositionError(
+                f"{path}: {name} is mjstack's own, expected a name that mjstack does not have."
+                " Rename the file."
+            )
     return f"{_FILE}{folder.resolve()}"
