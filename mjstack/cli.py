@@ -31,7 +31,7 @@ from rich.console import Console
 import mjstack
 from mjstack.config import Config
 from mjstack.config.help import help_text, key_help
-from mjstack.config.load import compose, explained, split_search_path, to_config
+from mjstack.config.load import compose, compose_job, split_search_path, to_config
 from mjstack.config.overrides import check_overrides, parse
 from mjstack.config.session import (
     CONFIG_NAME,
@@ -136,9 +136,7 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
     master = compose(hydra, overrides, RunMode.MULTIRUN)
     for job in jobs:
-        with explained(job):
-            cfg = hydra.config_loader.load_sweep_config(master, job)
-        _check(cfg, job)
+        _check(compose_job(hydra, master, job), job)
     check_writable(_folder(master, "sweep"))
     returned = run_and_report(lambda: hydra.multirun(CONFIG_NAME, run_job, overrides))
     batches = returned if isinstance(returned, list) else []  # a launcher's own processes return

@@ -286,6 +286,18 @@ def test_bad_input_is_one_line(overrides: list[str], says: str) -> None:
     assert says in message
 
 
+def test_a_swapped_function_does_not_inherit_parameters() -> None:
+    reach = "reward.reach.func=mjstack.mdp.reward.reach"
+    swap = "reward.reach.func=mjstack.mdp.reward.action_rate"
+    kept = load_config([reach]).reward["reach"]
+    assert kept.params
+    assert load_config([swap, "reward.reach.weight=3.0"]).reward["reach"].params == {}
+    given = load_config([swap, "+reward.reach.params.mine=2", "reward.reach.params={scale: 1}"])
+    assert given.reward["reach"].params == {"mine": 2, "scale": 1}
+    check = load_config(["task.check.func=mine.Check", "task.check.window=7"]).task.check
+    assert check == {"func": "mine.Check", "window": 7}
+
+
 def test_every_field_says_what_it_means() -> None:
     keys = list(list_keys(load_config()))
     assert len(keys) > 150

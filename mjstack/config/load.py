@@ -12,7 +12,7 @@ from hydra._internal.hydra import Hydra
 from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from mjstack.config.explain import explain
@@ -31,6 +31,7 @@ from mjstack.config.trust import check_trusted, used_folder
 from mjstack.config.validate import validate
 from mjstack.errors import CompositionError, ConfigError
 
+_KEEPING = ("job.", "gate.")  # their other keys are no parameters of the function
 _schema = OmegaConf.structured(Config)
 _schema.gate._set_flag("struct", False)  # gates of the search path are added to it
 ConfigStore.instance().store(name="mjstack_schema", node=_schema, provider="mjstack")
@@ -80,12 +81,51 @@ def split_search_path(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def compose(hydra: Hydra, overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictConfig:
     """Compose without validating values; Hydra's part is in it, and errors are one line each."""
-    with explained(overrides):
-        return hydra.compose_config(CONFIG_NAME, list(overrides), run_mode, from_shell=False)
+    with _explained(overrides):
+        cfg = hydra.compose_config(CONFIG_NAME, list(overrides), run_mode, from_shell=False)
+        _drop_inherited(hydra, cfg, overrides)
+    return cfg
+
+
+def compose_job(hydra: Hydra, sweep: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """Compose a job of a sweep, as `compose`."""
+    with _explained(overrides):
+        cfg = hydra.config_loader.load_sweep_config(sweep, list(overrides))
+        _drop_inherited(hydra, cfg, overrides)
+    return cfg
+
+
+def _drop_inherited(hydra: Hydra, cfg: DictConfig, overrides: Sequence[str]) -> None:
+    """Leave a term whose ``func`` an override swaps with the parameters that overrides give it:
+    those of the other function are not its own.
+    """
+    keys = [override.lstrip("+").partition("=")[0] for override in overrides]
+    swapped = [key for key in keys if key.endswith(".func") and not key.startswith(_KEEPING)]
+    if not swapped:
+        return
+    others = [o for o, key in zip(overrides, keys, strict=True) if key not in swapped]
+    before = hydra.compose_config(CONFIG_NAME, others, RunMode.RUN, from_shell=False)
+    for key in swapped:
+        old = OmegaConf.select(before, key)
+        if old is None or old == OmegaConf.select(cfg, key):
+            continue
+        term = key.removesuffix(".func")
+        section = term if term == "task.check" else f"{term}.params"
+        given = {"func"}
+        for override, name in zip(overrides, keys, strict=True):
+            if name == section:
+                value = parse(override).value()
+                given.update(map(str, value) if isinstance(value, dict) else ())
+            elif name.startswith(f"{section}."):
+                given.add(name.removeprefix(f"{section}.").partition(".")[0])
+        node = OmegaConf.select(cfg, section) or {}
+        with open_dict(cfg):
+            for name in [name for name in node if name not in given]:
+                del node[name]
 
 
 @contextmanager
-def explained(overrides: Sequence[str]) -> Iterator[None]:
+def _explained(overrides: Sequence[str]) -> Iterator[None]:
     """Turn Hydra's errors about overrides into one line each."""
     try:
         yield
