@@ -125,8 +125,8 @@ def hydra_session() -> Iterator[Hydra]:
         setbase("1.3")
         path = create_config_search_path(f"{_FILE}{CONFIG_FOLDER}")
         path.get_path().pop()  # the schema, which Hydra wants last
-        for entry in _entries():
-            path.append(PROVIDER, entry)
+        for folder in config_folders():
+            path.append(PROVIDER, f"{_FILE}{folder}")
         path.append("schema", "structured://")
         hydra = Hydra(task_name="run", config_loader=_Loader(path))
         GlobalHydra.instance().initialize(hydra)
@@ -152,10 +152,12 @@ def without_hydra(cfg: DictConfig) -> DictConfig:
 
 def list_choices() -> dict[str, list[str]]:
     """Names of every group's files in the whole search path, sorted, by group."""
-    with hydra_session() as hydra:
-        loader = hydra.config_loader
-        groups = [group for group in loader.list_groups("") if group != "hydra"]
-        return {g: sorted(loader.get_group_options(g, ObjectType.CONFIG)) for g in groups}
+    folders = (CONFIG_FOLDER, *config_folders())
+    paths = [path for folder in folders for path in folder.glob("*/*.yaml")]
+    choices: dict[str, list[str]] = {}
+    for group, name in sorted({(path.parent.name, path.stem) for path in paths}):
+        choices.setdefault(group, []).append(name)
+    return choices
 
 
 class _Loader(ConfigLoaderImpl):
