@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from box_checker import BLUE, RED, BoxOutcome, BoxRecording, check_box_world
 from check_cases import STOPPED_EARLY, limits
+from compositions import load_config
 
-from mjstack.config import load_config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext

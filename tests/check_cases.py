@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-from mjstack.config import load_config
+from compositions import load_config
+
 from mjstack.config.schema import Config
 from mjstack.tasks.check import CheckResult, Rules, make_check
 

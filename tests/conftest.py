@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from compositions import load_config
 
-from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Hook

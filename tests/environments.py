@@ -1,18 +1,17 @@
-"""Environments for tests. Configurations and simulations are slow to make, so tests share them, one
-environment at a time.
+"""Environments for tests. Simulations are slow to make, so tests share them, one environment at a
+time.
 """
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
 import torch
 from comparison import assert_same_run
+from compositions import load_config
 
-from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import Env
 from mjstack.managers import required_fields
@@ -34,30 +33,29 @@ COUNTS = (
 VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata", *COUNTS)
 Trace = list[dict[str, torch.Tensor]]
 
-_composed = cache(lambda overrides: load_config(list(overrides)))
-_model = cache(lambda robot: build_model(_composed((f"robot={robot}",))))
+_model = cache(lambda robot: build_model(configure(robot=robot)))
 
 
 def configure(*overrides: str, robot: str = "so101") -> Config:
     """A configuration of the caller's own."""
-    return copy.deepcopy(_composed((f"robot={robot}", *overrides)))
+    return load_config((f"robot={robot}", *overrides))
 
 
 @cache
-def brisk(robot: str = "so101", task: str = "stack") -> tuple[str, ...]:
+def at_double_speed(robot: str = "so101", task: str = "stack") -> tuple[str, ...]:
     """Overrides that halve the phases' times: both arms still do both tasks, and stacking has the
     same peaks.
     """
-    phases = _composed((f"robot={robot}", f"task={task}")).controller.phases
+    phases = configure(f"task={task}", robot=robot).controller.phases
     return tuple(
         f"controller.phases.{name}.seconds={phase.seconds / 2}" for name, phase in phases.items()
     )
 
 
 @cache
-def rushed() -> tuple[str, ...]:
+def one_second_episode() -> tuple[str, ...]:
     """Overrides of an episode that is over, and has failed, after a second."""
-    phases = _composed(("robot=so101", "task=stack")).controller.phases
+    phases = configure().controller.phases
     return (
         "task.check.window=5",
         *(f"controller.phases.{name}.seconds=0.1" for name in phases),
@@ -68,7 +66,7 @@ def new_sim(backend: str, nworld: int, robot: str = "so101") -> Simulation:
     """A simulation with every field that a reset term of mjstack writes, and room for random
     actions.
     """
-    cfg = _composed((f"robot={robot}", "reset=randomized"))
+    cfg = configure("reset=randomized", robot=robot)
     return make_simulation(
         _model(robot),
         cfg,
@@ -136,7 +134,7 @@ def returned(step: tuple[Any, ...]) -> dict[str, torch.Tensor]:
     return out
 
 
-def held(env: Env, views: tuple[str, ...] = VIEWS) -> dict[str, torch.Tensor]:
+def state_of(env: Env, views: tuple[str, ...] = VIEWS) -> dict[str, torch.Tensor]:
     """Copies of everything that an environment and its simulation keep for each world."""
     out = {name: getattr(env.sim, name).clone() for name in views}
     out |= {f"fields.{name}": field.clone() for name, field in env.sim.fields.items()}

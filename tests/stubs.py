@@ -25,7 +25,7 @@ LAYOUT = {
 BROKEN = 8  # red not lifted
 
 
-def pretended(
+def fake_demonstrations(
     fails: Callable[[int, int], bool],
     after: Callable[[int, torch.Tensor], None] | None = None,
     *,

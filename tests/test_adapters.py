@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from compositions import make_env
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import ClipAction, DictInfoToList, RecordEpisodeStatistics
@@ -31,7 +32,7 @@ def make() -> Iterator[Make]:
 
     def build(*overrides: str, nworld: int = 3, seed: int = 0) -> mjstack.Env:
         base = ["task=reach", "sim=native", f"task.episode_steps={FRAMES}"]
-        made.append(mjstack.make_env([*base, *overrides], nworld=nworld, seed=seed))
+        made.append(make_env([*base, *overrides], nworld=nworld, seed=seed))
         return made[-1]
 
     yield build
@@ -235,7 +236,7 @@ def test_vector_step_before_reset(make: Make) -> None:
 @pytest.mark.parametrize("group", ["policy", None])
 def test_single_env_passes_gymnasiums_checker(group: str | None) -> None:
     def build(**_: Any) -> GymnasiumEnv:
-        return GymnasiumEnv(mjstack.make_env(["task=reach", "sim=native"], nworld=1), group=group)
+        return GymnasiumEnv(make_env(["task=reach", "sim=native"], nworld=1), group=group)
 
     # A registered environment is checked more thoroughly: for determinism, and by making it again.
     gymnasium.register("mjstack-test/Reach-v0", entry_point=build)

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import torch
 from check_cases import rules_of
-from environments import brisk
+from compositions import load_config
+from environments import at_double_speed
 
-from mjstack.config import load_config
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
@@ -262,7 +262,7 @@ def test_no_trajectory_is_kept(new_context: Callable[..., RunContext], tmp_path:
     """A trajectory of qpos alone would take 48 kB a world on the host."""
 
     def peak(nworld: int) -> int:
-        context = new_context("sim=native", f"nworld={nworld}", *brisk())
+        context = new_context("sim=native", f"nworld={nworld}", *at_double_speed())
         assert context.model.nq * 8 * 300 == 48_000
         tracemalloc.start()
         play(context, tmp_path)

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from compositions import load_config
 from test_robot_models import REPO, upstream
 
 from mjstack.bench.cli import bench_ik
-from mjstack.config import load_config
 from mjstack.config.schema import RobotCfg
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError, ConfigError, MjstackError, UnknownName

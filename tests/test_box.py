@@ -12,9 +12,8 @@ import pytest
 import torch
 from box_checker import BoxRecording, lowest_geometry
 from check_cases import limits
+from compositions import load_config, make_env
 
-from mjstack import make_env
-from mjstack.config import load_config
 from mjstack.config.schema import Config
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env

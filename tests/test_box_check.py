@@ -16,9 +16,9 @@ import torch
 from box_checker import BLUE, RED, BoxOutcome
 from box_recordings import RecordingContext, World, feed, put_cube, recording_context
 from check_cases import Altered, Cases, rules_of
-from environments import brisk
+from compositions import load_config
+from environments import at_double_speed
 
-from mjstack.config import load_config
 from mjstack.config.schema import Backend
 from mjstack.envs import Env
 from mjstack.episodes.failures import Sign
@@ -170,7 +170,7 @@ def test_mjwarp_fills_the_box(robot: str, controller: str, device: str) -> None:
     jittered ones.
     """
     cpu = device == "cpu"
-    faster = brisk(robot, "box") if cpu else ()
+    faster = at_double_speed(robot, "box") if cpu else ()
     cfg = load_config(["task=box", f"robot={robot}", f"controller={controller}", *faster])
     context = RecordingContext(cfg=cfg)
     nworld, reset = (1, NOMINAL) if cpu else (64, cfg.reset)

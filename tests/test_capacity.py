@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from environments import brisk
+from compositions import load_config
+from environments import at_double_speed
 
 import mjstack
-from mjstack.config import load_config
 from mjstack.config.schema import Backend
 from mjstack.envs import Env, build_env
 from mjstack.envs.buffers import (
@@ -299,7 +299,7 @@ def test_sizes_at_the_peak_are_enough_and_one_less_is_not(
 def too_small(new_context: NewContext) -> tuple[RunContext, GateResult, list[str]]:
     """The gate on Warp's CPU device with too few rows, and what it said."""
     said: list[str] = []
-    few = ("nworld=2", "gate.capacity.random_steps=20", *brisk())
+    few = ("nworld=2", "gate.capacity.random_steps=20", *at_double_speed())
     context = new_context("sim=mjwarp", "sim.device=cpu", "batch.njmax=100", *few)
     context.say = said.append
     (result,) = run_capacity(context)
@@ -316,7 +316,12 @@ def test_too_small_is_found_and_the_printed_override_cures_it(
     overrides = task.removeprefix("scripted task: ").split()
     assert f"batch.njmax={result.metrics['recommended.njmax']}" in overrides
     cured = new_context(
-        "sim=mjwarp", "sim.device=cpu", "nworld=2", "batch.njmax=100", *overrides, *brisk()
+        "sim=mjwarp",
+        "sim.device=cpu",
+        "nworld=2",
+        "batch.njmax=100",
+        *overrides,
+        *at_double_speed(),
     )
     run = play_task(cured, cured.cfg.reset, resolve_sizes(cured.cfg))
     assert not run.peaks.overflow.any()
@@ -396,7 +401,7 @@ def test_defaults_too_small_for_environments_fail(new_context: NewContext) -> No
         "nworld=2",
         "gate.capacity.random_steps=40",
         "robot.placements.stack.env_njmax=60",
-        *brisk(),
+        *at_double_speed(),
     )
     (result,) = run_capacity(context)
     assert result.status is Status.failed
@@ -405,7 +410,9 @@ def test_defaults_too_small_for_environments_fail(new_context: NewContext) -> No
 
 def test_native_says_what_it_cannot_know(new_context: NewContext) -> None:
     said: list[str] = []
-    context = new_context("sim=native", "nworld=2", "gate.capacity.random_steps=5", *brisk())
+    context = new_context(
+        "sim=native", "nworld=2", "gate.capacity.random_steps=5", *at_double_speed()
+    )
     context.say = said.append
     (result,) = run_capacity(context)
     assert result.status is Status.passed
@@ -419,7 +426,9 @@ def test_native_says_what_it_cannot_know(new_context: NewContext) -> None:
 def test_a_layout_out_of_reach_leaves_the_other_workloads(
     new_context: NewContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    context = new_context("sim=native", "nworld=1", "gate.capacity.random_steps=5", *brisk())
+    context = new_context(
+        "sim=native", "nworld=1", "gate.capacity.random_steps=5", *at_double_speed()
+    )
     measure = capacity_module.measure_task
 
     def unreachable(context: RunContext, reset: dict) -> Workload:
@@ -651,7 +660,12 @@ def test_batch_uses_what_capacity_measured(new_context: NewContext) -> None:
 def test_batch_measures_where_capacity_does_not_run(new_context: NewContext) -> None:
     said: list[str] = []
     context = new_context(
-        "sim=mjwarp", "sim.device=cpu", "nworld=1", "batch=auto", "gates=[batch]", *brisk()
+        "sim=mjwarp",
+        "sim.device=cpu",
+        "nworld=1",
+        "batch=auto",
+        "gates=[batch]",
+        *at_double_speed(),
     )
     context.say = said.append
     (result,) = run_batch(context)

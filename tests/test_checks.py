@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 from check_cases import rules_of
+from compositions import load_config
 from test_box_check import planned, scripted
 from test_stack_check import World as StackWorld
 from test_stack_check import feed as feed_stack
 
-from mjstack.config import load_config
 from mjstack.config.fields import spec
 from mjstack.config.schema import Backend
 from mjstack.config.schema.scene import PlaceCfg

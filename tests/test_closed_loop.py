@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 from check_cases import limits
+from compositions import load_config, make_env
 
-from mjstack import make_env
-from mjstack.config import load_config
 from mjstack.drivers.closed_loop import ClosedLoopDriver, make_expert
 from mjstack.drivers.tilt import _keeps, _places
 from mjstack.envs import Env, driven_config

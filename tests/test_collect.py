@@ -19,11 +19,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from environments import brisk
-from stubs import episodes_of, pairs, pretended
+from compositions import load_config
+from environments import at_double_speed
+from stubs import episodes_of, fake_demonstrations, pairs
 
 from mjstack.cli import run
-from mjstack.config import load_config
 from mjstack.config.fingerprint import config_hash
 from mjstack.config.schema import Backend, Config
 from mjstack.datasets import DatasetWriter, Feature, read_dataset
@@ -462,7 +462,7 @@ def test_seeds_go_on_until_the_episodes_are_there(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        collection, "play_demonstrations", pretended(lambda seed, world: world == 1)
+        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: world == 1)
     )
     assert collect("nworld=4", "job.episodes=7", "seed=5") == 0
     found = pairs(folder / "dataset")
@@ -503,7 +503,9 @@ FROM_LAYOUT = [
 def test_a_layout_counts_by_its_content(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    monkeypatch.setattr(
+        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
+    )
     first = Path("worlds.csv")
     moved = Path("elsewhere.csv")
     first.write_text(LAYOUT)
@@ -549,7 +551,9 @@ def test_failures_are_kept_and_marked(folder: Path, monkeypatch: pytest.MonkeyPa
         values[3, 2:3] = torch.nan  # a world that diverged: of no use
 
     monkeypatch.setattr(
-        collection, "play_demonstrations", pretended(lambda seed, world: world in (1, 2), break_two)
+        collection,
+        "play_demonstrations",
+        fake_demonstrations(lambda seed, world: world in (1, 2), break_two),
     )
     assert collect("nworld=4", "job.episodes=5", "job.keep_failures=true") == 0
     rows = episodes_of(folder / "dataset")
@@ -568,14 +572,18 @@ def test_failures_are_kept_and_marked(folder: Path, monkeypatch: pytest.MonkeyPa
 def test_an_expert_that_never_succeeds_is_given_up(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: True))
+    monkeypatch.setattr(
+        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: True)
+    )
     args = ["nworld=2", "job.episodes=3"]
     assert collect(*args) == 1
     (gate,) = report_of(folder)["gates"]
     assert gate["reason"].startswith(
         "3 seeds in a row brought no episode, the last because of: red not lifted in 2 of 2 worlds"
     )
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    monkeypatch.setattr(
+        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
+    )
     assert collect(*args) == 0
     assert pairs(folder / "dataset") == [(3, 0), (3, 1), (4, 0)]
     assert report_of(folder)["gates"][0]["metrics"]["success_rate"] == pytest.approx(4 / 10)
@@ -589,7 +597,7 @@ def test_worlds_of_which_none_is_finite_are_given_up(
         values[3] = torch.nan
 
     monkeypatch.setattr(
-        collection, "play_demonstrations", pretended(lambda seed, world: False, diverge)
+        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False, diverge)
     )
     assert collect("nworld=2", "job.episodes=3", f"job.keep_failures={keep_failures}") == 1
     (gate,) = report_of(folder)["gates"]
@@ -607,14 +615,16 @@ def test_ctrl_c_keeps_finished_batches(folder: Path, monkeypatch: pytest.MonkeyP
 
     args = ["nworld=2", "job.episodes=5"]
     monkeypatch.setattr(
-        collection, "play_demonstrations", pretended(lambda seed, world: False, stop)
+        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False, stop)
     )
     assert collect(*args) == 130
     assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
     found = report_of(folder)
     assert found["status"] == "interrupted"
     assert found["gates"][0]["reason"].startswith("interrupted; 2 episodes, 5 asked for")
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    monkeypatch.setattr(
+        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
+    )
     assert collect(*args) == 0
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
 
@@ -630,7 +640,9 @@ def test_a_full_disk_is_one_line(
         add(self, *args)  # type: ignore[arg-type]
 
     args = ["nworld=2", "job.episodes=5"]
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    monkeypatch.setattr(
+        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
+    )
     monkeypatch.setattr(Shard, "add", full)
     assert collect(*args) == 1
     err = capsys.readouterr().err.strip()
@@ -654,9 +666,9 @@ from functools import partial
 from mjstack.cli import run
 from mjstack.datasets.shard import Shard
 from mjstack.jobs import collection
-from stubs import pretended
+from stubs import fake_demonstrations
 
-collection.play_demonstrations = pretended(lambda seed, world: world == 1, noise=True)
+collection.play_demonstrations = fake_demonstrations(lambda seed, world: world == 1, noise=True)
 collection.DatasetWriter = partial(collection.DatasetWriter, file_mb=1)
 add = Shard.add
 
@@ -692,7 +704,9 @@ run(ARGS)
         ""
     )  # and so would be left by a kill a little later, in a second call
     monkeypatch.setattr(
-        collection, "play_demonstrations", pretended(lambda seed, world: world == 1, noise=True)
+        collection,
+        "play_demonstrations",
+        fake_demonstrations(lambda seed, world: world == 1, noise=True),
     )
     assert run([*COMMAND, *args]) == 0
     assert pairs(folder / "dataset") == whole
@@ -709,7 +723,9 @@ run(ARGS)
 def test_damaged_notes_are_one_line(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(lambda seed, world: False))
+    monkeypatch.setattr(
+        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
+    )
     assert collect("nworld=2", "job.episodes=1") == 0
     (folder / FILE).write_text("[{]")
     capsys.readouterr()
@@ -756,7 +772,7 @@ def test_mjwarp_demonstrations(folder: Path) -> None:
                 "nworld=1",
                 "job.episodes=1",
                 "robot=rebot",
-                *brisk("rebot"),
+                *at_double_speed("rebot"),
             ]
         )
         == 0

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from environments import configure
-from stubs import episodes_of, pairs, pretended
+from stubs import episodes_of, fake_demonstrations, pairs
 
 from mjstack.cli import run
 from mjstack.config.fingerprint import config_content
@@ -58,7 +58,9 @@ def patch_all(monkeypatch: pytest.MonkeyPatch) -> None:
     what is slow is made once.
     """
     monkeypatch.setattr(collection, "DatasetWriter", partial(DatasetWriter, file_mb=1))
-    monkeypatch.setattr(collection, "play_demonstrations", pretended(some_fail, noise=True))
+    monkeypatch.setattr(
+        collection, "play_demonstrations", fake_demonstrations(some_fail, noise=True)
+    )
     monkeypatch.setattr(collection, "run_provenance", lambda cfg, context: dict(_provenance()))
     monkeypatch.setattr(
         demonstration_spec,
@@ -217,7 +219,7 @@ def test_ctrl_c_after_ctrl_c(tmp_path: Path) -> None:
     one = left_in(tmp_path / "whole", collect(tmp_path / "whole", nworld=16, episodes=20))
     home = tmp_path / "parts"
     played = []
-    play = pretended(some_fail, noise=True)
+    play = fake_demonstrations(some_fail, noise=True)
 
     def told(context: Any, sim: Any, seed: int, values: torch.Tensor, worlds: int) -> Any:
         played.append((seed, worlds))
@@ -348,7 +350,7 @@ def test_worlds_that_are_judged_otherwise_the_second_time(
     play_interrupted(tmp_path, 3, keep_failures=keep_failures)
     first = episodes_of(tmp_path / "dataset")
     flipped = {0, 4, 5}  # one that is committed, one that succeeded, and one that was rejected
-    otherwise = pretended(
+    otherwise = fake_demonstrations(
         lambda seed, world: some_fail(seed, world) != (seed == 0 and world in flipped), noise=True
     )
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -380,7 +382,7 @@ def test_what_is_not_finite_is_left_out(
             values[3, world] = torch.nan
 
     monkeypatch.setattr(
-        collection, "play_demonstrations", pretended(some_fail, diverge, noise=True)
+        collection, "play_demonstrations", fake_demonstrations(some_fail, diverge, noise=True)
     )
     expected = left_in(tmp_path / "whole", collect(tmp_path / "whole", keep_failures=True))
     assert [note["not_finite"] for note in expected["notes"]] == [1, 0]

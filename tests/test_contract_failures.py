@@ -12,7 +12,7 @@ import pytest
 import torch
 from check_cases import rules_of
 from comparison import assert_same_run
-from environments import brisk
+from environments import at_double_speed
 
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
@@ -71,7 +71,7 @@ def test_native(
 
 
 def test_mjwarp(stage: Callable[..., RunContext], make_sim: Callable[..., Simulation]) -> None:
-    context = stage("so101", *brisk())
+    context = stage("so101", *at_double_speed())
     sim = make_sim("mjwarp", 3)
     push = teleport(context, 1)
 
@@ -142,7 +142,7 @@ def test_overflow_in_exactly_the_crowded_world(
     assert sim.overflow.tolist() == [0, 0, 0]
 
 
-FEW = ("sim=native", "nworld=2", "gate.capacity.random_steps=20", *brisk())
+FEW = ("sim=native", "nworld=2", "gate.capacity.random_steps=20", *at_double_speed())
 
 
 def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., RunContext]) -> None:
@@ -181,7 +181,7 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
         "gate.throughput.steps=2",
         "gate.throughput.repetitions=1",
         "gates=[batch,throughput]",
-        *brisk(),
+        *at_double_speed(),
     )
 
     def broken_episode(env: Env, driver: Driver, observers: list, **kwargs: Any) -> Episode:

@@ -18,12 +18,12 @@ from environments import (
     assert_rows,
     assert_traces,
     configure,
-    held,
     mask_of,
     on_new_sim,
     on_shared_sim,
     play,
     returned,
+    state_of,
 )
 
 from mjstack.config.schema import Config
@@ -69,9 +69,9 @@ def test_a_masked_reset_touches_nobody_else(backend: str, task: str, robot: str)
     others = [0, 2]
     chosen = [1, 3]
     env.sim.sensordata.fill_(1.0)  # as if they had touched something
-    before = held(env)
+    before = state_of(env)
     start = returned(env.reset(mask=mask_of(env, *chosen)))
-    after = held(env)
+    after = state_of(env)
     for name in before:
         assert torch.equal(after[name][others], before[name][others]), name
     for name, value in start.items():
@@ -98,7 +98,7 @@ def test_a_masked_reset_touches_nobody_else(backend: str, task: str, robot: str)
     fresh_start = returned(fresh.reset())
     assert fresh.episode.tolist() == [1] * N
     assert_rows(start, fresh_start, chosen, chosen, backend, "reset")
-    new = held(fresh)
+    new = state_of(fresh)
     for name in [n for n in after if n in (*STATE, *POSES) or n.startswith("fields.")]:
         assert_same_run(after[name][chosen], new[name][chosen], backend)
     assert_traces(later, play(fresh, moves[6:]), chosen, chosen, backend)
@@ -110,7 +110,7 @@ def test_starts_depend_on_seed_world_and_episode_alone(robot: str) -> None:
     names = ("qpos", "qvel", "ctrl", "site_xpos")
 
     def starts(env: Env) -> dict[str, torch.Tensor]:
-        kept = held(env, names)
+        kept = state_of(env, names)
         return {
             name: v.double().cpu()
             for name, v in kept.items()

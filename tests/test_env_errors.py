@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from compositions import load_config
 from environments import assert_rows, configure, mask_of, on_shared_sim, returned
 
 from mjstack import make_env
-from mjstack.config import load_config
 from mjstack.config.schema import (
     Backend,
     Config,

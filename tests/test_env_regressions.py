@@ -10,6 +10,7 @@ from collections.abc import Callable
 import mujoco
 import pytest
 import torch
+from compositions import make_env
 
 import mjstack
 from mjstack.config.schema import ObservationTermCfg, TermCfg
@@ -19,7 +20,7 @@ from mjstack.errors import ConfigError, FaultError, MissingField, TermError
 
 
 def native(*overrides: str, nworld: int = 2) -> Env:
-    return mjstack.make_env(["sim=native", *overrides], nworld=nworld)
+    return make_env(["sim=native", *overrides], nworld=nworld)
 
 
 def zeros(env: Env) -> torch.Tensor:
@@ -61,16 +62,14 @@ def test_an_observation_with_a_memory_is_refused() -> None:
 
 def test_a_reset_after_an_overflow_counts_the_start_alone() -> None:
     """Most contacts of a run are more than those of its start."""
-    env = mjstack.make_env(
-        ["sim=mjwarp", "sim.device=cpu", "batch.naconmax=54", "reset=nominal"], nworld=2
-    )
+    env = make_env(["sim=mjwarp", "sim.device=cpu", "batch.naconmax=54", "reset=nominal"], nworld=2)
     env.reset(seed=0)
     env.sim.peak_pool.fill_(1000)
     env.reset(seed=0)
 
 
 def test_an_overflow_names_the_size_that_is_in_force() -> None:
-    env = mjstack.make_env(
+    env = make_env(
         ["sim=mjwarp", "sim.device=cpu", "batch.naconmax=40", "reset=randomized"], nworld=2
     )
     env.reset(seed=0)

@@ -9,6 +9,7 @@ import logging
 import pytest
 import torch
 import warp as wp
+from compositions import make_env
 from environments import actions, configure, returned
 
 import mjstack
@@ -28,7 +29,7 @@ DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
 
 def make(backend: str, graph: str, nworld: int, *overrides: str) -> Env:
     device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
-    return mjstack.make_env(
+    return make_env(
         ["sim=mjwarp", "reset=randomized", f"graph={graph}", *overrides],
         nworld=nworld,
         device=device,
@@ -292,7 +293,7 @@ def test_what_failed_is_captured_anew_after_a_change() -> None:
 
 def test_what_a_step_returns_is_the_callers_own() -> None:
     """One block of memory; but to autograd each tensor is one of its own."""
-    env = mjstack.make_env(["task=reach", "sim=native"], nworld=2)
+    env = make_env(["task=reach", "sim=native"], nworld=2)
     env.reset(seed=0)
     zero = torch.zeros((2, env.action_manager.action_dim))
     obs, reward, terminated, truncated, extras = env.step(zero)

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from compositions import load_config
 
 from mjstack.cli import run
-from mjstack.config import Config, load_config
+from mjstack.config import Config
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError
 from mjstack.gates.runner import run_guarded

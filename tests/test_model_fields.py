@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from comparison import assert_worlds_step_alone
+from compositions import load_config
 
-from mjstack.config import load_config
 from mjstack.config.schema import Backend
 from mjstack.episodes.context import RunContext
 from mjstack.errors import RebindError, UnknownName

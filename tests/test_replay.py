@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import torch
 from check_cases import rules_of
-from environments import brisk, rushed
+from compositions import load_config
+from environments import at_double_speed, one_second_episode
 from omegaconf import OmegaConf
 
 from mjstack.cli import run
-from mjstack.config import load_config
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Backend, TermCfg
 from mjstack.episodes.context import RunContext
@@ -368,7 +368,7 @@ def from_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(home)
         Path("carry.csv").write_text(CARRY)
-        assert run(["gates=[batch,success]", *start, *rushed()]) == 1
+        assert run(["gates=[batch,success]", *start, *one_second_episode()]) == 1
         Path("carry.csv").unlink()
     return home / "run"
 
@@ -517,7 +517,7 @@ def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
         "nworld=3",
         "reset=randomized",
         "robot=rebot",
-        *brisk("rebot"),
+        *at_double_speed("rebot"),
     ]
     run([*args, f"hydra.run.dir={folder}"])
     _, report = replay(folder, "world=2", "sim=native")
@@ -539,7 +539,7 @@ def test_mjwarp_world_is_played_on_both_engines(
         "sim.device=cpu",
         "nworld=2",
         "task.check.xy_err=1e-6",
-        *brisk(),
+        *at_double_speed(),
     ]
     assert run([*args, f"hydra.run.dir={folder}"]) == 1
     status, report = replay(folder, "world=1")

@@ -9,8 +9,8 @@ import math
 import mujoco_warp as mjw
 import pytest
 import torch
+from compositions import load_config
 
-from mjstack import load_config
 from mjstack.config.schema import Backend
 from mjstack.math import quat_from_yaw
 from mjstack.scene import SceneIndex, build_model, table_top

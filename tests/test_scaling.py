@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from environments import rushed
+from compositions import load_config
+from environments import one_second_episode
 from matplotlib.axes import Axes
 
 from mjstack.cli import run
-from mjstack.config import load_config
 from mjstack.errors import ConfigError
 from mjstack.files import to_csv
 from mjstack.jobs import scaling
@@ -115,7 +115,7 @@ def test_failing_run_is_a_gap_and_runs_again_if_asked(
 ) -> None:
     args = [
         *TINY,
-        *rushed(),
+        *one_second_episode(),
         "sim.device=cpu",
         "job.nworlds=[1]",
         "job.backends=[mjwarp,native]",

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from comparison import assert_same_run, assert_worlds_step_alone
+from compositions import load_config
 
-from mjstack.config import load_config
 from mjstack.config.schema import Backend
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError, RebindError, UnsupportedModel

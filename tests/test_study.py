@@ -13,10 +13,10 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from compositions import load_config
 
 from mjstack.bench.timing import describe_lost, lost_worlds
 from mjstack.cli import run
-from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config, StudyJobCfg
 from mjstack.episodes.context import RunContext
 from mjstack.errors import MjstackError

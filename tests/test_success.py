@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 import torch
 from check_cases import rules_of
-from environments import brisk, configure, rushed
+from compositions import load_config
+from environments import at_double_speed, configure, one_second_episode
 
 from mjstack.cli import run
-from mjstack.config import load_config
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor, Sign
@@ -50,7 +50,7 @@ def passed(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "gate.success.region=[0.03,0.03]",
         "gate.success.cell_episodes=2",
     ]
-    assert run([*args, *brisk(), f"hydra.run.dir={folder}"]) == 0
+    assert run([*args, *at_double_speed(), f"hydra.run.dir={folder}"]) == 0
     return folder
 
 
@@ -67,7 +67,7 @@ def warp(passed: Path) -> Path:
                 "sim.device=cpu",
                 "nworld=6",
                 *start,
-                *brisk(),
+                *at_double_speed(),
                 f"hydra.run.dir={folder}",
             ]
         )
@@ -154,7 +154,7 @@ def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
         "sim=native",
         "nworld=2",
         "robot.gripper_closed=[0.7]",
-        *brisk(),
+        *at_double_speed(),
         f"hydra.run.dir={folder}",
     ]
     assert run(args) == 1
@@ -194,7 +194,9 @@ def hasty() -> Callable[..., RunContext]:
 
     def make(*overrides: str) -> RunContext:
         return RunContext(
-            cfg=load_config(["gates=[success]", "sim=native", "nworld=2", *rushed(), *overrides])
+            cfg=load_config(
+                ["gates=[success]", "sim=native", "nworld=2", *one_second_episode(), *overrides]
+            )
         )
 
     return make

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from check_cases import limits
-from environments import actions, configure, held, mask_of, new_sim, on_shared_sim, returned
+from environments import actions, configure, mask_of, new_sim, on_shared_sim, returned, state_of
 from stack_checker import BLUE, RED, lowest_corner, rotation_matrix
 
 from mjstack import make_env
@@ -1112,10 +1112,10 @@ def test_a_masked_reset_draws_for_its_worlds_alone(robot: str) -> None:
     for view in (*env.sim.fields.values(), env.sim.qpos, env.sim.ctrl):
         view *= 1.01  # the others keep whatever they have, drawn or not
     env.sim.kinematics()
-    before = held(env)
+    before = state_of(env)
     mask = torch.rand(MANY, generator=torch.Generator().manual_seed(0)) < 0.3
     env.reset(mask=mask)
-    after = held(env)
+    after = state_of(env)
     changed = (
         "qpos",
         "ctrl",

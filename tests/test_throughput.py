@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from environments import brisk
+from compositions import load_config
+from environments import at_double_speed
 
 from mjstack.bench import cli, env_step, episode, physics, power
 from mjstack.bench.env_step import measure_env_step
 from mjstack.bench.power import EnergyMeter
 from mjstack.bench.timing import Measurement, capture_problem, steps_that_fit, timed
-from mjstack.config import load_config
 from mjstack.config.schema import GraphMode
 from mjstack.envs import Env, build_env
 from mjstack.episodes.context import RunContext
@@ -38,7 +38,7 @@ SHORT = (
     "gate.throughput.steps=3",
     "gate.throughput.env_steps=2",
     "gate.throughput.cpu_max_seconds=120",
-    *brisk(),
+    *at_double_speed(),
 )
 SPEEDS = ("per_s", "ms_per", "seconds", "ratio", "over_physics", "power")
 
@@ -182,7 +182,7 @@ def test_bare_steps_play_the_same_trajectory(
     """Warp's CPU device is bit-reproducible: whatever else a step does, the physics of both is the
     same.
     """
-    context = new_context("nworld=1", *brisk())
+    context = new_context("nworld=1", *at_double_speed())
     sim = make_sim("mjwarp", 1)
     context.play(sim, context.cfg.reset)
     final = sim.qpos.clone()
