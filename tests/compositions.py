@@ -5,10 +5,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from functools import cache
+from typing import Any
 
 import mjstack
+from mjstack.config.overrides import parse
 from mjstack.config.schema import Config
+from mjstack.config.validate import validate
 from mjstack.envs import Env, build_env
+from mjstack.tasks.check import make_check
 
 
 @cache
@@ -18,7 +22,9 @@ def _composed(overrides: tuple[str, ...]) -> Config:
 
 def load_config(overrides: Sequence[str] = ()) -> Config:
     """What `mjstack.load_config` returns, as a copy of the caller's own."""
-    return copy.deepcopy(_composed(tuple(o for o in overrides if o != "robot=so101")))
+    return copy.deepcopy(
+        _composed(tuple(o for o in overrides if o not in ("robot=so101", "task=stack")))
+    )
 
 
 def make_env(
@@ -33,3 +39,22 @@ def make_env(
     return build_env(
         load_config([*overrides, *(f"{k}={v}" for k, v in given.items() if v is not None)])
     )
+
+
+def checked(*overrides: str, task: str = "stack") -> None:
+    """Check a configuration of a task as composing it with these overrides would, their values put
+    in place directly.
+    """
+    cfg = load_config([f"task={task}"])
+    for override in overrides:
+        parsed = parse(override.lstrip("+"))
+        *path, last = parsed.key_or_group.split(".")
+        node: Any = cfg
+        for name in path:
+            node = node[name] if isinstance(node, dict) else getattr(node, name)
+        if isinstance(node, dict):
+            node[last] = parsed.value()
+        else:
+            setattr(node, last, parsed.value())
+    validate(cfg)
+    make_check(cfg)

@@ -12,7 +12,7 @@ import pytest
 import torch
 from box_checker import BoxRecording, lowest_geometry
 from check_cases import limits
-from compositions import load_config, make_env
+from compositions import checked, load_config, make_env
 
 from mjstack.config.schema import Config
 from mjstack.drivers.open_loop import OpenLoopPlanner
@@ -393,31 +393,45 @@ def test_lowest_point_of_a_mesh_is_never_too_high() -> None:
 
 
 @pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("scene.box.center=[0.305,0.2]", ["scene.box.center", "on the table with all its walls"]),
+        ("scene.box.height=0.005", ["scene.box.height=0.005", "0.006 m"]),
+        ("scene.box.wall=-0.006", ["scene.box.wall=-0.006", "above 0"]),
+        ("scene.box.floor_solref=[-4444,1]", ["scene.box.floor_solref", "time constant"]),
+        ("scene.box.friction=[1,0.005]", ["scene.box.friction", "3 numbers"]),
+        (
+            "scene.places.red_slot.xy=[0.46,0.26]",
+            ["scene.places.red_slot.xy", "a place in the box"],
+        ),
+        ("scene.objects.blue.xy=[0.35,0.0]", ["scene.objects.blue.xy", "beside the box"]),
+        ("scene.random_xy=[0.1]", ["scene.random_xy", "2 numbers"]),
+        ("scene.random_xy=[0.1,-0.1]", ["scene.random_xy", "at least 0"]),
+        ("task.check.window=0", ["task.check.window=0", "at least 1"]),
+        ("task.check.window=2001", ["task.check.window=2001", "2000"]),
+        ("task.check.open_fraction=1.2", ["task.check.open_fraction=1.2", "at most 1"]),
+        ("task.check.force=0", ["task.check.force=0", "above 0"]),
+        ("task.check.inside=-0.001", ["task.check.inside=-0.001", "at least 0"]),
+        ("task.check.lift_steps=0", ["task.check.lift_steps=0", "at least 1"]),
+        ("task.check.rest_sped=1", ["rest_sped", "rest_speed"]),
+    ],
+)
+def test_a_bad_value_is_one_line(override: str, parts: list[str]) -> None:
+    with pytest.raises(MjstackError) as caught:
+        checked(override, task="box")
+    assert caught.value.exit_code == 2
+    assert "\n" not in str(caught.value)
+    for part in parts:
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
     ("overrides", "parts"),
     [
         (["scene=stack"], ["red_slot", "object or place"]),
         (["phases=stack"], ["gate.parity.states", "approach_red"]),
         (["~controller.phases.settle_blue"], ["task.check", "settle_blue"]),
-        (["scene.box.center=[0.305,0.2]"], ["scene.box.center", "on the table with all its walls"]),
-        (["scene.box.height=0.005"], ["scene.box.height=0.005", "0.006 m"]),
-        (["scene.box.wall=-0.006"], ["scene.box.wall=-0.006", "above 0"]),
-        (["scene.box.floor_solref=[-4444,1]"], ["scene.box.floor_solref", "time constant"]),
-        (["scene.box.friction=[1,0.005]"], ["scene.box.friction", "3 numbers"]),
-        (
-            ["scene.places.red_slot.xy=[0.46,0.26]"],
-            ["scene.places.red_slot.xy", "a place in the box"],
-        ),
         (["scene.places.red_slot.xy=null"], ["red_slot"]),
-        (["scene.objects.blue.xy=[0.35,0.0]"], ["scene.objects.blue.xy", "beside the box"]),
-        (["scene.random_xy=[0.1]"], ["scene.random_xy", "2 numbers"]),
-        (["scene.random_xy=[0.1,-0.1]"], ["scene.random_xy", "at least 0"]),
-        (["task.check.window=0"], ["task.check.window=0", "at least 1"]),
-        (["task.check.window=2001"], ["task.check.window=2001", "2000"]),
-        (["task.check.open_fraction=1.2"], ["task.check.open_fraction=1.2", "at most 1"]),
-        (["task.check.force=0"], ["task.check.force=0", "above 0"]),
-        (["task.check.inside=-0.001"], ["task.check.inside=-0.001", "at least 0"]),
-        (["task.check.lift_steps=0"], ["task.check.lift_steps=0", "at least 1"]),
-        (["task.check.rest_sped=1"], ["rest_sped", "rest_speed"]),
         (["scene.box.heigth=1"], ["scene.box.heigth"]),
         (["timing=default", "timing.decimation=11"], ["50 Hz"]),
     ],

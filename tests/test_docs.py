@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
 
 import pytest
+import warp as wp
 from doc_blocks import PAGES, ROOT, TRAINS, python_blocks, python_lines, write_files
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -35,28 +38,28 @@ def test_lines_keep_their_numbers() -> None:
     assert kept == {4: "x = 1", 17: "z = x"}
 
 
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty working folder; modules that a page imports from it are forgotten afterwards."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(wp.config, "log_level", wp.config.log_level)
+    yield tmp_path
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None) or "").startswith(str(tmp_path)):
+            del sys.modules[name]
+
+
 @pytest.mark.parametrize("name", GUIDES)
-def test_python_blocks_run(name: str, tmp_path: Path) -> None:
-    """In a process and a file of their own: Warp reads the source of kernels, so they cannot come
-    from a string.
+def test_python_blocks_run(name: str, folder: Path) -> None:
+    """From a file: Warp reads the source of kernels, so they cannot come from a string. A line
+    number in a traceback is the page's.
     """
     text = (DOCS / name).read_text(encoding="utf-8")
-    write_files(text, tmp_path)
-    program = python_lines(text)
-    script = tmp_path / f"{Path(name).stem}_blocks.py"
-    script.write_text(program, encoding="utf-8")
-    env = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
-    done = subprocess.run(
-        [sys.executable, str(script)],
-        cwd=tmp_path,
-        env=env,
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert done.returncode == 0, (
-        f"line numbers are those of docs/{name}\n{done.stdout}\n{done.stderr}"
-    )
+    write_files(text, folder)
+    script = folder / f"{Path(name).stem}_blocks.py"
+    script.write_text(python_lines(text), encoding="utf-8")
+    runpy.run_path(str(script), run_name=script.stem)
 
 
 def shown_commands() -> list[dict[str, str]]:
@@ -100,12 +103,10 @@ def test_shown_commands_compose() -> None:
 
 
 def test_the_task_of_the_guide_passes_its_gates(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = (DOCS / "own_tasks.md").read_text(encoding="utf-8")
-    write_files(text, tmp_path)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
+    write_files(text, folder)
     commands = re.findall(r"(?m)^\$ mjstack (--config-dir lift/conf .* sim=native)$", text)
     for command, gate in zip(commands, ("baseline", "accurate"), strict=True):
         assert run(shlex.split(command)) == 0, capsys.readouterr()
