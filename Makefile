@@ -1,4 +1,5 @@
-# Two commands: `make run` runs the main job, `make test` runs lint, types and tests. Both set up .venv on first use.
+# `make run` runs the main job, `make test` checks what matters in minutes, `make test-all` runs every test. Each sets up
+# .venv on first use.
 PYTHON ?= python3
 ARGS ?=
 VENV := .venv
@@ -8,18 +9,28 @@ READY_DEV := $(VENV)/.installed-dev
 READY_DOCS := $(VENV)/.installed-docs
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-.PHONY: run test docs setup clean
+.PHONY: run test test-rest test-all docs setup clean
 
 run: $(READY)
 	$(BIN)/python scripts/run.py robot=so101 nworld=32 $(ARGS)
 
-# Two processes on two cores: with threads of their own as well they would wait for each other.
-# pip left no bytecode: without this, where the shell forbids writing it, each process that a test starts compiles torch's.
+# Two processes on two cores: with threads of their own as well they would wait for each other. A file's tests share what
+# they build, so a process takes whole files. pip left no bytecode: without this, where the shell forbids writing it, each
+# process that a test starts compiles torch's.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+
+# Lint, types, and the tests without which nobody would trust a package; the examples are among them.
 test: $(READY_DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m "not full"
+
+# The tests that `make test` leaves out.
+test-rest: $(READY_DEV)
+	$(PYTEST) -m full
+
+test-all: test test-rest
 
 # build/site/index.html opens from the disk. The build fetches nothing.
 docs: $(READY_DOCS)

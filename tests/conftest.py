@@ -20,37 +20,11 @@ from mjstack.episodes.observers import Hook
 from mjstack.sim import Simulation, make_simulation
 
 ROBOTS = ("so101", "rebot")
-# Files of 40 s and more start first, the longest at the front, so that both processes end together.
-# The second process begins with files that need few of MJWarp's kernels: with a cold cache both
-# would compile the same ones.
-LONGEST = (
-    *("graph", "readme", "scaling", "collect", "capacity", "replay", "success", "box_check", "cli"),
-    *(
-        "env_contract",
-        "terms",
-        "docs",
-        "config",
-        "study",
-        "batched_ik",
-        "reachability",
-        "starts_file",
-    ),
-)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Orders files; within a file, and among the others, the order stays."""
-    place = {f"test_{name}": number for number, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
 
 def pytest_collection_finish() -> None:
-    """Spares the garbage collector the modules and the tests, which stay to the end: a sixth of the
-    time went into them.
-    """
-    gc.collect()
+    """Spare the garbage collector the modules, which stay to the end."""
     gc.freeze()
-    gc.set_threshold(50_000, 20, 20)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -71,6 +71,7 @@ def test_vector_spaces(make: Make) -> None:
     assert "final_obs" not in infos
 
 
+@pytest.mark.full
 def test_vector_env_in_absolute_joint_commands_has_the_actuators_bounds(make: Make) -> None:
     inner = make("action=joint_absolute")
     space = GymnasiumVectorEnv(inner).single_action_space
@@ -79,6 +80,7 @@ def test_vector_env_in_absolute_joint_commands_has_the_actuators_bounds(make: Ma
     np.testing.assert_array_equal(np.stack((space.low, space.high), 1), limits)
 
 
+@pytest.mark.full
 def test_vector_groups(make: Make) -> None:
     inner = make()
     env = GymnasiumVectorEnv(inner, group=None)
@@ -94,6 +96,7 @@ def test_vector_groups(make: Make) -> None:
         GymnasiumVectorEnv(inner, group="polcy")
 
 
+@pytest.mark.full
 def test_vector_seeding(make: Make) -> None:
     env = GymnasiumVectorEnv(make())
     rng = np.random.default_rng(0)
@@ -151,6 +154,7 @@ def test_vector_autoreset_in_the_same_step(make: Make) -> None:
         assert list(infos["final_info"]["_success"]) == list(truncated)
 
 
+@pytest.mark.full
 def test_vector_final_obs_of_all_groups(make: Make) -> None:
     env = GymnasiumVectorEnv(make("task.episode_steps=1"), group=None)
     env.reset(seed=0)
@@ -159,6 +163,7 @@ def test_vector_final_obs_of_all_groups(make: Make) -> None:
     assert all(final in env.single_observation_space for final in infos["final_obs"])
 
 
+@pytest.mark.full
 def test_vector_success_ends_an_episode(make: Make) -> None:
     env = GymnasiumVectorEnv(
         make("task.success.params.distance=10.0", "task.success.params.steps=2")
@@ -172,6 +177,7 @@ def test_vector_success_ends_an_episode(make: Make) -> None:
     assert infos["final_info"]["success"].all()
 
 
+@pytest.mark.full
 def test_vector_wrappers_of_gymnasium_work(make: Make) -> None:
     env = DictInfoToList(ClipAction(RecordEpisodeStatistics(GymnasiumVectorEnv(make()))))
     env.reset(seed=0)
@@ -183,6 +189,7 @@ def test_vector_wrappers_of_gymnasium_work(make: Make) -> None:
     env.close()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("action", "message"),
     [
@@ -202,6 +209,7 @@ def test_vector_wrong_actions(make: Make, action: Any, message: str) -> None:
         env.step(action)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -224,6 +232,7 @@ def test_vector_wrong_resets(make: Make, arguments: dict[str, Any], message: str
         env.reset(**arguments)
 
 
+@pytest.mark.full
 def test_vector_step_before_reset(make: Make) -> None:
     env = GymnasiumVectorEnv(make())
     with pytest.raises(ArgumentError, match="reset"):
@@ -253,6 +262,7 @@ def test_single_env_passes_gymnasiums_checker(group: str | None) -> None:
         del gymnasium.registry["mjstack-test/Reach-v0"]
 
 
+@pytest.mark.full
 def test_single_env_is_the_one_world(make: Make) -> None:
     """The done step returns the final observation, and ``reset`` the start of the episode that
     follows.
@@ -279,6 +289,7 @@ def test_single_env_is_the_one_world(make: Make) -> None:
     assert int(env.inner.episode) == 3
 
 
+@pytest.mark.full
 def test_single_env_seed_after_the_end_of_an_episode(make: Make) -> None:
     env = GymnasiumEnv(make("task.episode_steps=1", nworld=1))
     first, _ = env.reset(seed=2)
@@ -287,6 +298,7 @@ def test_single_env_seed_after_the_end_of_an_episode(make: Make) -> None:
     np.testing.assert_array_equal(first, again)
 
 
+@pytest.mark.full
 def test_single_env_wrong_use(make: Make) -> None:
     with pytest.raises(
         ArgumentError, match=r"env: found 3 worlds, expected one\. Build it with nworld=1"
@@ -341,6 +353,7 @@ def test_rsl_rl_tells_time_outs_from_other_ends(make: Make) -> None:
     ]
 
 
+@pytest.mark.full
 def test_rsl_rl_episode_length_is_the_environments_own(make: Make) -> None:
     inner = make()
     env = RslRlVecEnv(inner)
@@ -359,6 +372,7 @@ def test_rsl_rl_episode_length_is_the_environments_own(make: Make) -> None:
             env.episode_length_buf = wrong
 
 
+@pytest.mark.full
 def test_rsl_rl_log(make: Make) -> None:
     env = RslRlVecEnv(make(), log_interval=FRAMES + 1)
     logs = [env.step(torch.zeros(3, 6))[3].get("log") for _ in range(2 * FRAMES + 2)]
@@ -376,6 +390,7 @@ def test_rsl_rl_log(make: Make) -> None:
         RslRlVecEnv(env.env, log_interval=0)
 
 
+@pytest.mark.full
 def test_rsl_rl_actions_are_clamped_and_checked(make: Make) -> None:
     inner = make()
     env = RslRlVecEnv(inner)
@@ -387,6 +402,7 @@ def test_rsl_rl_actions_are_clamped_and_checked(make: Make) -> None:
             env.step(wrong)
 
 
+@pytest.mark.full
 def test_rsl_rl_steps_in_inference_mode_and_out_of_it(make: Make) -> None:
     """Runners collect in inference mode, and whoever evaluates afterwards may not."""
     env = RslRlVecEnv(make())
@@ -411,6 +427,7 @@ def test_import_of_mjstack_loads_no_adapter() -> None:
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("adapter", "library"),
     [("gymnasium", "gymnasium"), ("rsl_rl", "rsl_rl"), ("rsl_rl", "tensordict")],

@@ -124,6 +124,7 @@ def test_failing_worlds_are_a_table(two_seeds: tuple[Path, GateResult, list[str]
             assert float(row[name]) == pytest.approx(values[int(row["world"])], rel=1e-5)
 
 
+@pytest.mark.full
 def test_second_seed_is_what_it_is_alone(
     two_seeds: tuple[Path, GateResult, list[str]],
     new_context: Callable[..., RunContext],
@@ -171,6 +172,7 @@ class Stop(Exception):
     """Something that nobody foresaw."""
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("error", [Stop("the second seed"), KeyboardInterrupt()])
 def test_what_stops_the_second_seed_keeps_the_first(
     error: BaseException,
@@ -200,6 +202,7 @@ def test_what_stops_the_second_seed_keeps_the_first(
     assert (record.failed == RULES["STACKED"]).all()
 
 
+@pytest.mark.full
 def test_full_disk_takes_no_verdict_back(
     new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -247,6 +250,7 @@ def test_damaged_record_is_one_line(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.full
 def test_a_few_failures_may_be_allowed(new_context: Callable[..., RunContext]) -> None:
     """nworld=5 of seed 0 has world 4 off; allowed, it is still named."""
     result = play(new_context("sim=native", "nworld=5", "gate.batch.failed_worlds=1", TIGHT), None)
@@ -258,6 +262,7 @@ def test_a_few_failures_may_be_allowed(new_context: Callable[..., RunContext]) -
     )  # allowed, and void nonetheless
 
 
+@pytest.mark.full
 def test_no_trajectory_is_kept(new_context: Callable[..., RunContext], tmp_path: Path) -> None:
     """A trajectory of qpos alone would take 48 kB a world on the host."""
 
@@ -275,6 +280,7 @@ def test_no_trajectory_is_kept(new_context: Callable[..., RunContext], tmp_path:
     assert (peak(12) - peak(2)) / 10 < 15_000
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("lacks", ["check", "phases"])
 def test_gates_of_a_task_without_an_episode_are_skipped(lacks: str) -> None:
     cfg = load_config(["sim=native", "gates=[baseline,parity,capacity,batch,success]"])

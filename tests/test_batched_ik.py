@@ -288,6 +288,7 @@ def shipped(context: RunContext) -> dict[str, float]:
     return {"posture_gain": c.posture_gain, "approach_gain": c.approach_gain}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("gains", ["shipped", "drawn home"])
 def test_reaches_what_mink_reaches(
     robot: str, gains: str, stage: Stage, arm: Arm, by_mink: Callable, capsys: pytest.CaptureFixture
@@ -332,6 +333,7 @@ def test_reaches_what_mink_reaches(
         )
 
 
+@pytest.mark.full
 def test_drawn_home_it_ends_where_mink_does(
     robot: str, arm: Arm, by_mink: Callable, capsys: pytest.CaptureFixture
 ) -> None:
@@ -355,6 +357,7 @@ def test_drawn_home_it_ends_where_mink_does(
         assert away.mean() <= mink_away.mean() + 0.001
 
 
+@pytest.mark.full
 def test_an_approach_gain_leans_less_than_mink(
     stage: Stage, get_arm: Callable[[str], Arm], by_mink: Callable
 ) -> None:
@@ -375,6 +378,7 @@ def test_an_approach_gain_leans_less_than_mink(
     assert tilt.mean() < mink_tilt.mean() - 5.0
 
 
+@pytest.mark.full
 def test_follows_minks_way_as_shipped(
     robot: str, stage: Stage, arm: Arm, by_mink: Callable, capsys: pytest.CaptureFixture
 ) -> None:
@@ -450,6 +454,7 @@ def test_gains_do_not_spoil_the_position(
     assert (worst[free] <= 0.0001).mean() >= 0.98
 
 
+@pytest.mark.full
 def test_a_posture_is_approached_as_far_as_the_target_allows(
     robot: str, arm: Arm, device: str, workspace: Callable
 ) -> None:
@@ -484,6 +489,7 @@ def test_a_posture_is_approached_as_far_as_the_target_allows(
     assert np.median(before) > 0.2
 
 
+@pytest.mark.full
 def test_the_approach_axis_turns_down_as_far_as_the_target_allows(
     robot: str, arm: Arm, device: str, workspace: Callable
 ) -> None:
@@ -515,6 +521,7 @@ def test_the_approach_axis_turns_down_as_far_as_the_target_allows(
     assert np.quantile(slopes, 0.9) < 0.01
 
 
+@pytest.mark.full
 def test_the_approach_axis_turns_where_it_is_wished(
     robot: str, arm: Arm, device: str, workspace: Callable
 ) -> None:
@@ -554,6 +561,7 @@ def test_the_approach_axis_turns_where_it_is_wished(
     assert np.mean(arm.directions(down)[1][:, 2]) < np.mean(wished[:, 2]) - 0.1
 
 
+@pytest.mark.full
 def test_a_wished_approach_needs_a_gain_and_a_direction_per_world(arm: Arm) -> None:
     start = torch.tensor(arm.at_home(4))
     down = torch.tensor([[0.0, 0.0, -1.0]])
@@ -563,6 +571,7 @@ def test_a_wished_approach_needs_a_gain_and_a_direction_per_world(arm: Arm) -> N
         arm.solver(4, "cpu", approach_gain=0.1).solve(start, start[:, :3], approach=down)
 
 
+@pytest.mark.full
 def test_a_start_at_its_target_still_goes_to_the_posture(
     robot: str, arm: Arm, device: str, workspace: Callable
 ) -> None:
@@ -650,6 +659,7 @@ def test_directions_are_native_mujocos(arm: Arm, device: str, dtype: torch.dtype
     np.testing.assert_allclose(ik.approach(given).cpu().numpy(), expected[1], atol=2e-6)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("source", ["builtin", "menagerie"])
 def test_the_approach_axis_leads_from_the_wrist_to_the_grasp_point(
     robot: str, source: str, monkeypatch: pytest.MonkeyPatch
@@ -704,6 +714,7 @@ def test_small_steps_arrive(robot: str, arm: Arm, device: str, workspace: Callab
     assert np.abs(command - start)[usable].max() < 0.5
 
 
+@pytest.mark.full
 def test_limits_hold_and_the_other_joints_stay(arm: Arm, device: str) -> None:
     """Even from commands beyond the limits, and towards targets that pull against them."""
     rng = np.random.default_rng(4)
@@ -815,6 +826,7 @@ def test_not_finite_input_stays_in_its_world(arm: Arm, device: str) -> None:
     np.testing.assert_array_equal(results(ik, start, target)[0], clean_command)
 
 
+@pytest.mark.full
 def test_world_k_of_n_is_world_k_of_one(robot: str, arm: Arm, workspace: Callable) -> None:
     start = arm.anywhere(64, 9)
     target = workspace(robot)[1][:64]
@@ -1005,6 +1017,7 @@ def test_an_approach_body_that_not_every_joint_moves_is_refused() -> None:
             BatchedIk(arm.model, replace(arm.robot, approach_body=body), 2, "cpu")
 
 
+@pytest.mark.full
 def test_a_gain_counts_in_any_chain(device: str) -> None:
     """With moved joints on one side of the fork, a slide among them, and an approach axis that is
     none of theirs.
@@ -1124,6 +1137,7 @@ def test_a_cuda_graph_holds_it(arm: Arm, cuda: str, gain: float) -> None:
         assert torch.equal(flags, flagged)
 
 
+@pytest.mark.full
 def test_the_benchmark_prints_a_table_and_writes_its_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -102,6 +102,7 @@ def test_the_motion_is_the_protocols(robot: str) -> None:
     assert (t.inside, t.rest_speed, t.window, t.jaw_clearance) == (0.003, 0.04, 50, 0.02)
 
 
+@pytest.mark.full
 def test_other_scenes_have_no_box_and_pay_for_no_sensor_of_it(robot: str) -> None:
     cfg = load_config([f"robot={robot}"])
     model = build_model(cfg)
@@ -165,11 +166,13 @@ def test_home_is_the_first_approach_and_clear_of_everything(robot: str) -> None:
     assert at == pytest.approx([*cfg.scene.objects["red"].xy, TOP[robot] + 0.19], abs=5e-6)
 
 
+@pytest.mark.full
 def test_a_home_of_ones_own_counts() -> None:
     home = [0.5, -0.4, 0.1, 0.8, 1.584, 0.6]
     assert load_config(["task=box", f"robot.home={home}"]).robot.home == home
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("reset", ["nominal", "jitter", "randomized"])
 def test_random_actions_from_every_start(robot: str, reset: str) -> None:
     env = small_env(f"reset={reset}", robot=robot, nworld=2)
@@ -211,6 +214,7 @@ def rests(env: Env) -> dict[str, list[float]]:
     return {RED: [*scene.places["red_slot"].xy, z], BLUE: [*scene.places["blue_slot"].xy, z]}
 
 
+@pytest.mark.full
 def test_terms_know_the_box(robot: str) -> None:
     """World 0: both on the table. 1: red in the box. 2: both in it. 3: red over its place, on the
     rim's height and above.
@@ -252,6 +256,7 @@ def test_terms_know_the_box(robot: str) -> None:
     env.close()
 
 
+@pytest.mark.full
 def test_a_place_counts_off_the_table_whatever_the_boxs_floor() -> None:
     """Red over its place, its lowest corner 0.5 mm below and above half the floor, and at rest on
     the floor; all else alike.
@@ -312,6 +317,7 @@ def test_matrix_of_a_quaternion() -> None:
         np.testing.assert_allclose(matrix.ravel(), wanted, atol=1e-12)
 
 
+@pytest.mark.full
 def test_lowest_point_of_the_jaws(robot: str) -> None:
     cfg = configured(robot)
     model = build_model(cfg)
@@ -425,6 +431,7 @@ def test_a_bad_value_is_one_line(override: str, parts: list[str]) -> None:
         assert part in str(caught.value)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("overrides", "parts"),
     [
@@ -445,6 +452,7 @@ def test_bad_input_is_one_line(overrides: list[str], parts: list[str]) -> None:
         assert part in message
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("override", "parts"),
     [
@@ -460,6 +468,7 @@ def test_bad_terms_are_named(override: str, parts: list[str]) -> None:
         assert part in str(caught.value)
 
 
+@pytest.mark.full
 def test_terms_of_the_box_need_a_box() -> None:
     with pytest.raises(MjstackError, match="box"):
         make_env(["task=stack", "sim=native", "reward=box"], nworld=1)

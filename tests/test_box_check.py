@@ -28,6 +28,8 @@ from mjstack.report.record import Status
 from mjstack.sim import make_simulation
 from mjstack.tasks.check import CheckResult
 
+pytestmark = pytest.mark.full
+
 RULES = rules_of("box")
 CASES = Cases(RULES)
 HAIR = 2e-6  # [m], [m/s]: a good deal more than float32 rounds at these sizes

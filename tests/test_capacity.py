@@ -90,6 +90,7 @@ def test_peaks_survive_masked_resets(
         assert getattr(sim, name).tolist() == [0, 0, 0], name
 
 
+@pytest.mark.full
 def test_a_peak_after_a_reset_counts(
     backend: str, make_sim: Make, stage: Callable[[str], RunContext]
 ) -> None:
@@ -104,6 +105,7 @@ def test_a_peak_after_a_reset_counts(
     assert torch.equal(sim.most_constraints, torch.maximum(quiet, sim.peak_constraints))
 
 
+@pytest.mark.full
 def test_peaks_of_an_environment_outlive_its_episodes(backend: str) -> None:
     """Every world ends in every third step; the loop keeps what it sees before each reset."""
     cfg = load_config(["termination.time_out.params.steps=3", "seed=3"])
@@ -163,6 +165,7 @@ def test_peaks_join() -> None:
     assert both.overflow.tolist() == [0, 1, 0, 2]
 
 
+@pytest.mark.full
 def test_room_to_measure_in_grows_where_it_is_too_little() -> None:
     cfg = load_config([])
     tried: list[BatchSizes] = []
@@ -179,6 +182,7 @@ def test_room_to_measure_in_grows_where_it_is_too_little() -> None:
     require_physics("it", found, room)
 
 
+@pytest.mark.full
 def test_room_to_measure_in_does_not_grow_for_ever() -> None:
     tried: list[BatchSizes] = []
 
@@ -215,6 +219,7 @@ def test_nothing_is_sized_from_motion_that_lost_physics(bits: Overflow, fix: str
     assert "\n" not in says
 
 
+@pytest.mark.full
 def test_what_is_set_wins() -> None:
     cfg = load_config(["batch=auto", "batch.njmax=500"])
     found = apply_configured(cfg, BatchSizes(nconmax=16, njmax=100, nccdmax=8, source="measured"))
@@ -225,6 +230,7 @@ def test_what_is_set_wins() -> None:
     assert resolve_measuring_sizes(load_config(["batch.njmax=900"])).njmax == 900
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("sizes", "nworld", "room"),
     [
@@ -306,6 +312,7 @@ def too_small(new_context: NewContext) -> tuple[RunContext, GateResult, list[str
     return context, result, said
 
 
+@pytest.mark.full
 def test_too_small_is_found_and_the_printed_override_cures_it(
     too_small: tuple[RunContext, GateResult, list[str]], new_context: NewContext
 ) -> None:
@@ -331,6 +338,7 @@ def test_too_small_is_found_and_the_printed_override_cures_it(
     assert ill.succeeded == 0
 
 
+@pytest.mark.full
 def test_sizes_were_tried_with_the_same_outcome(
     too_small: tuple[RunContext, GateResult, list[str]],
 ) -> None:
@@ -360,6 +368,7 @@ def test_sizes_were_tried_with_the_same_outcome(
     assert m["recommended_env.njmax"] >= 1.25 * needed
 
 
+@pytest.mark.full
 def test_environments_with_too_few_rows_by_choice_are_a_remark(
     too_small: tuple[RunContext, GateResult, list[str]],
 ) -> None:
@@ -371,6 +380,7 @@ def test_environments_with_too_few_rows_by_choice_are_a_remark(
     )
 
 
+@pytest.mark.full
 def test_memory_is_that_of_the_arrays(
     too_small: tuple[RunContext, GateResult, list[str]], stage: Callable[[str], RunContext]
 ) -> None:
@@ -395,6 +405,7 @@ def test_memory_is_that_of_the_arrays(
             assert data_bytes(model, nworld, sizes) == sim.memory_bytes()  # type: ignore[attr-defined]
 
 
+@pytest.mark.full
 def test_defaults_too_small_for_environments_fail(new_context: NewContext) -> None:
     context = new_context(
         "sim=native",
@@ -408,6 +419,7 @@ def test_defaults_too_small_for_environments_fail(new_context: NewContext) -> No
     assert "environments: njmax overflow in 2 of 2 worlds" in result.reason
 
 
+@pytest.mark.full
 def test_native_says_what_it_cannot_know(new_context: NewContext) -> None:
     said: list[str] = []
     context = new_context(
@@ -423,6 +435,7 @@ def test_native_says_what_it_cannot_know(new_context: NewContext) -> None:
     assert any("does not count the collision pairs" in line for line in said)
 
 
+@pytest.mark.full
 def test_a_layout_out_of_reach_leaves_the_other_workloads(
     new_context: NewContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -489,6 +502,7 @@ def test_a_second_run_that_differs(again: dict, on_cpu: str, on_cuda: str) -> No
         assert flipped == 0 or "another result in 1 of 2 worlds (0)" in found.problem + found.remark
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("device", ["cpu", "cuda:0"])
 def test_each_workload_is_played_again_and_a_flip_fails_where_runs_repeat(
     device: str, new_context: NewContext, monkeypatch: pytest.MonkeyPatch
@@ -528,6 +542,7 @@ def test_each_workload_is_played_again_and_a_flip_fails_where_runs_repeat(
         assert f"{flip}: on CUDA sums have no fixed order" in result.details
 
 
+@pytest.mark.full
 def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     new_context: NewContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -554,6 +569,7 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     assert "rerun.randomized.sizes" not in result.notes
 
 
+@pytest.mark.full
 def test_convex_pairs_and_whole_pools_are_held_against_their_keys() -> None:
     cfg = load_config(["nworld=4", "batch.naconmax=60", "batch.naccdmax=12"])
     seen = peaks(nworld=4, contacts=20, pool_ccd_pairs=40)
@@ -578,6 +594,7 @@ def test_convex_pairs_and_whole_pools_are_held_against_their_keys() -> None:
 # batch=auto
 
 
+@pytest.mark.full
 def test_environment_is_sized_by_a_probe() -> None:
     overrides = ["batch=auto", "sim=mjwarp", "gate.capacity.probe_steps=4"]
     env = mjstack.make_env([*overrides], nworld=2, device="cpu")
@@ -596,6 +613,7 @@ def test_environment_is_sized_by_a_probe() -> None:
     assert chosen.sim.sizes.nconmax < 128
 
 
+@pytest.mark.full
 def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     small = BatchSizes(nconmax=128, njmax=4)  # and 32 after the last growth
     monkeypatch.setattr("mjstack.envs.buffers.resolve_measuring_sizes", lambda _: small)
@@ -622,6 +640,7 @@ def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: pytest.Monk
     assert not [ref for ref in made if ref() is not None]
 
 
+@pytest.mark.full
 def test_gates_get_no_sizes_from_a_task_that_lost_physics(
     new_context: NewContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -636,11 +655,13 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
     assert context.artifacts.sizes is None
 
 
+@pytest.mark.full
 def test_native_environment_measures_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mjstack.envs.buffers.measure_peaks", lambda *_: pytest.fail("measured"))
     mjstack.make_env(["batch=auto", "sim=native"], nworld=1).reset(seed=0)
 
 
+@pytest.mark.full
 def test_batch_uses_what_capacity_measured(new_context: NewContext) -> None:
     context = new_context(
         "sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto", "batch.nconmax=48"
@@ -657,6 +678,7 @@ def test_batch_uses_what_capacity_measured(new_context: NewContext) -> None:
     assert (plain.sizes, plain.env_sizes) == (BatchSizes(nconmax=128, njmax=300), None)
 
 
+@pytest.mark.full
 def test_batch_measures_where_capacity_does_not_run(new_context: NewContext) -> None:
     said: list[str] = []
     context = new_context(
@@ -693,6 +715,7 @@ BAD = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("override", "says"), BAD, ids=[override for override, _ in BAD])
 def test_bad_values_give_one_line(override: str, says: str) -> None:
     with pytest.raises(MjstackError) as caught:

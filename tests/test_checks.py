@@ -120,6 +120,7 @@ def test_a_bad_value_is_one_line(override: str, parts: list[str]) -> None:
         assert part in str(caught.value)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("overrides", "parts"),
     [
@@ -150,6 +151,7 @@ def stack_worlds(rec: SimpleNamespace) -> list[StackWorld]:
     ]
 
 
+@pytest.mark.full
 def test_expert_episodes_of_the_stack_pass_without_phases(
     robot: str, recorded: Callable[[str], SimpleNamespace]
 ) -> None:
@@ -157,6 +159,7 @@ def test_expert_episodes_of_the_stack_pass_without_phases(
     assert feed_stack(stack_worlds(rec), rec, phased=False).failed.tolist() == [0] * 4
 
 
+@pytest.mark.full
 def test_a_throw_and_a_push_lift_and_carry_nothing(
     recorded: Callable[[str], SimpleNamespace],
 ) -> None:
@@ -183,6 +186,7 @@ def test_a_throw_and_a_push_lift_and_carry_nothing(
     assert feed_stack(worlds, rec).failed.tolist()[:2] == [0, 0]
 
 
+@pytest.mark.full
 def test_a_lift_in_the_settled_window_comes_too_late(
     recorded: Callable[[str], SimpleNamespace],
 ) -> None:

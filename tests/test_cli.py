@@ -83,6 +83,7 @@ BAD = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("args", BAD, ids=[" ".join(args) for args in BAD])
 def test_bad_input_exits_2_in_one_line_and_writes_nothing(
     args: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
@@ -138,6 +139,7 @@ def starting(folder: Path, module: str, before: str, *args: str) -> subprocess.C
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("module", ["hydra", "torch"])
 def test_ctrl_c_while_modules_load_is_a_line(module: str, folder: Path) -> None:
     done = starting(folder, module, "default_int_handler", "gates=[baseline]")
@@ -149,11 +151,13 @@ def test_ctrl_c_while_modules_load_is_a_line(module: str, folder: Path) -> None:
     assert everything(folder) == []
 
 
+@pytest.mark.full
 def test_ctrl_c_stays_ignored_where_it_was(folder: Path) -> None:
     done = starting(folder, "hydra", "SIG_IGN", "nworld=0")
     assert done.returncode == 2, done.stderr
 
 
+@pytest.mark.full
 def test_what_is_misspelt_does_not_wait_for_torch(folder: Path) -> None:
     program = """
 import sys
@@ -191,6 +195,7 @@ def test_an_override_with_dashes_is_told_without(
     )
 
 
+@pytest.mark.full
 def test_the_command_in_another_program_leaves_its_ctrl_c_alone(folder: Path) -> None:
     program = """
 import os, signal, sys, threading
@@ -226,6 +231,7 @@ def test_packages_are_there_after_a_plain_import() -> None:
         find("no_such")
 
 
+@pytest.mark.full
 def test_help_says_what_there_is_to_choose(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -251,6 +257,7 @@ def test_help_says_what_there_is_to_choose(
     assert everything(folder) == []
 
 
+@pytest.mark.full
 def test_help_may_be_cut_off_by_its_reader() -> None:
     command = f"{sys.executable} {SCRIPT} --help | head -1; exit ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
@@ -320,6 +327,7 @@ def test_cfg_prints_and_writes_nothing(folder: Path, capsys: pytest.CaptureFixtu
     assert everything(folder) == []
 
 
+@pytest.mark.full
 def test_ctrl_c_leaves_the_finished_gates_and_a_kill_would_too(folder: Path) -> None:
     """In a long native batch, after baseline has passed. A kill leaves the files as they are."""
     args = ["gates=[baseline,batch]", "nworld=400", "sim=native", "hydra.run.dir=out"]

@@ -66,6 +66,7 @@ def test_phases_follow_their_times_and_targets(robot: str, stage: Stage) -> None
     env.close()
 
 
+@pytest.mark.full
 def test_every_world_looks_at_its_own_cube(stage: Stage) -> None:
     """A cube that is moved before the descent is followed; in the other world nothing changes."""
     env, controller = driven(stage("so101"), nworld=2)
@@ -101,6 +102,7 @@ def test_jaws_turn_to_a_face(stage: Stage) -> None:
     assert off[0.0].max() > 15.0
 
 
+@pytest.mark.full
 def test_an_empty_grasp_is_tried_once_more_in_time(robot: str, stage: Stage) -> None:
     """World 1 loses its cube to the side as the jaws close. It goes back, looks again, hurries, and
     stacks all the same.
@@ -136,6 +138,7 @@ def test_an_empty_grasp_is_tried_once_more_in_time(robot: str, stage: Stage) -> 
     env.close()
 
 
+@pytest.mark.full
 def test_a_cube_arrives_as_it_stood() -> None:
     """From near the base, where the gripper could point down, to far from it, where it must lean;
     and the other way round.
@@ -163,6 +166,7 @@ def test_a_cube_arrives_as_it_stood() -> None:
     env.close()
 
 
+@pytest.mark.full
 def test_tilt_follows_the_phases() -> None:
     """In the box task red's tilt is kept until blue is observed; a place without an anchor is
     where the target was before.
@@ -182,6 +186,7 @@ def test_tilt_follows_the_phases() -> None:
     assert [names[place] for place in _places(cfg)] == ["retreat_blue"] * 19
 
 
+@pytest.mark.full
 def test_no_retry_without_time(stage: Stage) -> None:
     env, controller = driven(stage("so101"), "controller.speed_limit=1.2", nworld=1)
     grasp = [phase.name for phase in controller.phases].index("grasp_red")
@@ -194,6 +199,7 @@ def test_no_retry_without_time(stage: Stage) -> None:
     env.close()
 
 
+@pytest.mark.full
 def test_worlds_start_over_by_themselves() -> None:
     """A world that ends in the middle of a phase is in its first phase in the step after, the
     others go on.
@@ -221,6 +227,7 @@ def test_worlds_start_over_by_themselves() -> None:
     again.close()
 
 
+@pytest.mark.full
 def test_a_world_does_not_depend_on_its_neighbours(stage: Stage) -> None:
     context = stage("so101")
     runs = []
@@ -235,6 +242,7 @@ def test_a_world_does_not_depend_on_its_neighbours(stage: Stage) -> None:
     torch.testing.assert_close(runs[0], runs[1], rtol=0.0, atol=1e-6)
 
 
+@pytest.mark.full
 def test_out_of_reach_is_flagged_in_its_world(stage: Stage) -> None:
     env, controller = driven(stage("so101"), nworld=2)
     env.sim.qpos[1, env.index.object_qpos[0]] = 0.9
@@ -245,6 +253,7 @@ def test_out_of_reach_is_flagged_in_its_world(stage: Stage) -> None:
     env.close()
 
 
+@pytest.mark.full
 def test_other_actions_are_refused() -> None:
     env = make_env(["task=stack", "sim=native"], nworld=1)
     with pytest.raises(ArgumentError, match=r"action=joint_absolute"):
@@ -252,6 +261,7 @@ def test_other_actions_are_refused() -> None:
     env.close()
 
 
+@pytest.mark.full
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_captured_commands_are_the_eager_ones() -> None:

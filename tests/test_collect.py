@@ -155,6 +155,7 @@ def test_names_and_units(demos: SimpleNamespace) -> None:
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("robot", ["so101", "rebot"])
 @pytest.mark.parametrize("task", ["stack", "box"])
 def test_every_number_has_a_name_and_a_unit(robot: str, task: str) -> None:
@@ -169,6 +170,7 @@ def test_every_number_has_a_name_and_a_unit(robot: str, task: str) -> None:
     env.close()
 
 
+@pytest.mark.full
 def test_names_of_a_history_and_of_a_strange_term() -> None:
     history = "+observation.policy.terms.grasp_point_to_red.history=2"
     strange = "+observation.policy.terms.count={func: mjstack.mdp.reward.success}"
@@ -214,6 +216,7 @@ def test_success_is_the_evidence(demos: SimpleNamespace) -> None:
         assert row["config_sha256"] == config_hash(episode_config(demos.cfg))
 
 
+@pytest.mark.full
 def test_a_step_is_the_state_before_its_action(demos: SimpleNamespace) -> None:
     """The actions, played in the environment, bring the same observations before and the same
     rewards after each of them.
@@ -285,6 +288,7 @@ def test_reported_lines_load_it(demos: SimpleNamespace) -> None:
     assert action.endswith("'rad']")
 
 
+@pytest.mark.full
 def test_the_same_command_again_does_nothing(
     demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -298,6 +302,7 @@ def test_the_same_command_again_does_nothing(
     assert reason.endswith("; they were there already")
 
 
+@pytest.mark.full
 def test_another_configuration_is_refused(
     demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -313,6 +318,7 @@ def test_another_configuration_is_refused(
     assert contents(demos.cwd) == before
 
 
+@pytest.mark.full
 def test_a_dataset_that_is_being_written_is_refused(
     demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -332,6 +338,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "outputs" / "demos"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("args", "words"),
     [
@@ -363,6 +370,7 @@ def test_bad_input_is_one_line(
     assert contents(cwd) == before
 
 
+@pytest.mark.full
 def test_what_the_hash_is_of() -> None:
     def home(*overrides: str) -> Path:
         return collect_folder(load_config(["job=collect", "sim=native", *overrides]))
@@ -431,6 +439,7 @@ def test_first_difference(theirs: dict, ours: dict, text: str, alone: bool) -> N
     assert (str(found), found.alone) == (text, alone)
 
 
+@pytest.mark.full
 def test_another_group_is_refused_by_its_names(
     demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -458,6 +467,7 @@ def collect(*overrides: str) -> int:
     return run_collect_job(plan_collection(RunContext(cfg)), home, []).exit_code
 
 
+@pytest.mark.full
 def test_seeds_go_on_until_the_episodes_are_there(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -500,6 +510,7 @@ FROM_LAYOUT = [
 ]
 
 
+@pytest.mark.full
 def test_a_layout_counts_by_its_content(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -532,6 +543,7 @@ def test_a_layout_counts_by_its_content(
     assert contents(Path.cwd()) == before
 
 
+@pytest.mark.full
 def test_a_layout_that_only_the_term_names_counts_too(folder: Path) -> None:
     homes = set()
     for path, text in (("a.csv", LAYOUT), ("b.csv", LAYOUT), ("b.csv", LAYOUT + "\n")):
@@ -546,6 +558,7 @@ def test_a_layout_that_only_the_term_names_counts_too(folder: Path) -> None:
     assert len(homes) == 2
 
 
+@pytest.mark.full
 def test_failures_are_kept_and_marked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def break_two(seed: int, values: torch.Tensor) -> None:
         values[3, 2:3] = torch.nan  # a world that diverged: of no use
@@ -569,6 +582,7 @@ def test_failures_are_kept_and_marked(folder: Path, monkeypatch: pytest.MonkeyPa
     assert any(line.startswith("1 episodes with a number that is not finite") for line in details)
 
 
+@pytest.mark.full
 def test_an_expert_that_never_succeeds_is_given_up(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -589,6 +603,7 @@ def test_an_expert_that_never_succeeds_is_given_up(
     assert report_of(folder)["gates"][0]["metrics"]["success_rate"] == pytest.approx(4 / 10)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("keep_failures", [False, True])
 def test_worlds_of_which_none_is_finite_are_given_up(
     folder: Path, keep_failures: bool, monkeypatch: pytest.MonkeyPatch
@@ -608,6 +623,7 @@ def test_worlds_of_which_none_is_finite_are_given_up(
     assert gate["metrics"]["episodes"] == 0
 
 
+@pytest.mark.full
 def test_ctrl_c_keeps_finished_batches(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(seed: int, values: torch.Tensor) -> None:
         if seed == 1:
@@ -629,6 +645,7 @@ def test_ctrl_c_keeps_finished_batches(folder: Path, monkeypatch: pytest.MonkeyP
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
 
 
+@pytest.mark.full
 def test_a_full_disk_is_one_line(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -656,6 +673,7 @@ def test_a_full_disk_is_one_line(
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
 
 
+@pytest.mark.full
 def test_a_kill_in_the_middle_of_a_batch(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Killed when the batch's first data file is committed and an episode of the second one is on
     the disk.
@@ -720,6 +738,7 @@ run(ARGS)
     assert report_of(folder)["gates"][0]["metrics"]["succeeded"] == 8
 
 
+@pytest.mark.full
 def test_damaged_notes_are_one_line(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -733,6 +752,7 @@ def test_damaged_notes_are_one_line(
     assert f"{FILE} cannot be read (JSONDecodeError)" in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_the_buffer_bounds_the_worlds() -> None:
     cfg = load_config([*COMMAND, "nworld=100"])
     env = build_env(demonstration_config(cfg), nworld=1, backend=Backend.native, device="cpu")
@@ -762,6 +782,7 @@ def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> No
             assert np.array_equal(arrays["b"], values[:, world, 3:].numpy())
 
 
+@pytest.mark.full
 def test_mjwarp_demonstrations(folder: Path) -> None:
     assert (
         run(
@@ -785,6 +806,7 @@ def test_mjwarp_demonstrations(folder: Path) -> None:
     assert np.abs(steps["observation.state"][51:, :6] - steps["action"][50:-1, :6]).max() < 0.1
 
 
+@pytest.mark.full
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_demonstrations_on_cuda(folder: Path) -> None:

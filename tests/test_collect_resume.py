@@ -36,6 +36,8 @@ from mjstack.jobs.demonstration import play_demonstrations
 from mjstack.jobs.runner import run_provenance
 from mjstack.report.record import GateResult, Status
 
+pytestmark = pytest.mark.full
+
 COMMAND = ["job=collect", "sim=native"]
 
 

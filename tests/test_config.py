@@ -297,6 +297,7 @@ BAD = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
 def test_bad_input_is_one_line(overrides: list[str], says: str) -> None:
     with pytest.raises(MjstackError) as caught:
@@ -320,6 +321,7 @@ def test_a_swapped_function_does_not_inherit_parameters() -> None:
     assert check == {"func": "mine.Check", "window": 7}
 
 
+@pytest.mark.full
 def test_every_field_says_what_it_means() -> None:
     keys = list(list_keys(load_config()))
     assert len(keys) > 150
@@ -329,6 +331,7 @@ def test_every_field_says_what_it_means() -> None:
     assert (rate.value, rate.accepts) == ("0.99", "a number from 0 to 1")
 
 
+@pytest.mark.full
 def test_the_reference_has_every_group_and_job() -> None:
     text = reference_markdown()
     for key in ("nworld", "gate.batch.seeds", "controller.phases.NAME.gripper", "job.margin"):
@@ -349,6 +352,7 @@ def test_native_on_cuda_is_refused() -> None:
     assert caught.value.exit_code == 2
 
 
+@pytest.mark.full
 def test_missing_menagerie_folder_is_refused(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

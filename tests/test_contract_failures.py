@@ -42,6 +42,7 @@ def rules(bits: torch.Tensor) -> list[set[str]]:
     return [set(rules_of("stack").broken(int(b))) for b in bits]
 
 
+@pytest.mark.full
 def test_native(
     robot: str, stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]
 ) -> None:
@@ -70,6 +71,7 @@ def test_native(
     assert found[5] == {"STEPS"}
 
 
+@pytest.mark.full
 def test_mjwarp(stage: Callable[..., RunContext], make_sim: Callable[..., Simulation]) -> None:
     context = stage("so101", *at_double_speed())
     sim = make_sim("mjwarp", 3)
@@ -87,6 +89,7 @@ def test_mjwarp(stage: Callable[..., RunContext], make_sim: Callable[..., Simula
     assert {"FINITE", "STACKED"} <= found[2]
 
 
+@pytest.mark.full
 def test_nan_leaves_the_other_worlds_alone(
     backend: str, stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]
 ) -> None:
@@ -117,6 +120,7 @@ def crowd(context: RunContext, sim: Simulation, world: int) -> None:
     sim.qpos[world, blue + 2] = top + 0.015
 
 
+@pytest.mark.full
 def test_overflow_in_exactly_the_crowded_world(
     stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]
 ) -> None:
@@ -145,6 +149,7 @@ def test_overflow_in_exactly_the_crowded_world(
 FEW = ("sim=native", "nworld=2", "gate.capacity.random_steps=20", *at_double_speed())
 
 
+@pytest.mark.full
 def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., RunContext]) -> None:
     context = new_context(*FEW, "batch.njmax=100")
     (result,) = run_capacity(context)
@@ -165,6 +170,7 @@ def test_capacity_gate_passes_with_what_it_recommends(
     assert int(result.metrics["recommended.nconmax"]) <= 40
 
 
+@pytest.mark.full
 def test_capacity_gate_sizes_the_contact_pool(new_context: Callable[..., RunContext]) -> None:
     (result,) = run_capacity(new_context(*FEW, "batch.nconmax=8"))
     assert result.status is Status.failed
@@ -172,6 +178,7 @@ def test_capacity_gate_sizes_the_contact_pool(new_context: Callable[..., RunCont
     assert "batch.nconmax=" in result.reason
 
 
+@pytest.mark.full
 def test_batch_gate_names_world_and_rule_and_voids_throughput(
     new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -358,6 +358,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("survive", range(6))
 def test_a_kill_at_any_moment_keeps_what_was_committed(survive: int, tmp_path: Path) -> None:
     """SIGKILL before each file of the second commit takes its place: data, tasks, episodes,
@@ -418,6 +419,7 @@ def second_batch(writer: DatasetWriter) -> None:
     writer.flush()
 
 
+@pytest.mark.full
 def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
     """Wherever in the second batch the room ends: in each of its frames' files and in each of the
     small ones.
@@ -457,6 +459,7 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
     assert failed == 13
 
 
+@pytest.mark.full
 def test_a_real_limit_of_the_system(tmp_path: Path) -> None:
     """The kernel refuses to let a file grow, in the middle of the frames."""
     program = """

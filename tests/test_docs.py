@@ -50,6 +50,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             del sys.modules[name]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", GUIDES)
 def test_python_blocks_run(name: str, folder: Path) -> None:
     """From a file: Warp reads the source of kernels, so they cannot come from a string. A line
@@ -82,6 +83,7 @@ def shown_commands() -> list[dict[str, str]]:
     return commands
 
 
+@pytest.mark.full
 def test_shown_commands_compose() -> None:
     """Together where no key has two values: a composition takes half a second."""
     groups: list[list[dict[str, str]]] = []
@@ -130,6 +132,7 @@ def train(block: str, folder: Path) -> list[float]:
     return [float(match[1]) for match in found if match]
 
 
+@pytest.mark.full
 def test_training_block_learns(tmp_path: Path) -> None:
     """Without learning (a learning rate of 0) the return stays at 0.4 and varies by 0.1; with it,
     it passes 1.5.

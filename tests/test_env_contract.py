@@ -104,6 +104,7 @@ def test_a_masked_reset_touches_nobody_else(backend: str, task: str, robot: str)
     assert_traces(later, play(fresh, moves[6:]), chosen, chosen, backend)
 
 
+@pytest.mark.full
 def test_starts_depend_on_seed_world_and_episode_alone(robot: str) -> None:
     """On how many worlds there are, which of them reset with it, and the backend they do not."""
     cfg = randomized("reach", robot)
@@ -188,6 +189,7 @@ def test_the_seed_decides_the_episode(backend: str, task: str, robot: str) -> No
 # Outputs are written anew
 
 
+@pytest.mark.full
 @scenes
 def test_outputs_filled_with_nan_change_nothing(backend: str, task: str, robot: str) -> None:
     cfg = randomized(task, robot, steps=4)
@@ -392,6 +394,7 @@ def test_noise_is_keyed_and_within_its_width() -> None:
     assert not noises(env, 0).any()
 
 
+@pytest.mark.full
 def test_noise_then_clip_then_scale(backend: str) -> None:
     cfg = configure("task=stack", "reset=nominal")
     term = cfg.observation["policy"].terms["joint_vel"]
@@ -439,6 +442,7 @@ def assert_layout(env: Env, row: dict[str, torch.Tensor]) -> None:
             assert value.dtype is (torch.float32 if name == "reward" else torch.bool)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("action", ["joint_relative", "joint_absolute", "joint_delta", "ee_delta"])
 def test_every_action_group_steps(backend: str, robot: str, action: str) -> None:
     cfg = without_ends(configure("task=stack", f"action={action}", "reset=jitter", robot=robot))
@@ -501,6 +505,7 @@ def test_every_action_group_steps(backend: str, robot: str, action: str) -> None
         assert_same_run(*commands, backend)
 
 
+@pytest.mark.full
 def test_end_effector_delta_moves_the_commanded_grasp_point(backend: str, robot: str) -> None:
     """The command's forward kinematics, by native MuJoCo, moves by 1 cm along each axis in turn."""
     env = on_shared_sim(
@@ -536,6 +541,7 @@ def test_end_effector_delta_moves_the_commanded_grasp_point(backend: str, robot:
         )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("reset", ["nominal", "jitter", "randomized"])
 @pytest.mark.parametrize("task", ["stack", "reach"])
 def test_every_reset_group_steps(backend: str, task: str, robot: str, reset: str) -> None:
@@ -682,6 +688,7 @@ def test_statistics_are_those_of_the_episodes_that_ended(backend: str) -> None:
 # Long runs
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("kind", "nworld", "steps"), [("native", 16, 300), ("mjwarp", 4, 60)])
 def test_random_actions_for_a_while(kind: str, nworld: int, steps: int) -> None:
     """`python tests/env_soak.py` makes it long."""

@@ -152,6 +152,7 @@ def test_step_before_reset(cfg: Config) -> None:
     env.step(zeros(env))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("seed", [-1, 1 << 32])
 def test_configured_seed_out_of_range(seed: int) -> None:
     fails(ConfigError, lambda: make_env(["sim=native"], nworld=1, seed=seed), f"seed={seed}")
@@ -180,6 +181,7 @@ def test_overrides_as_a_configuration() -> None:
     )  # type: ignore[arg-type]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("override", "words"),
     [
@@ -594,6 +596,7 @@ def test_randomisation_out_of_range(key: str, value: object) -> None:
     fails(ConfigError, lambda: build(cfg), f"reset.cubes.params.{key}=")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("name", "params"),
     [
@@ -620,6 +623,7 @@ def warp_env(cfg: Config, **batch: int) -> Env:
     return build_env(cfg, nworld=2, backend=Backend.mjwarp, device="cpu")
 
 
+@pytest.mark.full
 def test_contact_pool_too_small_for_the_start() -> None:
     env = warp_env(configure("reset=randomized"), nconmax=1)
     message = fails(
@@ -657,6 +661,7 @@ def test_contact_pool_too_small_for_the_start() -> None:
     fails(FaultError, whole.reset, "batch.naconmax=2", "Raise it to more than batch.naconmax=")
 
 
+@pytest.mark.full
 def test_constraint_rows_too_few_without_the_termination(cfg: Config) -> None:
     """Each step of a resting start needs some 100 rows; the environment says so at the
     first step.
@@ -676,6 +681,7 @@ def test_constraint_rows_too_few_without_the_termination(cfg: Config) -> None:
     assert int(rows[1]) > 40
 
 
+@pytest.mark.full
 def test_constraint_rows_too_few_end_episodes_with_the_termination(cfg: Config) -> None:
     env = warp_env(cfg, njmax=40)
     env.reset()

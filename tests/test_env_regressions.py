@@ -18,6 +18,8 @@ from mjstack.envs import Env, build_env
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, FaultError, MissingField, TermError
 
+pytestmark = pytest.mark.full
+
 
 def native(*overrides: str, nworld: int = 2) -> Env:
     return make_env(["sim=native", *overrides], nworld=nworld)

@@ -41,6 +41,7 @@ def reads_the_device(env: EnvView) -> torch.Tensor:
     return torch.full((env.nworld,), bool(env.sim.qpos[0, 0].item() > 1e9), device=env.device)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
     """300 steps. On the CPU device bit for bit; on CUDA, where two runs of the same differ, the
@@ -133,6 +134,7 @@ def test_the_kernel_draws_what_the_generator_draws(device: str) -> None:
         torch.testing.assert_close(scaled.cpu(), 0.7 + 0.3 * (plain + 1.0), rtol=1e-6, atol=0.0)
 
 
+@pytest.mark.full
 @pytest.mark.gpu
 @CUDA
 @pytest.mark.parametrize("graph", ["require", "auto"])
@@ -165,6 +167,7 @@ def test_a_term_that_reads_the_device_is_named(
     assert int(other.sim.step_count[0]) == 30
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_new_size_is_captured_anew(backend: str) -> None:
     env = make(backend, "auto", 4, "~termination.overflow")
@@ -193,6 +196,7 @@ def _step_and_look(env: Env, action: torch.Tensor) -> None:
     env.raise_faults()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_new_option_is_captured_anew(backend: str) -> None:
     """A captured step bakes the iteration limit in."""
@@ -253,6 +257,7 @@ def test_without_capture_the_work_just_runs() -> None:
     assert not graph.captured
 
 
+@pytest.mark.full
 @pytest.mark.gpu
 @CUDA
 def test_an_episode_of_the_gate_is_captured_and_accepted() -> None:

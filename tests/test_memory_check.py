@@ -20,6 +20,8 @@ from mjstack.report.record import GateResult, Status
 from mjstack.scene import build_model
 from mjstack.sim.native import NativeSimulation, native_bytes
 
+pytestmark = pytest.mark.full
+
 MANY = 100_000_000
 
 

@@ -93,6 +93,7 @@ def start(sim: Simulation, context: RunContext) -> None:
     sim.ctrl[:, torch.from_numpy(context.index.ctrl)] += 0.05
 
 
+@pytest.mark.full
 def test_every_field_has_mujocos_shape_and_values(
     backend: str, make_fields: Make, stage: Stage
 ) -> None:
@@ -108,6 +109,7 @@ def test_every_field_has_mujocos_shape_and_values(
             np.testing.assert_allclose(field[k].cpu().numpy(), value, rtol=1e-6, err_msg=name)
 
 
+@pytest.mark.full
 def test_the_models_values_change_nothing(
     backend: str, make_fields: Make, make_sim: Make, stage: Stage
 ) -> None:
@@ -120,6 +122,7 @@ def test_the_models_values_change_nothing(
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.full
 def test_the_names_are_those_that_mjwarp_batches(make_fields: Make) -> None:
     make_fields("mjwarp")  # sets Warp up
     from dataclasses import fields as dataclass_fields
@@ -137,6 +140,7 @@ def test_the_names_are_those_that_mjwarp_batches(make_fields: Make) -> None:
     assert set(FIELD_NAMES) <= floats
 
 
+@pytest.mark.full
 def test_fields_keep_their_address(backend: str, make_fields: Make) -> None:
     sim = make_fields(backend)
     before = {name: field.data_ptr() for name, field in sim.fields.items()}
@@ -154,6 +158,7 @@ def test_fields_keep_their_address(backend: str, make_fields: Make) -> None:
         sim.fields["geom_size"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("name", "nearest"),
     [("body_mas", "body_mass"), ("geom_frictoin", "geom_friction"), ("bodymass", "body_mass")],
@@ -177,6 +182,7 @@ def test_an_unknown_field_names_the_nearest(
     assert caught.value.exit_code == 2
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["geom_dataid", "body_parentid", "dof_M0", "opt"])
 def test_a_field_that_cannot_differ_is_refused(stage: Stage, name: str) -> None:
     for kind in (Backend.native, Backend.mjwarp):
@@ -218,6 +224,7 @@ def test_a_heavy_cube_is_slowed_less(backend: str, make_fields: Make, stage: Sta
         assert float(sim.qvel[k, v + 2]) == pytest.approx(fall, rel=1e-3), k
 
 
+@pytest.mark.full
 def test_friction_stops_a_cube_in_one_world_only(
     backend: str, make_fields: Make, stage: Stage
 ) -> None:
@@ -254,6 +261,7 @@ STATIC = """
 """
 
 
+@pytest.mark.full
 def test_static_geoms_follow_their_fields(backend: str) -> None:
     """MJWarp by itself places geoms that never move once, when the data is made."""
     m = mujoco.MjModel.from_xml_string(STATIC)
@@ -291,6 +299,7 @@ def test_static_geoms_follow_their_fields(backend: str) -> None:
     assert sim.contact_count.tolist() == [0, 1, 0]
 
 
+@pytest.mark.full
 def test_world_k_of_n_is_world_k_of_one(backend: str, make_fields: Make, stage: Stage) -> None:
     many = make_fields(backend)
     context = stage("so101")
@@ -299,6 +308,7 @@ def test_world_k_of_n_is_world_k_of_one(backend: str, make_fields: Make, stage: 
     assert_worlds_step_alone(many, make_fields(backend, 1), backend)
 
 
+@pytest.mark.full
 def test_reset_leaves_fields(backend: str, make_fields: Make, stage: Stage) -> None:
     sim = make_fields(backend)
     randomise(sim, stage("so101"))
@@ -310,6 +320,7 @@ def test_reset_leaves_fields(backend: str, make_fields: Make, stage: Stage) -> N
         assert torch.equal(field, before[name]), name
 
 
+@pytest.mark.full
 def test_reset_starts_from_the_worlds_own_qpos0(backend: str, make_fields: Make) -> None:
     sim = make_fields(backend, N, ("qpos0",))
     expected = sim.qpos.clone()
@@ -372,6 +383,7 @@ def test_a_scaled_free_body_is_what_set_const_computes(stage: Stage) -> None:
     assert derived.body_mass[body] == s * context.model.body_mass[body]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "joints",
     [
@@ -411,6 +423,7 @@ def test_native_mass_matrix_of_a_simple_body_follows_its_mass(joints: str) -> No
         np.testing.assert_allclose(sim.qpos[k], data.qpos, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.full
 def test_buffer_sizes_can_be_given(make_fields: Make, stage: Stage) -> None:
     sizes = BatchSizes(nconmax=40, njmax=200)
     sim = make_simulation(

@@ -177,6 +177,7 @@ def test_lowest_point_of_any_shape(shape: str) -> None:
         assert float(found) == pytest.approx(want, abs=1e-6)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("objects", [ONE, MANY], ids=["one", "many"])
 def test_random_starts_keep_apart_and_come_back_from_a_file(
     folder: Callable[[str], Path], objects: str, tmp_path: Path
@@ -288,6 +289,7 @@ def test_what_is_stacked_is_higher_from_then_on() -> None:
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -308,6 +310,7 @@ def test_a_scene_that_cannot_be(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("task", ["stack", "box"])
 def test_starts_and_commands_are_those_of_before(robot: str, task: str) -> None:
     """Recorded at commit 3e08f6d, which knew two cubes only: starts, joint targets of drivers."""

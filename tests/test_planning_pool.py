@@ -20,6 +20,8 @@ from mjstack.episodes.context import RunContext
 from mjstack.errors import Unreachable, WorkerLost
 from mjstack.scene.phases import nominal_xy
 
+pytestmark = pytest.mark.full
+
 Stage = Callable[[str], RunContext]
 Workers = list[planning_pool._Worker]
 FAR = [1.5, 0.0]

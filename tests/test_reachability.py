@@ -67,6 +67,7 @@ def test_solutions_are_where_mujoco_says(stage: Stage, robot: str, grip: str) ->
             assert ik.solve(point, np.array(gripper), ik.home)[1] < 5e-4  # mink gets there too
 
 
+@pytest.mark.full
 def test_the_tilt_is_that_of_the_gripper_and_the_smallest(stage: Stage, robot: str) -> None:
     cfg = stage(robot).cfg
     model = stage(robot).model
@@ -98,6 +99,7 @@ def test_the_tilt_is_that_of_the_gripper_and_the_smallest(stage: Stage, robot: s
         assert reach._tilt(found[left < 5e-4]).min() > tilt - math.radians(0.5)
 
 
+@pytest.mark.full
 def test_out_of_reach_is_as_far_as_it_is(stage: Stage, robot: str) -> None:
     cfg = stage(robot).cfg
     reach = PointReach(stage(robot).model, cfg.robot, cfg.robot.gripper_open)
@@ -110,6 +112,7 @@ def test_out_of_reach_is_as_far_as_it_is(stage: Stage, robot: str) -> None:
     assert distance[1] - distance[0] == pytest.approx(0.1, abs=1e-3)
 
 
+@pytest.mark.full
 def test_joints_stay_within_both_ranges(stage: Stage, robot: str) -> None:
     cfg = stage(robot).cfg
     model = stage(robot).model
@@ -131,6 +134,7 @@ REGIONS = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("robot", "xy", "says"), REGIONS)
 def test_a_region_beyond_the_arm_is_refused(robot: str, xy: str, says: str | None) -> None:
     overrides = [f"robot={robot}", "sim=native", "reset=randomized", f"reset.cubes.params.xy={xy}"]
@@ -148,6 +152,7 @@ def test_a_region_beyond_the_arm_is_refused(robot: str, xy: str, says: str | Non
     assert "\n" not in message
 
 
+@pytest.mark.full
 def test_randomized_takes_the_layouts_region_and_the_command_line_another() -> None:
     cfg = mjstack.load_config(["reset=randomized", "robot.placements.stack.random_xy=[0.02,0.04]"])
     assert cfg.reset["cubes"].params["xy"] == [0.02, 0.04]
@@ -230,6 +235,7 @@ def with_wall(
     return build_scene(spec, cfg.scene, cfg.timing, cfg.solver, jaw_bodies=cfg.robot.jaw_bodies)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("euler", [0.0, 0.6])
 def test_nothing_starts_in_a_wall(robot: str, euler: float) -> None:
     cfg = configure("reset=randomized", robot=robot)
@@ -286,6 +292,7 @@ def touches_arm(
     return any(cube in pair and model.geom("table").id not in pair for pair in pairs)
 
 
+@pytest.mark.full
 def test_nothing_starts_at_the_arm_wherever_noise_puts_it() -> None:
     """Around the jaws of a SO-101 that has come down to the table."""
     cfg = configure(
@@ -315,6 +322,7 @@ def test_nothing_starts_at_the_arm_wherever_noise_puts_it() -> None:
     assert hit.sum() > 30
 
 
+@pytest.mark.full
 def test_all_of_the_region_is_drawn_from(robot: str, stage: Stage) -> None:
     """Nothing but the other cube keeps one from any place of it."""
     for task in ("stack", "box"):
@@ -340,6 +348,7 @@ def test_all_of_the_region_is_drawn_from(robot: str, stage: Stage) -> None:
             assert bool(placement._choose(draws)[1].all()), (task, cube)
 
 
+@pytest.mark.full
 def test_a_wall_that_leaves_no_room_is_said() -> None:
     cfg = configure("reset=randomized")
     model = with_wall(
@@ -357,6 +366,7 @@ def test_a_wall_that_leaves_no_room_is_said() -> None:
         placement.require_room("xy", [0.05, 0.05], 16)
 
 
+@pytest.mark.full
 def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
     """Red's first free candidate alone would leave blue no place in some worlds."""
     overrides = [
@@ -394,6 +404,7 @@ def level(cfg: Config, reached: Callable[[np.ndarray, np.ndarray], np.ndarray]) 
     )
 
 
+@pytest.mark.full
 def test_regions_stay_inside_what_is_reached() -> None:
     cfg = mjstack.load_config(["job=reachability", "job.step=0.005", "job.margin=0.01"])
     x0, y0 = cfg.scene.objects["red"].xy
@@ -421,6 +432,7 @@ def test_regions_stay_inside_what_is_reached() -> None:
         assert 0.0 <= edge - everywhere.largest[k] <= 0.001
 
 
+@pytest.mark.full
 def test_levels_are_the_controllers(robot: str) -> None:
     cfg = mjstack.load_config([f"robot={robot}", "job=reachability"])
     h = cfg.robot.approach_height + 0.022
@@ -475,6 +487,7 @@ def test_the_job_leaves_a_map(
     assert "largest square" in capsys.readouterr().out
 
 
+@pytest.mark.full
 def test_a_region_that_is_not_reached_fails_the_job(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -490,6 +503,7 @@ def test_a_region_that_is_not_reached_fails_the_job(
     assert json.loads((tmp_path / "report.json").read_text())["status"] == "fail"
 
 
+@pytest.mark.full
 def test_an_interrupted_job_keeps_its_levels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -510,6 +524,7 @@ def test_an_interrupted_job_keeps_its_levels(
     assert "carry" not in head
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [

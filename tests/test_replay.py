@@ -180,6 +180,7 @@ def test_trajectory_holds_the_episode(
     sim.close()
 
 
+@pytest.mark.full
 def test_saved_configuration_is_the_runs_own(
     earlier: Path, succeeded: tuple[Path, int, dict]
 ) -> None:
@@ -200,6 +201,7 @@ def test_saved_configuration_is_the_runs_own(
     assert (played.seed, played.task.check.xy_err) == (1, 0.0015)
 
 
+@pytest.mark.full
 def test_another_verdict_is_said(
     earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
@@ -322,6 +324,7 @@ def test_what_is_promised_of_another_end(
     assert says in found[1]
 
 
+@pytest.mark.full
 def test_a_start_that_is_not_the_recorded_one_is_refused(
     earlier: Path,
     tmp_path: Path,
@@ -373,6 +376,7 @@ def from_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home / "run"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("gate", ["batch", "success"])
 def test_a_run_from_a_file_replays_from_its_own_copy(
     gate: str, from_file: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path
@@ -389,6 +393,7 @@ def test_a_run_from_a_file_replays_from_its_own_copy(
         assert held["field.body_mass"][-2:].tolist() == [0.09, 0.08]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("edit", "says"),
     [
@@ -428,6 +433,7 @@ def test_another_layout_is_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["copy"]
 
 
+@pytest.mark.full
 def test_what_the_start_does_not_show_is_found_at_the_end(
     from_file: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
@@ -441,6 +447,7 @@ def test_what_the_start_does_not_show_is_found_at_the_end(
     assert status == 1
 
 
+@pytest.mark.full
 def test_copies_of_layouts(tmp_path: Path) -> None:
     """Each file once, byte for byte, and those of an earlier run in the folder go unless they are
     read.
@@ -483,6 +490,7 @@ def test_copies_of_layouts(tmp_path: Path) -> None:
     assert list(copy_names(plain)) == [f"{tmp_path}/a.csv", str(own)]
 
 
+@pytest.mark.full
 def test_run_that_did_not_get_to_the_world(
     earlier: Path,
     replay: Callable[..., tuple[int, dict]],
@@ -507,6 +515,7 @@ def test_run_that_did_not_get_to_the_world(
         assert any(line in detail for detail in gate["details"])
 
 
+@pytest.mark.full
 def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
     replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
@@ -529,6 +538,7 @@ def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
         assert not np.isclose(held["field.body_mass"][-2:], 0.08).any()  # scaled
 
 
+@pytest.mark.full
 def test_mjwarp_world_is_played_on_both_engines(
     replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
@@ -618,6 +628,7 @@ BAD = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("args", "says"), BAD, ids=[" ".join(args) for args, _ in BAD])
 def test_bad_input_is_one_line_and_writes_nothing(
     args: list[str],
@@ -694,6 +705,7 @@ def _replace(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", DAMAGE)
 def test_damaged_folder_is_one_line_and_writes_nothing(
     name: str,
@@ -711,6 +723,7 @@ def test_damaged_folder_is_one_line_and_writes_nothing(
     assert [path.name for path in tmp_path.iterdir()] == ["copy"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("args", [["run=somewhere"], ["world=3"]])
 def test_keys_of_replay_belong_to_replay(
     args: list[str], capsys: pytest.CaptureFixture[str]

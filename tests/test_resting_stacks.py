@@ -16,6 +16,8 @@ from mjstack.math import quat_from_yaw
 from mjstack.scene import SceneIndex, build_model, table_top
 from mjstack.sim import make_simulation
 
+pytestmark = pytest.mark.full
+
 NWORLD = 512
 SECONDS = 5.0
 

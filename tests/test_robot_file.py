@@ -43,6 +43,7 @@ def test_the_file_is_relative_to_the_yaml_that_names_it() -> None:
     assert scara().robot.file == str(SCARA / "scara.xml")
 
 
+@pytest.mark.full
 def test_the_file_can_be_absolute_or_relative_to_the_working_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -63,6 +64,7 @@ def test_a_profile_without_start_title_and_ik_joints_gets_them() -> None:
     assert load_config(["robot.title=''"]).robot.title == "so101"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("file", ["arm.xml", "/no/folder/arm.xml"])
 def test_a_missing_file_is_refused(file: str) -> None:
     with pytest.raises(ConfigError, match=f"robot.file={file}: expected an MJCF file") as caught:
@@ -70,6 +72,7 @@ def test_a_missing_file_is_refused(file: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.full
 def test_a_robot_without_a_file_is_refused() -> None:
     with pytest.raises(
         ConfigError, match=r"robot\.file=null: expected the MJCF file of robot mine"
@@ -77,6 +80,7 @@ def test_a_robot_without_a_file_is_refused() -> None:
         build_model(load_config(["robot.name=mine"]))
 
 
+@pytest.mark.full
 def test_menagerie_without_its_names_is_refused() -> None:
     cfg = load_config(["model=menagerie", "robot.menagerie_name=''"])
     with pytest.raises(ConfigError, match=r"robot\.menagerie_name=: expected"):
@@ -104,6 +108,7 @@ BROKEN = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("old", "new", "error", "message"), BROKEN)
 def test_a_file_that_does_not_fit_the_profile_is_refused(
     old: str, new: str, error: type[MjstackError], message: str, tmp_path: Path

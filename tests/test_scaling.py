@@ -66,6 +66,7 @@ def stamps(folder: Path) -> dict[str, int]:
     return {path.parent.name: path.stat().st_mtime_ns for path in home(folder).rglob("run.json")}
 
 
+@pytest.mark.full
 def test_runs_resume_and_leave_table_and_plot(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -117,6 +118,7 @@ def test_runs_resume_and_leave_table_and_plot(
     assert [path.name for path in folder.iterdir()] == ["outputs"]
 
 
+@pytest.mark.full
 def test_failing_run_is_a_gap_and_runs_again_if_asked(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -272,6 +274,7 @@ def test_a_call_that_is_too_short_still_tries_its_first_run(
     assert "incomplete: 2 of 2 runs have not run (stopped)" in capsys.readouterr().out
 
 
+@pytest.mark.full
 def test_failed_plot_takes_nothing_back(
     folder: Path,
     simulated: list[tuple[int, str]],
@@ -287,6 +290,7 @@ def test_failed_plot_takes_nothing_back(
     assert ("native", 1) in table(folder)
 
 
+@pytest.mark.full
 def test_full_disk_is_one_line(
     folder: Path,
     simulated: list[tuple[int, str]],
@@ -304,6 +308,7 @@ def test_full_disk_is_one_line(
     assert len(err.strip().splitlines()) == 1
 
 
+@pytest.mark.full
 def test_full_disk_at_ctrl_c_is_one_line_too(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -334,6 +339,7 @@ def alive(marker: str) -> list[str]:
     return found
 
 
+@pytest.mark.full
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="no /proc here")
 def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
     marker = f"MJSTACK_TEST={folder.name}"
@@ -375,6 +381,7 @@ def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
     assert alive(marker) == []
 
 
+@pytest.mark.full
 def test_folder_depends_on_what_a_run_depends_on() -> None:
     def name(*overrides: str) -> str:
         return str(scaling_folder(load_config(["job=scaling", *overrides])))
@@ -403,6 +410,7 @@ def test_folder_depends_on_what_a_run_depends_on() -> None:
         assert name(override) != same, override
 
 
+@pytest.mark.full
 def test_folder_depends_on_a_layouts_content(tmp_path: Path) -> None:
     def name(path: Path) -> str:
         return str(
@@ -474,6 +482,7 @@ BAD = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("args", BAD, ids=[" ".join(args) for args in BAD])
 def test_bad_input_is_one_line_and_writes_nothing(
     args: list[str], folder: Path, capsys: pytest.CaptureFixture[str]

@@ -95,6 +95,7 @@ def test_an_environment_of_another_folder(lean: Path) -> None:
         load_config(["task=lean"])
 
 
+@pytest.mark.full
 def test_the_search_path_is_an_override_too(lean: Path) -> None:
     cfg = load_config([f"hydra.searchpath=[file://{lean}]", "task=lean"])
     assert cfg.reward["height"].func == "lean.height"
@@ -103,6 +104,7 @@ def test_the_search_path_is_an_override_too(lean: Path) -> None:
     assert load_config([override, "task=lean"]).task.name == "lean"
 
 
+@pytest.mark.full
 def test_help_and_cfg_see_the_folder(lean: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["--config-dir", str(lean), "--help"]) == 0
     assert "stack, box, lean, reach" in " ".join(capsys.readouterr().out.split())
@@ -111,6 +113,7 @@ def test_help_and_cfg_see_the_folder(lean: Path, capsys: pytest.CaptureFixture[s
     assert "Did you mean 'lean'?" in refused(["-cd", str(lean), "task=lea"], capsys)
 
 
+@pytest.mark.full
 def test_a_sweep_and_a_replay(
     lean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

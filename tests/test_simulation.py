@@ -250,6 +250,7 @@ def test_forward_writes_every_derived_number(backend: str, make_sim: Make, stage
     assert torch.equal(sim.qvel, state[1])
 
 
+@pytest.mark.full
 def test_activations_and_sensors(backend: str, sensing: Callable[[str], Simulation]) -> None:
     sim = sensing(backend)
     m = sim.model
@@ -325,6 +326,7 @@ def test_kinematics_changes_no_physics(backend: str, make_sim: Make, stage: Stag
         assert torch.equal(a, b)
 
 
+@pytest.mark.full
 def test_native_kinematics_visits_masked_worlds_only(make_sim: Make, stage: Stage) -> None:
     sim = make_sim("native", N)
     start(sim, stage("so101"))
@@ -373,6 +375,7 @@ def test_options_as_uploaded(backend: str, make_sim: Make) -> None:
     assert options["box_box"] == "primitive"
 
 
+@pytest.mark.full
 def test_captured_and_uncaptured_steps_agree(make_sim: Make, stage: Stage) -> None:
     finals = []
     for overrides in ((), ("graph=off",)):
@@ -414,6 +417,7 @@ def test_native_threads_do_not_matter(make_sim: Make, stage: Stage) -> None:
     assert torch.equal(*finals)
 
 
+@pytest.mark.full
 def test_unsupported_model_says_so_in_one_line() -> None:
     spec = mujoco.MjSpec()
     spec.worldbody.add_body(name="b").add_geom(size=[0.1, 0, 0])
@@ -428,6 +432,7 @@ def test_unsupported_model_says_so_in_one_line() -> None:
     assert caught.value.exit_code == 1
 
 
+@pytest.mark.full
 def test_random_stacks_come_to_rest_on_mjwarp() -> None:
     """A few stacks on the CPU device. Only the hundreds of tests/test_resting_stacks.py tell the
     two box colliders apart.

@@ -115,6 +115,7 @@ def assert_same(result: CheckResult, k: int, expected: Outcome) -> None:
         ), name
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_recorded_episodes(
     robot: str, recorded: Callable[[str], SimpleNamespace], dtype: torch.dtype
@@ -382,6 +383,7 @@ def test_altered_recording(name: str, altered: Altered) -> None:
     assert_same(result, k, reference(world))
 
 
+@pytest.mark.full
 def test_episode_cut_short_fails_whatever_came_before(
     recorded: Callable[[str], SimpleNamespace],
 ) -> None:

@@ -76,6 +76,7 @@ def plain_rows(cfg: Config, n: int = N) -> Rows:
     ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("reset", ["randomized", "jitter"])
 def test_what_was_written_starts_alike_to_the_last_float32_digit(
     backend: str, robot: str, reset: str, tmp_path: Path
@@ -137,6 +138,7 @@ def test_the_columns_say_what_is_in_the_worlds(robot: str, tmp_path: Path) -> No
             assert gain == pytest.approx(value[f"gain_{name}"], rel=1e-15)
 
 
+@pytest.mark.full
 def test_absent_columns_leave_the_models_own(backend: str, robot: str, tmp_path: Path) -> None:
     cfg = from_file(tmp_path / "worlds.csv", robot=robot)
     rows = plain_rows(cfg)
@@ -194,6 +196,7 @@ def test_a_masked_reset_writes_its_worlds_alone(backend: str, tmp_path: Path) ->
         assert torch.equal(now[name][2], first[name][2]), name
 
 
+@pytest.mark.full
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_a_captured_step_starts_worlds_from_the_file(tmp_path: Path) -> None:
@@ -441,6 +444,7 @@ def test_values_within_the_configured_ranges_alone(tmp_path: Path) -> None:
     assert float(env.sim.fields["body_mass"][0, env.index.bodies["red"]]) == 0.05
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("args", "says"),
     [
@@ -468,6 +472,7 @@ def test_the_command_line_refuses_before_anything_is_written(
     assert [path.name for path in tmp_path.iterdir()] == ["worlds.csv"]
 
 
+@pytest.mark.full
 def test_a_batch_plays_the_worlds_of_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -84,6 +84,7 @@ def test_native_study(tmp_path: Path) -> None:
     assert "![study.png](study.png)" in text
 
 
+@pytest.mark.full
 def test_a_broken_variant_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make = study._simulation
 
@@ -108,6 +109,7 @@ def test_a_broken_variant_stops_no_other(tmp_path: Path, monkeypatch: pytest.Mon
     assert report(tmp_path)["status"] == "fail"
 
 
+@pytest.mark.full
 def test_without_a_base_there_is_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(_: RunContext) -> Simulation:
         raise RuntimeError("no room")
@@ -118,6 +120,7 @@ def test_without_a_base_there_is_a_report(tmp_path: Path, monkeypatch: pytest.Mo
     assert only["reason"] == "the configured solver cannot be timed: no room"
 
 
+@pytest.mark.full
 def test_ctrl_c_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     measure = study._measure
     calls = []
@@ -138,6 +141,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert [gate["name"] for gate in found["gates"]] == ["base"]
 
 
+@pytest.mark.full
 def test_mjwarp_tells_who_stopped_at_a_limit(tmp_path: Path) -> None:
     cfg = configure("sim=mjwarp", "sim.device=cpu", "nworld=1", keep=("base", "ls_iterations_5"))
     assert run_study_job(RunContext(cfg), tmp_path, []).status is Status.passed
@@ -151,6 +155,7 @@ def test_limits_are_no_lost_physics() -> None:
     assert LOST_PHYSICS & int(SolverLimit.ITERATIONS | SolverLimit.LS_ITERATIONS) == 0
 
 
+@pytest.mark.full
 def test_no_time_for_worlds_that_diverged(
     make_sim: Callable[..., Simulation], backend: str
 ) -> None:
@@ -162,6 +167,7 @@ def test_no_time_for_worlds_that_diverged(
     assert describe_lost(lost_worlds(sim, 10)).startswith("1 worlds overflowed, diverged")
 
 
+@pytest.mark.full
 def test_a_variant_without_its_steps_has_no_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -183,6 +189,7 @@ def gripper_geoms(model: mujoco.MjModel, cfg: Config) -> np.ndarray:
     return np.isin(model.geom_bodyid, bodies)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("condim", [3, 4, 6])
 def test_gripper_condim_reaches_the_gripper_alone(robot: str, condim: int) -> None:
     plain_cfg = load_config([f"robot={robot}"])
@@ -195,6 +202,7 @@ def test_gripper_condim_reaches_the_gripper_alone(robot: str, condim: int) -> No
     assert set(plain.geom_condim[gripper]) <= {3, 4, 6}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_cone_reaches_both_backends(cone: str) -> None:
     cfg = load_config([f"solver.cone={cone}"])
@@ -231,6 +239,7 @@ BAD = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
 def test_bad_input_is_one_line_and_nothing_is_written(
     overrides: list[str],
@@ -247,6 +256,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.full
 def test_an_own_variant_takes_the_rest_from_the_configured_solver() -> None:
     cfg = load_config(
         ["job=study", "solver=asset", "+job.variants.mine={iterations: 7, cone: pyramidal}"]
@@ -257,6 +267,7 @@ def test_an_own_variant_takes_the_rest_from_the_configured_solver() -> None:
     check_job(cfg)
 
 
+@pytest.mark.full
 def test_the_box_is_studied_too(tmp_path: Path) -> None:
     cfg = configure("task=box", keep=("base",))
     assert run_study_job(RunContext(cfg), tmp_path, []).exit_code == 0

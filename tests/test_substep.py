@@ -83,6 +83,7 @@ def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
         assert torch.equal(ours.peak_pool, plain.peak_pool)
 
 
+@pytest.mark.full
 @pytest.mark.gpu
 @CUDA
 @pytest.mark.parametrize("robot", ["so101", "rebot"])

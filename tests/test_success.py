@@ -132,6 +132,7 @@ def test_small_region_passes(passed: Path) -> None:
         assert held["phase_names"].tolist() == PHASES
 
 
+@pytest.mark.full
 def test_rebot_passes(new_context: Callable[..., RunContext], tmp_path: Path) -> None:
     context = new_context("sim=native", "nworld=4", robot="rebot")
     result = play(context, tmp_path)
@@ -202,6 +203,7 @@ def hasty() -> Callable[..., RunContext]:
     return make
 
 
+@pytest.mark.full
 def test_seeds_add_up_and_the_rate_decides(
     hasty: Callable[..., RunContext], tmp_path: Path
 ) -> None:
@@ -244,6 +246,7 @@ def test_seeds_add_up_and_the_rate_decides(
     assert "2 of 2 episodes (0, 1) failed: " in result.reason
 
 
+@pytest.mark.full
 def test_both_backends_start_and_end_alike(passed: Path, warp: Path) -> None:
     native = record_of(passed)
     other = record_of(warp)
@@ -264,6 +267,7 @@ def test_both_backends_start_and_end_alike(passed: Path, warp: Path) -> None:
     assert "Warp" in notes["backend"]
 
 
+@pytest.mark.full
 def test_replay_plays_the_gates_world(passed: Path, warp: Path, tmp_path: Path) -> None:
     """Region, controller and file are the run's own: a native world ends bit for bit where it did,
     MJWarp's too.
@@ -284,6 +288,7 @@ def test_replay_plays_the_gates_world(passed: Path, warp: Path, tmp_path: Path) 
         assert np.array_equal(held["start_qpos"].astype(np.float32), theirs["start_qpos"][3])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("world", "says"),
     [("batch:1", "a gate that run had, success"), ("1:1", "seed 0"), ("6", "a world from 0 to 5")],
@@ -339,6 +344,7 @@ BAD = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("args", "says"), BAD, ids=[" ".join(args) for args, _ in BAD])
 def test_bad_input_is_one_line_and_writes_nothing(
     args: list[str],
@@ -362,6 +368,7 @@ def test_bad_input_is_one_line_and_writes_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.full
 def test_region_is_the_gates_alone() -> None:
     """Without the gate, its region is not tried; with it, no other start changes."""
     check_machine(load_config(["sim=native", "gates=[batch]", "gate.success.region=[0.1,0.1]"]))
@@ -378,6 +385,7 @@ class Stop(Exception):
     """Something that nobody foresaw."""
 
 
+@pytest.mark.full
 def test_what_stops_the_second_seed_keeps_the_first(
     hasty: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -398,6 +406,7 @@ def test_what_stops_the_second_seed_keeps_the_first(
     }
 
 
+@pytest.mark.full
 def test_full_disk_takes_no_verdict_back(
     hasty: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -528,6 +537,7 @@ def recount(
     return Sign.NONE, -1, -1
 
 
+@pytest.mark.full
 def test_signs_in_real_episodes(new_context: Callable[..., RunContext]) -> None:
     """Worlds that somebody interferes with: each shows its own sign, in its phase, and one is
     undisturbed.
@@ -571,6 +581,7 @@ def test_signs_in_real_episodes(new_context: Callable[..., RunContext]) -> None:
     assert watch.step.tolist()[4] == at["done"] + 6
 
 
+@pytest.mark.full
 def test_each_cube_of_the_box_has_its_own_release(monkeypatch: pytest.MonkeyPatch) -> None:
     """World by world: all well; red misses, blue does not; red is let go well and leaves under
     blue's approach; blue misses; blue leaves at the end."""
@@ -672,6 +683,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
     assert [row[0] for row in table.rows] == [found[0].where]
 
 
+@pytest.mark.full
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 @pytest.mark.parametrize("robot", ["so101", "rebot"])

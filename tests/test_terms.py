@@ -267,6 +267,7 @@ def cubes_of(
     return torch.stack(pose, -2).numpy(), torch.stack(velocity, -2).numpy()
 
 
+@pytest.mark.full
 def test_rewards_of_a_scripted_episode(
     robot: str, scripted: Callable[[str], SimpleNamespace]
 ) -> None:
@@ -312,6 +313,7 @@ def test_rewards_of_a_scripted_episode(
     assert got["success"][-1].min() == pytest.approx(1.0, rel=1e-5)
 
 
+@pytest.mark.full
 def test_jaw_force_is_mujocos_contact_force(
     robot: str, backend: str, scripted: Callable[[str], SimpleNamespace]
 ) -> None:
@@ -344,6 +346,7 @@ def test_jaw_force_is_mujocos_contact_force(
                 np.testing.assert_allclose(force[k], expected, rtol=0.05)
 
 
+@pytest.mark.full
 def test_jaw_force_has_a_column_for_each_jaw(robot: str) -> None:
     env = on_shared_sim("native", 3, configure(robot=robot))
     for cube in CUBES:
@@ -394,6 +397,7 @@ def jaw_forces(env: Env, world: int) -> list[float]:
     return out
 
 
+@pytest.mark.full
 def test_success_ends_a_scripted_episode(
     robot: str, stage: Stage, scripted: Callable[[str], SimpleNamespace]
 ) -> None:
@@ -620,6 +624,7 @@ def assert_success(
         )
 
 
+@pytest.mark.full
 def test_stack_success_is_rules_four_and_five(
     robot: str, scripted: Callable[[str], SimpleNamespace]
 ) -> None:
@@ -813,6 +818,7 @@ class Bench:
         return self.actions.previous_action
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["native", "mjwarp"])
 def test_managers_work_on_any_object_of_that_shape(kind: str) -> None:
     """And do there what they do in an environment: the same numbers from the same seed."""
@@ -900,6 +906,7 @@ def test_tables_show_settings_and_the_environment_shows_all_tables() -> None:
     assert "height=0.05" in row
 
 
+@pytest.mark.full
 def test_overrides_change_exactly_what_they_name() -> None:
     env = make_env(
         ["sim=native", "action=ee_delta", "reset=nominal", "~reward.grasp", "reward.lift.weight=3"],
@@ -959,6 +966,7 @@ def corners(pose: np.ndarray, half: float) -> np.ndarray:
 WIDE = {"so101": [0.12, 0.15], "rebot": [0.10, 0.20]}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("reset", ["nominal", "jitter", "randomized", "wide"])
 def test_cubes_start_on_the_table_and_touch_nothing_else(robot: str, reset: str) -> None:
     cfg = configure(f"reset={'randomized' if reset == 'wide' else reset}", robot=robot)
@@ -989,6 +997,7 @@ def test_cubes_start_on_the_table_and_touch_nothing_else(robot: str, reset: str)
     assert gap > (0.01 if reset in ("randomized", "wide") else 0.0)
 
 
+@pytest.mark.full
 def test_home_jitter_and_noise_stay_within_their_widths(robot: str) -> None:
     nominal = start_of(configure("reset=nominal", robot=robot))
     qpos0 = torch.from_numpy(nominal.sim.model.qpos0.copy())

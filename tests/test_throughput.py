@@ -116,6 +116,7 @@ def test_native_measurements(new_context: Callable[..., RunContext]) -> None:
     assert not any("bare" in name for name in m)
 
 
+@pytest.mark.full
 def test_episode_alternates_with_bare_steps_on_mjwarp(
     new_context: Callable[..., RunContext],
 ) -> None:
@@ -141,6 +142,7 @@ def test_episode_alternates_with_bare_steps_on_mjwarp(
     assert m["episode.capture_s"] > 0.0
 
 
+@pytest.mark.full
 def test_warm_up_and_capture_are_apart_on_mjwarp(new_context: Callable[..., RunContext]) -> None:
     only = "gate.throughput.measurements=[physics,env_step]"
     result, _ = run_throughput(
@@ -174,6 +176,7 @@ def test_eager_work_is_void_where_it_should_be_captured(
     assert bool(capture_problem(sim, mode, captured)) is void
 
 
+@pytest.mark.full
 def test_bare_steps_play_the_same_trajectory(
     new_context: Callable[..., RunContext],
     make_sim: Callable[..., Simulation],
@@ -194,6 +197,7 @@ def test_bare_steps_play_the_same_trajectory(
     assert episode.play_bare(context, sim)[1] == "1 worlds did not do the task with bare steps"  # type: ignore[arg-type]
 
 
+@pytest.mark.full
 def test_bare_steps_that_lose_worlds_do_not_count(
     new_context: Callable[..., RunContext],
     make_sim: Callable[..., Simulation],
@@ -211,6 +215,7 @@ def test_bare_steps_that_lose_worlds_do_not_count(
     assert episode.play_bare(context, sim)[1] == "1 worlds overflowed or diverged with bare steps"  # type: ignore[arg-type]
 
 
+@pytest.mark.full
 def test_rejected_episode_voids_every_measurement(new_context: Callable[..., RunContext]) -> None:
     result, _ = run_throughput(
         new_context(
@@ -228,6 +233,7 @@ def test_rejected_episode_voids_every_measurement(new_context: Callable[..., Run
     assert result.metrics["episode.succeeded"] == 0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["physics", "env_step"])
 def test_overflow_voids_the_figure(new_context: Callable[..., RunContext], name: str) -> None:
     """40 rows hold a start above the table, and neither a grasped cube nor thrashing."""
@@ -247,6 +253,7 @@ def test_overflow_voids_the_figure(new_context: Callable[..., RunContext], name:
     assert speeds(result) == []
 
 
+@pytest.mark.full
 def test_steps_not_made_void_the_figure(
     new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -264,6 +271,7 @@ def test_steps_not_made_void_the_figure(
     assert speeds(result) == []
 
 
+@pytest.mark.full
 def test_broken_measurement_leaves_the_others(
     new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -285,6 +293,7 @@ def test_broken_measurement_leaves_the_others(
     assert speeds(result, "physics") != []
 
 
+@pytest.mark.full
 def test_broken_episode_does_not_verify_the_task(
     new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -305,6 +314,7 @@ def test_broken_episode_does_not_verify_the_task(
         assert ("the task was not verified" not in result.reason) is verified
 
 
+@pytest.mark.full
 def test_no_time_for_an_episode_is_said(new_context: Callable[..., RunContext]) -> None:
     result, _ = run_throughput(
         new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.cpu_max_seconds=1e-4")
@@ -317,6 +327,7 @@ def test_no_time_for_an_episode_is_said(new_context: Callable[..., RunContext]) 
     assert speeds(result, "episode") == []
 
 
+@pytest.mark.full
 def test_start_states_repeat_without_the_batch_gate(
     new_context: Callable[..., RunContext],
 ) -> None:
@@ -337,6 +348,7 @@ def test_start_states_repeat_without_the_batch_gate(
     assert physics.carry_start(context, sim) is kept
 
 
+@pytest.mark.full
 def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., RunContext]) -> None:
     """Red beside the jaws in two of five worlds, then in three of them."""
     context = new_context(
@@ -382,6 +394,7 @@ class Witness:
         self.ends.append((self.steps, self.sim.qpos.clone()))
 
 
+@pytest.mark.full
 def test_the_parts_play_one_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Physics alone ends where the whole step ended, except in worlds that were reset meanwhile, of
     which there are some.
@@ -481,6 +494,7 @@ def test_the_meter_runs_while_the_work_does() -> None:
     assert seen == ["wait", "start", "work", "wait", "stop"]
 
 
+@pytest.mark.full
 def test_the_meter_sees_an_episodes_replayed_steps(new_context: Callable[..., RunContext]) -> None:
     context = new_context("sim=native", "nworld=1")
     seen = []
@@ -550,6 +564,7 @@ def test_a_benchmark_prints_its_table_and_keeps_its_figures(
     assert data["versions"]["mujoco"]
 
 
+@pytest.mark.full
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_episode_costs_hardly_more_than_bare_steps(new_context: Callable[..., RunContext]) -> None:
