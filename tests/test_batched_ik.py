@@ -6,7 +6,7 @@ import gc
 import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -15,126 +15,24 @@ import pytest
 import torch
 import warp as wp
 from compositions import load_config
+from ik_arm import CUDA, DEVICES, Arm, results, tensors
 from test_robot_models import REPO, upstream
 
 from mjstack.bench.cli import bench_ik
-from mjstack.config.schema import RobotCfg
 from mjstack.episodes.context import RunContext
-from mjstack.errors import ArgumentError, ConfigError, MjstackError, UnknownName
-from mjstack.kinematics.batched_ik import BatchedIk
+from mjstack.errors import ArgumentError
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.robots import robot_spec
 from mjstack.sim.warp_setup import torch_stream_scope
 
 Stage = Callable[[str], RunContext]
 
-CUDA = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here"),
-]
-DEVICES = ["cpu", pytest.param("cuda:0", marks=CUDA)]
 TOLERANCE = 0.0005  # m, as the scripted controller's
 
 
 @pytest.fixture(params=DEVICES)
 def device(request: pytest.FixtureRequest) -> str:
     return request.param
-
-
-class Arm:
-    """A robot in a model, with kinematics of its own by native MuJoCo."""
-
-    def __init__(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
-        self.model = model
-        self.robot = robot
-        self.names = [*robot.arm_joints, *robot.gripper_joints]
-        self.low, self.high = np.array([model.joint(name).range for name in self.names]).T
-        self.moved = [self.names.index(name) for name in robot.ik_joints]
-        self.home = np.array(robot.home)
-        for name, value in robot.locked.items():
-            self.home[self.names.index(name)] = value
-        self.home[len(robot.arm_joints) :] = robot.gripper_open
-
-    def grasp_point(self, commands: np.ndarray) -> np.ndarray:
-        data = mujoco.MjData(self.model)
-        out = []
-        for command in np.asarray(commands, dtype=float):
-            for name, value in zip(self.names, command, strict=True):
-                data.joint(name).qpos[0] = value
-            mujoco.mj_kinematics(self.model, data)
-            out.append(np.mean([data.site(name).xpos for name in self.robot.grasp_sites], axis=0))
-        return np.array(out)
-
-    def directions(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Closing and approach axis."""
-        data = mujoco.MjData(self.model)
-        closing = []
-        approach = []
-        for command in np.asarray(commands, dtype=float):
-            for name, value in zip(self.names, command, strict=True):
-                data.joint(name).qpos[0] = value
-            mujoco.mj_kinematics(self.model, data)
-            first, second = (data.site(name).xpos for name in self.robot.grasp_sites)
-            closing.append((second - first) / np.linalg.norm(second - first))
-            approach.append(
-                data.body(self.robot.approach_body).xmat.reshape(3, 3) @ self.robot.approach_axis
-            )
-        return np.array(closing), np.array(approach)
-
-    def jacobian(self, command: np.ndarray) -> np.ndarray:
-        """Of the grasp point for the joints that inverse kinematics moves, by differences, shape
-        ``(3, n_moved)``.
-        """
-        steps = np.zeros((2 * len(self.moved), len(command)))
-        for k, j in enumerate(self.moved):
-            steps[2 * k, j] = 1e-5
-            steps[2 * k + 1, j] = -1e-5
-        at = self.grasp_point(command + steps)
-        return ((at[::2] - at[1::2]) / 2e-5).T
-
-    def spare(self, command: np.ndarray) -> np.ndarray:
-        """Projects onto what those joints can do without moving the centre, shape ``(n_moved,
-        n_moved)``.
-        """
-        jacobian = self.jacobian(command)
-        return np.eye(len(self.moved)) - np.linalg.pinv(jacobian) @ jacobian
-
-    def free(self, commands: np.ndarray, margin: float = 0.01) -> np.ndarray:
-        """Worlds in which no moved joint is near a limit."""
-        q = commands[:, self.moved]
-        low = self.low[self.moved]
-        high = self.high[self.moved]
-        return ((q > low + margin) & (q < high - margin)).all(1)
-
-    def solver(self, nworld: int, device: str = "cpu", **settings: float) -> BatchedIk:
-        return BatchedIk(self.model, self.robot, nworld, device, **settings)
-
-    def at_home(self, nworld: int) -> np.ndarray:
-        return np.tile(self.home, (nworld, 1))
-
-    def at_limits(self, nworld: int, seed: int) -> np.ndarray:
-        """As `anywhere`, with about half of those joints at a limit, 1e-5 rad inside."""
-        commands = self.anywhere(nworld, seed)
-        rng = np.random.default_rng(seed + 1000)
-        low = self.low + 1e-5
-        high = self.high - 1e-5
-        ends = np.where(rng.random(commands.shape) < 0.5, low, high)
-        chosen = rng.random(commands.shape) < 0.5
-        commands[:, self.moved] = np.where(chosen, ends, np.clip(commands, low, high))[
-            :, self.moved
-        ]
-        return commands
-
-    def anywhere(self, nworld: int, seed: int) -> np.ndarray:
-        """Random positions of the joints that inverse kinematics moves; the others at home, gripper
-        open.
-        """
-        commands = self.at_home(nworld)
-        moved = self.moved
-        commands[:, moved] = np.random.default_rng(seed).uniform(
-            self.low[moved], self.high[moved], (nworld, len(moved))
-        )
-        return commands
 
 
 def above_table(
@@ -154,18 +52,6 @@ def above_table(
         points.append(at[inside])
         seed += 1
     return np.concatenate(commands)[:n], np.concatenate(points)[:n]
-
-
-def tensors(device: str, *arrays: np.ndarray) -> list[torch.Tensor]:
-    return [torch.as_tensor(array, device=device) for array in arrays]
-
-
-def results(
-    ik: BatchedIk, command: np.ndarray, target: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """A solve, copied to the host as float64."""
-    new, distance = ik.solve(*tensors(str(ik.device), command, target))
-    return new.cpu().numpy().astype(float), distance.cpu().numpy().astype(float)
 
 
 @pytest.fixture(scope="module")
@@ -895,196 +781,6 @@ def test_the_robot_alone_is_the_robot_in_its_scene(robot: str, stage: Stage, arm
         strict=True,
     ):
         np.testing.assert_array_equal(a, b)
-
-
-ODD = """
-<mujoco>
-  <worldbody>
-    <body name="shoulder" pos="0.1 -0.2 0.3" euler="20 30 40">
-      <body pos="0.05 0 0.1" euler="0 50 0">
-        <joint name="lift" type="slide" axis="0.2 0.1 1" pos="0.3 0 0" ref="0.05" range="-0.2 0.3"/>
-        <joint name="turn" axis="0 1 1" pos="0.02 -0.03 0.04" ref="25" range="-100 100"/>
-        <geom size="0.01"/>
-        <body pos="0.2 0 0" euler="90 0 0">
-          <joint name="passive" axis="1 0 0" pos="0 0.1 0" ref="15"/>
-          <geom size="0.01"/>
-          <body name="palm" pos="0.1 0.1 0.05">
-            <joint name="bend" axis="1 0 1" pos="0 0.01 0" range="-150 150"/>
-            <geom size="0.01"/>
-            <body name="finger" pos="0 0 0.15">
-              <joint name="first_finger" axis="1 0 0" pos="0 0 0.02" ref="-30" range="-90 90"/>
-              <geom size="0.01"/>
-              <site name="a" pos="0.01 0.12 0.06" euler="10 20 30"/>
-            </body>
-            <body pos="0 0.02 0.1" euler="0 0 45">
-              <joint name="second_finger" type="slide" axis="1 0 0" range="-0.1 0.1"/>
-              <geom size="0.01"/>
-              <body pos="0.03 0 0.02"><geom size="0.01"/><site name="b" pos="0 0 0.03"/></body>
-            </body>
-          </body>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <position name="lift" joint="lift" ctrlrange="-0.1 0.5"/>
-    <position name="turn" joint="turn"/>
-    <position name="bend" joint="bend"/>
-    <position name="first_finger" joint="first_finger"/>
-    <position name="second_finger" joint="second_finger"/>
-  </actuator>
-</mujoco>
-"""
-
-
-def odd_arm() -> Arm:
-    """Slides and hinges beside their body's origin, two in one body, reference angles, one without
-    a command, a fork.
-    """
-    robot = RobotCfg(
-        arm_joints=["lift", "turn", "bend", "first_finger", "second_finger"],
-        gripper_joints=[],
-        home=[0.1, 0.2, 0.3, 0.1, 0.0],
-        gripper_open=[],
-        gripper_closed=[],
-        ik_joints=["lift", "turn", "bend", "first_finger", "second_finger"],
-        locked={},
-        grasp_sites=["a", "b"],
-        approach_body="palm",
-        approach_axis=[0.0, 0.6, 0.8],
-    )
-    return Arm(mujoco.MjModel.from_xml_string(ODD), robot)
-
-
-def test_any_chain_of_hinges_and_slides(device: str) -> None:
-    """Its Jacobian is right if a solve from close by converges as fast as Newton's method."""
-    arm = odd_arm()
-    commands = np.random.default_rng(18).uniform(arm.low, arm.high, (100, 5))
-    commands[:, 0] = np.clip(commands[:, 0], -0.09, 0.29)
-    ik = arm.solver(100, device, iterations=5)
-    (given,) = tensors(device, commands)
-    assert np.abs(ik.grasp_point(given).cpu().numpy() - arm.grasp_point(commands)).max() <= 1e-6
-    for found, expected in zip(ik.directions(given), arm.directions(commands), strict=True):
-        assert np.abs(found.cpu().numpy() - expected).max() <= 2e-6
-    near = np.clip(
-        commands + np.random.default_rng(19).normal(scale=0.005, size=commands.shape),
-        arm.low,
-        arm.high,
-    )
-    near[:, 0] = np.clip(near[:, 0], -0.1, 0.3)
-    command, distance = results(ik, commands, arm.grasp_point(near))
-    assert np.quantile(distance, 0.95) <= 1e-6
-    assert (
-        command[:, 0] >= -0.1
-    ).all()  # its actuator's range is narrower below, the joint's above
-    _, distance = results(ik, commands, np.tile([0.0, 0.0, -5.0], (100, 1)))
-    assert np.isfinite(distance).all()
-
-
-def test_the_narrower_of_both_ranges_holds() -> None:
-    arm = odd_arm()
-    for z, limit in ((5.0, 0.3), (-5.0, -0.1)):
-        command, _ = results(
-            arm.solver(1, iterations=60), arm.at_home(1), np.array([[0.0, 0.0, z]])
-        )
-        assert command[0, 0] == pytest.approx(limit, abs=1e-6)
-        assert -0.1 <= command[0, 0] <= 0.3
-
-
-@pytest.mark.parametrize(
-    ("change", "name"),
-    [
-        ({"grasp_sites": ["a", "lost_site"]}, "site 'lost_site'"),
-        ({"arm_joints": ["lift", "lost_joint"]}, "joint 'lost_joint'"),
-        ({"arm_joints": ["lift", "passive"], "ik_joints": ["passive"]}, "actuator 'passive'"),
-        ({"ik_joints": ["lift", "benf"]}, "arm joint 'benf' does not exist. Did you mean 'bend'"),
-        ({"approach_body": "plam"}, "body 'plam' does not exist. Did you mean 'palm'"),
-    ],
-)
-def test_missing_names_are_named(change: dict[str, list[str]], name: str) -> None:
-    arm = odd_arm()
-    with pytest.raises(UnknownName, match=name) as caught:
-        BatchedIk(arm.model, replace(arm.robot, **change), 2, "cpu")
-    assert "\n" not in str(caught.value)
-
-
-def test_an_approach_body_that_not_every_joint_moves_is_refused() -> None:
-    arm = odd_arm()
-    for body in ("shoulder", "finger"):
-        with pytest.raises(
-            ConfigError, match=f"robot.approach_body={body}: expected .* moves: palm"
-        ):
-            BatchedIk(arm.model, replace(arm.robot, approach_body=body), 2, "cpu")
-
-
-@pytest.mark.full
-def test_a_gain_counts_in_any_chain(device: str) -> None:
-    """With moved joints on one side of the fork, a slide among them, and an approach axis that is
-    none of theirs.
-    """
-    arm = odd_arm()
-    start = np.random.default_rng(37).uniform(0.5 * arm.low, 0.5 * arm.high, (100, 5))
-    start[:, 0] = np.clip(start[:, 0], -0.05, 0.1)
-    at = arm.grasp_point(start)
-    for gains in ({"posture_gain": 0.2}, {"approach_gain": 0.2}):
-        command, distance = results(arm.solver(100, device, iterations=100, **gains), start, at)
-        assert (distance <= 0.0001).mean() >= 0.95
-        if "posture_gain" in gains:
-            before, after = (np.linalg.norm(c - arm.home, axis=1) for c in (start, command))
-            assert np.median(before - after) > 0.1
-        else:
-            before, after = (-arm.directions(c)[1][:, 2] for c in (start, command))
-            assert np.median(after - before) > 0.1
-
-
-def test_other_joint_types_are_refused() -> None:
-    hinge = '<joint name="bend" axis="1 0 1" pos="0 0.01 0" range="-150 150"/>'
-    assert hinge in ODD
-    model = mujoco.MjModel.from_xml_string(ODD.replace(hinge, '<joint name="bend" type="ball"/>'))
-    with pytest.raises(MjstackError, match="joint 'bend' is of type ball, expected hinge or slide"):
-        BatchedIk(model, odd_arm().robot, 2, "cpu")
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"iterations": 0},
-        {"nworld": 0},
-        {"damping": 0.0},
-        {"damping": float("nan")},
-        {"max_step": -1.0},
-        {"tolerance": 0.0},
-        {"block_dim": 0},
-        {"posture_gain": -0.1},
-        {"approach_gain": float("nan")},
-        {"posture_gain": 1.5},
-        {"iterations": 3, "approach_gain": 0.1},
-    ],
-)
-def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
-    arm = odd_arm()
-    with pytest.raises(ArgumentError, match=next(iter(settings))):
-        BatchedIk(arm.model, arm.robot, **{"nworld": 2, "device": "cpu", **settings})
-
-
-def test_shapes_are_not_broadcast() -> None:
-    ik = odd_arm().solver(3)
-    with pytest.raises(ArgumentError, match=r"q: found shape \(1, 5\), expected shape \(3, 5\)"):
-        ik.solve(torch.zeros(1, 5), torch.zeros(3, 3))
-    with pytest.raises(ArgumentError, match=r"target: found shape \(3,\), expected shape \(3, 3\)"):
-        ik.solve(torch.zeros(3, 5), torch.zeros(3))
-    with pytest.raises(ArgumentError, match="q: found shape"):
-        ik.grasp_point(torch.zeros(3, 4))
-    with pytest.raises(ArgumentError, match="q: found shape"):
-        ik.directions(torch.zeros(3, 4))
-    with pytest.raises(
-        ArgumentError, match="posture: found one, expected None, because posture_gain is 0"
-    ):
-        ik.solve(torch.zeros(3, 5), torch.zeros(3, 3), torch.zeros(5))
-    drawn = odd_arm().solver(3, posture_gain=0.1)
-    for shape in ((4,), (1, 5), (3, 4), (1, 3, 5)):
-        with pytest.raises(ArgumentError, match="posture: found shape"):
-            drawn.solve(torch.zeros(3, 5), torch.zeros(3, 3), torch.zeros(shape))
 
 
 @pytest.mark.parametrize("cuda", [pytest.param("cuda:0", marks=CUDA)])

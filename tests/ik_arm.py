@@ -1,0 +1,125 @@
+"""An arm with kinematics by native MuJoCo, to hold batched inverse kinematics against."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from mjstack.config.schema import RobotCfg
+from mjstack.kinematics.batched_ik import BatchedIk
+
+CUDA = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here"),
+]
+DEVICES = ["cpu", pytest.param("cuda:0", marks=CUDA)]
+
+
+class Arm:
+    """A robot in a model, with kinematics of its own by native MuJoCo."""
+
+    def __init__(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
+        self.model = model
+        self.robot = robot
+        self.names = [*robot.arm_joints, *robot.gripper_joints]
+        self.low, self.high = np.array([model.joint(name).range for name in self.names]).T
+        self.moved = [self.names.index(name) for name in robot.ik_joints]
+        self.home = np.array(robot.home)
+        for name, value in robot.locked.items():
+            self.home[self.names.index(name)] = value
+        self.home[len(robot.arm_joints) :] = robot.gripper_open
+
+    def grasp_point(self, commands: np.ndarray) -> np.ndarray:
+        data = mujoco.MjData(self.model)
+        out = []
+        for command in np.asarray(commands, dtype=float):
+            for name, value in zip(self.names, command, strict=True):
+                data.joint(name).qpos[0] = value
+            mujoco.mj_kinematics(self.model, data)
+            out.append(np.mean([data.site(name).xpos for name in self.robot.grasp_sites], axis=0))
+        return np.array(out)
+
+    def directions(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Closing and approach axis."""
+        data = mujoco.MjData(self.model)
+        closing = []
+        approach = []
+        for command in np.asarray(commands, dtype=float):
+            for name, value in zip(self.names, command, strict=True):
+                data.joint(name).qpos[0] = value
+            mujoco.mj_kinematics(self.model, data)
+            first, second = (data.site(name).xpos for name in self.robot.grasp_sites)
+            closing.append((second - first) / np.linalg.norm(second - first))
+            approach.append(
+                data.body(self.robot.approach_body).xmat.reshape(3, 3) @ self.robot.approach_axis
+            )
+        return np.array(closing), np.array(approach)
+
+    def jacobian(self, command: np.ndarray) -> np.ndarray:
+        """Of the grasp point for the joints that inverse kinematics moves, by differences, shape
+        ``(3, n_moved)``.
+        """
+        steps = np.zeros((2 * len(self.moved), len(command)))
+        for k, j in enumerate(self.moved):
+            steps[2 * k, j] = 1e-5
+            steps[2 * k + 1, j] = -1e-5
+        at = self.grasp_point(command + steps)
+        return ((at[::2] - at[1::2]) / 2e-5).T
+
+    def spare(self, command: np.ndarray) -> np.ndarray:
+        """Projects onto what those joints can do without moving the centre, shape ``(n_moved,
+        n_moved)``.
+        """
+        jacobian = self.jacobian(command)
+        return np.eye(len(self.moved)) - np.linalg.pinv(jacobian) @ jacobian
+
+    def free(self, commands: np.ndarray, margin: float = 0.01) -> np.ndarray:
+        """Worlds in which no moved joint is near a limit."""
+        q = commands[:, self.moved]
+        low = self.low[self.moved]
+        high = self.high[self.moved]
+        return ((q > low + margin) & (q < high - margin)).all(1)
+
+    def solver(self, nworld: int, device: str = "cpu", **settings: float) -> BatchedIk:
+        return BatchedIk(self.model, self.robot, nworld, device, **settings)
+
+    def at_home(self, nworld: int) -> np.ndarray:
+        return np.tile(self.home, (nworld, 1))
+
+    def at_limits(self, nworld: int, seed: int) -> np.ndarray:
+        """As `anywhere`, with about half of those joints at a limit, 1e-5 rad inside."""
+        commands = self.anywhere(nworld, seed)
+        rng = np.random.default_rng(seed + 1000)
+        low = self.low + 1e-5
+        high = self.high - 1e-5
+        ends = np.where(rng.random(commands.shape) < 0.5, low, high)
+        chosen = rng.random(commands.shape) < 0.5
+        commands[:, self.moved] = np.where(chosen, ends, np.clip(commands, low, high))[
+            :, self.moved
+        ]
+        return commands
+
+    def anywhere(self, nworld: int, seed: int) -> np.ndarray:
+        """Random positions of the joints that inverse kinematics moves; the others at home, gripper
+        open.
+        """
+        commands = self.at_home(nworld)
+        moved = self.moved
+        commands[:, moved] = np.random.default_rng(seed).uniform(
+            self.low[moved], self.high[moved], (nworld, len(moved))
+        )
+        return commands
+
+
+def tensors(device: str, *arrays: np.ndarray) -> list[torch.Tensor]:
+    return [torch.as_tensor(array, device=device) for array in arrays]
+
+
+def results(
+    ik: BatchedIk, command: np.ndarray, target: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A solve, copied to the host as float64."""
+    new, distance = ik.solve(*tensors(str(ik.device), command, target))
+    return new.cpu().numpy().astype(float), distance.cpu().numpy().astype(float)

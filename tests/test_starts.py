@@ -1,0 +1,210 @@
+"""How worlds start: on the table, within the ranges of their terms, each on its own."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from environments import configure, on_shared_sim, state_of
+from stack_checker import rotation_matrix
+
+from mjstack.config.schema import Config
+from mjstack.envs import Env
+from mjstack.scene import table_top
+
+MANY = 200
+
+
+def start_of(cfg: Config, seed: int = 0) -> Env:
+    env = on_shared_sim("native", MANY, cfg)
+    env.reset(seed=seed)
+    return env
+
+
+def corners(pose: np.ndarray, half: float) -> np.ndarray:
+    signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8)
+    return (pose[:3, None] + rotation_matrix(pose[3:]) @ (half * signs)).T
+
+
+# Half-widths of a region in which cubes overlap, leave the table or hit the arm unless each is
+# placed with care.
+WIDE = {"so101": [0.12, 0.15], "rebot": [0.10, 0.20]}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("reset", ["nominal", "jitter", "randomized", "wide"])
+def test_cubes_start_on_the_table_and_touch_nothing_else(robot: str, reset: str) -> None:
+    cfg = configure(f"reset={'randomized' if reset == 'wide' else reset}", robot=robot)
+    if reset == "wide":
+        cfg.reset["cubes"].params.update(xy=WIDE[robot], candidates=32)
+        cfg.controller.ik_tolerance = 1.0  # the arm does not get to all of it
+    env = start_of(cfg)
+    m = env.sim.model
+    scene = env.cfg.scene
+    data = mujoco.MjData(m)
+    table = m.geom("table").id
+    cubes = [m.geom(name).id for name in ("red", "blue")]
+    gap = math.inf
+    for k in range(1 if reset == "nominal" else MANY):
+        data.qpos[:] = env.sim.qpos[k]
+        mujoco.mj_forward(m, data)
+        for a in env.index.object_qpos:
+            at = corners(data.qpos[a : a + 7], scene.objects["red"].half_height)
+            assert at[:, 2].min() == pytest.approx(table_top(env.cfg.scene), abs=1e-9)
+            assert np.ptp(at[:, 2]) == pytest.approx(2.0 * scene.objects["red"].half_height)
+            assert (np.abs(at[:, :2] - scene.table_center[:2]) <= scene.table_half[:2]).all()
+        touching = {tuple(sorted(contact.geom)) for contact in data.contact}
+        assert {pair for pair in touching if set(pair) & {*cubes}} <= {
+            tuple(sorted((table, cube))) for cube in cubes
+        }
+        gap = min(gap, mujoco.mj_geomDistance(m, data, *cubes, 1.0, None))
+        np.testing.assert_array_equal(env.sim.qvel[k], 0.0)
+    assert gap > (0.01 if reset in ("randomized", "wide") else 0.0)
+
+
+@pytest.mark.full
+def test_home_jitter_and_noise_stay_within_their_widths(robot: str) -> None:
+    nominal = start_of(configure("reset=nominal", robot=robot))
+    qpos0 = torch.from_numpy(nominal.sim.model.qpos0.copy())
+    columns = torch.from_numpy(nominal.index.robot_qpos)
+    ctrl = torch.from_numpy(nominal.index.ctrl)
+    home = torch.tensor(nominal.cfg.robot.home, dtype=torch.float64)
+    expected = qpos0.clone()
+    expected[columns] = home
+    torch.testing.assert_close(nominal.sim.qpos, expected.expand(MANY, -1), rtol=0, atol=1e-12)
+    torch.testing.assert_close(nominal.sim.ctrl[:, ctrl], home.expand(MANY, -1), rtol=0, atol=1e-12)
+
+    jitter = start_of(configure("reset=jitter", robot=robot))
+    assert torch.equal(jitter.sim.qpos[:, columns], nominal.sim.qpos[:, columns])
+    for a in jitter.index.object_qpos:
+        off = jitter.sim.qpos[:, a : a + 3] - qpos0[a : a + 3]
+        yaw = 2.0 * torch.atan2(jitter.sim.qpos[:, a + 6], jitter.sim.qpos[:, a + 3])
+        for values, width in ((off[:, 0], 0.002), (off[:, 1], 0.002), (yaw, 0.05)):
+            assert values.abs().max() <= width
+            assert 0.9 * width < values.max()
+            assert values.min() < -0.9 * width
+            assert abs(float(values.mean())) < 0.15 * width
+        assert not off[:, 2].any()
+
+    noisy = start_of(configure("reset=randomized", robot=robot))
+    n_arm = noisy.index.n_arm
+    start = torch.tensor(noisy.cfg.robot.start, dtype=torch.float64)
+    off = noisy.sim.qpos[:, columns] - start
+    assert torch.equal(noisy.sim.qpos[:, columns], noisy.sim.ctrl[:, ctrl])
+    assert off[:, :n_arm].abs().max() <= 0.02 + 1e-12
+    limits = torch.from_numpy(noisy.index.ctrl_range)
+    assert (
+        (noisy.sim.ctrl[:, ctrl] >= limits[:, 0]) & (noisy.sim.ctrl[:, ctrl] <= limits[:, 1])
+    ).all()
+    assert not off[:, n_arm:].any()
+    for j in range(n_arm):
+        assert len(torch.unique(off[:, j])) > MANY // 3, (
+            j
+        )  # home may lie on a limit, as the SO-101's does not
+    for a in noisy.index.object_qpos:
+        off = noisy.sim.qpos[:, a : a + 2] - qpos0[a : a + 2]
+        yaw = 2.0 * torch.atan2(noisy.sim.qpos[:, a + 6], noisy.sim.qpos[:, a + 3])
+        half = torch.tensor(noisy.cfg.scene.random_xy, dtype=torch.float64)
+        assert (off.abs().amax(0) <= half).all()
+        assert (off.amax(0) > 0.7 * half).all()
+        assert (off.amin(0) < -0.7 * half).all()  # some places are taken by the arm
+        # Whole turns: every quarter of them is taken.
+        assert (
+            torch.histc(torch.remainder(yaw, 2 * math.pi), 4, 0.0, 2 * math.pi).min() > MANY // 10
+        )
+
+
+def test_masses_friction_and_gains_are_drawn_anew_from_the_models_own(robot: str) -> None:
+    env = start_of(configure("reset=randomized", robot=robot))
+    m = env.sim.model
+    index = env.index
+    bodies = [m.body(name).id for name in ("red", "blue")]
+    geoms = [m.geom(name).id for name in ("red", "blue")]
+    servos = torch.from_numpy(index.ctrl)
+    seen: dict[str, list[torch.Tensor]] = {"mass": [], "friction": [], "gain": []}
+    for _ in range(6):
+        fields = {name: field.clone() for name, field in env.sim.fields.items()}
+        ratio = {name: field / torch.from_numpy(getattr(m, name)) for name, field in fields.items()}
+        mass = ratio["body_mass"][:, bodies]
+        dofs = [[v + i for i in range(6)] for v in index.object_qvel]
+        for other in (
+            ratio["body_inertia"][:, bodies],
+            ratio["body_subtreemass"][:, bodies, None],
+            1.0 / ratio["body_invweight0"][:, bodies],
+            1.0 / ratio["dof_invweight0"][:, dofs],
+        ):
+            torch.testing.assert_close(other, mass[..., None].expand_as(other), rtol=1e-6, atol=0)
+        gain = (
+            fields["actuator_gainprm"][:, servos, 0]
+            / torch.from_numpy(m.actuator_gainprm)[servos, 0]
+        )
+        bias = (
+            fields["actuator_biasprm"][:, servos, 1:3]
+            / torch.from_numpy(m.actuator_biasprm)[servos, 1:3]
+        )
+        finite = torch.isfinite(bias)  # no damping stays no damping
+        torch.testing.assert_close(
+            bias[finite], gain[..., None].expand_as(bias)[finite], rtol=1e-6, atol=0
+        )
+        assert finite[..., 0].all()
+        partners = [m.geom("table").id]
+        partners += [
+            g for g in range(m.ngeom) if m.body(m.geom_bodyid[g]).name in env.cfg.robot.jaw_bodies
+        ]
+        seen["mass"].append(mass)
+        seen["friction"].append(fields["geom_friction"][:, geoms, 0])
+        seen["gain"].append(gain)
+        # Nothing else is touched.
+        for name, columns in (
+            ("body_mass", bodies),
+            ("body_inertia", bodies),
+            ("body_invweight0", bodies),
+            ("geom_friction", [*geoms, *partners]),
+            ("actuator_gainprm", index.ctrl.tolist()),
+        ):
+            rest = [i for i in range(fields[name].shape[1]) if i not in columns]
+            model = torch.from_numpy(getattr(m, name))
+            assert (fields[name][:, rest] == model[rest]).all()
+        assert (fields["geom_friction"][..., 1:] == torch.from_numpy(m.geom_friction)[:, 1:]).all()
+        env.reset()
+    for name, (low, high) in (("mass", (0.7, 1.3)), ("friction", (0.8, 1.4)), ("gain", (0.9, 1.1))):
+        values = torch.stack(seen[name])  # episodes, worlds, elements
+        margin = 0.03 * (high - low)
+        assert (values >= low - 1e-9).all()
+        assert (values <= high + 1e-9).all()
+        # The whole range in every episode: factors upon factors would leave it or close in on
+        # something.
+        assert (values.amin((1, 2)) < low + margin).all()
+        assert (values.amax((1, 2)) > high - margin).all()
+        assert len(torch.unique(values[0, :, 0])) == MANY
+        assert not (values[0] == values[1]).any()
+        assert not (values[0, :, 0] == values[0, :, 1]).any()
+
+
+def test_a_masked_reset_draws_for_its_worlds_alone(robot: str) -> None:
+    env = start_of(configure("reset=randomized", robot=robot))
+    for view in (*env.sim.fields.values(), env.sim.qpos, env.sim.ctrl):
+        view *= 1.01  # the others keep whatever they have, drawn or not
+    env.sim.kinematics()
+    before = state_of(env)
+    mask = torch.rand(MANY, generator=torch.Generator().manual_seed(0)) < 0.3
+    env.reset(mask=mask)
+    after = state_of(env)
+    changed = (
+        "qpos",
+        "ctrl",
+        "episode",
+        "fields.body_mass",
+        "fields.geom_friction",
+        "fields.actuator_gainprm",
+    )
+    for name in before:
+        assert torch.equal(after[name][~mask], before[name][~mask]), name
+    for name in changed:
+        differs = (after[name][mask] != before[name][mask]).flatten(
+            1 if before[name].dim() > 1 else 0
+        )
+        assert (differs.any(1) if differs.dim() > 1 else differs).all(), name
