@@ -543,7 +543,7 @@ def test_end_effector_delta_moves_the_commanded_grasp_point(backend: str, robot:
 
 @pytest.mark.full
 @pytest.mark.parametrize("reset", ["nominal", "jitter", "randomized"])
-@pytest.mark.parametrize("task", ["stack", "reach"])
+@scenes
 def test_every_reset_group_steps(backend: str, task: str, robot: str, reset: str) -> None:
     env = on_shared_sim(backend, 3, configure(f"task={task}", f"reset={reset}", robot=robot))
     assert_layout(env, returned(env.reset(seed=0)))
