@@ -37,8 +37,8 @@ HAIR = 2e-6  # [m], [m/s]: a good deal more than float32 rounds at these sizes
 
 @cache
 def planned() -> SimpleNamespace:
-    """Two jittered native worlds of the SO-101; in the second one red drops out of the hand halfway to the box,
-    onto the table beside it.
+    """Two jittered native worlds of the SO-101; in the second one red drops out of the hand halfway
+    to the box, onto the table beside it.
     """
 
     def drop(env: Env, _: str) -> None:
