@@ -20,7 +20,6 @@ from mjstack.managers.view import EnvView
 from mjstack.rng import uniform
 from mjstack.sim.draws import draw_uniform
 from mjstack.sim.graph import StepGraph
-from mjstack.sim.sizes import BatchSizes
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 BACKENDS = ["mjwarp", pytest.param("mjwarp-cuda", marks=[pytest.mark.gpu, CUDA])]
@@ -167,57 +166,6 @@ def test_a_term_that_reads_the_device_is_named(
         other.step(zero)
     assert torch.isfinite(other.sim.qpos).all()
     assert int(other.sim.step_count[0]) == 30
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_new_size_is_captured_anew(backend: str) -> None:
-    env = make(backend, "auto", 4, "~termination.overflow")
-    env.reset(seed=0)
-    zero = torch.zeros((4, env.action_manager.action_dim), device=env.device)
-    for _ in range(3):
-        env.step(zero)
-    before = env.sim.qpos.clone()
-    steps = int(env.sim.step_count[0])
-    env.sim.resize(BatchSizes(nconmax=64, njmax=8))  # type: ignore[attr-defined]
-    assert torch.equal(env.sim.qpos, before)
-    with pytest.raises(mjstack.MjstackError, match="NEFC overflow in 4 of 4 worlds"):
-        _step_and_look(env, zero)
-    env.sim.resize(BatchSizes(nconmax=128, njmax=768))  # type: ignore[attr-defined]
-    env.reset(seed=0)
-    for _ in range(4):
-        env.step(zero)
-    env.raise_faults()
-    assert int(env.sim.step_count[0]) == 40
-    assert steps == 30
-
-
-def _step_and_look(env: Env, action: torch.Tensor) -> None:
-    for _ in range(4):
-        env.step(action)
-    env.raise_faults()
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_new_option_is_captured_anew(backend: str) -> None:
-    """A captured step bakes the iteration limit in."""
-    ends = []
-    for graph in ("off", "require"):
-        env = make(backend, graph, 4)
-        env.reset(seed=1)
-        moves = actions(env, 12)
-        for move in moves[:4]:
-            env.step(move)
-        env.sim.set_options(iterations=1, ls_iterations=1)
-        for move in moves[4:]:
-            env.step(move)
-        assert env.sim.option_values()["iterations"] == 1
-        ends.append((env.sim.qpos.clone(), env.sim.solver_limits.clone()))  # type: ignore[attr-defined]
-    assert ends[0][1].any()
-    assert (ends[0][1] != 0).equal(ends[1][1] != 0)
-    if backend == "mjwarp":
-        assert torch.equal(ends[0][0], ends[1][0])
 
 
 @pytest.mark.parametrize("device", DEVICES)

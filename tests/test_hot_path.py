@@ -154,7 +154,7 @@ PATHS: dict[str, list[str] | None] = {
             "_place",
         )
     ],
-    "sim/usage.py": ["Usage.count", "Usage.select"],
+    "sim/usage.py": ["Usage.count", "Usage.clear"],
     "sim/substep.py": ["rearranged_step"],
     "sim/graph.py": ["side_by_side"],
     "sim/repeated.py": ["in_parallel"],

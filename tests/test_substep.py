@@ -11,10 +11,10 @@ from environments import configure
 from mjstack.config.schema import Backend
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import make_simulation
-from mjstack.sim.engine import mjw
 from mjstack.sim.mjwarp import MjwarpSimulation
 from mjstack.sim.sizes import resolve_env_sizes
 from mjstack.sim.substep import Arrangement, can_rearrange
+from mjstack.sim.warp_setup import mjw
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]

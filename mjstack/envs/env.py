@@ -42,9 +42,8 @@ class Env:
     6. the worlds that ended are reset, and observed again.
 
     On CUDA the whole step is one graph: the first step after a build runs eagerly, the second is
-    captured, and later ones replay it. It is captured anew after ``sim.resize`` and
-    ``sim.set_options``; after a change of anything else that it has baked in, such as a term's
-    Python number, call `recapture`.
+    captured, and later ones replay it. After a change of anything that it has
+    baked in, such as a term's Python number, call `recapture`.
 
     What derives from contacts (``sensordata``, ``contact_count``) is that of the last physics step
     before, and zero in a world that has just been reset.
@@ -261,7 +260,7 @@ class Env:
             self.device,
             self.cfg.graph,
             name=name,
-            version=lambda: self.sim.version + self._version,
+            version=lambda: self._version,
             culprit=lambda: current_term.label,
         )
 

@@ -22,7 +22,7 @@ from mjstack.envs.buffers import (
 )
 from mjstack.episodes.rollout import Reset
 from mjstack.managers.reset import required_fields
-from mjstack.sim import BatchSizes, Simulation, make_simulation
+from mjstack.sim import BatchSizes, Simulation, device_memory, make_simulation
 
 if TYPE_CHECKING:
     from mjstack.episodes.context import RunContext
@@ -179,7 +179,6 @@ def _play(
 
 
 def _used(device: str) -> int | None:
-    from mjstack.sim.memory import used_bytes  # loads Warp, which native runs do not need
-
     gc.collect()  # the worlds of the run before
-    return used_bytes(device)
+    memory = device_memory(device)
+    return None if memory is None else memory[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,9 +26,7 @@ def resolve_device(requested: str) -> str:
     if requested == "auto":
         return "cuda:0" if count else "cpu"
     if requested.startswith("cuda") and int(requested.partition(":")[2]) >= count:
-        found = (
-            f"cuda:0 to cuda:{count - 1}" if count > 1 else "cuda:0" if count else "no CUDA device"
-        )
+        found = ", ".join(f"cuda:{number}" for number in range(count)) or "no CUDA device"
         raise DeviceError(
             f"sim.device={requested}: this machine has {found}. Use sim.device=auto or"
             " sim.device=cpu."
@@ -113,6 +110,7 @@ def device_memory(device: str) -> tuple[int, int] | None:
         return None
     import warp as wp  # native runs do not need it
 
+    torch.cuda.synchronize(device)
     free, total = torch.cuda.mem_get_info(device)
     where = wp.get_device(device)
     pooled = wp.get_mempool_used_mem_current(where) if where.is_mempool_enabled else 0
@@ -120,22 +118,10 @@ def device_memory(device: str) -> tuple[int, int] | None:
 
 
 def cuda_driver() -> str:
-    """Version of the NVIDIA driver, from the kernel module or NVML; ``unknown`` where neither
-    tells.
-    """
+    """Version of the NVIDIA driver, from the kernel module; ``unknown`` where it does not tell."""
     try:
         text = Path("/proc/driver/nvidia/version").read_text()
     except OSError:
         text = ""
-    match = re.search(r"\b(\d{3}\.\d+(?:\.\d+)?)\b", text)
-    if match:
-        return match.group(1)
-    try:
-        query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-        return (
-            subprocess.run(query, capture_output=True, text=True, timeout=10, check=True)
-            .stdout.splitlines()[0]
-            .strip()
-        )
-    except (OSError, subprocess.SubprocessError, IndexError):
-        return "unknown"
+    match = re.search(r"\b\d{3}\.\d+(\.\d+)?\b", text)
+    return match.group() if match else "unknown"

@@ -7,10 +7,9 @@ import re
 from collections.abc import Callable
 
 import mujoco
-import warp as wp
 
-from mjstack.sim.engine import mjw
 from mjstack.sim.sizes import BatchSizes
+from mjstack.sim.warp_setup import mjw, wp
 
 _UNITS = {"B": 1, "KB": 1 << 10, "MB": 1 << 20, "GB": 1 << 30}
 
@@ -22,17 +21,6 @@ def array_bytes(node: object) -> int:
     if dataclasses.is_dataclass(node):
         return sum(array_bytes(getattr(node, field.name)) for field in dataclasses.fields(node))
     return 0
-
-
-def keep_arrays(fresh: object, old: object) -> None:
-    """Put the arrays of old data into new data where their size is the same, so that views stay."""
-    for field in dataclasses.fields(fresh):  # type: ignore[arg-type]
-        ours = getattr(fresh, field.name)
-        theirs = getattr(old, field.name)
-        if isinstance(ours, wp.array) and ours.shape == theirs.shape and ours.dtype == theirs.dtype:
-            setattr(fresh, field.name, theirs)
-        elif dataclasses.is_dataclass(ours):
-            keep_arrays(ours, theirs)
 
 
 def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
@@ -71,14 +59,3 @@ def borrowed_bytes(call: Callable[[], None], device: str) -> int | None:
     _, _, peaks = "".join(lines).partition("Peak usage:")
     peak = re.search(rf"^\s+{re.escape(device)}\s+([\d.]+) (B|KB|MB|GB)$", peaks, re.MULTILINE)
     return None if peak is None else int(float(peak[1]) * _UNITS[peak[2]])
-
-
-def used_bytes(device: str) -> int | None:
-    """Bytes that Warp's memory pool of a CUDA device has given out, or None where there is no such
-    pool.
-    """
-    where = wp.get_device(device)
-    if not where.is_cuda or not wp.is_mempool_enabled(where):
-        return None
-    wp.synchronize_device(where)
-    return int(wp.get_mempool_used_mem_current(where))

@@ -8,23 +8,25 @@ from functools import partial
 
 import mujoco
 import torch
-import warp as wp
 
 from mjstack.config.schema import GraphMode
 from mjstack.errors import UnsupportedModel
-from mjstack.sim.engine import mjw
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
-from mjstack.sim.memory import array_bytes, borrowed_bytes, keep_arrays
+from mjstack.sim.memory import array_bytes, borrowed_bytes
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
+from mjstack.sim.simulation import Simulation, named_options
 from mjstack.sim.sizes import BatchSizes
-from mjstack.sim.static_geoms import place_static_geoms
-from mjstack.sim.substep import Arrangement, can_rearrange, rearranged_step
+from mjstack.sim.substep import (
+    Arrangement,
+    can_rearrange,
+    place_static_geoms,
+    rearranged_step,
+)
 from mjstack.sim.usage import Usage
-from mjstack.sim.views import FixedViews, check_mask
-from mjstack.sim.warp_setup import torch_stream_scope
+from mjstack.sim.warp_setup import mjw, torch_stream_scope, wp
 
 
-class MjwarpSimulation(FixedViews):
+class MjwarpSimulation(Simulation):
     """`Simulation` on MuJoCo Warp, float32.
 
     Box against box uses the primitive collider, as native MuJoCo does: with MJWarp's convex one the
@@ -32,13 +34,7 @@ class MjwarpSimulation(FixedViews):
     one `step(n)` are captured into a graph, unless they are a part of a larger one.
 
     Attributes:
-        peak_pool: Most contacts, broad-phase pairs, and contacts of one kind of convex collision,
-            of all worlds at once since the last full reset, shape ``(3,)``, int32. The third bounds
-            what nccdmax must hold.
-        version: Grows whenever something changes that a graph has baked in.
         arrangement: How a captured step is arranged.
-        solver_limits: Bits of `SolverLimit` for worlds whose solver stopped at a limit, shape
-            ``(nworld,)``, int32.
     """
 
     backend = "mjwarp"
@@ -74,7 +70,6 @@ class MjwarpSimulation(FixedViews):
         self._device = wp.get_device(device)
         self._graph_mode = graph
         self._graphs: dict[tuple[int, bool], StepGraph] = {}
-        self.version = 0
         self.arrangement = Arrangement()
         names = check_fields(fields)
         self._placing = not PLACING_FIELDS.isdisjoint(names)
@@ -93,17 +88,12 @@ class MjwarpSimulation(FixedViews):
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
             self._can_rearrange = can_rearrange(model, self._m)
-            self._usage = Usage(model, nworld)
-        d = self._d
-        self.qpos, self.qvel, self.act, self.ctrl = map(
-            wp.to_torch, (d.qpos, d.qvel, d.act, d.ctrl)
-        )
-        self.xpos = wp.to_torch(d.xpos)
-        self.xquat = wp.to_torch(d.xquat)
-        self.site_xpos = wp.to_torch(d.site_xpos)
-        self.geom_xpos = wp.to_torch(d.geom_xpos)
-        self.qfrc_actuator = wp.to_torch(d.qfrc_actuator)
-        self.sensordata = wp.to_torch(d.sensordata)
+            self._usage = usage = Usage(model, nworld, self.device)
+        for name in (
+            *("qpos", "qvel", "act", "ctrl", "xpos", "xquat", "site_xpos", "geom_xpos"),
+            *("qfrc_actuator", "sensordata"),
+        ):
+            setattr(self, name, wp.to_torch(getattr(self._d, name)))
         # `view` never copies: a field that MJWarp holds as vectors or matrices keeps its memory
         # under MuJoCo's shape.
         self.fields = Fields(
@@ -112,8 +102,7 @@ class MjwarpSimulation(FixedViews):
                 for name in names
             }
         )
-        self.constraint_count = wp.to_torch(d.nefc)
-        usage = self._usage
+        self.constraint_count = wp.to_torch(self._d.nefc)
         self.contact_count = usage.contacts
         self.peak_contacts = usage.peak_contacts
         self.peak_constraints = usage.peak_rows
@@ -121,6 +110,9 @@ class MjwarpSimulation(FixedViews):
         self.overflow = usage.overflow
         self.solver_limits = usage.limits
         self.step_count = usage.steps
+        self._erased = tuple(torch.zeros_like(usage.overflow) for _ in range(3))
+        self._mask = torch.zeros(nworld, dtype=torch.bool, device=self.device)
+        self._selected = wp.from_torch(self._mask)
         self._warm_up()
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
@@ -131,7 +123,7 @@ class MjwarpSimulation(FixedViews):
             if n == 0 or inside_graph():
                 self._decimation(n, kinematics)
             else:
-                self._graph(n, kinematics)()
+                self.graph_of(n, kinematics=kinematics)()
 
     def forward(self) -> None:
         """Compute everything that derives from the state, without advancing time."""
@@ -142,8 +134,7 @@ class MjwarpSimulation(FixedViews):
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
         """Bring the poses of all worlds up to the current qpos: a mask would save nothing."""
-        if mask is not None:
-            check_mask(mask, self.nworld, self.device)
+        self._check_mask(mask)
         with torch_stream_scope(self._device):
             self._pose()
 
@@ -151,27 +142,16 @@ class MjwarpSimulation(FixedViews):
         """Put the masked worlds back to qpos0, at rest, and clears their counters and overflow
         bits.
         """
-        if mask is not None:
-            check_mask(mask, self.nworld, self.device)
-        selected = self._usage.select(mask)
+        self._check_mask(mask)
+        self._keep_peaks(mask)
+        if mask is None:
+            self._mask.fill_(True)
+            self._usage.peak_pool.zero_()
+        else:
+            self._mask.copy_(mask)
         with torch_stream_scope(self._device):
-            mjw.reset_data(self._m, self._d, reset=selected)
-            self._usage.clear()
-
-    @property
-    def most_contacts(self) -> torch.Tensor:
-        """Largest contact_count since the last full reset."""
-        return torch.maximum(self._usage.most[0], self.peak_contacts)
-
-    @property
-    def most_constraints(self) -> torch.Tensor:
-        """Largest constraint_count since the last full reset."""
-        return torch.maximum(self._usage.most[1], self.peak_constraints)
-
-    @property
-    def overflow_ever(self) -> torch.Tensor:
-        """Overflow bits since the last full reset."""
-        return self._usage.most[2] | self.overflow
+            mjw.reset_data(self._m, self._d, reset=self._selected)
+        self._usage.clear(self._mask)
 
     def memory_bytes(self) -> int:
         """Bytes of MJWarp's data: all that grows with nworld, but for per-world fields and what a
@@ -191,13 +171,9 @@ class MjwarpSimulation(FixedViews):
         primitive = bool(int(opt.disableflags) & int(mjw.DisableBit.NATIVECCD))
         return {
             "timestep": float(opt.timestep.numpy()[0]),
-            "iterations": int(opt.iterations),
-            "ls_iterations": int(opt.ls_iterations),
             "impratio": float(opt.impratio_invsqrt.numpy()[0]) ** -2,
             "tolerance": float(opt.tolerance.numpy()[0]),
-            "integrator": mujoco.mjtIntegrator(int(opt.integrator)).name,
-            "cone": mujoco.mjtCone(int(opt.cone)).name,
-            "solver": mujoco.mjtSolver(int(opt.solver)).name,
+            **named_options(opt),
             "box_box": "primitive" if primitive else "convex",
         }
 
@@ -215,69 +191,33 @@ class MjwarpSimulation(FixedViews):
             self.device,
             self._graph_mode,
             name="a bare step",
-            version=lambda: self.version,
             scratch=lambda: False,
         )
 
     def graph_of(self, n: int = 1, *, kinematics: bool = False) -> StepGraph:
         """The graph that `step(n)` replays."""
-        return self._graph(n, kinematics)
+        key = (n, kinematics)
+        if key not in self._graphs:
+            self._graphs[key] = StepGraph(
+                lambda: self._decimation(n, kinematics),
+                self.device,
+                self._graph_mode,
+                name=f"step({n})",
+                scratch=lambda: self.arrangement.scratch,
+            )
+        return self._graphs[key]
 
     def latch(self) -> None:
         """Record what the worlds use and have lost by now; `step` does it by itself."""
         with torch_stream_scope(self._device):
             self._count(steps=0)
 
-    def resize(self, sizes: BatchSizes) -> None:
-        """Give the worlds other buffer sizes. Their state and every view stay; contacts and rows
-        are empty until a step.
-
-        Args:
-            sizes: The new sizes.
-        """
-        self.synchronize()  # a graph may still write into what goes now
-        self._graphs.clear()
-        with wp.ScopedDevice(self._device):
-            fresh = mjw.make_data(self.model, nworld=self.nworld, **sizes.as_kwargs(self.nworld))
-            keep_arrays(fresh, self._d)
-            for count in (fresh.nacon, fresh.nefc, fresh.ncollision):
-                count.zero_()
-        self._d = fresh
-        self.sizes = sizes
-        self.version += 1
-
     def arrange(self, arrangement: Arrangement) -> None:
         """Choose how a captured step is arranged; for measurements, because the numbers stay the
         same.
         """
         self.arrangement = arrangement
-        self.version += 1
-
-    def set_options(
-        self,
-        *,
-        iterations: int | None = None,
-        ls_iterations: int | None = None,
-        tolerance: float | None = None,
-        impratio: float | None = None,
-    ) -> None:
-        """Change the constraint solver's limits; graphs, which have them baked in, are captured
-        anew.
-
-        Args:
-            iterations: Most Newton iterations.
-            ls_iterations: Most line-search iterations.
-            tolerance: At which the solver stops; at least 1e-6 counts.
-            impratio: Ratio of frictional to normal constraint impedance.
-        """
-        opt = self._m.opt
-        opt.iterations = opt.iterations if iterations is None else iterations
-        opt.ls_iterations = opt.ls_iterations if ls_iterations is None else ls_iterations
-        if tolerance is not None:
-            opt.tolerance.fill_(max(tolerance, 1e-6))
-        if impratio is not None:
-            opt.impratio_invsqrt.fill_(impratio**-0.5)
-        self.version += 1
+        self._graphs.clear()
 
     def synchronize(self) -> None:
         """Wait for the device."""
@@ -362,16 +302,3 @@ class MjwarpSimulation(FixedViews):
         self.synchronize()
         self.reset()
         self.synchronize()
-
-    def _graph(self, n: int, kinematics: bool) -> StepGraph:
-        key = (n, kinematics)
-        if key not in self._graphs:
-            self._graphs[key] = StepGraph(
-                lambda: self._decimation(n, kinematics),
-                self.device,
-                self._graph_mode,
-                name=f"step({n})",
-                version=lambda: self.version,
-                scratch=lambda: self.arrangement.scratch,
-            )
-        return self._graphs[key]

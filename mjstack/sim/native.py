@@ -17,8 +17,7 @@ import numpy as np
 import torch
 
 from mjstack.sim.model_fields import Fields, SimpleBodies, check_fields
-from mjstack.sim.simulation import Overflow
-from mjstack.sim.views import FixedViews, check_mask
+from mjstack.sim.simulation import Overflow, Simulation, named_options
 
 _S = mujoco.mjtState
 _SPEC = int(
@@ -69,7 +68,7 @@ def native_bytes(model: mujoco.MjModel, nworld: int) -> int:
     return 8 * nworld * numbers
 
 
-class NativeSimulation(FixedViews):
+class NativeSimulation(Simulation):
     """`Simulation` on native MuJoCo, float64 on the CPU.
 
     A world's whole state, warm start included (``qacc_warmstart``), is one row that goes into a
@@ -80,7 +79,6 @@ class NativeSimulation(FixedViews):
     """
 
     backend = "native"
-    version = 0  # nothing is ever captured
 
     def __init__(
         self,
@@ -111,21 +109,13 @@ class NativeSimulation(FixedViews):
         )
         self._pool = ThreadPoolExecutor(nthread) if nthread > 1 else None
 
+        # mj_getState's order: time, qpos, qvel, act, warm start, ctrl.
         m = self.model
         self._state = np.zeros((nworld, mujoco.mj_stateSize(m, _SPEC)))
-        # mj_getState's order: time, qpos, qvel, act, warm start, ctrl.
-        q = 1
-        v = 1 + m.nq
-        a = 1 + m.nq + m.nv
-        u = self._state.shape[1] - m.nu
-        self._qpos = self._state[:, q:v]
-        self._physics = self._state[:, q : a + m.na]
-        self.qpos, self.qvel = torch.from_numpy(self._qpos), torch.from_numpy(self._state[:, v:a])
-        self.act, self.ctrl = (
-            torch.from_numpy(self._state[:, a : a + m.na]),
-            torch.from_numpy(self._state[:, u:]),
-        )
-        self.qacc_warmstart = torch.from_numpy(self._state[:, u - m.nv : u])
+        widths = (1, m.nq, m.nv, m.na, m.nv, m.nu)
+        parts = torch.from_numpy(self._state).split(widths, dim=1)
+        _, self.qpos, self.qvel, self.act, self.qacc_warmstart, self.ctrl = parts
+        self._physics = self._state[:, 1 : 1 + m.nq + m.nv + m.na]
         self._initial = self._state[0].copy()
         mujoco.mj_getState(m, mujoco.MjData(m), self._initial, _SPEC)
 
@@ -139,10 +129,8 @@ class NativeSimulation(FixedViews):
             "qfrc_actuator": np.zeros((nworld, m.nv)),
             "sensordata": np.zeros((nworld, m.nsensordata)),
         }
-        self.xpos, self.xquat, self.site_xpos, self.geom_xpos = map(
-            torch.from_numpy, self._poses.values()
-        )
-        self.qfrc_actuator, self.sensordata = map(torch.from_numpy, self._others.values())
+        for name, array in (self._poses | self._others).items():
+            setattr(self, name, torch.from_numpy(array))
         # Columns: contacts, rows, peak contacts, peak rows, overflow bits.
         self._counts = np.zeros((nworld, 5), dtype=np.int32)
         (
@@ -152,8 +140,7 @@ class NativeSimulation(FixedViews):
             self.peak_constraints,
             self.overflow,
         ) = torch.from_numpy(self._counts).unbind(1)
-        # What masked resets would erase, in the columns of the last three.
-        self._most = np.zeros((nworld, 3), dtype=np.int32)
+        self._erased = torch.zeros((3, nworld), dtype=torch.int32).unbind(0)
         self._steps = np.zeros(nworld, dtype=np.int64)
         self.step_count = torch.from_numpy(self._steps)
         self._fields = {
@@ -204,61 +191,17 @@ class NativeSimulation(FixedViews):
         rows = self._rows(mask)
         self._state[rows] = self._initial
         if "qpos0" in self._fields:
-            self._qpos[rows] = self._fields["qpos0"][rows]
+            self.qpos.numpy()[rows] = self._fields["qpos0"][rows]
         self._others["sensordata"][rows] = 0
-        self._most = np.zeros_like(self._most) if mask is None else self._all_peaks()
+        self._keep_peaks(mask)
         self._counts[rows] = 0
         self._steps[rows] = 0
 
-    @property
-    def most_contacts(self) -> torch.Tensor:
-        """Largest contact_count since the last full reset."""
-        return torch.from_numpy(self._all_peaks()[:, 0])
-
-    @property
-    def most_constraints(self) -> torch.Tensor:
-        """Largest constraint_count since the last full reset."""
-        return torch.from_numpy(self._all_peaks()[:, 1])
-
-    @property
-    def overflow_ever(self) -> torch.Tensor:
-        """Overflow bits since the last full reset."""
-        return torch.from_numpy(self._all_peaks()[:, 2])
-
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options of the model."""
-        opt = self.model.opt
-        return {
-            "timestep": opt.timestep,
-            "iterations": opt.iterations,
-            "ls_iterations": opt.ls_iterations,
-            "impratio": opt.impratio,
-            "tolerance": opt.tolerance,
-            "integrator": mujoco.mjtIntegrator(opt.integrator).name,
-            "cone": mujoco.mjtCone(opt.cone).name,
-            "solver": mujoco.mjtSolver(opt.solver).name,
-            "box_box": "primitive",
-        }
-
-    def set_options(
-        self,
-        *,
-        iterations: int | None = None,
-        ls_iterations: int | None = None,
-        tolerance: float | None = None,
-        impratio: float | None = None,
-    ) -> None:
-        """Change the constraint solver's limits."""
-        given = {
-            "iterations": iterations,
-            "ls_iterations": ls_iterations,
-            "tolerance": tolerance,
-            "impratio": impratio,
-        }
-        for model in (self.model, *(worker.model for worker in self._workers)):
-            for name, value in given.items():
-                if value is not None:
-                    setattr(model.opt, name, value)
+        option = self.model.opt
+        numbers = {name: getattr(option, name) for name in ("timestep", "impratio", "tolerance")}
+        return {**numbers, **named_options(option), "box_box": "primitive"}
 
     def synchronize(self) -> None:
         """Nothing to wait for: `step` returns when every thread has."""
@@ -287,18 +230,10 @@ class NativeSimulation(FixedViews):
             fields.append((self._simple.dof_M0, model.dof_M0))
         return _Worker(model, data, fields, pairs(data, self._poses), pairs(data, self._others))
 
-    def _all_peaks(self) -> np.ndarray:
-        """Peak contacts, rows, and overflow bits since the last full reset, ``(nworld, 3)``."""
-        peaks = np.maximum(self._most[:, :2], self._counts[:, 2:4])
-        bits = self._most[:, 2] | self._counts[:, 4]
-        return np.column_stack((peaks, bits))
-
     def _rows(self, mask: torch.Tensor | None) -> np.ndarray:
         """The mask as numpy sees it; every world for None."""
-        if mask is None:
-            return np.ones(self.nworld, dtype=bool)
-        check_mask(mask, self.nworld, self.device)
-        return mask.numpy()
+        self._check_mask(mask)
+        return np.ones(self.nworld, dtype=bool) if mask is None else mask.numpy()
 
     def _finite_worlds(
         self, *derived: dict[str, np.ndarray], rows: np.ndarray | None = None

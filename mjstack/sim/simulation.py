@@ -1,13 +1,14 @@
-"""The protocol of every physics backend: torch views of batched state, and how to step it."""
+"""The base of every physics backend: torch views of batched state, and how to step it."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from enum import IntFlag
-from typing import Protocol
 
 import mujoco
 import torch
 
+from mjstack.errors import ArgumentError, RebindError
 from mjstack.sim.model_fields import Fields
 from mjstack.sim.repeated import Repeated
 from mjstack.sim.sizes import BatchSizes
@@ -51,7 +52,7 @@ def describe_overflow(bits: int) -> str:
 LOST_PHYSICS = int(sum(Overflow))
 
 
-class Simulation(Protocol):
+class Simulation(ABC):
     """``nworld`` copies of one model, stepped together.
 
     Views are allocated once and keep their address for life: write into them (``sim.ctrl[:] =
@@ -106,7 +107,6 @@ class Simulation(Protocol):
         most_constraints: Largest constraint_count over the same time, shape ``(nworld,)``, int32.
         overflow_ever: Bits of `Overflow` raised since the last full reset, shape
             ``(nworld,)``, int32.
-        version: Grows when something changes that a captured graph has baked in.
         sizes: Sizes of fixed buffers; None where there are none, as in native MuJoCo.
         peak_pool: Most contacts, broad-phase pairs, and contacts of one kind of convex collision,
             of all worlds at once since the last full reset, shape ``(3,)``, int32; None where the
@@ -137,32 +137,39 @@ class Simulation(Protocol):
     overflow: torch.Tensor
     peak_contacts: torch.Tensor
     peak_constraints: torch.Tensor
-    version: int
+    sizes: BatchSizes | None = None
+    peak_pool: torch.Tensor | None = None
+    solver_limits: torch.Tensor | None = None
+    # Peak contacts, peak rows and overflow bits that masked resets have erased since the last full
+    # one. They are taken in just before such a reset, and not in every substep: nothing else lowers
+    # a counter, so the two together never miss one, and it costs a step three small operations.
+    _erased: tuple[torch.Tensor, ...]
 
-    @property
-    def sizes(self) -> BatchSizes | None:
-        """See above."""
-
-    @property
-    def peak_pool(self) -> torch.Tensor | None:
-        """See above."""
-
-    @property
-    def solver_limits(self) -> torch.Tensor | None:
-        """See above."""
+    def __setattr__(self, name: str, value: object) -> None:
+        # Captured graphs and the stepping code know the memory, not the attribute: a rebound view
+        # would be ignored without a word. Python ends `sim.qpos += 1` by setting the attribute to
+        # the tensor that it has just changed in place.
+        bound = self.__dict__.get(name)
+        if isinstance(bound, (torch.Tensor, Fields)) and bound is not value:
+            raise RebindError(f"sim.{name}" + "[name]" * isinstance(bound, Fields))
+        super().__setattr__(name, value)
 
     @property
     def most_contacts(self) -> torch.Tensor:
         """See above."""
+        return torch.maximum(self._erased[0], self.peak_contacts)
 
     @property
     def most_constraints(self) -> torch.Tensor:
         """See above."""
+        return torch.maximum(self._erased[1], self.peak_constraints)
 
     @property
     def overflow_ever(self) -> torch.Tensor:
         """See above."""
+        return self._erased[2] | self.overflow
 
+    @abstractmethod
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
         """Advance every world by n physics steps under the current ctrl.
 
@@ -172,18 +179,24 @@ class Simulation(Protocol):
                 physics is the same.
         """
 
+    @abstractmethod
     def forward(self) -> None:
         """Compute everything that derives from qpos, qvel, act and ctrl, without
         advancing time.
         """
 
+    @abstractmethod
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
         """Bring the poses up to the current qpos, without advancing time.
 
         Args:
             mask: Worlds that need it (None: all). Others may be brought up to date too.
+
+        Raises:
+            ArgumentError: As for `reset`.
         """
 
+    @abstractmethod
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Put worlds back to the model's qpos0, at rest: act, ctrl, sensordata, counters and
         overflow bits become zero.
@@ -198,28 +211,57 @@ class Simulation(Protocol):
 
     def graph_of(self, n: int = 1, *, kinematics: bool = False) -> Repeated | None:
         """The graph that ``step(n)`` replays; None on a backend that captures nothing."""
+        return None
 
     def memory_bytes(self) -> int | None:
         """Bytes of the arrays that grow with nworld; None where they are not counted."""
+        return None
 
     def borrowed_bytes(self) -> int | None:
         """The most that a step borrows at once beside them; None where it is not known."""
+        return None
 
+    @abstractmethod
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as this backend holds them, by MuJoCo's names."""
 
-    def set_options(
-        self,
-        *,
-        iterations: int | None = None,
-        ls_iterations: int | None = None,
-        tolerance: float | None = None,
-        impratio: float | None = None,
-    ) -> None:
-        """Change the constraint solver's limits in all worlds, from the next step on."""
-
+    @abstractmethod
     def synchronize(self) -> None:
         """Wait for the device."""
 
+    @abstractmethod
     def close(self) -> None:
         """Give threads and buffers back."""
+
+    def _check_mask(self, mask: torch.Tensor | None) -> None:
+        """Check what can be known of a mask without reading it; `reset` has the error."""
+        expected = f"a torch.bool tensor of shape ({self.nworld},) on {self.device}"
+        if mask is None:
+            return
+        if not isinstance(mask, torch.Tensor):
+            raise ArgumentError("mask", f"a {type(mask).__name__}", expected)
+        if (mask.dtype, mask.shape, mask.device) != (torch.bool, (self.nworld,), self.device):
+            given = f"a {mask.dtype} tensor of shape {tuple(mask.shape)} on {mask.device}"
+            raise ArgumentError("mask", given, expected)
+
+    def _keep_peaks(self, mask: torch.Tensor | None) -> None:
+        """Keep the peaks that a reset of some worlds would erase; drop all in a full one."""
+        contacts, rows, bits = self._erased
+        if mask is None:
+            for buffer in self._erased:
+                buffer.zero_()
+        else:
+            torch.maximum(contacts, self.peak_contacts, out=contacts)
+            torch.maximum(rows, self.peak_constraints, out=rows)
+            bits |= self.overflow
+
+
+def named_options(option: object) -> dict[str, float | int | str]:
+    """Iteration limits and MuJoCo's names of the choices, of a model's or an uploaded option."""
+    limits = {name: int(getattr(option, name)) for name in ("iterations", "ls_iterations")}
+    kinds = {
+        "integrator": mujoco.mjtIntegrator,
+        "cone": mujoco.mjtCone,
+        "solver": mujoco.mjtSolver,
+    }
+    return limits | {name: kind(int(getattr(option, name))).name for name, kind in kinds.items()}

@@ -1,13 +1,14 @@
 """Counters of what the worlds use of MJWarp's buffers, kept on the device by Warp kernels."""
 
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
+from itertools import combinations_with_replacement
+
 import mujoco
 import numpy as np
 import torch
-import warp as wp
 
-from mjstack.sim.engine import mjw
 from mjstack.sim.simulation import LOST_PHYSICS
+from mjstack.sim.warp_setup import mjw, wp
 
 
 class Usage:
@@ -22,32 +23,19 @@ class Usage:
         overflow: Bits of `Overflow` since the world's last reset, shape ``(nworld,)``, int32.
         limits: Bits of `SolverLimit`, the same.
         steps: Physics steps since the world's last reset, shape ``(nworld,)``, int64.
-        most: Peak contacts, peak rows and overflow bits that masked resets have erased since the
-            last full one. They are taken in just before such a reset, and not in every substep:
-            nothing else lowers a counter, so the two together never miss one, and it costs a
-            captured step three small operations.
     """
 
-    def __init__(self, model: mujoco.MjModel, nworld: int) -> None:
-        """Allocate the counters on Warp's current device."""
-        self._contacts, self._peak_contacts, self._peak_rows, self._lost, self._limits = (
-            wp.zeros(nworld, dtype=int) for _ in range(5)
-        )
-        self._peak_pool = wp.zeros(3, dtype=int)
-        self._steps = wp.zeros(nworld, dtype=wp.int64)
-        self._mask = wp.zeros(nworld, dtype=bool)
+    def __init__(self, model: mujoco.MjModel, nworld: int, device: torch.device) -> None:
+        """Allocate the counters."""
+        counts = torch.zeros((5, nworld), dtype=torch.int32, device=device)
+        self.contacts, self.peak_contacts, self.peak_rows, self.overflow, self.limits = counts
+        self.peak_pool = torch.zeros(3, dtype=torch.int32, device=device)
+        self.steps = torch.zeros(nworld, dtype=torch.int64, device=device)
+        self._arrays = [wp.from_torch(view) for view in (*counts, self.peak_pool, self.steps)]
+        self._perworld = counts
         kinds = convex_kinds(model)
         self._kinds = None if kinds is None else wp.array(kinds, dtype=int)
         self._kind_counts = wp.zeros(0 if kinds is None else int(kinds.max()) + 1, dtype=int)
-        self.contacts = wp.to_torch(self._contacts)
-        self.peak_contacts = wp.to_torch(self._peak_contacts)
-        self.peak_rows = wp.to_torch(self._peak_rows)
-        self.peak_pool = wp.to_torch(self._peak_pool)
-        self.overflow = wp.to_torch(self._lost)
-        self.limits = wp.to_torch(self._limits)
-        self.steps = wp.to_torch(self._steps)
-        self._torch_mask = wp.to_torch(self._mask)
-        self.most = tuple(torch.zeros_like(self.overflow) for _ in range(3))
 
     def count(self, m: mjw.Model, d: mjw.Data, steps: int) -> None:
         """Count what the worlds use now, and the steps that they have just made."""
@@ -56,7 +44,8 @@ class Usage:
         # A thread per world, and at least one for every eighth place of the pool, which is mostly
         # empty.
         stride = max(nworld, pool // 8)
-        self._contacts.zero_()
+        contacts, peak_contacts, peak_rows, lost, limits, peak_pool, steps_made = self._arrays
+        contacts.zero_()
         wp.launch(
             record_usage,
             dim=stride,
@@ -70,15 +59,7 @@ class Usage:
                 steps,
                 stride,
             ],
-            outputs=[
-                self._contacts,
-                self._peak_contacts,
-                self._peak_rows,
-                self._peak_pool,
-                self._lost,
-                self._limits,
-                self._steps,
-            ],
+            outputs=[contacts, peak_contacts, peak_rows, peak_pool, lost, limits, steps_made],
         )
         if self._kinds is not None:
             self._kind_counts.zero_()
@@ -86,43 +67,13 @@ class Usage:
                 record_convex_contacts,
                 dim=stride,
                 inputs=[d.nacon, d.contact.geom, m.geom_type, self._kinds, stride],
-                outputs=[self._kind_counts, self._peak_pool],
+                outputs=[self._kind_counts, peak_pool],
             )
 
-    def select(self, mask: torch.Tensor | None) -> wp.array:
-        """Keep the peaks that a reset of some worlds would erase; return the mask for Warp.
-
-        Args:
-            mask: The worlds (None: all), shape ``(nworld,)``, bool.
-        """
-        contacts, rows, bits = self.most
-        if mask is None:
-            self._torch_mask.fill_(True)
-            self.peak_pool.zero_()
-            for buffer in self.most:
-                buffer.zero_()
-        else:
-            self._torch_mask.copy_(mask)
-            torch.maximum(contacts, self.peak_contacts, out=contacts)
-            torch.maximum(rows, self.peak_rows, out=rows)
-            bits |= self.overflow
-        return self._mask
-
-    def clear(self) -> None:
-        """Clear the counters of the worlds that were selected."""
-        wp.launch(
-            clear_counters,
-            dim=len(self.contacts),
-            inputs=[self._mask],
-            outputs=[
-                self._peak_contacts,
-                self._peak_rows,
-                self._contacts,
-                self._lost,
-                self._limits,
-                self._steps,
-            ],
-        )
+    def clear(self, mask: torch.Tensor) -> None:
+        """Clear the counters of the worlds of a mask, shape ``(nworld,)``, bool."""
+        self._perworld.masked_fill_(mask, 0)
+        self.steps.masked_fill_(mask, 0)
 
 
 def convex_kinds(model: mujoco.MjModel) -> np.ndarray | None:
@@ -133,27 +84,15 @@ def convex_kinds(model: mujoco.MjModel) -> np.ndarray | None:
     sphere with a cylinder.
     """
     g = mujoco.mjtGeom
-    present = {int(t) for t in model.geom_type}
-    shapes = [
-        int(t)
-        for t in (
-            g.mjGEOM_HFIELD,
-            g.mjGEOM_SPHERE,
-            g.mjGEOM_CAPSULE,
-            g.mjGEOM_ELLIPSOID,
-            g.mjGEOM_CYLINDER,
-        )
-    ]
-    shapes += [int(t) for t in (g.mjGEOM_BOX, g.mjGEOM_MESH)]
-    simple = {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CAPSULE), int(g.mjGEOM_BOX)}
-    kinds = np.full(2 * (max(present) + 1,), -1, dtype=np.int32)
+    shapes = sorted({*model.geom_type.tolist()} - {int(g.mjGEOM_PLANE), int(g.mjGEOM_SDF)})
+    primitive = {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CAPSULE), int(g.mjGEOM_BOX)}
+    round_ = {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CYLINDER)}
+    kinds = np.full(2 * (model.geom_type.max(initial=0) + 1,), -1, dtype=np.int32)
     number = 0
-    for i, a in enumerate(shapes):
-        for b in shapes[i:]:
-            primitive = {a, b} <= simple or {a, b} == {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CYLINDER)}
-            if not primitive and {a, b} <= present:
-                kinds[a, b] = kinds[b, a] = number
-                number += 1
+    for a, b in combinations_with_replacement(shapes, 2):
+        if not ({a, b} <= primitive or {a, b} == round_):
+            kinds[a, b] = kinds[b, a] = number
+            number += 1
     return kinds if number else None
 
 
@@ -218,24 +157,3 @@ def record_convex_contacts(
         kind = kinds[geom_type[geom[c][0]], geom_type[geom[c][1]]]
         if kind >= 0:
             wp.atomic_max(peak_pool, 2, wp.atomic_add(counts, kind, 1) + 1)
-
-
-@wp.kernel(enable_backward=False)
-def clear_counters(
-    mask: wp.array[bool],
-    peak_contacts: wp.array[int],
-    peak_nefc: wp.array[int],
-    contacts: wp.array[int],
-    lost: wp.array[int],
-    limits: wp.array[int],
-    steps: wp.array[wp.int64],
-) -> None:
-    """Start the counters of the masked worlds anew."""
-    w = wp.tid()
-    if mask[w]:
-        peak_contacts[w] = 0
-        peak_nefc[w] = 0
-        contacts[w] = 0
-        lost[w] = 0
-        limits[w] = 0
-        steps[w] = wp.int64(0)

@@ -1,13 +1,14 @@
-"""Warp, configured before its first use, and ordered with torch's work."""
+"""Warp and MuJoCo Warp, imported in one place, and ordered with torch's work."""
 
 from __future__ import annotations
 
 import torch
 import warp as wp
 
-__all__ = ["torch_stream_scope", "wp"]
-
 wp.config.log_level = wp.LOG_ERROR  # it would greet on every run
+import mujoco_warp as mjw  # noqa: E402  (the first use of Warp)
+
+__all__ = ["mjw", "torch_stream_scope", "wp"]
 
 # One object per torch stream, for ever: a second one for the same stream would unregister it when
 # freed.
