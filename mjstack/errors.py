@@ -162,19 +162,10 @@ class Unreachable(MjstackError):
 class WorkerLost(MjstackError):
     """A process that plans worlds has ended before its work was done."""
 
-    def __init__(self, label: str, status: int) -> None:
-        """Builds the message.
-
-        Args:
-            label: Which worker, such as ``2 of 15``.
-            status: Its exit status; negative for the signal that killed it.
-        """
-        ended = (
-            f"was killed by signal {-status}" if status < 0 else f"ended with exit status {status}"
-        )
+    def __init__(self) -> None:
         super().__init__(
-            f"planning worker {label} {ended}: expected it to run until every world is planned. Run"
-            " again with more free memory, or on one core (taskset -c 0), which starts no workers."
+            "a planning process was killed or ended before every world was planned. Run again with"
+            " more free memory, or on one core (taskset -c 0), which starts no processes."
         )
 
 

@@ -16,7 +16,7 @@ from mjstack.envs import Env, driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError
 from mjstack.managers.reset import required_fields
-from mjstack.scene.phases import build_targets
+from mjstack.scene.phases import build_phases
 from mjstack.sim import make_simulation
 
 Stage = Callable[[str], RunContext]
@@ -55,7 +55,7 @@ def test_phases_follow_their_times_and_targets(robot: str, stage: Stage) -> None
         assert controller.phase.tolist() == [phase] * 3
         env.step(command)
         if step in ends:  # commanded to the target; the servos lag by a few millimetres
-            target = build_targets(env.cfg)[controller.phases[ends[step]].name]
+            target = controller.phases[ends[step]].target
             assert target is not None
             wanted = torch.cat((red[:, :2], torch.full((3, 1), target.z, dtype=red.dtype)), 1)
             reached = controller._ik.grasp_point(command).double()
@@ -174,16 +174,20 @@ def test_tilt_follows_the_phases() -> None:
     cfg = load_config(["task=box"])
     phases = cfg.controller.phases
     names = list(phases)
-    specs = list(phases.values())
-    kept = [name for name, keeps in zip(names, _keeps(specs), strict=True) if keeps]
+    built = build_phases(cfg)
+    kept = [name for name, keeps in zip(names, _keeps(built), strict=True) if keeps]
     roles = ("lift", "carry", "hold", "open", "retreat", "settle")
     assert kept == [f"{role}_{cube}" for cube in ("red", "blue") for role in roles] + ["done"]
-    assert [names[place] for place in _places(cfg)] == ["hold_red"] * 6 + ["hold_blue"] * 13
+    assert [names[place] for place in _places(build_phases(cfg))] == ["hold_red"] * 6 + [
+        "hold_blue"
+    ] * 13
     phases["hold_red"].anchor = None
-    assert [names[place] for place in _places(cfg)][:7] == ["carry_red"] * 6 + ["hold_blue"]
-    for spec in specs:
+    assert [names[place] for place in _places(build_phases(cfg))][:7] == ["carry_red"] * 6 + [
+        "hold_blue"
+    ]
+    for spec in phases.values():
         spec.grasps = None
-    assert [names[place] for place in _places(cfg)] == ["retreat_blue"] * 19
+    assert [names[place] for place in _places(build_phases(cfg))] == ["retreat_blue"] * 19
 
 
 @pytest.mark.full

@@ -25,7 +25,7 @@ from mjstack.mdp.geometry import above_table, place_xy, pose_w, source_xy
 from mjstack.mdp.observation import object_to_place
 from mjstack.mdp.reward import near_place
 from mjstack.mdp.starts.starts_file import write_starts
-from mjstack.scene.phases import build_targets, nominal_xy, target_xy
+from mjstack.scene.phases import build_phases, nominal_xy, target_xy
 
 TABLE = """
   table_center: [0.35, -0.04, 0.012]
@@ -248,7 +248,7 @@ def test_both_drivers_aim_toward_the_goal(folder: Callable[[str], Path]) -> None
     along = (goal - puck) / np.linalg.norm(goal - puck, axis=1, keepdims=True)
     left = np.column_stack((-along[:, 1], along[:, 0]))
     want = {"approach": puck - 0.06 * along + 0.01 * left, "push": goal - 0.03 * along}
-    targets = build_targets(env.cfg)
+    targets = {phase.name: phase.target for phase in build_phases(env.cfg)}
     for name, xy in want.items():
         target = targets[name]
         assert target is not None
@@ -273,9 +273,9 @@ def test_both_drivers_aim_toward_the_goal(folder: Callable[[str], Path]) -> None
 def test_what_is_stacked_is_higher_from_then_on() -> None:
     """After red was put on blue, red's centre is a cube higher."""
     cfg = load_config([])
-    before = build_targets(cfg)
+    before = {phase.name: phase.target for phase in build_phases(cfg)}
     cfg.controller.phases["retreat"].anchor = "red"
-    after = build_targets(cfg)
+    after = {phase.name: phase.target for phase in build_phases(cfg)}
     target, moved = before["retreat"], after["retreat"]
     assert target is not None
     assert moved is not None

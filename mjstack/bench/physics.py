@@ -24,7 +24,6 @@ from mjstack.episodes.observers import CommandRecorder, Snapshots
 from mjstack.episodes.rollout import State, restore
 from mjstack.errors import MjstackError
 from mjstack.mdp.geometry import objects_in_hand
-from mjstack.scene.phases import carried_objects
 from mjstack.sim import Simulation, resolve_device
 
 BARE = "mujoco_warp.step as it is"
@@ -234,7 +233,6 @@ def _in_hand(context: RunContext, sim: Simulation) -> int | None:
 
     None if the phase carries none.
     """
-    phases = context.cfg.controller.phases
-    place = list(phases).index(context.cfg.gate.throughput.from_phase)
-    number = carried_objects(context.cfg)[place]
+    name = context.cfg.gate.throughput.from_phase
+    number = next(phase.carried for phase in context.planner.phases if phase.name == name)
     return None if number < 0 else int(objects_in_hand(context.index, sim)[:, number].sum())

@@ -17,7 +17,7 @@ from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import objects_in_hand, place_xy, pose_w, robot
-from mjstack.scene.phases import build_phases, build_targets, grasped_objects, source_names
+from mjstack.scene.phases import Target, build_phases, source_names
 from mjstack.tasks.check import make_check
 
 _QUARTER = 0.5 * math.pi
@@ -100,7 +100,7 @@ class ClosedLoopDriver:
         self._n_arm = env.index.n_arm
         self._nominal = torch.as_tensor(nominal, dtype=torch.float32, device=device)
         self._tilt = (
-            CarryTilt(env.sim.model, cfg, self._ik, self._nominal)
+            CarryTilt(env.sim.model, cfg, self.phases, self._ik, self._nominal)
             if c.approach_gain > 0.0
             else None
         )
@@ -202,10 +202,10 @@ class ClosedLoopDriver:
         table = self._target.index_select(0, phase)
         seen = self._last_seen(self._source, phase)
         offset = table[:, :2]
-        if self._turns:
+        if any(spec.toward is not None for spec in self._cfg.controller.phases.values()):
             away = self._last_seen(self._toward, phase) - seen
             angle = torch.atan2(away[:, 1], away[:, 0])
-            angle = angle * self._has_toward.index_select(0, phase)
+            angle = angle * self._turns.index_select(0, phase)
             along, left = offset.unbind(1)
             cos = torch.cos(angle)
             sin = torch.sin(angle)
@@ -292,23 +292,22 @@ class ClosedLoopDriver:
 
     def _build_tables(self, cfg: Config, device: torch.device) -> None:
         """What each phase says, as tensors."""
-        names = list(cfg.controller.phases)
-        specs = list(cfg.controller.phases.values())
-        targets = list(build_targets(cfg).values())
+        phases = self.phases
+        names = [phase.name for phase in phases]
+        specs = [phase.spec for phase in phases]
+        targets = [phase.target or Target(0, -1, (0.0, 0.0), 0.0) for phase in phases]
         sources = source_names(cfg.scene)
         grips = {"open": cfg.robot.gripper_open, "closed": cfg.robot.gripper_closed}
-        steps = [phase.stop - phase.start for phase in self.phases]
 
         def table(values: list, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.tensor(values, dtype=dtype, device=device)
 
-        self._length = table(steps)
-        self._target = table([[*t.offset, t.z] if t else [0.0] * 3 for t in targets])
-        self._source = table([t.source if t else 0 for t in targets], torch.int64)
-        self._toward = table([max(t.toward, 0) if t else 0 for t in targets], torch.int64)
-        self._has_toward = table([float(t is not None and t.toward >= 0) for t in targets])
-        self._turns = any(spec.toward is not None for spec in specs)
-        self._holds = table([t is None for t in targets], torch.bool)
+        self._length = table([phase.stop - phase.start for phase in phases])
+        self._target = table([[*target.offset, target.z] for target in targets])
+        self._source = table([target.source for target in targets], torch.int64)
+        self._toward = table([max(target.toward, 0) for target in targets], torch.int64)
+        self._turns = table([float(target.toward >= 0) for target in targets])
+        self._holds = table([phase.target is None for phase in phases], torch.bool)
         self._grip = table([grips[spec.gripper] for spec in specs])
         observes = [
             [spec.observe and name in (spec.anchor, spec.toward) for name in sources]
@@ -320,14 +319,14 @@ class ClosedLoopDriver:
             for spec in specs
         ]
         self._aligns = table(aligns, torch.bool)
-        self._grasps = table(grasped_objects(cfg), torch.int64)
+        self._grasps = table([phase.grasped for phase in phases], torch.int64)
         self._numbers = torch.arange(len(cfg.scene.objects), device=device)
         self._can_retry = table([spec.retry is not None for spec in specs], torch.bool)
         self._retry_to = table(
             [names.index(spec.retry) if spec.retry else 0 for spec in specs], torch.int64
         )
         # From the start of a phase to that of the last one, where the arm rests.
-        self._needed = table([self.phases[-1].start - phase.start for phase in self.phases])
+        self._needed = table([phases[-1].start - phase.start for phase in phases])
         self._speed_limit = cfg.controller.speed_limit
         window = 0 if cfg.task.check is None else make_check(cfg).settle_steps
         self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)

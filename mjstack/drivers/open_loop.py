@@ -3,24 +3,37 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Generator
-from contextlib import closing
+import os
+import signal
+import sys
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
+from multiprocessing import get_context, parent_process
+from threading import Thread
+from types import ModuleType
 
 import numpy as np
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.drivers.planning_pool import PARALLEL_FROM, WORLDS_PER_PROCESS, Plan, plan_in_parallel
-from mjstack.errors import Unreachable
+from mjstack.errors import Unreachable, WorkerLost
 from mjstack.kinematics.mink_ik import GraspIk
-from mjstack.scene.phases import (
-    build_phases,
-    build_targets,
-    carried_objects,
-    nominal_xy,
-    target_xy,
-)
+from mjstack.scene.phases import build_phases, nominal_xy, target_xy
 from mjstack.sim.native import available_cores
+
+# Distinct worlds: some 6 s of planning; a process needs 3 s before its first plan.
+PARALLEL_FROM = 512
+WORLDS_PER_PROCESS = 128  # distinct worlds that pay for one process more
+_CHUNK = 8  # worlds, 0.1 s of planning: messages cost little beside it
+
+_THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+# World, commands at the knots (n, nu), largest distance [m] from a target.
+Plan = tuple[int, np.ndarray, float]
+
+_planner: OpenLoopPlanner  # of a process that plans for another one
 
 
 class JointTrajectory:
@@ -83,23 +96,13 @@ class JointTrajectory:
 class OpenLoopPlanner:
     """Plans joint trajectories for objects and places at given positions, with mink."""
 
-    def __init__(
-        self, cfg: Config, *, parallel_from: int = PARALLEL_FROM, processes: int | None = None
-    ) -> None:
+    def __init__(self, cfg: Config) -> None:
         """Plans the nominal start, from which every other plan starts.
-
-        Args:
-            cfg: The configuration.
-            parallel_from: Number of distinct worlds from which on other processes help with them.
-            processes: How many plan then, this one among them; by default as many as there are
-                cores and work for.
 
         Raises:
             Unreachable: A nominal target is out of reach.
         """
         self._cfg = cfg
-        self._parallel_from = parallel_from
-        self._processes = processes
         self.phases = build_phases(cfg)
         self.ik = GraspIk(
             cfg.robot,
@@ -111,8 +114,6 @@ class OpenLoopPlanner:
         self._weights, self._segments = self._step_weights()
         self._seed: np.ndarray | None = None
         self._last: tuple[np.ndarray, JointTrajectory] | None = None
-        self._phase_targets = build_targets(cfg)
-        self._carried = carried_objects(cfg)
         self._seed = self.plan_world(0, nominal_xy(cfg.scene))[0]
 
     def plan(
@@ -216,16 +217,13 @@ class OpenLoopPlanner:
         return knots, worst
 
     def _plans(self, worlds: list[int], sources_xy: np.ndarray) -> Generator[Plan]:
-        """The plans of some worlds, one after the other here, or shared out where there are many;
-        then in any order.
+        """The plans of some worlds, one after the other here, or shared out where there are
+        many.
         """
-        if len(worlds) >= self._parallel_from:
-            processes = self._processes or min(available_cores(), len(worlds) // WORLDS_PER_PROCESS)
-            if processes > 1:
-                yield from plan_in_parallel(
-                    self._cfg, self.plan_world, worlds, sources_xy, processes
-                )
-                return
+        processes = min(available_cores(), len(worlds) // WORLDS_PER_PROCESS)
+        if len(worlds) >= PARALLEL_FROM and processes > 1:
+            yield from plan_in_parallel(self._cfg, worlds, sources_xy, processes)
+            return
         for world in worlds:
             yield world, *self.plan_world(world, sources_xy[world])
 
@@ -238,14 +236,12 @@ class OpenLoopPlanner:
         held = -1
         grips = {"open": np.array(robot.gripper_open), "closed": np.array(robot.gripper_closed)}
         out: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-        for (name, cfg), carried in zip(
-            self._cfg.controller.phases.items(), self._carried, strict=True
-        ):
-            if held >= 0 and carried < 0:  # let go where the last target was
+        for phase in self.phases:
+            if held >= 0 and phase.carried < 0:  # let go where the last target was
                 where[held] = out[-1][1][:2]
-            held = carried
-            grip = grips[cfg.gripper]
-            target = self._phase_targets[name]
+            held = phase.carried
+            grip = grips[phase.spec.gripper]
+            target = phase.target
             end = out[-1][1] if target is None else np.array([*target_xy(target, where), target.z])
             # The first phase's target stands from the first step; only the gripper moves from home.
             start = out[-1][1] if out else end
@@ -269,6 +265,75 @@ class OpenLoopPlanner:
                 rows.append(row)
                 segments.append(i * n)
         return np.array(rows), np.array(segments)
+
+
+def plan_in_parallel(
+    cfg: Config, worlds: Sequence[int], sources_xy: np.ndarray, processes: int
+) -> Generator[Plan]:
+    """Plans worlds in processes, which are gone when this has ended, in whatever way it ends.
+
+    Args:
+        cfg: From which a process builds its planner.
+        worlds: Their numbers, ascending.
+        sources_xy: Position of each object and place of every world at the start [m], shape
+            ``(nworld, sources, 2)``.
+        processes: How many plan.
+
+    Yields:
+        A plan per world, in the order of worlds.
+
+    Raises:
+        Unreachable: A target is out of reach; of several such worlds it names the first, as one
+            process would.
+        WorkerLost: A process has ended by itself.
+    """
+    # Processes are not forks: this one may hold a CUDA context and threads.
+    pool = ProcessPoolExecutor(processes, get_context("spawn"), _start_process, (cfg,))
+    try:
+        with _as_programs():
+            plans = pool.map(_plan, worlds, sources_xy[list(worlds)], chunksize=_CHUNK)
+        yield from plans
+    except BrokenProcessPool:
+        raise WorkerLost from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _as_programs() -> Iterator[None]:
+    """Processes that start in here do not import the main module again, which need not bear it,
+    leave Ctrl-C to this process, and use one core each.
+    """
+    main = sys.modules["__main__"]
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    sys.modules["__main__"] = ModuleType("__main__")
+    limits = {name: "1" for name in _THREAD_LIMITS if name not in os.environ}
+    os.environ.update(limits)
+    try:
+        yield
+    finally:
+        for name in limits:
+            del os.environ[name]
+        sys.modules["__main__"] = main
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+def _start_process(cfg: Config) -> None:
+    """Makes the planner of a process, which ends when the one that started it does."""
+    global _planner
+    Thread(target=_end_with_parent, daemon=True).start()
+    _planner = OpenLoopPlanner(cfg)
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _plan(world: int, xy: np.ndarray) -> Plan:
+    return world, *_planner.plan_world(world, xy)
 
 
 def _smoothstep(u: float) -> float:

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import mujoco
 import torch
 
-from mjstack.config.schema import Config, PhaseCfg
+from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.scene.index import find
-from mjstack.scene.phases import carried_objects
+from mjstack.scene.phases import Phase
 
 
 class CarryTilt:
@@ -30,13 +30,19 @@ class CarryTilt:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, cfg: Config, ik: BatchedIk, nominal: torch.Tensor
+        self,
+        model: mujoco.MjModel,
+        cfg: Config,
+        phases: Sequence[Phase],
+        ik: BatchedIk,
+        nominal: torch.Tensor,
     ) -> None:
         """Allocates for the worlds of the solver.
 
         Args:
             model: The compiled scene.
             cfg: The configuration; ``controller.approach_gain`` must be positive.
+            phases: The phases.
             ik: The driver's solver.
             nominal: Commands at the end of each phase of the nominal plan, shape ``(phases, nu)``,
                 float32.
@@ -57,10 +63,9 @@ class CarryTilt:
             approach_gain=c.approach_gain,
         )
         self._sign = turn_sign(model, cfg)
-        specs = list(c.phases.values())
-        self._keeps = torch.tensor(_keeps(specs), device=device)
-        self._grasps = torch.tensor([spec.grasps is not None for spec in specs], device=device)
-        self.place = torch.tensor(_places(cfg), device=device)
+        self._keeps = torch.tensor(_keeps(phases), device=device)
+        self._grasps = torch.tensor([phase.grasped >= 0 for phase in phases], device=device)
+        self.place = torch.tensor(_places(phases), device=device)
         self._there = nominal.new_zeros((ik.nworld, nominal.shape[1]))
         self._kept = nominal.new_zeros((ik.nworld, 3))
         self._kept_turn = nominal.new_zeros(ik.nworld)
@@ -111,28 +116,28 @@ def turn_sign(model: mujoco.MjModel, cfg: Config) -> float:
     return math.copysign(1.0, up)
 
 
-def _keeps(specs: Sequence[PhaseCfg]) -> list[bool]:
+def _keeps(phases: Sequence[Phase]) -> list[bool]:
     """Whether the tilt of the last grasp is kept in each phase."""
     out = []
     kept = False
-    for spec in specs:
-        kept = kept and not (spec.observe and spec.gripper == "open")
-        out.append(kept and spec.grasps is None)
-        kept = kept or spec.grasps is not None
+    for phase in phases:
+        kept = kept and not (phase.spec.observe and phase.spec.gripper == "open")
+        out.append(kept and phase.grasped < 0)
+        kept = kept or phase.grasped >= 0
     return out
 
 
-def _places(cfg: Config) -> list[int]:
+def _places(phases: Sequence[Phase]) -> list[int]:
     """Number of the phase at whose target the next object, or the held one, is released, for each
     phase; after all of them, the last.
     """
-    specs = list(cfg.controller.phases.values())
-    carries = [number >= 0 for number in carried_objects(cfg)]
-    ends = [k for k, held in enumerate(carries) if held and not any(carries[k + 1 : k + 2])] or [
-        len(carries) - 1
-    ]
-    # Without an anchor the target before holds.
-    at = {
-        end: max(k for k in range(end + 1) if k == 0 or specs[k].anchor is not None) for end in ends
-    }
-    return [at[next((end for end in ends if end >= k), ends[-1])] for k in range(len(carries))]
+    carries = [phase.carried >= 0 for phase in phases] + [False]
+    last = len(phases) - 1
+    ends = [k for k in range(len(phases)) if carries[k] and not carries[k + 1]] or [last]
+    out = []
+    for k in range(len(phases)):
+        place = next((end for end in ends if end >= k), ends[-1])
+        while place > 0 and phases[place].target is None:  # the target before holds
+            place -= 1
+        out.append(place)
+    return out

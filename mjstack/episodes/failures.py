@@ -12,7 +12,7 @@ from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.rollout import Observer
 from mjstack.math import not_finite
-from mjstack.scene.phases import carried_objects, grasped_objects
+from mjstack.scene.phases import build_phases
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.tasks.check import make_check
 
@@ -86,9 +86,10 @@ class FailureMonitor(Observer):
         numbers = {name: number for number, name in enumerate(cfg.scene.objects)}
         column = {numbers[name]: place for place, name in enumerate(objects)}
         # Without phases there is one, in which nothing is grasped or carried.
+        phases = build_phases(cfg)
         self._tables = tuple(
             [column.get(number, -1) for number in table] or [-1]
-            for table in (grasped_objects(cfg), carried_objects(cfg))
+            for table in ([p.grasped for p in phases], [p.carried for p in phases])
         )
         self._releases = _releases(self._tables[1], len(objects))
 

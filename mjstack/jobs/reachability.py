@@ -115,15 +115,15 @@ def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
         raise ConfigError(
             "controller.phases", list(cfg.controller.phases), "a phase with an object as its anchor"
         )
-    low, high = (end(targets, key=lambda target: target.target.z) for end in (min, max))
+    low, high = (end(targets, key=lambda pair: pair[1].z) for end in (min, max))
     first = targets[0]
     top = table_top(cfg.scene)
     # The jaws close where they grasp, but come there open, which reaches less far where one jaw
     # stays.
     return {
-        "grasp": (low.target.z - top, "open"),
-        "approach": (first.target.z - top, first.gripper),
-        "carry": (high.target.z - top, high.gripper),
+        "grasp": (low[1].z - top, "open"),
+        "approach": (first[1].z - top, first[0].spec.gripper),
+        "carry": (high[1].z - top, high[0].spec.gripper),
     }
 
 

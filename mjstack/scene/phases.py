@@ -6,17 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjstack.config.schema import Config, SceneCfg
+from mjstack.config.schema import Config, PhaseCfg, SceneCfg
 from mjstack.scene.build import table_top
-
-
-@dataclass(frozen=True, slots=True)
-class Phase:
-    """A phase as steps ``start`` to ``stop`` (exclusive) of the episode."""
-
-    name: str
-    start: int
-    stop: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,31 +28,26 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True)
-class ObjectTarget:
-    """Where a phase brings the grasp point at an object that stands on the table.
+class Phase:
+    """A phase of the scripted motion.
 
     Attributes:
-        phase: The first phase that does.
-        height: Above the object's centre [m].
-        gripper: ``open`` or ``closed``.
-        target: The target.
+        name: Its name.
+        start: Its first step in the episode.
+        stop: The first step after it.
+        spec: The configuration of the phase.
+        target: Where it brings the grasp point; None where the last target holds.
+        grasped: Number of the object that it grasps, or -1.
+        carried: Number of the object that is in the hand all through it, or -1.
     """
 
-    phase: str
-    height: float
-    gripper: str
-    target: Target
-
-
-def build_phases(cfg: Config) -> list[Phase]:
-    """The controller's phases laid out over the episode's steps."""
-    phases = []
-    start = 0
-    for name, phase in cfg.controller.phases.items():
-        stop = start + round(phase.seconds / cfg.timing.step_dt)
-        phases.append(Phase(name, start, stop))
-        start = stop
-    return phases
+    name: str
+    start: int
+    stop: int
+    spec: PhaseCfg
+    target: Target | None
+    grasped: int
+    carried: int
 
 
 def source_names(scene: SceneCfg) -> list[str]:
@@ -75,15 +61,16 @@ def nominal_xy(scene: SceneCfg) -> np.ndarray:
     return np.array([*objects, *(place.xy for place in scene.places.values())]).reshape(-1, 2)
 
 
-def build_targets(cfg: Config) -> dict[str, Target | None]:
-    """The target of every phase; None where the last target holds.
+def build_phases(cfg: Config) -> list[Phase]:
+    """The controller's phases laid out over the episode's steps.
 
     An object that was put onto another one is as high as that makes it in the phases that follow.
     """
     scene = cfg.scene
     sources = source_names(scene)
     bottom = dict.fromkeys(sources, 0.0)  # above the table, when a phase begins
-    targets: dict[str, Target | None] = {}
+    phases: list[Phase] = []
+    start = 0
     held = ""  # the object that was grasped last
     in_hand = False
     rest = 0.0  # height above the table at which the last target would leave it
@@ -91,7 +78,7 @@ def build_targets(cfg: Config) -> dict[str, Target | None]:
         if spec.gripper == "open" and in_hand:
             bottom[held] = rest
             in_hand = False
-        targets[name] = None
+        target = None
         if spec.anchor is not None:
             thing = scene.objects.get(spec.anchor)
             half = thing.half_height if thing is not None else 0.0
@@ -108,11 +95,16 @@ def build_targets(cfg: Config) -> dict[str, Target | None]:
             toward = -1 if spec.toward is None else sources.index(spec.toward)
             offset = (spec.offset[0], spec.offset[1])
             z = table_top(scene) + up + above
-            targets[name] = Target(sources.index(spec.anchor), toward, offset, z)
+            target = Target(sources.index(spec.anchor), toward, offset, z)
+        stop = start + round(spec.seconds / cfg.timing.step_dt)
+        grasped = -1 if spec.grasps is None else sources.index(spec.grasps)
+        carried = sources.index(held) if in_hand and spec.grasps is None else -1
+        phases.append(Phase(name, start, stop, spec, target, grasped, carried))
+        start = stop
         if spec.grasps is not None:
             held = spec.grasps
             in_hand = True
-    return targets
+    return phases
 
 
 def target_xy(target: Target, sources: np.ndarray) -> np.ndarray:
@@ -130,38 +122,15 @@ def target_xy(target: Target, sources: np.ndarray) -> np.ndarray:
     return at + np.stack((along * cos - left * sin, along * sin + left * cos), axis=-1)
 
 
-def object_targets(cfg: Config) -> dict[str, list[ObjectTarget]]:
-    """What the phases ask of the position of each free object, in their order; each height, offset
-    and opening once.
+def object_targets(cfg: Config) -> dict[str, list[tuple[Phase, Target]]]:
+    """The phases that go to each free object, in their order; each height, offset and opening
+    once.
     """
-    found: dict[str, dict[tuple, ObjectTarget]] = {name: {} for name in cfg.scene.free}
+    found: dict[str, dict[tuple, tuple[Phase, Target]]] = {name: {} for name in cfg.scene.free}
     names = source_names(cfg.scene)
-    for name, target in build_targets(cfg).items():
-        if target is None or names[target.source] not in found:
-            continue
-        thing = names[target.source]
-        gripper = cfg.controller.phases[name].gripper
-        center = table_top(cfg.scene) + cfg.scene.objects[thing].half_height
-        height = target.z - center
-        key = (round(height, 6), gripper, target.offset, target.toward)
-        found[thing].setdefault(key, ObjectTarget(name, height, gripper, target))
+    for phase in build_phases(cfg):
+        target = phase.target
+        if target is not None and (thing := names[target.source]) in found:
+            key = (round(target.z, 6), phase.spec.gripper, target.offset, target.toward)
+            found[thing].setdefault(key, (phase, target))
     return {name: list(targets.values()) for name, targets in found.items()}
-
-
-def grasped_objects(cfg: Config) -> list[int]:
-    """Number of the object that each phase grasps, or -1."""
-    numbers = {name: number for number, name in enumerate(cfg.scene.objects)}
-    return [numbers.get(spec.grasps or "", -1) for spec in cfg.controller.phases.values()]
-
-
-def carried_objects(cfg: Config) -> list[int]:
-    """Number of the object that is in the hand all through each phase, or -1."""
-    out = []
-    held = -1
-    for spec, grasped in zip(cfg.controller.phases.values(), grasped_objects(cfg), strict=True):
-        if spec.gripper == "open":
-            held = -1
-        out.append(held if grasped < 0 else -1)
-        if grasped >= 0:
-            held = grasped
-    return out

@@ -10,14 +10,22 @@ import numpy as np
 from mjstack.errors import ParameterError
 from mjstack.kinematics.reach import PointReach
 from mjstack.managers.view import EnvView
-from mjstack.scene.phases import ObjectTarget, nominal_xy, object_targets, source_names, target_xy
+from mjstack.scene import table_top
+from mjstack.scene.phases import (
+    Phase,
+    Target,
+    nominal_xy,
+    object_targets,
+    source_names,
+    target_xy,
+)
 
 _GRID = 0.02  # [m] between the positions whose reach is tried
 
 
 def reach_distances(
     env: EnvView, name: str, xy: np.ndarray
-) -> tuple[np.ndarray, list[ObjectTarget]]:
+) -> tuple[np.ndarray, list[tuple[Phase, Target]]]:
     """How far the grasp point stays from where the phases bring it at an object.
 
     Args:
@@ -26,7 +34,7 @@ def reach_distances(
         xy: Where it stands [m], shape ``(n, 2)``.
 
     Returns:
-        Distance [m], shape ``(n, targets)``, and the targets.
+        Distance [m], shape ``(n, targets)``, and the phases with their targets.
     """
     robot = env.cfg.robot
     targets = object_targets(env.cfg)[name]
@@ -34,13 +42,14 @@ def reach_distances(
     sources[:, source_names(env.cfg.scene).index(name)] = xy
     distances = np.zeros((len(xy), len(targets)))
     for gripper, command in (("open", robot.gripper_open), ("closed", robot.gripper_closed)):
-        columns = [k for k, target in enumerate(targets) if target.gripper == gripper]
+        columns = [k for k, (phase, _) in enumerate(targets) if phase.spec.gripper == gripper]
         if not columns or not len(xy):
             continue
         points = np.empty((len(xy), len(columns), 3))
         for place, k in enumerate(columns):
-            points[:, place, :2] = target_xy(targets[k].target, sources)
-            points[:, place, 2] = targets[k].target.z
+            _, target = targets[k]
+            points[:, place, :2] = target_xy(target, sources)
+            points[:, place, 2] = target.z
         reach = PointReach(env.sim.model, robot, command)
         distances[:, columns] = reach.solve(points.reshape(-1, 3)).distance.reshape(len(xy), -1)
     return distances, targets
@@ -96,16 +105,14 @@ def out_of_reach(
         return None
     row, column = (int(k) for k in np.unravel_index(distances.argmax(), distances.shape))
     x, y = places[row]
-    target = targets[column]
-    where = (
-        "at its centre"
-        if abs(target.height) < 5e-4
-        else f"{1e3 * target.height:.0f} mm above its centre"
-    )
+    phase, target = targets[column]
+    scene = env.cfg.scene
+    height = target.z - table_top(scene) - scene.objects[name].half_height
+    where = "at its centre" if abs(height) < 5e-4 else f"{1e3 * height:.0f} mm above its centre"
     return (
         row,
         (
-            f"with {name} at ({x:.3f}, {y:.3f}) m the point {where} (phase {target.phase}) is "
+            f"with {name} at ({x:.3f}, {y:.3f}) m the point {where} (phase {phase.name}) is "
             f"{1e3 * distances[row, column]:.1f} mm out of reach"
         ),
     )
