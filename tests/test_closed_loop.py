@@ -58,7 +58,7 @@ def test_phases_follow_their_times_and_targets(robot: str, stage: Stage) -> None
             target = controller.phases[ends[step]].target
             assert target is not None
             wanted = torch.cat((red[:, :2], torch.full((3, 1), target.z, dtype=red.dtype)), 1)
-            reached = controller._ik.grasp_point(command).double()
+            reached = controller._ik.forward(command)[0].double()
             assert (reached - wanted).norm(dim=1).max() < env.cfg.controller.ik_tolerance
             assert (centre(env) - wanted).norm(dim=1).max() < 0.012
     assert float(controller.error.max()) < env.cfg.controller.ik_tolerance
@@ -75,7 +75,7 @@ def test_every_world_looks_at_its_own_cube(stage: Stage) -> None:
         if step == controller.phases[0].stop:
             env.sim.qpos[1, address] += 0.02
         env.step(controller.command())
-    grasp_point = controller._ik.grasp_point(controller._command)
+    grasp_point = controller._ik.forward(controller._command)[0]
     assert (grasp_point[:, :2] - env.sim.qpos[:, address : address + 2]).norm(dim=1).max() < 0.004
     env.close()
 
@@ -94,7 +94,7 @@ def test_jaws_turn_to_a_face(stage: Stage) -> None:
         env.sim.qpos[:, address + 4 : address + 6] = 0.0
         for _ in range(controller.phases[1].stop):
             env.step(controller.command())
-        closing = controller._ik.closing_axis(controller._command).double()
+        closing = controller._ik.forward(controller._command)[1].double()
         angle = torch.rad2deg(yaw - torch.atan2(closing[:, 1], closing[:, 0]))
         off[align] = (torch.remainder(angle + 45.0, 90.0) - 45.0).abs()
         env.close()
@@ -156,7 +156,7 @@ def test_a_cube_arrives_as_it_stood() -> None:
     for step in range(expert.steps):
         env.step(expert.command())
         if name := ends.get(step):
-            lean[name] = torch.rad2deg(torch.acos(-expert._ik.approach(expert._command)[:, 2]))
+            lean[name] = torch.rad2deg(torch.acos(-expert._ik.forward(expert._command)[2][:, 2]))
             x, y = env.sim.qpos[:, red + 4 : red + 6].unbind(1)
             tilt[name] = torch.rad2deg(torch.acos(1.0 - 2.0 * (x * x + y * y)))
     # If it pointed down wherever it can: 23 degrees both, and cubes tilted by 23 and 22.

@@ -137,7 +137,7 @@ PATHS: dict[str, list[str] | None] = {
     "episodes/failures.py": ["FailureMonitor.update", "_of"],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",
-        "BatchedIk._forward",
+        "BatchedIk.forward",
         "BatchedIk._launch",
         "BatchedIk._copy_in",
     ],

@@ -261,7 +261,7 @@ def test_both_drivers_aim_toward_the_goal(folder: Callable[[str], Path]) -> None
         command = driver.command()
         for number, name in enumerate(want):
             if step == driver.phases[number].stop - 1:
-                closed = driver._ik.grasp_point(command).double().numpy()
+                closed = driver._ik.forward(command)[0].double().numpy()
                 np.testing.assert_allclose(closed[:, :2], want[name], atol=6e-4)
                 for world in range(2):
                     planned = planner.ik.grasp_point(trajectory.command(step)[world].numpy())

@@ -94,9 +94,8 @@ def test_the_tilt_is_that_of_the_gripper_and_the_smallest(stage: Stage, robot: s
     for point, tilt in zip(points, upright.tilt, strict=True):
         start = rng.uniform(reach._low, reach._high, (300, len(reach._low)))
         many = np.tile(point, (300, 1))
-        found, _ = reach._descend(start, many, 100, 0.02)
-        found, left = reach._descend(found, many, 60)
-        assert reach._tilt(found[left < 5e-4]).min() > tilt - math.radians(0.5)
+        found = reach._look(reach._descend(reach._descend(start, many, 0.02), many), many)
+        assert found.tilt[found.distance < 5e-4].min() > tilt - math.radians(0.5)
 
 
 @pytest.mark.full
@@ -107,7 +106,7 @@ def test_out_of_reach_is_as_far_as_it_is(stage: Stage, robot: str) -> None:
     distance = reach.solve(far).distance
     # Stretched towards it: nothing of the range of 200,000 postures is nearer.
     q = np.random.default_rng(0).uniform(reach._low, reach._high, (200_000, len(reach._low)))
-    nearest = np.linalg.norm(far[0] - reach._forward(q)[1], axis=1).min()
+    nearest = reach._look(q, far[:1]).distance.min()
     assert 0.0 < distance[0] <= nearest
     assert distance[1] - distance[0] == pytest.approx(0.1, abs=1e-3)
 

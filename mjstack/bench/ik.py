@@ -108,7 +108,7 @@ def _problem(cfg: Config, ik: BatchedIk) -> tuple[torch.Tensor, torch.Tensor]:
     away[:, moved] += (
         torch.rand((ik.nworld, len(moved)), generator=torch.Generator().manual_seed(0)) - 0.5
     )
-    return home.to(ik.device), ik.grasp_point(away.to(ik.device)).clone()
+    return home.to(ik.device), ik.forward(away.to(ik.device))[0].clone()
 
 
 def _time(work: Callable[[], None], device: str, repetitions: int) -> list[float]:

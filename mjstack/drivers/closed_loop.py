@@ -242,7 +242,7 @@ class ClosedLoopDriver:
         self._roll.masked_fill_(fresh, 0.0)
         column = self._nominal[0, self._roll_column]
         command[:, self._roll_column] = column + self._roll
-        closing, approach = self._ik.directions(command)
+        _, closing, approach = self._ik.forward(command)
         yaw = self._yaw.gather(1, self._source.index_select(0, self.phase)[:, None])[:, 0]
         off = yaw - torch.atan2(closing[:, 1], closing[:, 0])
         off = off - _QUARTER * torch.round(off / _QUARTER)
@@ -268,9 +268,9 @@ class ClosedLoopDriver:
         names = [*self._cfg.robot.arm_joints, *self._cfg.robot.gripper_joints]
         column = names.index(str(self._cfg.robot.roll_joint))
         command = self._nominal[:1].expand(self._env.nworld, -1).clone()
-        before = self._ik.directions(command)[0][0].double().cpu()
+        before = self._ik.forward(command)[1][0].double().cpu()
         command[:, column] += 0.1
-        after = self._ik.directions(command)[0][0].double().cpu()
+        after = self._ik.forward(command)[1][0].double().cpu()
         return column, math.copysign(1.0, float(before[0] * after[1] - before[1] * after[0]))
 
     def _observe(self, entering: torch.Tensor, fresh: torch.Tensor) -> None:

@@ -90,10 +90,10 @@ class CarryTilt:
         self._there.copy_(self._there_ik.solve(start, there)[0])
         grasps = self._grasps.index_select(0, phase)
         keeps = self._keeps.index_select(0, phase)
-        self._kept.copy_(torch.where(grasps[:, None], self._ik.approach(command), self._kept))
+        self._kept.copy_(torch.where(grasps[:, None], self._ik.forward(command)[2], self._kept))
         self._kept_turn.copy_(torch.where(grasps, command[:, 0], self._kept_turn))
         x, y, z = torch.where(
-            keeps[:, None], self._kept, self._there_ik.approach(self._there)
+            keeps[:, None], self._kept, self._there_ik.forward(self._there)[2]
         ).unbind(1)
         turn = self._sign * (command[:, 0] - torch.where(keeps, self._kept_turn, self._there[:, 0]))
         cos = torch.cos(turn)

@@ -13,13 +13,15 @@ from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError, UnknownName
 from mjstack.kinematics.chain import build_chain
 from mjstack.kinematics.ik_kernels import forward_kernel, solve_kernel
-from mjstack.kinematics.joints import joint_limits
+from mjstack.kinematics.joints import joint_limits, locked_home
 from mjstack.scene.index import find
 from mjstack.sim.warp_setup import torch_stream_scope
 
 # m: with a gain, an iterate this close to the target replaces a closer one that came before
 _NEAR = 0.00002
 _LEAST_WITH_GAIN = 4  # iterations
+_LEAST = 1e-9  # of a positive argument
+_MOST = 1e9
 
 
 class BatchedIk:
@@ -90,23 +92,19 @@ class BatchedIk:
         """
         # Arguments
         gained = posture_gain > 0.0 or approach_gain > 0.0
-        for name, count, least in (
-            ("nworld", nworld, 1),
-            ("iterations", iterations, _LEAST_WITH_GAIN if gained else 1),
-            ("block_dim", block_dim, 1),
+        least = _LEAST_WITH_GAIN if gained else 1
+        for name, value, low, high in (
+            ("nworld", nworld, 1, _MOST),
+            ("iterations", iterations, least, _MOST),
+            ("block_dim", block_dim, 1, _MOST),
+            ("damping", damping, _LEAST, _MOST),
+            ("max_step", max_step, _LEAST, _MOST),
+            ("tolerance", tolerance, _LEAST, _MOST),
+            ("posture_gain", posture_gain, 0.0, 1.0),
+            ("approach_gain", approach_gain, 0.0, 1.0),
         ):
-            if count < least:
-                raise ArgumentError(name, count, f"an integer of at least {least}")
-        for name, value in (
-            ("damping", damping),
-            ("max_step", max_step),
-            ("tolerance", tolerance),
-        ):
-            if not 0.0 < value < np.inf:
-                raise ArgumentError(name, value, "a positive number")
-        for name, value in (("posture_gain", posture_gain), ("approach_gain", approach_gain)):
-            if not 0.0 <= value <= 1.0:
-                raise ArgumentError(name, value, "a number from 0 to 1")
+            if not low <= value <= high:
+                raise ArgumentError(name, value, f"a number from {low:g} to {high:g}")
 
         # Device and settings
         self.nworld = nworld
@@ -118,60 +116,30 @@ class BatchedIk:
         # of 4, 3 of 8, 10 of 40.
         guided = iterations - max(min(3, iterations // 2), iterations // 4) if gained else 0
         near = _NEAR if gained else -1.0
-        self._settings = [
-            *(iterations, guided, damping, max_step, posture_gain, approach_gain, near, tolerance)
-        ]
+        self._settings = [iterations, guided, damping, max_step]
+        self._settings += [posture_gain, approach_gain, near, tolerance]
 
         # Memory and kernels
         self._allocate(model, robot)
         q = self._view["q"]
-        self._forward(q)  # compiles and loads the kernels: a capture may do neither
+        self.forward(q)  # compiles and loads the kernels: a capture may do neither
         self.solve(q, self._view["target"])
         wp.synchronize_device(self._device)
 
-    def grasp_point(self, q: torch.Tensor) -> torch.Tensor:
-        """Forward kinematics.
+    def forward(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Forward kinematics, in one launch.
 
         Args:
             q: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``.
 
         Returns:
-            Grasp point [m], shape ``(nworld, 3)``, float32.
+            The grasp point [m]; the closing axis, a unit vector from the first grasp site to the
+            second, zero where they meet; and the approach axis, a unit vector from the wrist
+            towards the grasped object. Each has shape ``(nworld, 3)``, float32.
         """
-        return self._forward(q)[0]
-
-    def directions(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The closing and the approach axis in one launch.
-
-        Args:
-            q: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``.
-
-        Returns:
-            The results of `closing_axis` and `approach`.
-        """
-        return self._forward(q)[1:]
-
-    def closing_axis(self, q: torch.Tensor) -> torch.Tensor:
-        """Unit vector from the first grasp site to the second; zero where they meet.
-
-        Args:
-            q: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``.
-
-        Returns:
-            The closing axis, shape ``(nworld, 3)``, float32.
-        """
-        return self._forward(q)[1]
-
-    def approach(self, q: torch.Tensor) -> torch.Tensor:
-        """The robot's approach axis, from the wrist towards the grasped object.
-
-        Args:
-            q: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``.
-
-        Returns:
-            A unit vector, shape ``(nworld, 3)``, float32.
-        """
-        return self._forward(q)[2]
+        self._copy_in("q", q)
+        self._launch(forward_kernel, ["q"], [], ["point", "closing", "pointing"])
+        return self._view["point"], self._view["closing"], self._view["pointing"]
 
     def solve(
         self,
@@ -228,12 +196,6 @@ class BatchedIk:
         )
         return self._view["solution"], self._view["distance"]
 
-    def _forward(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Grasp point, closing axis and approach axis."""
-        self._copy_in("q", q)
-        self._launch(forward_kernel, ["q"], [], ["point", "closing", "pointing"])
-        return self._view["point"], self._view["closing"], self._view["pointing"]
-
     def _allocate(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
         """Make the chain, the kernel and all buffers, each a Warp array and a torch view of it."""
         names = [*robot.arm_joints, *robot.gripper_joints]
@@ -242,20 +204,19 @@ class BatchedIk:
             if name not in robot.arm_joints:
                 raise UnknownName("arm joint", name, robot.arm_joints)
         moved = [robot.arm_joints.index(name) for name in robot.ik_joints]
-        low = np.full(len(names), -np.inf, dtype=np.float32)
-        high = np.full(len(names), np.inf, dtype=np.float32)
-        low[moved], high[moved] = _round_inwards(*joint_limits(model, robot.ik_joints))
-        home = np.array(robot.home, dtype=np.float32)
-        for name, value in robot.locked.items():
-            home[names.index(name)] = value
+        limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(names))
+        for side, values in enumerate(joint_limits(model, robot.ik_joints)):
+            limits[side, moved] = _round_inwards(values, 1.0 - 2.0 * side)
         n = self.nworld
         with wp.ScopedDevice(self._device):
-            self._chain, shape = build_chain(model, robot, joints, moved, low, high)
+            self._chain, shape = build_chain(model, robot, joints, moved, *limits)
             self._array = {
                 **{k: wp.zeros((n, len(names)), dtype=float) for k in ("q", "posture", "solution")},
-                **{k: wp.zeros(n, dtype=wp.vec3) for k in ("target", "approach", "point")},
-                **{k: wp.zeros(n, dtype=wp.vec3) for k in ("closing", "pointing")},
-                "home": wp.array(np.tile(home, (n, 1)), dtype=float),
+                **{
+                    k: wp.zeros(n, dtype=wp.vec3)
+                    for k in ("target", "approach", "point", "closing", "pointing")
+                },
+                "home": wp.array(np.tile(locked_home(robot), (n, 1)), dtype=float),
                 "down": wp.full(n, wp.vec3(0.0, 0.0, -1.0), dtype=wp.vec3),
                 "distance": wp.zeros(n, dtype=float),
                 "unreachable": wp.zeros(n, dtype=wp.bool),
@@ -286,11 +247,8 @@ class BatchedIk:
         buffer.copy_(values)
 
 
-def _round_inwards(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Limits as float32 that are not outside of the given ones."""
-    low32 = low.astype(np.float32)
-    high32 = high.astype(np.float32)
-    return (
-        np.where(low32 < low, np.nextafter(low32, np.float32(np.inf)), low32),
-        np.where(high32 > high, np.nextafter(high32, np.float32(-np.inf)), high32),
-    )
+def _round_inwards(limits: np.ndarray, sign: float) -> np.ndarray:
+    """Limits as float32 that are not outside of the given ones; sign is 1 for low ones, else -1."""
+    rounded = limits.astype(np.float32)
+    inwards = np.nextafter(rounded, np.float32(sign * np.inf))
+    return np.where(sign * rounded < sign * limits, inwards, rounded)

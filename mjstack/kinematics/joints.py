@@ -21,19 +21,27 @@ def joint_limits(model: mujoco.MjModel, names: Sequence[str]) -> tuple[np.ndarra
     Returns:
         Low and high limits [rad, m], each of shape ``(n,)``; infinite where there is none.
     """
-    low = np.full(len(names), -np.inf)
-    high = np.full(len(names), np.inf)
-    for k, name in enumerate(names):
-        joint = find(model, "joint", name)
-        servo = find(model, "actuator", name)
-        for limited, span in (
-            (model.jnt_limited[joint], model.jnt_range[joint]),
-            (model.actuator_ctrllimited[servo], model.actuator_ctrlrange[servo]),
-        ):
-            if limited:
-                low[k] = max(low[k], span[0])
-                high[k] = min(high[k], span[1])
-    return low, high
+    joints = [find(model, "joint", name) for name in names]
+    servos = [find(model, "actuator", name) for name in names]
+    low, high = zip(
+        *(
+            np.where(limited[:, None], span, [-np.inf, np.inf]).T
+            for limited, span in (
+                (model.jnt_limited[joints], model.jnt_range[joints]),
+                (model.actuator_ctrllimited[servos], model.actuator_ctrlrange[servos]),
+            )
+        ),
+        strict=True,
+    )
+    return np.maximum(*low), np.minimum(*high)
+
+
+def locked_home(robot: RobotCfg) -> np.ndarray:
+    """The robot's home with the locked joints where they are locked [rad, m], shape ``(nu,)``."""
+    names = [*robot.arm_joints, *robot.gripper_joints]
+    return np.array(
+        [robot.locked.get(name, value) for name, value in zip(names, robot.home, strict=True)]
+    )
 
 
 def approach_body(model: mujoco.MjModel, robot: RobotCfg) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 
 from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError
+from mjstack.kinematics.joints import locked_home
 from mjstack.robots import robot_spec
 from mjstack.scene.index import find
 
@@ -76,9 +77,7 @@ class GraspIk:
                     )
         self._qpos = self.model.jnt_qposadr[joints]
         self._n_arm = len(robot.arm_joints)
-        self.home = np.array(robot.home)
-        for name, value in robot.locked.items():
-            self.home[names.index(name)] = value
+        self.home = locked_home(robot)
         self._configuration = mink.Configuration(self.model)
         moving = {int(self.model.joint(name).dofadr[0]) for name in robot.ik_joints}
         frozen = [dof for dof in range(self.model.nv) if dof not in moving]

@@ -13,16 +13,17 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import RobotCfg
-from mjstack.kinematics.joints import approach_body, joint_limits
+from mjstack.kinematics.joints import approach_body, joint_limits, locked_home
 from mjstack.scene.index import find
 
+_ITERATIONS = 60  # at most, per start
 _DAMPING = 1e-3  # [m/rad] of the steps towards a point
 _MAX_STEP = 0.3  # [rad, m] per joint and iteration
 _CONVERGED = 1e-6  # [m]
 _STILL = 1e-5  # [rad, m] a smaller step ends the search
 _POINTING = 0.02  # [m/rad] weight of the approach axis against the position
 # [rad] off home, of each hinge after the first: every start has its own branch of solutions
-_STARTS = (-0.6, 0.0, 0.6)
+_STARTS = (0.0, -0.6, 0.6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,24 +60,17 @@ class PointReach:
             UnknownName: The model lacks a joint or site of the robot.
         """
         data = mujoco.MjData(model)
-        n_arm = len(robot.arm_joints)
-        positions = dict(
-            zip(
-                [*robot.arm_joints, *robot.gripper_joints],
-                [*robot.home[:n_arm], *gripper],
-                strict=True,
-            )
-        )
-        positions |= robot.locked
-        for name, value in positions.items():
-            data.qpos[model.jnt_qposadr[find(model, "joint", name)]] = value
+        names = [*robot.arm_joints, *robot.gripper_joints]
+        home = locked_home(robot)
+        home[len(robot.arm_joints) :] = gripper
+        data.qpos[[model.jnt_qposadr[find(model, "joint", name)] for name in names]] = home
         mujoco.mj_kinematics(model, data)
         joints = sorted(
             (find(model, "joint", name) for name in robot.ik_joints),
             key=lambda j: int(model.jnt_bodyid[j]),
         )
-        self._slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
-        self._home = np.array([positions[model.joint(j).name] for j in joints])
+        self._hinges = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE
+        self._home = data.qpos[model.jnt_qposadr[joints]]
         self._anchors = data.xanchor[joints].copy()
         self._axes = data.xaxis[joints].copy()
         sites = [find(model, "site", name) for name in robot.grasp_sites]
@@ -85,124 +79,93 @@ class PointReach:
         self._pointing = turned @ robot.approach_axis
         self._low, self._high = joint_limits(model, [model.joint(j).name for j in joints])
 
-    def solve(self, points: np.ndarray, iterations: int = 60) -> Reached:
+    def solve(self, points: np.ndarray) -> Reached:
         """Bring the grasp point as near to each point as possible, from a few starts.
 
         Args:
             points: Targets [m], shape ``(n, 3)``.
-            iterations: Most steps per start.
         """
-        q = np.tile(self._home, (len(points), 1))
-        distance = np.full(len(points), np.inf)
-        for off in sorted(_STARTS, key=abs):
-            left = np.flatnonzero(distance > _CONVERGED)
-            if not left.size:
+        best = self._look(np.tile(self._home, (len(points), 1)), points)
+        for off in _STARTS:
+            if (best.distance <= _CONVERGED).all():
                 break
-            found, error = self._descend(self._start(points[left], off), points[left], iterations)
-            better = error < distance[left]
-            q[left[better]] = found[better]
-            distance[left[better]] = error[better]
-        return Reached(q, distance, self._tilt(q))
+            found = self._look(self._descend(self._start(points, off), points), points)
+            best = _choose(found.distance < best.distance, found, best)
+        return best
 
-    def solve_upright(self, points: np.ndarray, tolerance: float, iterations: int = 60) -> Reached:
+    def solve_upright(self, points: np.ndarray, tolerance: float) -> Reached:
         """Solve, and of the solutions within tolerance take the one with the least tilt.
 
         Args:
             points: Targets [m], shape ``(n, 3)``.
             tolerance: Distance that counts as reached [m].
-            iterations: Most steps per start.
         """
-        best = self.solve(points, iterations)
-        q = best.q.copy()
-        distance = best.distance.copy()
-        tilt = best.tilt.copy()
-        reached = np.flatnonzero(distance <= tolerance)
-        for start in [q[reached], *(self._start(points[reached], off) for off in _STARTS)]:
-            found, _ = self._descend(start, points[reached], iterations, _POINTING)
-            found, error = self._descend(found, points[reached], iterations)
-            lower = (error <= tolerance) & (self._tilt(found) < tilt[reached])
-            rows = reached[lower]
-            q[rows], distance[rows], tilt[rows] = (
-                found[lower],
-                error[lower],
-                self._tilt(found)[lower],
-            )
-        return Reached(q, distance, tilt)
+        best = self.solve(points)
+        reached = best.distance <= tolerance
+        goals = points[reached]
+        upright = self._look(best.q[reached], goals)
+        for start in [upright.q, *(self._start(goals, off) for off in _STARTS)]:
+            turned = self._descend(start, goals, _POINTING)
+            found = self._look(self._descend(turned, goals), goals)
+            better = (found.distance <= tolerance) & (found.tilt < upright.tilt)
+            upright = _choose(better, found, upright)
+        for name in ("q", "distance", "tilt"):
+            getattr(best, name)[reached] = getattr(upright, name)
+        return best
 
     def _start(self, points: np.ndarray, off: float) -> np.ndarray:
         """Home with the other hinges bent by ``off``; a first hinge that is upright turns towards
         the points.
         """
-        q = np.tile(self._home + np.where(self._slides, 0.0, off), (len(points), 1))
-        axis = self._axes[0]
-        anchor = self._anchors[0]
+        q = np.tile(self._home + off * self._hinges, (len(points), 1))
         q[:, 0] = self._home[0]
-        if abs(axis[2]) > 0.99 and not self._slides[0]:
-            ahead = points - anchor
-            arm = self._tip - anchor
-            turn = np.arctan2(ahead[:, 1], ahead[:, 0]) - np.arctan2(arm[1], arm[0])
-            q[:, 0] += np.sign(axis[2]) * ((turn + np.pi) % (2.0 * np.pi) - np.pi)
+        up = self._axes[0, 2]
+        if abs(up) > 0.99 and self._hinges[0]:
+            plane = np.array([1.0, 1.0j, 0.0])
+            arm = (self._tip - self._anchors[0]) @ plane
+            q[:, 0] += np.sign(up) * np.angle((points - self._anchors[0]) @ plane * arm.conj())
         return np.clip(q, self._low, self._high)
 
-    def _descend(
-        self, start: np.ndarray, points: np.ndarray, iterations: int, pointing: float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Damped least squares within the limits. Reached points drop out, unless ``pointing``
-        reduces their tilt.
+    def _descend(self, start: np.ndarray, points: np.ndarray, pointing: float = 0.0) -> np.ndarray:
+        """Damped least squares within the limits; with ``pointing`` the approach axis counts
+        too.
         """
         q = start.copy()
         left = np.arange(len(points))
-        for _ in range(iterations):
-            jacobian, tip, direction = self._forward(q[left])
-            error = points[left] - tip
-            far = np.linalg.norm(error, axis=1)
-            if pointing:
-                turning = np.cross(self._world_axes, direction[:, None]).swapaxes(1, 2)
-                turning[..., self._slides] = 0.0
-                jacobian = np.concatenate((jacobian, pointing * turning), axis=1)
-                error = np.concatenate((error, pointing * ([0.0, 0.0, -1.0] - direction)), axis=1)
-            else:
-                keep = far > _CONVERGED
-                left = left[keep]
-                jacobian = jacobian[keep]
-                error = error[keep]
-                far = far[keep]
-                if not left.size:
-                    break
-            step = self._step(
-                q[left], jacobian, error, _DAMPING if pointing else _DAMPING + 0.05 * far
-            )
-            moved = np.clip(q[left] + step, self._low, self._high)
-            still = np.abs(moved - q[left]).max(axis=1) < _STILL
-            q[left] = moved
-            left = left[~still]
+        weights = np.repeat([1.0, pointing], 3)
+        goals = np.column_stack((points, np.tile([0.0, 0.0, -1.0], (len(points), 1))))
+        for _ in range(_ITERATIONS):
             if not left.size:
                 break
-        return q, np.linalg.norm(points - self._forward(q)[1], axis=1)
+            jacobian, pose = self._forward(q[left])
+            error = weights * (goals[left] - pose)
+            far = np.linalg.norm(error[:, :3], axis=1)
+            damping = _DAMPING + (0.0 if pointing else 0.05) * far
+            before = q[left]
+            step = self._step(before, weights[:, None] * jacobian, error, damping)
+            q[left] = np.clip(before + step, self._low, self._high)
+            left = left[np.abs(q[left] - before).max(axis=1) >= _STILL]
+        return q
 
     def _step(
-        self, q: np.ndarray, jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray | float
+        self, q: np.ndarray, jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray
     ) -> np.ndarray:
         """One step. A joint that would leave its range is held, and the others are solved again."""
-        weight = np.broadcast_to(np.square(damping), len(q))[:, None, None] * np.eye(q.shape[1])
+        weight = np.square(damping)[:, None, None] * np.eye(q.shape[1])
         free = np.ones_like(q, dtype=bool)
         for _ in range(3):
             open_ = jacobian * free[:, None]
-            rhs = np.einsum("nij,ni->nj", open_, error)[..., None]
+            turned = open_.swapaxes(1, 2)
             step = (
-                np.linalg.solve(np.einsum("nij,nik->njk", open_, open_) + weight, rhs)[..., 0]
-                * free
+                free * np.linalg.solve(turned @ open_ + weight, turned @ error[..., None])[..., 0]
             )
-            out = ((q <= self._low) & (step < 0.0)) | ((q >= self._high) & (step > 0.0))
-            if not out.any():
-                break
-            free &= ~out
-        return step * np.minimum(
-            1.0, _MAX_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12)
-        )
+            free &= ~(((q <= self._low) & (step < 0.0)) | ((q >= self._high) & (step > 0.0)))
+        largest = np.abs(step).max(axis=1, keepdims=True)
+        return step * np.minimum(1.0, _MAX_STEP / np.maximum(largest, 1e-12))
 
-    def _forward(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Jacobian ``(n, 3, joints)``, grasp point and pointing direction, both ``(n, 3)``.
+    def _forward(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Grasp point and pointing direction, shape ``(n, 6)``, and their Jacobian, shape
+        ``(n, 6, joints)``.
 
         A product of exponentials: each joint moves the links after it about, or along, its axis at
         home.
@@ -213,27 +176,39 @@ class PointReach:
         axes = np.empty((n, joints, 3))
         anchors = np.empty((n, joints, 3))
         for k, (axis, anchor) in enumerate(zip(self._axes, self._anchors, strict=True)):
+            moved = q[:, k] - self._home[k]
             axes[:, k] = rotation @ axis
             anchors[:, k] = rotation @ anchor + shift
-            if self._slides[k]:
-                shift = shift + axes[:, k] * (q[:, k] - self._home[k])[:, None]
-                continue
-            turn = _rotations(axis, q[:, k] - self._home[k])
-            shift = shift + np.einsum("nij,nj->ni", rotation, anchor - turn @ anchor)
-            rotation = rotation @ turn
+            if self._hinges[k]:
+                rotation = rotation @ _rotations(axis, moved)
+                shift = anchors[:, k] - rotation @ anchor
+            else:
+                shift = shift + axes[:, k] * moved[:, None]
         tip = rotation @ self._tip + shift
-        self._world_axes = axes
-        columns = np.where(self._slides[:, None], axes, np.cross(axes, tip[:, None] - anchors))
-        return columns.swapaxes(1, 2), tip, rotation @ self._pointing
+        direction = rotation @ self._pointing
+        turning = self._hinges[:, None]
+        rows = np.where(turning, np.cross(axes, tip[:, None] - anchors), axes)
+        pointing = turning * np.cross(axes, direction[:, None])
+        jacobian = np.concatenate((rows, pointing), axis=2).swapaxes(1, 2)
+        return jacobian, np.column_stack((tip, direction))
 
-    def _tilt(self, q: np.ndarray) -> np.ndarray:
-        return np.arccos(np.clip(-self._forward(q)[2][:, 2], -1.0, 1.0))
+    def _look(self, q: np.ndarray, points: np.ndarray) -> Reached:
+        pose = self._forward(q)[1]
+        distance = np.linalg.norm(points - pose[:, :3], axis=1)
+        return Reached(q, distance, np.arccos(np.clip(-pose[:, 5], -1.0, 1.0)))
+
+
+def _choose(first: np.ndarray, a: Reached, b: Reached) -> Reached:
+    """Points of a where ``first``, else those of b."""
+    return Reached(
+        np.where(first[:, None], a.q, b.q),
+        np.where(first, a.distance, b.distance),
+        np.where(first, a.tilt, b.tilt),
+    )
 
 
 def _rotations(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Rotations about one axis, shape ``(n, 3, 3)``."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    s = np.sin(angles)[:, None, None]
-    c = np.cos(angles)[:, None, None]
-    return np.eye(3) + s * cross + (1.0 - c) * (cross @ cross)
+    cross = np.cross(axis, np.eye(3)).T
+    turns = angles[:, None, None]
+    return np.eye(3) + np.sin(turns) * cross + (1.0 - np.cos(turns)) * (cross @ cross)

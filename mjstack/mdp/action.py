@@ -160,7 +160,7 @@ class EndEffectorDelta(ActionTerm):
     def write_commands(self, action: torch.Tensor) -> None:
         """Writes the arm's commands."""
         last = self._columns.read(self._ctrl)
-        target = self._ik.grasp_point(last) + self._scale * action.clamp(-1.0, 1.0).float()
+        target = self._ik.forward(last)[0] + self._scale * action.clamp(-1.0, 1.0).float()
         command, _ = self._ik.solve(last, target)
         command = command[:, : self._n_arm].to(self._ctrl.dtype)
         self._arm.write(

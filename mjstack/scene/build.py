@@ -10,14 +10,10 @@ from collections.abc import Sequence
 
 import mujoco
 
-from mjstack.config.schema import BoxCfg, Cone, Config, ObjectCfg, SceneCfg, SolverCfg, TimingCfg
+from mjstack.config.schema import BoxCfg, Config, ObjectCfg, SceneCfg, SolverCfg, TimingCfg
 from mjstack.robots import robot_spec
 
 WORLD = "world"  # MuJoCo's name of the body that never moves
-_CONES = {
-    Cone.elliptic: mujoco.mjtCone.mjCONE_ELLIPTIC,
-    Cone.pyramidal: mujoco.mjtCone.mjCONE_PYRAMIDAL,
-}
 _NETFORCE = 3  # the contact sensor's reduction to one force and torque, in the world frame
 
 
@@ -60,15 +56,10 @@ def build_scene(
     option = spec.option
     option.timestep = timing.physics_dt
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = _CONES[solver.cone]
-    if solver.iterations is not None:
-        option.iterations = solver.iterations
-    if solver.ls_iterations is not None:
-        option.ls_iterations = solver.ls_iterations
-    if solver.impratio is not None:
-        option.impratio = solver.impratio
-    if solver.tolerance is not None:
-        option.tolerance = solver.tolerance
+    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{solver.cone.name.upper()}")
+    for name in ("iterations", "ls_iterations", "impratio", "tolerance"):
+        if (value := getattr(solver, name)) is not None:
+            setattr(option, name, value)
     if solver.gripper_condim is not None:
         for jaw in jaw_bodies:
             for geom in spec.body(jaw).geoms:
@@ -94,14 +85,12 @@ def build_scene(
         _add_box(spec, scene.box, table_top(scene))
     for name, thing in scene.objects.items():
         _add_object(world, name, thing, table_top(scene))
-    for name in scene.objects:
-        for jaw in jaw_bodies:
-            _add_force_sensor(spec, force_sensor(jaw, name), jaw, name)
+    pairs = [(jaw, name) for name in scene.objects for jaw in jaw_bodies]
     if scene.support_sensors:
-        for name in scene.objects:
-            _add_force_sensor(spec, force_sensor(WORLD, name), WORLD, name)
-        for first, second in itertools.combinations(scene.objects, 2):
-            _add_force_sensor(spec, force_sensor(first, second), first, second)
+        pairs += [(WORLD, name) for name in scene.objects]
+        pairs += itertools.combinations(scene.objects, 2)
+    for first, second in pairs:
+        _add_force_sensor(spec, first, second)
     if visuals:
         world.add_light(pos=[0.2, -0.6, 1.6], dir=[0.1, 0.4, -1.0], diffuse=[0.6, 0.6, 0.6])
         spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
@@ -148,22 +137,14 @@ def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
     half_x, half_y = box.half
     thick = 0.5 * box.wall
     up = 0.5 * box.height
-    # The walls across x close the corners.
     parts = {
-        "floor": (
-            [x, y, top + 0.5 * box.floor],
-            [half_x, half_y, 0.5 * box.floor],
-            box.floor_solref,
-        ),
-        "near": (
-            [x - half_x - thick, y, top + up],
-            [thick, half_y + box.wall, up],
-            box.wall_solref,
-        ),
-        "far": ([x + half_x + thick, y, top + up], [thick, half_y + box.wall, up], box.wall_solref),
-        "right": ([x, y - half_y - thick, top + up], [half_x, thick, up], box.wall_solref),
-        "left": ([x, y + half_y + thick, top + up], [half_x, thick, up], box.wall_solref),
+        "floor": ([x, y, top + 0.5 * box.floor], [*box.half, 0.5 * box.floor], box.floor_solref)
     }
+    for name, i, j in (("near", -1, 0), ("far", 1, 0), ("right", 0, -1), ("left", 0, 1)):
+        pos = [x + i * half_x + i * thick, y + j * half_y + j * thick, top + up]
+        # The walls across x close the corners.
+        size = [thick, half_y + box.wall, up] if i else [half_x, thick, up]
+        parts[name] = (pos, size, box.wall_solref)
     for name, (pos, size, solref) in parts.items():
         spec.worldbody.add_geom(
             name=f"box_{name}",
@@ -177,10 +158,10 @@ def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
         )
 
 
-def _add_force_sensor(spec: mujoco.MjSpec, name: str, first: str, second: str) -> None:
+def _add_force_sensor(spec: mujoco.MjSpec, first: str, second: str) -> None:
     """Measures the net contact force [N] between two bodies: 3 numbers, world frame."""
     spec.add_sensor(
-        name=name,
+        name=force_sensor(first, second),
         type=mujoco.mjtSensor.mjSENS_CONTACT,
         objtype=mujoco.mjtObj.mjOBJ_BODY,
         objname=first,

@@ -10,11 +10,6 @@ import torch
 
 from mjstack.math import quat_z_row
 
-_CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
-_CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
-_SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
-_BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
-
 
 class LowestPoint:
     """The lowest point of the colliding geoms of some bodies.
@@ -35,40 +30,30 @@ class LowestPoint:
         wanted = [model.body(name).id for name in bodies]
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         geoms = np.flatnonzero(collides & np.isin(model.geom_bodyid, wanted))
-        center = np.zeros((len(geoms), 3))
+        g = mujoco.mjtGeom
+        kind = model.geom_type[geoms]
+        radius = model.geom_size[geoms, 0]
+        middle, half = model.geom_aabb[geoms].reshape(-1, 2, 3).swapaxes(0, 1)
+        # Of round shapes the box is only what lies between the balls or discs: half a length in z.
+        half = half.copy()
+        rounded = np.isin(kind, (g.mjGEOM_SPHERE, g.mjGEOM_CAPSULE, g.mjGEOM_CYLINDER))
+        half[rounded] = 0.0
+        long = np.isin(kind, (g.mjGEOM_CAPSULE, g.mjGEOM_CYLINDER))
+        half[long, 2] = model.geom_size[geoms[long], 1]
         axes = np.zeros((len(geoms), 3, 3))
-        box = np.zeros((len(geoms), 3))
-        ball = np.zeros(len(geoms))
-        disc = np.zeros(len(geoms))
-        for i, geom in enumerate(geoms):
-            kind = int(model.geom_type[geom])
-            size = model.geom_size[geom]
-            turn = np.empty(9)
-            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-            axes[i] = turn.reshape(3, 3)
-            center[i] = model.geom_pos[geom]
-            if kind == _SPHERE:
-                ball[i] = size[0]
-            elif kind == _CAPSULE:
-                ball[i] = size[0]
-                box[i, 2] = size[1]
-            elif kind == _CYLINDER:
-                disc[i] = size[0]
-                box[i, 2] = size[1]
-            elif kind == _BOX:
-                box[i] = size
-            else:
-                middle, half = model.geom_aabb[geom].reshape(2, 3)
-                center[i] += axes[i] @ middle
-                box[i] = half
+        for matrix, quat in zip(axes, model.geom_quat[geoms], strict=True):
+            mujoco.mju_quat2Mat(matrix.reshape(9), quat)
+        center = model.geom_pos[geoms] + (axes @ middle[..., None])[..., 0]
 
         def constant(values: np.ndarray) -> torch.Tensor:
             return torch.tensor(values, dtype=torch.float32, device=device)
 
         self._body = torch.tensor(model.geom_bodyid[geoms].copy(), dtype=torch.int64, device=device)
-        self._center, self._axes, self._box, self._ball, self._disc = map(
-            constant, (center, axes, box, ball, disc)
-        )
+        self._center = constant(center)
+        self._axes = constant(axes)
+        self._box = constant(half)
+        self._disc = constant(radius * (kind == g.mjGEOM_CYLINDER))
+        self._ball = constant(radius * np.isin(kind, (g.mjGEOM_SPHERE, g.mjGEOM_CAPSULE)))
 
     def height(self, xpos: torch.Tensor, xquat: torch.Tensor) -> torch.Tensor:
         """Height of the lowest point [m], shape ``(nworld,)``.

@@ -24,9 +24,10 @@ class Columns:
         """Takes the columns, in the order in which values are given."""
         self.indices = tuple(int(i) for i in indices)
         first = self.indices[0] if self.indices else 0
-        together = self.indices == tuple(range(first, first + len(self.indices)))
-        self._together = slice(first, first + len(self.indices)) if together else None
-        self._scattered = torch.tensor(self.indices, dtype=torch.int64, device=device)
+        stop = first + len(self.indices)
+        self._at: slice | torch.Tensor = slice(first, stop)
+        if self.indices != tuple(range(first, stop)):
+            self._at = torch.tensor(self.indices, dtype=torch.int64, device=device)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -35,25 +36,23 @@ class Columns:
         """The columns, shape ``(nworld, n, ...)``. It may be the view's own memory: do not write
         into it.
         """
-        return (
-            view.index_select(1, self._scattered)
-            if self._together is None
-            else view[:, self._together]
-        )
+        if isinstance(self._at, slice):
+            return view[:, self._at]
+        return view.index_select(1, self._at)
 
     def write(self, view: torch.Tensor, value: torch.Tensor) -> None:
         """Writes all worlds."""
-        view[:, self._scattered if self._together is None else self._together] = value
+        view[:, self._at] = value
 
     def write_masked(self, view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor) -> None:
         """Writes the worlds of a ``(nworld,)`` bool mask."""
         rows = mask.view(-1, *[1] * (view.dim() - 1))
+        part = self.read(view)
         value = value.to(view.dtype)
-        if self._together is None:
-            view[:, self._scattered] = torch.where(rows, value, self.read(view))
-        else:
-            part = view[:, self._together]
+        if isinstance(self._at, slice):
             torch.where(rows, value, part, out=part)
+        else:
+            view[:, self._at] = torch.where(rows, value, part)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +120,12 @@ class SceneIndex:
         self.ctrl_range = model.actuator_ctrlrange[self.ctrl].copy()
         self.n_arm = len(robot.arm_joints)
         self.grasp_sites = [find(model, "site", n) for n in robot.grasp_sites]
-        free = {name: find(model, "joint", name) for name in scene.free}
-        self.object_qpos = [int(model.jnt_qposadr[j]) for j in free.values()]
-        self.object_qvel = [int(model.jnt_dofadr[j]) for j in free.values()]
-        pairs = zip(self.object_qpos, self.object_qvel, strict=True)
-        self.objects = dict(zip(free, pairs, strict=True))
+        self.objects: dict[str, tuple[int, int]] = {}
+        for name in scene.free:
+            joint = find(model, "joint", name)
+            self.objects[name] = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        self.object_qpos = [qpos for qpos, _ in self.objects.values()]
+        self.object_qvel = [qvel for _, qvel in self.objects.values()]
         self.bodies = {name: find(model, "body", name) for name in scene.objects}
         self.fixed = {
             name: np.concatenate((model.body_pos[body], model.body_quat[body])).tolist()
@@ -156,17 +156,13 @@ class SceneIndex:
         if key not in self._tensors:
             addresses = self.robot_qpos, self.robot_qvel, self.ctrl, self.robot_qpos[self.n_arm :]
             columns = [Columns(a, device) for a in addresses]
-            values = (
-                self.robot_range,
-                self.ctrl_range,
-                self._robot.home,
-                self._robot.start,
-                self._robot.gripper_open,
-                self._robot.gripper_closed,
-            )
+            r = self._robot
             numbers = [
-                torch.as_tensor(np.asarray(v, dtype=float), dtype=dtype, device=device)
-                for v in values
+                torch.as_tensor(np.asarray(values, dtype=float), dtype=dtype, device=device)
+                for values in (
+                    *(self.robot_range, self.ctrl_range),
+                    *(r.home, r.start, r.gripper_open, r.gripper_closed),
+                )
             ]
             self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]
@@ -202,6 +198,6 @@ def find(model: mujoco.MjModel, kind: str, name: str) -> int:
             "site": model.nsite,
             "sensor": model.nsensor,
         }
-        count = counts[kind]
-        raise UnknownName(kind, name, [getattr(model, kind)(i).name for i in range(count)])
+        known = [getattr(model, kind)(i).name for i in range(counts[kind])]
+        raise UnknownName(kind, name, known)
     return index
