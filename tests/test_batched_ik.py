@@ -81,9 +81,9 @@ def workspace(
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_grasp_point_is_native_mujocos(arm: Arm, device: str, dtype: torch.dtype) -> None:
     commands = np.random.default_rng(1).uniform(arm.low, arm.high, (200, len(arm.names)))
-    centre = arm.solver(200, device).grasp_point(
-        torch.as_tensor(commands, dtype=dtype, device=device)
-    )
+    centre = arm.solver(200, device).forward(torch.as_tensor(commands, dtype=dtype, device=device))[
+        0
+    ]
     assert centre.shape == (200, 3)
     assert centre.dtype == torch.float32
     assert np.abs(centre.cpu().numpy() - arm.grasp_point(commands)).max() <= 1e-6

@@ -384,7 +384,7 @@ def test_environments_with_too_few_rows_by_choice_are_a_remark(
 def test_memory_is_that_of_the_arrays(
     too_small: tuple[RunContext, GateResult, list[str]], stage: Callable[[str], RunContext]
 ) -> None:
-    from mjstack.sim.memory import data_bytes
+    from mjstack.sim.usage import data_bytes
 
     context, result, _ = too_small
     m = result.metrics
@@ -466,7 +466,6 @@ def workload(**changes: object) -> Workload:
         "failed": np.zeros(2, dtype=np.int64),
         "seconds": 1.0,
         "data_bytes": 10,
-        "borrowed_bytes": None,
         "device_bytes": None,
         "description": "",
     }

@@ -131,7 +131,8 @@ PATHS: dict[str, list[str] | None] = {
                 "_last_seen",
                 "_turn",
             )
-        )
+        ),
+        "_put",
     ],
     "drivers/tilt.py": ["CarryTilt.desired_approach"],
     "episodes/failures.py": ["FailureMonitor.update", "_of"],
@@ -149,7 +150,6 @@ PATHS: dict[str, list[str] | None] = {
             "reset",
             "kinematics",
             "_decimation",
-            "_count",
             "_pose",
             "_place",
         )

@@ -115,18 +115,14 @@ class ClosedLoopDriver:
         self.retries = zeros(dtype=torch.int32)
         self.error = zeros()
         self.unreachable = zeros(dtype=torch.bool)
-        self._tried = zeros(
-            len(cfg.scene.objects), dtype=torch.bool
-        )  # whose grasp has been tried again
+        # Whose grasp has been tried again
+        self._tried = zeros(len(cfg.scene.objects), dtype=torch.bool)
         self._again = zeros(dtype=torch.bool)  # the phase was entered to try a grasp once more
-        self._seen = zeros(len(source_names(cfg.scene)), 2)  # x and y of objects and places
-        self._from = zeros(3)
-        self._to = zeros(3)
-        n_grip = len(cfg.robot.gripper_joints)
-        self._grip_from = zeros(n_grip)
-        self._grip_to = zeros(n_grip)
+        self._seen = zeros(len(source_names(cfg.scene)), 3)  # x, y and yaw of objects and places
+        # Grasp point and gripper at both ends of the phase
+        self._from = zeros(3 + len(cfg.robot.gripper_joints))
+        self._to = torch.zeros_like(self._from)
         self._command = zeros(len(cfg.robot.home))
-        self._yaw = zeros(len(source_names(cfg.scene)))
         self._roll = zeros()
         aligns = cfg.controller.yaw_alignment > 0.0
         self._roll_column, self._roll_sign = self._find_roll() if aligns else (0, 1.0)
@@ -137,7 +133,7 @@ class ClosedLoopDriver:
         """
         fresh = self._env.episode_step == 0
         self._advance(fresh)
-        length = self._length.index_select(0, self.phase)
+        length = self._length[self.phase]
         u = (self._time / length).clamp(max=1.0)
         s = _smoothstep(u)[:, None]
         # After an empty grasp straight up first, and only then to where the object is now: it may
@@ -145,24 +141,22 @@ class ClosedLoopDriver:
         up = _smoothstep((2.0 * u).clamp(max=1.0))
         over = _smoothstep((2.0 * u - 1.0).clamp(min=0.0))
         share = torch.where(self._again[:, None], torch.stack((over, over, up), dim=1), s)
-        target = torch.lerp(self._from, self._to, share)
-        grip = torch.lerp(self._grip_from, self._grip_to, s)
-        posture = self._nominal.index_select(0, self.phase)
+        target = torch.lerp(self._from[:, :3], self._to[:, :3], share)
+        posture = self._nominal[self.phase]
         start = torch.where(fresh[:, None], posture, self._command)
-        start[:, self._n_arm :] = grip
+        start[:, self._n_arm :] = torch.lerp(self._from[:, 3:], self._to[:, 3:], s)
         if self._cfg.controller.yaw_alignment > 0.0:
             self._turn(start, fresh)
         approach = None
         if self._tilt is not None:
-            approach = self._tilt.desired_approach(
-                start, self.phase, self._aim(self._tilt.place.index_select(0, self.phase)), fresh
-            )
+            there = self._aim(self._tilt.place[self.phase])
+            approach = self._tilt.desired_approach(start, self.phase, there, fresh)
         command, distance = self._ik.solve(
             start, target, posture if self._uses_posture else None, approach
         )
         self._command.copy_(command)
         last = self._time >= length - _DONE
-        self.error.copy_(torch.where(last, torch.maximum(self.error, distance), self.error))
+        _put(self.error, last, torch.maximum(self.error, distance))
         self.unreachable |= last & ~(distance <= self._cfg.controller.ik_tolerance)
         return self._command
 
@@ -170,42 +164,42 @@ class ClosedLoopDriver:
         """Time goes on by a step; worlds whose phase is over enter the next one, or try their grasp
         again.
         """
-        length = self._length.index_select(0, self.phase)
+        length = self._length[self.phase]
         over = (self._time >= length - _DONE) & (self.phase < len(self.phases) - 1) & ~fresh
         retry, rate = self._judge_grasp(over)
-        phase = torch.where(retry, self._retry_to.index_select(0, self.phase), self.phase + over)
+        phase = torch.where(retry, self._retry_to[self.phase], self.phase + over)
         phase.masked_fill_(fresh, 0)
-        self._rate.copy_(torch.where(retry, rate, self._rate)).masked_fill_(fresh, 1.0)
+        _put(self._rate, retry, rate)
+        self._rate.masked_fill_(fresh, 1.0)
         left_over = (self._time - length).clamp(min=0.0) * over
         entering = over | fresh
-        self._time.copy_(torch.where(entering, left_over * ~fresh, self._time)).add_(self._rate)
+        _put(self._time, entering, left_over * ~fresh)
+        self._time += self._rate
         self.retries += retry
-        self._again.copy_(torch.where(entering, retry, self._again))
+        _put(self._again, entering, retry)
         self.phase.copy_(phase)
         for buffer in (self.retries, self.error, self.unreachable):
             buffer.masked_fill_(fresh, 0)
         self._tried.masked_fill_(fresh[:, None], False)
 
         self._observe(entering, fresh)
-        rows = entering[:, None]
-        to = torch.where(self._holds.index_select(0, phase)[:, None], self._to, self._aim(phase))
-        self._from.copy_(torch.where(rows, torch.where(fresh[:, None], to, self._to), self._from))
-        self._to.copy_(torch.where(rows, to, self._to))
-        closing = torch.where(fresh[:, None], self._home_grip, self._grip_to)
-        self._grip_from.copy_(torch.where(rows, closing, self._grip_from))
-        self._grip_to.copy_(torch.where(rows, self._grip.index_select(0, phase), self._grip_to))
+        holds = self._holds[phase][:, None]
+        target = torch.where(holds, self._to[:, :3], self._aim(phase))
+        home = torch.cat((target, self._home_grip.expand(len(target), -1)), dim=1)
+        _put(self._from, entering, torch.where(fresh[:, None], home, self._to))
+        _put(self._to, entering, torch.cat((target, self._grip[phase]), dim=1))
 
     def _aim(self, phase: torch.Tensor) -> torch.Tensor:
         """Target of each world's phase, from where its anchor was last seen [m], shape ``(nworld,
         3)``.
         """
-        table = self._target.index_select(0, phase)
-        seen = self._last_seen(self._source, phase)
+        table = self._target[phase]
+        seen = self._last_seen(self._source, phase)[:, :2]
         offset = table[:, :2]
         if any(spec.toward is not None for spec in self._cfg.controller.phases.values()):
-            away = self._last_seen(self._toward, phase) - seen
+            away = self._last_seen(self._toward, phase)[:, :2] - seen
             angle = torch.atan2(away[:, 1], away[:, 0])
-            angle = angle * self._turns.index_select(0, phase)
+            angle = angle * self._turns[phase]
             along, left = offset.unbind(1)
             cos = torch.cos(angle)
             sin = torch.sin(angle)
@@ -213,21 +207,22 @@ class ClosedLoopDriver:
         return torch.cat((offset + seen, table[:, 2:]), dim=1)
 
     def _last_seen(self, sources: torch.Tensor, phase: torch.Tensor) -> torch.Tensor:
-        source = sources.index_select(0, phase)
-        return self._seen.gather(1, source[:, None, None].expand(-1, 1, 2))[:, 0]
+        """x, y [m] and yaw [rad] of each world's source of a phase, shape ``(nworld, 3)``."""
+        source = sources[phase]
+        return self._seen.gather(1, source[:, None, None].expand(-1, 1, 3))[:, 0]
 
     def _judge_grasp(self, over: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Worlds that try their grasp again, ``(nworld,)`` bool, and how fast they go on,
         ``(nworld,)``.
         """
         held = objects_in_hand(self._env.index, self._env.sim)
-        grasps = self._grasps.index_select(0, self.phase)
+        grasps = self._grasps[self.phase]
         number = grasps.clamp(min=0)[:, None]
         empty = over & (grasps >= 0) & ~held.gather(1, number)[:, 0]
-        again = self._retry_to.index_select(0, self.phase)
+        again = self._retry_to[self.phase]
         time_left = (self.steps - self._rest - self._env.episode_step).clamp(min=1)
-        rate = (self._needed.index_select(0, again) / time_left).clamp(min=1.0)
-        first = ~self._tried.gather(1, number)[:, 0] & self._can_retry.index_select(0, self.phase)
+        rate = (self._needed[again] / time_left).clamp(min=1.0)
+        first = ~self._tried.gather(1, number)[:, 0] & self._can_retry[self.phase]
         retry = empty & first & (rate <= self._speed_limit)
         self._tried |= retry[:, None] & (grasps[:, None] == self._numbers)
         return retry, rate
@@ -243,7 +238,7 @@ class ClosedLoopDriver:
         column = self._nominal[0, self._roll_column]
         command[:, self._roll_column] = column + self._roll
         _, closing, approach = self._ik.forward(command)
-        yaw = self._yaw.gather(1, self._source.index_select(0, self.phase)[:, None])[:, 0]
+        yaw = self._last_seen(self._source, self.phase)[:, 2]
         off = yaw - torch.atan2(closing[:, 1], closing[:, 0])
         off = off - _QUARTER * torch.round(off / _QUARTER)
         # Two faces are in question, a quarter turn apart; what has been turned so far counts for
@@ -258,7 +253,7 @@ class ClosedLoopDriver:
         step = (self._cfg.controller.yaw_alignment * wanted - self._roll).clamp(
             -_ROLL_STEP, _ROLL_STEP
         )
-        self._roll += step * self._aligns.index_select(0, self.phase)
+        self._roll += step * self._aligns[self.phase]
         command[:, self._roll_column] = column + self._roll
 
     def _find_roll(self) -> tuple[int, float]:
@@ -277,18 +272,16 @@ class ClosedLoopDriver:
         """Measures the objects that the phases which begin observe; everything where an episode
         begins.
         """
-        wanted = self._observes.index_select(0, self.phase)
+        wanted = self._observes[self.phase]
         objects = self._cfg.scene.objects
         for number, name in enumerate(objects):
-            now = fresh | entering & wanted[:, number]
-            seen = self._seen[:, number]
             pose = pose_w(self._env, name).float()
-            seen.copy_(torch.where(now[:, None], pose[:, :2], seen))
             w, x, y, z = pose[:, 3:].unbind(1)
             yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-            self._yaw[:, number] = torch.where(now, yaw, self._yaw[:, number])
+            seen = torch.cat((pose[:, :2], yaw[:, None]), dim=1)
+            _put(self._seen[:, number], fresh | entering & wanted[:, number], seen)
         for number, name in enumerate(self._cfg.scene.places, start=len(objects)):
-            self._seen[:, number] = place_xy(self._env, name).float()
+            self._seen[:, number, :2] = place_xy(self._env, name).float()
 
     def _build_tables(self, cfg: Config, device: torch.device) -> None:
         """What each phase says, as tensors."""
@@ -296,40 +289,52 @@ class ClosedLoopDriver:
         names = [phase.name for phase in phases]
         specs = [phase.spec for phase in phases]
         targets = [phase.target or Target(0, -1, (0.0, 0.0), 0.0) for phase in phases]
-        sources = source_names(cfg.scene)
         grips = {"open": cfg.robot.gripper_open, "closed": cfg.robot.gripper_closed}
+        thing_names = list(cfg.scene.objects)
 
         def table(values: list, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.tensor(values, dtype=dtype, device=device)
 
         self._length = table([phase.stop - phase.start for phase in phases])
+        # From the start of a phase to that of the last one, where the arm rests.
+        self._needed = table([phases[-1].start - phase.start for phase in phases])
         self._target = table([[*target.offset, target.z] for target in targets])
-        self._source = table([target.source for target in targets], torch.int64)
-        self._toward = table([max(target.toward, 0) for target in targets], torch.int64)
-        self._turns = table([float(target.toward >= 0) for target in targets])
-        self._holds = table([phase.target is None for phase in phases], torch.bool)
         self._grip = table([grips[spec.gripper] for spec in specs])
+        self._turns = table([float(target.toward >= 0) for target in targets])
+        numbers = [
+            [
+                target.source,
+                max(target.toward, 0),
+                phase.grasped,
+                names.index(spec.retry or names[0]),
+            ]
+            for target, phase, spec in zip(targets, phases, specs, strict=True)
+        ]
+        self._source, self._toward, self._grasps, self._retry_to = table(numbers, torch.int64).T
+        flags = [
+            [
+                phase.target is None,
+                spec.retry is not None,
+                spec.observe and spec.gripper == "open" and spec.anchor in thing_names,
+            ]
+            for phase, spec in zip(phases, specs, strict=True)
+        ]
+        self._holds, self._can_retry, self._aligns = table(flags, torch.bool).T
         observes = [
-            [spec.observe and name in (spec.anchor, spec.toward) for name in sources]
+            [spec.observe and name in (spec.anchor, spec.toward) for name in thing_names]
             for spec in specs
         ]
         self._observes = table(observes, torch.bool)
-        aligns = [
-            spec.observe and spec.gripper == "open" and spec.anchor in cfg.scene.objects
-            for spec in specs
-        ]
-        self._aligns = table(aligns, torch.bool)
-        self._grasps = table([phase.grasped for phase in phases], torch.int64)
-        self._numbers = torch.arange(len(cfg.scene.objects), device=device)
-        self._can_retry = table([spec.retry is not None for spec in specs], torch.bool)
-        self._retry_to = table(
-            [names.index(spec.retry) if spec.retry else 0 for spec in specs], torch.int64
-        )
-        # From the start of a phase to that of the last one, where the arm rests.
-        self._needed = table([phases[-1].start - phase.start for phase in phases])
+        self._numbers = torch.arange(len(thing_names), device=device)
         self._speed_limit = cfg.controller.speed_limit
         window = 0 if cfg.task.check is None else make_check(cfg).settle_steps
         self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)
+
+
+def _put(buffer: torch.Tensor, mask: torch.Tensor, values: torch.Tensor) -> None:
+    """Writes the rows of a ``(nworld,)`` bool mask; the buffer keeps its address."""
+    rows = mask if buffer.dim() == 1 else mask[:, None]
+    buffer.copy_(torch.where(rows, values, buffer))
 
 
 def _smoothstep(u: torch.Tensor) -> torch.Tensor:

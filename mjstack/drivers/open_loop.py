@@ -134,18 +134,15 @@ class OpenLoopPlanner:
         if self._last is not None and np.array_equal(self._last[0], sources_xy):
             return self._last[1]  # the gates of one run play the same batch
         nworld = sources_xy.shape[0]
-        knots = np.full(
-            (nworld, len(self.phases) * len(self._nodes), len(self._cfg.robot.home)), np.nan
-        )
+        n_knots = len(self.phases) * len(self._nodes)
+        knots = np.full((nworld, n_knots, len(self._cfg.robot.home)), np.nan)
         error = np.full(nworld, np.nan)
-        first: dict[bytes, int] = {}
-        twin = np.array(
-            [first.setdefault(xy.tobytes(), world) for world, xy in enumerate(sources_xy)],
-            dtype=np.intp,
-        )
+        flat = sources_xy.reshape(nworld, -1)
+        _, first, kind = np.unique(flat, axis=0, return_index=True, return_inverse=True)
+        twin = first[kind.reshape(-1)]
         alike = np.bincount(twin, minlength=nworld)
         done = 0
-        with closing(self._plans(list(first.values()), sources_xy)) as plans:
+        with closing(self._plans(sorted(first.tolist()), sources_xy)) as plans:
             for world, *plan in plans:
                 knots[world], error[world] = plan
                 done += int(alike[world])

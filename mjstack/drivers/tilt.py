@@ -85,11 +85,11 @@ class CarryTilt:
         Returns:
             Unit vectors, shape ``(nworld, 3)``, float32.
         """
-        nominal = self._nominal.index_select(0, self.place.index_select(0, phase))
+        nominal = self._nominal[self.place[phase]]
         start = torch.where(fresh[:, None], nominal, self._there)
         self._there.copy_(self._there_ik.solve(start, there)[0])
-        grasps = self._grasps.index_select(0, phase)
-        keeps = self._keeps.index_select(0, phase)
+        grasps = self._grasps[phase]
+        keeps = self._keeps[phase]
         self._kept.copy_(torch.where(grasps[:, None], self._ik.forward(command)[2], self._kept))
         self._kept_turn.copy_(torch.where(grasps, command[:, 0], self._kept_turn))
         x, y, z = torch.where(

@@ -40,7 +40,6 @@ class Workload:
             actions, which nothing judges.
         seconds: Wall time, with the building of the worlds.
         data_bytes: What MJWarp's arrays take, or None.
-        borrowed_bytes: What a step borrows beside them, or None.
         device_bytes: What the CUDA device gave out for these worlds, model included, or None.
         description: Backend and hardware.
     """
@@ -51,7 +50,6 @@ class Workload:
     failed: np.ndarray
     seconds: float
     data_bytes: int | None
-    borrowed_bytes: int | None
     device_bytes: int | None
     description: str
 
@@ -170,7 +168,6 @@ def _play(
         failed=failed,
         seconds=time.perf_counter() - began,
         data_bytes=sim.memory_bytes(),
-        borrowed_bytes=sim.borrowed_bytes(),
         device_bytes=None if before is None or after is None else after - before,
         description=sim.description,
     )

@@ -223,7 +223,7 @@ def _report(context: RunContext, group: _Group, result: GateResult) -> None:
     else:
         result.notes[f"{group.prefix}.nccdmax"] = "not counted: MJWarp's default"
     if not native:
-        from mjstack.sim.memory import data_bytes  # loads Warp, which native runs do not need
+        from mjstack.sim.usage import data_bytes  # loads Warp, which native runs do not need
 
         key = "task" if "task" in group.runs else "env"
         for which, sizes in (("current", group.sizes), ("recommended", wanted)):
@@ -329,7 +329,6 @@ def _compare(name: str, first: Workload, again: Workload, *, judged: bool, exact
     for part, run in (("measuring", first), ("rerun", again)):
         cost = {
             "data": run.data_bytes,
-            "borrowed_in_a_step": run.borrowed_bytes,
             "device": run.device_bytes,
         }
         for what, size in cost.items():

@@ -39,7 +39,7 @@ def check_room(cfg: Config, model: mujoco.MjModel) -> None:
     if backend is Backend.native:
         least = native_bytes(model, cfg.nworld)
     else:
-        from mjstack.sim.memory import data_bytes  # loads Warp
+        from mjstack.sim.usage import data_bytes  # loads Warp
 
         sizes = (
             BatchSizes(nconmax=1, njmax=1) if cfg.batch.auto else resolve_sizes(cfg)

@@ -67,7 +67,7 @@ class StepGraph:
         name: str,
         version: Callable[[], int] = lambda: 0,
         culprit: Callable[[], str] = lambda: "",
-        scratch: Callable[[], bool] = lambda: True,
+        scratch: bool = True,
     ) -> None:
         """Keep the work without running it.
 
@@ -79,7 +79,7 @@ class StepGraph:
             name: What it is called in messages.
             version: A number that changes when the graph has to be captured anew.
             culprit: Names what was current_term, for the message of a failed capture.
-            scratch: Whether Warp's temporaries come from an `Scratch`.
+            scratch: Whether Warp's temporaries come from a `Scratch`.
         """
         self._work = work
         self._mode = mode
@@ -173,7 +173,7 @@ class StepGraph:
         # no one else gets. So there is a second such pool.
         memory = torch.cuda.MemPool()
         pool = torch.cuda.graph_pool_handle()
-        scratch = Scratch(self._device) if self._scratch() else None
+        scratch = Scratch(self._device) if self._scratch else None
         _abandoned.append((graph, memory))
         try:
             with (

@@ -12,7 +12,6 @@ import torch
 from mjstack.config.schema import GraphMode
 from mjstack.errors import UnsupportedModel
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
-from mjstack.sim.memory import array_bytes, borrowed_bytes
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
 from mjstack.sim.simulation import Simulation, named_options
 from mjstack.sim.sizes import BatchSizes
@@ -22,7 +21,7 @@ from mjstack.sim.substep import (
     place_static_geoms,
     rearranged_step,
 )
-from mjstack.sim.usage import Usage
+from mjstack.sim.usage import Usage, array_bytes
 from mjstack.sim.warp_setup import mjw, torch_stream_scope, wp
 
 
@@ -130,7 +129,7 @@ class MjwarpSimulation(Simulation):
         with torch_stream_scope(self._device):
             self._place()
             mjw.forward(self._m, self._d)
-            self._count(steps=0)
+            self._usage.count(self._m, self._d, steps=0)
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
         """Bring the poses of all worlds up to the current qpos: a mask would save nothing."""
@@ -159,12 +158,6 @@ class MjwarpSimulation(Simulation):
         """
         return array_bytes(self._d)
 
-    def borrowed_bytes(self) -> int | None:
-        """The most that a step borrows at once beside it, or None if Warp does not tell. Convex
-        pairs are most of it.
-        """
-        return borrowed_bytes(self.forward, self._device.alias)
-
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as uploaded."""
         opt = self._m.opt
@@ -191,7 +184,7 @@ class MjwarpSimulation(Simulation):
             self.device,
             self._graph_mode,
             name="a bare step",
-            scratch=lambda: False,
+            scratch=False,
         )
 
     def graph_of(self, n: int = 1, *, kinematics: bool = False) -> StepGraph:
@@ -203,14 +196,14 @@ class MjwarpSimulation(Simulation):
                 self.device,
                 self._graph_mode,
                 name=f"step({n})",
-                scratch=lambda: self.arrangement.scratch,
+                scratch=self.arrangement.scratch,
             )
         return self._graphs[key]
 
     def latch(self) -> None:
         """Record what the worlds use and have lost by now; `step` does it by itself."""
         with torch_stream_scope(self._device):
-            self._count(steps=0)
+            self._usage.count(self._m, self._d, steps=0)
 
     def arrange(self, arrangement: Arrangement) -> None:
         """Choose how a captured step is arranged; for measurements, because the numbers stay the
@@ -229,7 +222,7 @@ class MjwarpSimulation(Simulation):
 
     def _decimation(self, n: int, kinematics: bool) -> None:
         self._place()
-        count = partial(self._count, steps=1)
+        count = partial(self._usage.count, self._m, self._d, steps=1)
         arrangement = self.arrangement
         if not (self._can_rearrange and arrangement.own_stages):
             for _ in range(n):
@@ -290,10 +283,6 @@ class MjwarpSimulation(Simulation):
             ],
             outputs=[d.geom_xpos, d.geom_xmat],
         )
-
-    def _count(self, *, steps: int) -> None:
-        """Count steps made, what each world uses now, and the most it has used."""
-        self._usage.count(self._m, self._d, steps)
 
     def _warm_up(self) -> None:
         """Compile and loads every kernel, then leaves the worlds as new."""

@@ -159,32 +159,22 @@ class NativeSimulation(Simulation):
         """Advance every world by n physics steps under the current ctrl; the poses follow with
         kinematics.
         """
-        if n == 0:
-            if kinematics:
-                self.kinematics()
-            return
-        self._visit(
-            partial(self._step, n=n, kinematics=kinematics),
-            self._finite_worlds(self._poses, self._others),
-        )
-        if kinematics:
-            self._finite_worlds(self._poses)
+        if n:
+            self._compute(n, kinematics)
+        elif kinematics:
+            self.kinematics()
 
     def forward(self) -> None:
         """Compute everything that derives from the state, without advancing time; warm starts stay
         as they are.
         """
-        self._visit(
-            partial(self._step, n=0, kinematics=False),
-            self._finite_worlds(self._poses, self._others),
-        )
+        self._compute(0, kinematics=False)
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
         """Bring the poses of the masked worlds up to the current qpos; the other worlds are not
         visited.
         """
-        rows = self._rows(mask)
-        self._visit(self._pose, self._finite_worlds(self._poses, rows=rows))
+        self._visit(self._pose, self._finite_worlds(self._poses, mask=mask))
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Put the masked worlds back to qpos0, at rest."""
@@ -235,22 +225,29 @@ class NativeSimulation(Simulation):
         self._check_mask(mask)
         return np.ones(self.nworld, dtype=bool) if mask is None else mask.numpy()
 
+    def _compute(self, n: int, kinematics: bool) -> None:
+        """Step every world n times, 0 meaning forward."""
+        work = partial(self._step, n=n, kinematics=kinematics)
+        self._visit(work, self._finite_worlds(self._poses, self._others))
+        if kinematics:
+            self._finite_worlds(self._poses)
+
     def _finite_worlds(
-        self, *derived: dict[str, np.ndarray], rows: np.ndarray | None = None
+        self, *derived: dict[str, np.ndarray], mask: torch.Tensor | None = None
     ) -> list[int]:
-        """The worlds among rows that can be computed; the others' derived arrays become NaN.
+        """The masked worlds that can be computed; the others' derived arrays become NaN.
 
         A diverged world stays as it is: MuJoCo would spend every solver iteration on its NaN, and
         gain nothing.
         """
+        rows = self._rows(mask)
         finite = np.isfinite(self._physics).all(axis=1)
-        chosen = np.ones_like(finite) if rows is None else rows
-        diverged = chosen & ~finite
+        diverged = rows & ~finite
         if diverged.any():
             for arrays in derived:
                 for array in arrays.values():
                     array[diverged] = np.nan
-        return np.flatnonzero(chosen & finite).tolist()
+        return np.flatnonzero(rows & finite).tolist()
 
     def _visit(self, work: Callable[[_Worker, Iterable[int]], None], worlds: list[int]) -> None:
         """Share worlds out among the threads."""

@@ -217,10 +217,6 @@ class Simulation(ABC):
         """Bytes of the arrays that grow with nworld; None where they are not counted."""
         return None
 
-    def borrowed_bytes(self) -> int | None:
-        """The most that a step borrows at once beside them; None where it is not known."""
-        return None
-
     @abstractmethod
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as this backend holds them, by MuJoCo's names."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
-from mjstack.config.schema import Config, PlacementsCfg
+from mjstack.config.schema import BatchCfg, Config, PlacementsCfg
 
 KEYS = ("nconmax", "njmax", "naconmax", "nccdmax", "naccdmax")
 
@@ -38,7 +39,7 @@ class BatchSizes:
         Args:
             nworld: Number of worlds.
         """
-        kwargs = {name: value for name in KEYS if (value := getattr(self, name)) is not None}
+        kwargs = _given(self)
         if "nccdmax" in kwargs:
             kwargs["nccdmax"] = min(
                 kwargs["nccdmax"], self.nconmax, self.contact_pool(nworld) // nworld
@@ -54,16 +55,13 @@ class BatchSizes:
     def convex_pool(self, nworld: int) -> int:
         """Convex pairs of one kind that fit into the pool of nworld worlds."""
         kwargs = self.as_kwargs(nworld)
-        return kwargs.get(
-            "naccdmax",
-            kwargs["nccdmax"] * nworld if "nccdmax" in kwargs else self.contact_pool(nworld),
-        )
+        share = kwargs.get("nccdmax")
+        pool = self.contact_pool(nworld) if share is None else share * nworld
+        return kwargs.get("naccdmax", pool)
 
     def as_overrides(self) -> str:
         """The same on the command line: ``batch.nconmax=40 batch.njmax=184``."""
-        return " ".join(
-            f"batch.{name}={value}" for name in KEYS if (value := getattr(self, name)) is not None
-        )
+        return " ".join(f"batch.{name}={value}" for name, value in _given(self).items())
 
 
 def resolve_sizes(cfg: Config) -> BatchSizes:
@@ -92,12 +90,16 @@ def resolve_measuring_sizes(cfg: Config) -> BatchSizes:
     )
 
 
+def apply_configured(cfg: Config, sizes: BatchSizes) -> BatchSizes:
+    """The sizes, with what the configuration sets in their place."""
+    return replace(sizes, **_given(cfg.batch))
+
+
 def _placements(cfg: Config) -> PlacementsCfg:
     """Those of the scene; a scene that gives all its own positions needs none."""
     return cfg.robot.placements.get(cfg.scene.name) or PlacementsCfg()
 
 
-def apply_configured(cfg: Config, sizes: BatchSizes) -> BatchSizes:
-    """The sizes, with what the configuration sets in their place."""
-    given = {name: value for name in KEYS if (value := getattr(cfg.batch, name)) is not None}
-    return replace(sizes, **given)
+def _given(sizes: BatchSizes | BatchCfg) -> dict[str, Any]:
+    """The sizes that are set."""
+    return {name: value for name in KEYS if (value := getattr(sizes, name)) is not None}

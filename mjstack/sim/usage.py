@@ -1,6 +1,9 @@
-"""Counters of what the worlds use of MJWarp's buffers, kept on the device by Warp kernels."""
+"""What the worlds use of MJWarp's buffers, counted on the device by Warp kernels, and what the
+buffers take.
+"""
 
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
+import dataclasses
 from itertools import combinations_with_replacement
 
 import mujoco
@@ -8,6 +11,7 @@ import numpy as np
 import torch
 
 from mjstack.sim.simulation import LOST_PHYSICS
+from mjstack.sim.sizes import BatchSizes
 from mjstack.sim.warp_setup import mjw, wp
 
 
@@ -94,6 +98,40 @@ def convex_kinds(model: mujoco.MjModel) -> np.ndarray | None:
             kinds[a, b] = kinds[b, a] = number
             number += 1
     return kinds if number else None
+
+
+def array_bytes(node: object) -> int:
+    """Bytes of all Warp arrays in a dataclass and in the dataclasses in it."""
+    if isinstance(node, wp.array):
+        return int(node.capacity)
+    if dataclasses.is_dataclass(node):
+        return sum(array_bytes(getattr(node, field.name)) for field in dataclasses.fields(node))
+    return 0
+
+
+def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
+    """Compute `MjwarpSimulation.memory_bytes` for these sizes, without allocating it.
+
+    Every array is as long as nworld, as the contact pool, or constant. So two small ones on the CPU
+    tell the rest.
+
+    Args:
+        model: The compiled model.
+        nworld: Number of worlds.
+        sizes: Buffer sizes.
+    """
+    share = dataclasses.replace(sizes, naconmax=None, naccdmax=None)
+    with wp.ScopedDevice("cpu"):
+        one, two, longer = (
+            array_bytes(
+                mjw.make_data(model, nworld=n, **dataclasses.replace(share, nconmax=c).as_kwargs(n))
+            )
+            for n, c in ((1, sizes.nconmax), (2, sizes.nconmax), (1, sizes.nconmax + 1))
+        )
+    per_contact = longer - one
+    per_world = two - one - sizes.nconmax * per_contact
+    constant = one - per_world - sizes.nconmax * per_contact
+    return constant + nworld * per_world + sizes.contact_pool(nworld) * per_contact
 
 
 @wp.kernel(enable_backward=False)
