@@ -155,13 +155,13 @@ def test_second_seed_is_what_it_is_alone(
 def test_commands_do_not_depend_on_nworld(nu: int, dtype: torch.dtype) -> None:
     """Not even in their last bits, or a world would not do alone what it did among many."""
     rng = np.random.default_rng(0)
-    knots = rng.normal(size=(200, 12, nu))
-    weights = rng.normal(size=(5, 6))
-    segments = np.array([0, 0, 6, 6, 6])
+    knots = torch.from_numpy(rng.normal(size=(200, 12, nu)))
+    weights = torch.from_numpy(rng.normal(size=(5, 6)))
+    numbers = torch.tensor([0, 0, 6, 6, 6])[:, None] + torch.arange(6)
     error = np.zeros(200)
-    many = JointTrajectory(knots, weights, segments, error).to(torch.device("cpu"), dtype)
+    many = JointTrajectory(knots, weights, numbers, error).to(torch.device("cpu"), dtype)
     for world in range(0, 200, 7):
-        alone = JointTrajectory(knots[world : world + 1], weights, segments, error[:1]).to(
+        alone = JointTrajectory(knots[world : world + 1], weights, numbers, error[:1]).to(
             torch.device("cpu"), dtype
         )
         for step in range(5):

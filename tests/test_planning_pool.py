@@ -57,7 +57,7 @@ def test_plans_are_those_of_one_process(robot: str, stage: Stage) -> None:
     planner.plan_world = None  # type: ignore[assignment,method-assign]  # nothing is planned here
     shared = planner.plan(xy, told.append)
     for world, knots, error in plan_alone(context.cfg, xy):
-        assert shared._knots[world].numpy().tobytes() == knots.tobytes()
+        assert shared.knots[world].numpy().tobytes() == knots.tobytes()
         assert shared.waypoint_error[world] == error
     assert len(told) == 62
     assert told == sorted(set(told))
@@ -194,4 +194,4 @@ def test_processes_by_cores_and_distinct_worlds(
     xy = layouts(context, distinct)[np.arange(nworld) % distinct]
     tape = planner.plan(xy)
     assert made == ([] if processes == 1 else [processes])
-    assert np.isfinite(tape._knots.numpy()).all()
+    assert np.isfinite(tape.knots.numpy()).all()

@@ -263,10 +263,12 @@ class ClosedLoopDriver:
         names = [*self._cfg.robot.arm_joints, *self._cfg.robot.gripper_joints]
         column = names.index(str(self._cfg.robot.roll_joint))
         command = self._nominal[:1].expand(self._env.nworld, -1).clone()
-        before = self._ik.forward(command)[1][0].double().cpu()
-        command[:, column] += 0.1
-        after = self._ik.forward(command)[1][0].double().cpu()
-        return column, math.copysign(1.0, float(before[0] * after[1] - before[1] * after[0]))
+        closing = []
+        for turn in (0.0, 0.1):
+            command[:, column] += turn
+            closing.append(self._ik.forward(command)[1][0].double().cpu())
+        (x0, y0, _), (x1, y1, _) = closing
+        return column, math.copysign(1.0, float(x0 * y1 - y0 * x1))
 
     def _observe(self, entering: torch.Tensor, fresh: torch.Tensor) -> None:
         """Measures the objects that the phases which begin observe; everything where an episode

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 import signal
 import sys
@@ -10,6 +9,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
 from multiprocessing import get_context, parent_process
 from threading import Thread
 from types import ModuleType
@@ -36,45 +36,39 @@ Plan = tuple[int, np.ndarray, float]
 _planner: OpenLoopPlanner  # of a process that plans for another one
 
 
+@dataclass(frozen=True)
 class JointTrajectory:
     """Commands of every world for the whole episode, held as a few knots per phase.
 
     The arm's motion between two targets is a polynomial in the smoothstep parameter through
     Chebyshev points, so that 600 steps need some 40 solutions of inverse kinematics a world, and
     memory does not grow with the episode.
+
+    Attributes:
+        knots: Commands, shape ``(nworld, n, nu)``.
+        weights: Weights of the knots of each step's phase, shape ``(steps, k)``.
+        numbers: Which knots those are, shape ``(steps, k)``, int64.
+        waypoint_error: Largest distance [m] from a target at any knot, shape ``(nworld,)``.
     """
 
-    def __init__(
-        self,
-        knots: np.ndarray,
-        weights: np.ndarray,
-        segments: np.ndarray,
-        waypoint_error: np.ndarray,
-    ) -> None:
-        """Wraps a plan.
+    knots: torch.Tensor
+    weights: torch.Tensor
+    numbers: torch.Tensor
+    waypoint_error: np.ndarray
 
-        Args:
-            knots: Commands, shape ``(nworld, n, nu)``.
-            weights: Weight of each knot of a step's segment, shape ``(steps, k)``.
-            segments: First knot of each step's segment, shape ``(steps,)``.
-            waypoint_error: Largest distance [m] from a target at any knot, shape ``(nworld,)``.
-        """
-        self.waypoint_error = waypoint_error
-        self.steps, self._k = weights.shape
-        self._segments = torch.from_numpy(segments)
-        self._weights = torch.from_numpy(weights)
-        self._knots = torch.from_numpy(knots)
-        self._offsets = torch.arange(self._k)
+    @property
+    def steps(self) -> int:
+        """Length of the episode."""
+        return len(self.weights)
 
     def to(self, device: torch.device, dtype: torch.dtype) -> JointTrajectory:
         """The same trajectory on a device."""
-        moved = copy.copy(self)
-        moved._weights, moved._knots = (
-            self._weights.to(device, dtype),
-            self._knots.to(device, dtype),
+        return replace(
+            self,
+            knots=self.knots.to(device, dtype),
+            weights=self.weights.to(device, dtype),
+            numbers=self.numbers.to(device),
         )
-        moved._segments, moved._offsets = self._segments.to(device), self._offsets.to(device)
-        return moved
 
     def command(self, step: int | torch.Tensor) -> torch.Tensor:
         """Commands of one step.
@@ -86,11 +80,11 @@ class JointTrajectory:
             Shape ``(nworld, nu)``.
         """
         if isinstance(step, int):
-            step = torch.tensor([step], device=self._offsets.device)
-        knots = self._knots.index_select(1, self._segments.index_select(0, step) + self._offsets)
+            step = torch.tensor([step], device=self.numbers.device)
+        knots = self.knots.index_select(1, self.numbers.index_select(0, step)[0])
         # Not einsum, whose rounding depends on nworld: a world's commands would not be those it
         # gets alone.
-        return (self._weights.index_select(0, step)[0][:, None] * knots).sum(1)
+        return (self.weights.index_select(0, step)[0][:, None] * knots).sum(1)
 
 
 class OpenLoopPlanner:
@@ -111,7 +105,7 @@ class OpenLoopPlanner:
             iterations=cfg.controller.ik_iterations,
         )
         self._nodes = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, cfg.controller.knots))
-        self._weights, self._segments = self._step_weights()
+        self._weights, self._numbers = self._step_weights()
         self._seed: np.ndarray | None = None
         self._last: tuple[np.ndarray, JointTrajectory] | None = None
         self._seed = self.plan_world(0, nominal_xy(cfg.scene))[0]
@@ -151,7 +145,7 @@ class OpenLoopPlanner:
         if len(first) < nworld:
             knots = knots[twin]
             error = error[twin]
-        trajectory = JointTrajectory(knots, self._weights, self._segments, error)
+        trajectory = JointTrajectory(torch.from_numpy(knots), self._weights, self._numbers, error)
         if nworld > 1:
             self._last = (sources_xy.copy(), trajectory)
         return trajectory
@@ -246,22 +240,23 @@ class OpenLoopPlanner:
             out.append((start, end, grip0, grip))
         return out
 
-    def _step_weights(self) -> tuple[np.ndarray, np.ndarray]:
-        """Barycentric Lagrange weights of the Chebyshev points, for every step."""
+    def _step_weights(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Barycentric Lagrange weights of the Chebyshev points, and their numbers, for every
+        step.
+        """
         n = len(self._nodes)
         bary = (-1.0) ** np.arange(n)
         bary[[0, -1]] *= 0.5
         rows = []
-        segments = []
+        numbers = []
         for i, phase in enumerate(self.phases):
             for step in range(phase.start, phase.stop):
                 s = _smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
                 gap = s - self._nodes
                 hit = np.abs(gap) < 1e-12
-                row = hit.astype(float) if hit.any() else (bary / gap) / (bary / gap).sum()
-                rows.append(row)
-                segments.append(i * n)
-        return np.array(rows), np.array(segments)
+                rows.append(hit.astype(float) if hit.any() else (bary / gap) / (bary / gap).sum())
+                numbers.append(range(i * n, i * n + n))
+        return torch.from_numpy(np.array(rows)), torch.tensor(numbers)
 
 
 def plan_in_parallel(

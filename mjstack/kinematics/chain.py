@@ -46,74 +46,52 @@ def build_chain(
     shared = len([body for body in first_path if body in second_path])
     columns = {joint: column for column, joint in enumerate(joints)}
     chain = Chain()
-    links = []
+    links: list[_Link] = []
+    turned: dict[int, np.ndarray] = {}  # quaternions of the bodies on the last link, seen from it
 
     def extend(bodies: list[int], start: _Pose) -> _Pose:
         """Append the bodies' links; return the frame after them, seen from the last joint."""
         pose = start
         for body in bodies:
             pose = _compose(pose, (model.body_pos[body], model.body_quat[body]))
-            for joint in _joints(model, body):
+            first_joint = model.body_jntadr[body]
+            for joint in range(first_joint, first_joint + model.body_jntnum[body]):
                 if joint in columns:
                     pose = _compose(pose, (model.jnt_pos[joint], _NO_TURN))
                     links.append(_read_link(model, joint, pose, columns[joint]))
                     pose = (-model.jnt_pos[joint], _NO_TURN)
+                    turned.clear()
+            turned[body] = pose[1]
         return pose
 
     trunk = extend(first_path[:shared], (np.zeros(3), _NO_TURN))
     chain.trunk = len(links)
-    chain.approach = wp.vec3(
-        *_read_approach_axis(model, robot, first_path[:shared], trunk, set(columns))
-    )
+    body = approach_body(model, robot)
+    if body not in turned:
+        names = ", ".join(model.body(b).name for b in turned) or "none"
+        expected = (
+            f"a body that carries both grasp sites and that every joint before them moves: {names}"
+        )
+        raise ConfigError("robot.approach_body", model.body(body).name, expected)
+    axis = np.empty(3)
+    mujoco.mju_rotVecQuat(axis, np.array(robot.approach_axis, dtype=float), turned[body])
+    chain.approach = wp.vec3(*(axis / np.linalg.norm(axis)))
     end = extend(first_path[shared:], trunk)
     chain.first_site = wp.vec3(*_compose(end, (model.site_pos[first], _NO_TURN))[0])
     chain.fork = len(links)
     end = extend(second_path[shared:], trunk)
     chain.second_site = wp.vec3(*_compose(end, (model.site_pos[second], _NO_TURN))[0])
     chain.end = len(links)
-    kinds = [kind for _, _, kind, _ in links]
-    column = [column for *_, column in links]
-    chain.frame = wp.array(
-        [[*pos, *quat[1:], quat[0]] for (pos, quat), *_ in links], dtype=wp.transform
-    )  # Warp: xyzw
-    chain.axis = wp.array([axis for _, axis, *_ in links], dtype=wp.vec3)
+    frames, axes, kinds, column = (list(values) for values in zip(*links, strict=True))
+    poses = [[*pos, *quat[1:], quat[0]] for pos, quat in frames]  # Warp: xyzw
+    chain.frame = wp.array(poses, dtype=wp.transform)
+    chain.axis = wp.array(axes, dtype=wp.vec3)
     chain.kind = wp.array(kinds, dtype=int)
     chain.column = wp.array(column, dtype=int)
     chain.low = wp.array(low[column], dtype=float)
     chain.high = wp.array(high[column], dtype=float)
     shape = Shape(tuple(kinds), tuple(c in moved for c in column), chain.trunk, chain.fork)
     return chain, shape
-
-
-def _read_approach_axis(
-    model: mujoco.MjModel, robot: RobotCfg, trunk: list[int], end: _Pose, commanded: set[int]
-) -> np.ndarray:
-    """Read the approach axis, seen from the trunk's last link.
-
-    Args:
-        model: The compiled model.
-        robot: The robot's profile.
-        trunk: Bodies that carry both sites, from the world's side.
-        end: Frame of the last of them, seen from the trunk's last link.
-        commanded: Joints that have a column in the joint targets.
-    """
-    first = max((i for i, b in enumerate(trunk) if commanded & set(_joints(model, b))), default=0)
-    rigid = trunk[first:]
-    body = approach_body(model, robot)
-    if body not in rigid:
-        names = ", ".join(model.body(b).name for b in rigid) or "none"
-        expected = (
-            f"a body that carries both grasp sites and that every joint before them moves: {names}"
-        )
-        raise ConfigError("robot.approach_body", model.body(body).name, expected)
-    turn = np.empty(4)
-    back = end[1].copy()  # from the last body of the trunk to this one, against the way
-    for b in reversed(rigid[rigid.index(body) + 1 :]):
-        mujoco.mju_negQuat(turn, model.body_quat[b])
-        mujoco.mju_mulQuat(back, back.copy(), turn)
-    out = np.empty(3)
-    mujoco.mju_rotVecQuat(out, np.array(robot.approach_axis, dtype=float), back)
-    return out / np.linalg.norm(out)
 
 
 def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose, column: int) -> _Link:
@@ -145,10 +123,6 @@ def _path(model: mujoco.MjModel, body: int) -> list[int]:
         path.insert(0, int(body))
         body = model.body_parentid[body]
     return path
-
-
-def _joints(model: mujoco.MjModel, body: int) -> range:
-    return range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
 
 
 def _compose(a: _Pose, b: _Pose) -> _Pose:

@@ -121,21 +121,17 @@ class SimpleBodies:
         ]
         # A simple body's inertial step is its own frame, so inertia is diagonal there: M0 =
         # armature + a * mass + b . inertia.
-        self._a, self._b = np.zeros(len(self._dofs)), np.zeros((len(self._dofs), 3))
-        for i, dof in enumerate(self._dofs):
-            joint = model.dof_jntid[dof]
-            k = int(dof - model.jnt_dofadr[joint])
-            kind = model.jnt_type[joint]
-            if kind == mujoco.mjtJoint.mjJNT_SLIDE or (
-                kind == mujoco.mjtJoint.mjJNT_FREE and k < 3
-            ):
-                self._a[i] = 1.0
-            elif kind == mujoco.mjtJoint.mjJNT_HINGE:
-                axis = model.jnt_axis[joint]
-                self._a[i] = np.sum(np.cross(axis, model.jnt_pos[joint]) ** 2)
-                self._b[i] = axis**2
-            else:
-                self._b[i, k % 3] = 1.0
+        joint = model.dof_jntid[self._dofs]
+        kind = model.jnt_type[joint]
+        number = self._dofs - model.jnt_dofadr[joint]  # of the degree of freedom in its joint
+        axis = model.jnt_axis[joint]
+        free = (kind == mujoco.mjtJoint.mjJNT_FREE) & (number < 3)
+        slides = (kind == mujoco.mjtJoint.mjJNT_SLIDE) | free
+        hinges = kind == mujoco.mjtJoint.mjJNT_HINGE
+        lever = (np.cross(axis, model.jnt_pos[joint]) ** 2).sum(axis=1)
+        self._a = np.where(hinges, lever, slides)
+        turns = ~slides[:, None] * np.eye(3)[number % 3]
+        self._b = np.where(hinges[:, None], axis**2, turns)
 
     def update(self) -> None:
         """Compute dof_M0 from what the fields hold now."""
