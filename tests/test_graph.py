@@ -12,7 +12,6 @@ import warp as wp
 from compositions import make_env
 from environments import actions, configure, returned
 
-import mjstack
 from mjstack.config.schema import GraphMode
 from mjstack.envs import Env
 from mjstack.errors import CaptureError

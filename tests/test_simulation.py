@@ -15,8 +15,8 @@ from mjstack.config.schema import Backend
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError, RebindError, UnsupportedModel
 from mjstack.math import quat_angle
-from mjstack.scene import build_scene, table_top
-from mjstack.sim import Simulation, make_simulation
+from mjstack.scene import build_model, build_scene, table_top
+from mjstack.sim import Simulation, SolverLimit, make_simulation
 
 N = 3
 STATE = ("qpos", "qvel", "act", "ctrl")
@@ -376,6 +376,18 @@ def test_options_as_uploaded(backend: str, make_sim: Make) -> None:
 
 
 @pytest.mark.full
+def test_worlds_whose_solver_stops_at_its_limit_are_told() -> None:
+    told = []
+    for overrides in ([], ["solver.iterations=1", "solver.ls_iterations=1"]):
+        cfg = load_config(overrides)
+        sim = make_simulation(build_model(cfg), cfg, 2, backend=Backend.mjwarp, device="cpu")
+        sim.step(10)
+        assert sim.solver_limits is not None
+        told.append((sim.solver_limits & int(SolverLimit.ITERATIONS)).tolist())
+        assert sim.overflow.tolist() == [0, 0]
+    assert told == [[0, 0], 2 * [int(SolverLimit.ITERATIONS)]]
+
+
 def test_captured_and_uncaptured_steps_agree(make_sim: Make, stage: Stage) -> None:
     finals = []
     for overrides in ((), ("graph=off",)):
