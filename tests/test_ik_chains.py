@@ -86,8 +86,8 @@ def test_any_chain_of_hinges_and_slides(device: str) -> None:
     commands[:, 0] = np.clip(commands[:, 0], -0.09, 0.29)
     ik = arm.solver(100, device, iterations=5)
     (given,) = tensors(device, commands)
-    assert np.abs(ik.grasp_point(given).cpu().numpy() - arm.grasp_point(commands)).max() <= 1e-6
-    for found, expected in zip(ik.directions(given), arm.directions(commands), strict=True):
+    assert np.abs(ik.forward(given)[0].cpu().numpy() - arm.grasp_point(commands)).max() <= 1e-6
+    for found, expected in zip(ik.forward(given)[1:], arm.directions(commands), strict=True):
         assert np.abs(found.cpu().numpy() - expected).max() <= 2e-6
     near = np.clip(
         commands + np.random.default_rng(19).normal(scale=0.005, size=commands.shape),
@@ -197,9 +197,7 @@ def test_shapes_are_not_broadcast() -> None:
     with pytest.raises(ArgumentError, match=r"target: found shape \(3,\), expected shape \(3, 3\)"):
         ik.solve(torch.zeros(3, 5), torch.zeros(3))
     with pytest.raises(ArgumentError, match="q: found shape"):
-        ik.grasp_point(torch.zeros(3, 4))
-    with pytest.raises(ArgumentError, match="q: found shape"):
-        ik.directions(torch.zeros(3, 4))
+        ik.forward(torch.zeros(3, 4))
     with pytest.raises(
         ArgumentError, match="posture: found one, expected None, because posture_gain is 0"
     ):
