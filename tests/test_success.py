@@ -268,24 +268,14 @@ def test_both_backends_start_and_end_alike(passed: Path, warp: Path) -> None:
 
 
 @pytest.mark.full
-def test_replay_plays_the_gates_world(passed: Path, warp: Path, tmp_path: Path) -> None:
-    """Region, controller and file are the run's own: a native world ends bit for bit where it did,
-    MJWarp's too.
-    """
+def test_replay_plays_the_gates_world(passed: Path, tmp_path: Path) -> None:
+    """Region and controller are the run's own: the world ends bit for bit where it did."""
     out = tmp_path / "out"
     assert run(["job=replay", f"run={passed}", "world=5", f"hydra.run.dir={out}"]) == 0
     gate = gate_of(out)
     assert gate["reason"].endswith("; as recorded, and it ends bit for bit where it did")
     assert len(gate["details"]) == len(RULES) + 1
     assert gate["details"][-1] == "first sign of failure: none; grasps tried again: 0"
-    both = tmp_path / "both"
-    assert run(["job=replay", f"run={warp}", "world=3", f"hydra.run.dir={both}"]) == 0
-    first, second = json.loads((both / "report.json").read_text())["gates"]
-    assert (first["name"], second["name"]) == ("replay_mjwarp", "replay_native")
-    assert first["reason"].endswith("; as recorded, and it ends bit for bit where it did")
-    assert second["reason"].endswith("that run's mjwarp world had the same result")
-    with np.load(both / "trajectory.npz") as held, np.load(warp / "success_seed0.npz") as theirs:
-        assert np.array_equal(held["start_qpos"].astype(np.float32), theirs["start_qpos"][3])
 
 
 @pytest.mark.full
