@@ -41,11 +41,8 @@ def make_env(
     )
 
 
-def checked(*overrides: str, task: str = "stack") -> None:
-    """Check a configuration of a task as composing it with these overrides would, their values put
-    in place directly.
-    """
-    cfg = load_config([f"task={task}"])
+def put(cfg: Config, *overrides: str) -> Config:
+    """Put the values of overrides into a configuration, without composing it anew."""
     for override in overrides:
         parsed = parse(override.lstrip("+"))
         *path, last = parsed.key_or_group.split(".")
@@ -56,5 +53,11 @@ def checked(*overrides: str, task: str = "stack") -> None:
             node[last] = parsed.value()
         else:
             setattr(node, last, parsed.value())
+    return cfg
+
+
+def checked(*overrides: str, task: str = "stack") -> None:
+    """Check a configuration of a task with the values of some overrides, as composing it would."""
+    cfg = put(load_config([f"task={task}"]), *overrides)
     validate(cfg)
     make_check(cfg)

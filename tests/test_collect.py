@@ -11,6 +11,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -19,7 +20,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from compositions import load_config
+from compositions import load_config, put
 from environments import at_double_speed
 from stubs import episodes_of, fake_demonstrations, pairs
 
@@ -372,8 +373,8 @@ def test_bad_input_is_one_line(
 
 @pytest.mark.full
 def test_what_the_hash_is_of() -> None:
-    def home(*overrides: str) -> Path:
-        return collect_folder(load_config(["job=collect", "sim=native", *overrides]))
+    def home(*values: str, choices: Sequence[str] = ()) -> Path:
+        return collect_folder(put(load_config(["job=collect", "sim=native", *choices]), *values))
 
     base = home()
     assert base.parent == Path("outputs/collect")
@@ -382,29 +383,30 @@ def test_what_the_hash_is_of() -> None:
             "job.episodes=7",
             "nworld=3",
             "gates=[batch]",
-            "graph=off",
             "batch.njmax=300",
             "job.buffer_gib=1",
         )
         == base
     )
-    assert home("gate.throughput.steps=3", "gate.success.seeds=2", "~termination.success") == base
-    others = [
+    assert home("gate.throughput.steps=3", "gate.success.seeds=2") == base
+    assert home(choices=["~termination.success", "graph=off"]) == base
+    groups = [
         "robot=rebot",
         "task=box",
         "model=menagerie",
         "timing=fine",
         "controller=open_loop",
         "reset=jitter",
-        "seed=1",
     ]
-    others += [
-        "+observation.policy.noise=false",
+    values = [
+        "seed=1",
+        "observation.policy.noise=false",
         "reward.lift.weight=3",
         "task.check.xy_err=0.01",
     ]
-    others += ["job.keep_failures=true", "controller.phases.done.seconds=2.0"]
-    assert len({base, *(home(other) for other in others)}) == 1 + len(others)
+    values += ["job.keep_failures=true", "controller.phases.done.seconds=2.0"]
+    others = [*(home(choices=[group]) for group in groups), *(home(value) for value in values)]
+    assert len({base, *others}) == 1 + len(others)
     on_cpu = collect_folder(load_config(["job=collect", "sim=mjwarp", "sim.device=cpu"]))
     assert (
         on_cpu != base
