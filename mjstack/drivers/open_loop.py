@@ -163,11 +163,11 @@ class OpenLoopPlanner:
         nominal = nominal_xy(self._cfg.scene)
         trajectory = self.plan(nominal[None])
         worst = 0.0
-        for phase, (start, end, _, _) in zip(self.phases, self._targets(nominal), strict=True):
+        for phase, (start, end) in zip(self.phases, self._targets(nominal), strict=True):
             for step in range(phase.start, phase.stop):
                 s = _smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
                 at = self.ik.grasp_point(trajectory.command(step)[0].numpy())
-                worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start)))))
+                worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start))[:3])))
         return worst
 
     def plan_world(self, world: int, xy: np.ndarray) -> tuple[np.ndarray, float]:
@@ -188,20 +188,18 @@ class OpenLoopPlanner:
         knots = np.empty((len(self.phases) * n, len(self._cfg.robot.home)))
         worst = 0.0
         command = self.ik.home
-        for i, (phase, (start, end, grip0, grip1)) in enumerate(
-            zip(self.phases, self._targets(xy), strict=True)
-        ):
-            still = bool((start == end).all() and (grip0 == grip1).all())
+        for i, (phase, (start, end)) in enumerate(zip(self.phases, self._targets(xy), strict=True)):
+            still = bool((start == end).all())
             for j, s in enumerate(self._nodes):
                 k = i * n + j
                 repeated = (still and j > 0) or (j == 0 and i > 0)
                 if not repeated:
                     guess = command if self._seed is None else self._seed[k]
-                    target = start + s * (end - start)
-                    command, distance = self.ik.solve(target, grip0 + s * (grip1 - grip0), guess)
+                    way = start + s * (end - start)
+                    command, distance = self.ik.solve(way[:3], way[3:], guess)
                     if not distance <= self.ik.tolerance:
                         raise Unreachable(
-                            world, phase.name, target.tolist(), distance, self.ik.tolerance
+                            world, phase.name, way[:3].tolist(), distance, self.ik.tolerance
                         )
                     worst = max(worst, distance)
                 knots[k] = command
@@ -218,26 +216,23 @@ class OpenLoopPlanner:
         for world in worlds:
             yield world, *self.plan_world(world, sources_xy[world])
 
-    def _targets(
-        self, xy: np.ndarray
-    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """Start and end of the grasp point and of the gripper command, per phase."""
+    def _targets(self, xy: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Start and end of each phase: the grasp point [m] and then the gripper's command."""
         robot = self._cfg.robot
         where = xy.copy()  # of each object after the phases so far
         held = -1
-        grips = {"open": np.array(robot.gripper_open), "closed": np.array(robot.gripper_closed)}
-        out: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+        grips = {"open": robot.gripper_open, "closed": robot.gripper_closed}
+        out: list[tuple[np.ndarray, np.ndarray]] = []
         for phase in self.phases:
             if held >= 0 and phase.carried < 0:  # let go where the last target was
                 where[held] = out[-1][1][:2]
             held = phase.carried
-            grip = grips[phase.spec.gripper]
             target = phase.target
-            end = out[-1][1] if target is None else np.array([*target_xy(target, where), target.z])
+            point = out[-1][1][:3] if target is None else [*target_xy(target, where), target.z]
+            end = np.array([*point, *grips[phase.spec.gripper]])
             # The first phase's target stands from the first step; only the gripper moves from home.
-            start = out[-1][1] if out else end
-            grip0 = out[-1][3] if out else np.array(robot.home[len(robot.arm_joints) :])
-            out.append((start, end, grip0, grip))
+            home = np.array([*point, *robot.home[len(robot.arm_joints) :]])
+            out.append((out[-1][1] if out else home, end))
         return out
 
     def _step_weights(self) -> tuple[torch.Tensor, torch.Tensor]:

@@ -17,7 +17,7 @@ from mjstack.envs import Env, driven_config
 from mjstack.mdp.geometry import source_xy
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
-from mjstack.sim.repeated import Eager, Repeated
+from mjstack.sim.repeated import Repeated
 
 CLOSED_LOOP = "closed_loop"  # the controller with feedback; any other name plays a plan
 Reset = dict[str, TermCfg]
@@ -105,7 +105,7 @@ def rollout(
         sim.ctrl.copy_(driver.command())
         cast(Callable[[], None], physics)()
 
-    play = Eager(bare) if physics else env.captured(work, "a step of the episode")
+    play = Repeated(bare) if physics else env.captured(work, "a step of the episode")
     # On Warp's CPU device physics alone is captured, once for all episodes.
     graph: Repeated | None = play
     if sim.device.type != "cuda" and physics is None:

@@ -15,6 +15,7 @@ import torch
 
 from mjstack.config.schema import GraphMode
 from mjstack.errors import CaptureError
+from mjstack.sim.repeated import Repeated
 from mjstack.sim.warp_setup import torch_stream_scope, wp
 
 _ALIGNMENT = 512  # bytes
@@ -45,7 +46,7 @@ def _inside() -> Iterator[None]:
         _nesting -= 1
 
 
-class StepGraph:
+class StepGraph(Repeated):
     """Work that is the same at every call: no host read, fixed shapes, the same memory.
 
     The first call runs it eagerly, which compiles kernels and makes allocations happen. The second
@@ -81,7 +82,7 @@ class StepGraph:
             culprit: Names what was current_term, for the message of a failed capture.
             scratch: Whether Warp's temporaries come from a `Scratch`.
         """
-        self._work = work
+        super().__init__(work)
         self._mode = mode
         self._name = name
         self._version = version
@@ -92,7 +93,6 @@ class StepGraph:
         self._memory: tuple[torch.cuda.MemPool, Scratch | None] | None = None
         self._warm = self._failed = False
         self._seen = version()
-        self.warm_up_seconds = self.capture_seconds = 0.0
 
     @property
     def captured(self) -> bool:
@@ -148,7 +148,8 @@ class StepGraph:
             self._failed = True
             failure = CaptureError(self._name, self._culprit(), error)
             if self._device.is_cuda:
-                _recover(self._device)
+                with suppress(RuntimeError):  # it reports the failed capture once more
+                    torch.cuda.synchronize(wp.device_to_torch(self._device))
             if self._mode is GraphMode.require:
                 self._failed = False
                 raise failure from error
@@ -273,13 +274,3 @@ def side_by_side(device: torch.device, *works: Callable[[], None], branches: boo
             main.wait_stream(stream)
     finally:
         free.extend(used)
-
-
-def _recover(device: wp.Device) -> None:
-    """Clear the error that a broken capture leaves, so that eager work can go on."""
-    try:
-        torch.cuda.synchronize(wp.device_to_torch(device))
-    except RuntimeError:
-        log.debug(
-            "the first synchronize after a failed capture reports it once more", exc_info=True
-        )

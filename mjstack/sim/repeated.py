@@ -3,54 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import torch
 
 from mjstack.config.schema import GraphMode
 
 
-class Repeated(Protocol):
-    """Work that is the same at every call.
-
-    A `mjstack.sim.graph.StepGraph`, or `Eager` where nothing is captured.
+class Repeated:
+    """Work that is the same at every call, and just runs; `mjstack.sim.graph.StepGraph` captures
+    it.
 
     Attributes:
-        captured: Whether the next call replays a graph.
         warm_up_seconds: Time of the first call, if it was a warm-up [s].
         capture_seconds: Time of the capture [s].
     """
 
-    @property
-    def captured(self) -> bool:
-        """Whether the next call replays a graph."""
-
-    warm_up_seconds: float
-    capture_seconds: float
-
-    def __call__(self) -> None:
-        """Do the work."""
-
-    def drop(self) -> None:
-        """Free the graph and its memory."""
-
-
-class Eager:
-    """Work that just runs."""
-
-    captured = False
-    warm_up_seconds = capture_seconds = 0.0
+    warm_up_seconds = 0.0
+    capture_seconds = 0.0
 
     def __init__(self, work: Callable[[], None]) -> None:
         """``work`` is called as it is."""
         self._work = work
+
+    @property
+    def captured(self) -> bool:
+        """Whether the next call replays a graph."""
+        return False
 
     def __call__(self) -> None:
         """Do the work."""
         self._work()
 
     def drop(self) -> None:
-        """There is nothing to free."""
+        """Free the graph and its memory."""
 
 
 def as_graph(
@@ -64,7 +49,7 @@ def as_graph(
 ) -> Repeated:
     """Work as a `StepGraph` on CUDA, whose arguments these are; elsewhere as it is."""
     if device.type != "cuda":
-        return Eager(work)
+        return Repeated(work)
     from mjstack.sim.graph import StepGraph  # loads Warp, which native runs do not need
 
     return StepGraph(work, device, mode, name=name, version=version, culprit=culprit)
