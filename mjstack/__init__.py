@@ -3,6 +3,7 @@ verified in gates.
 """
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from mjstack.errors import MjstackError
@@ -23,20 +24,6 @@ _HOMES = {
     "Env": "mjstack.envs",
     "make_env": "mjstack.envs",
 }
-_PACKAGES = {
-    "config",
-    "drivers",
-    "envs",
-    "kinematics",
-    "managers",
-    "math",
-    "mdp",
-    "rng",
-    "robots",
-    "scene",
-    "sim",
-    "tasks",
-}
 
 if not TYPE_CHECKING:  # a type checker would take any name for one of these
 
@@ -46,9 +33,6 @@ if not TYPE_CHECKING:  # a type checker would take any name for one of these
         """
         if name in _HOMES:
             return getattr(import_module(_HOMES[name]), name)
-        if name in _PACKAGES:
+        if find_spec(f"mjstack.{name}"):
             return import_module(f"mjstack.{name}")
         raise AttributeError(f"module 'mjstack' has no attribute '{name}'")
-
-    def __dir__() -> list[str]:
-        return sorted({*globals(), *__all__, *_PACKAGES})

@@ -1,17 +1,16 @@
 """The command: ``mjstack``, ``python -m mjstack`` and ``python scripts/run.py``."""
 
-from mjstack.startup import guard, started
+import sys
 
 
 def main() -> None:
     """Entry point of the console script; leaves with the exit status of the run."""
-    guard()
     try:
-        from mjstack.cli import main as run  # takes seconds
-
-        run()
-    finally:
-        started()
+        from mjstack.cli import run  # takes seconds
+    except KeyboardInterrupt:
+        print("mjstack: interrupted before anything ran", file=sys.stderr)
+        raise SystemExit(130) from None
+    raise SystemExit(run(sys.argv[1:]))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ Hydra runs what was composed.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -30,9 +31,9 @@ from rich.console import Console
 
 import mjstack
 from mjstack.config import Config
+from mjstack.config.explain import check_overrides, parse
 from mjstack.config.help import help_text, key_help
 from mjstack.config.load import compose, compose_job, split_search_path, to_config
-from mjstack.config.overrides import check_overrides, parse
 from mjstack.config.session import (
     CONFIG_NAME,
     PROVIDER,
@@ -42,7 +43,6 @@ from mjstack.config.session import (
 from mjstack.errors import CompositionError, MjstackError, UnknownName
 from mjstack.report.record import Status
 from mjstack.report.table import Table
-from mjstack.startup import INTERRUPTED, started
 
 if TYPE_CHECKING:
     from mjstack.jobs import CheckedJob, JobResult
@@ -52,11 +52,6 @@ _WIDE = 3  # gates; with more of them a sweep's table has only their status
 
 _checked: dict[tuple[str, ...], CheckedJob] = {}  # by their overrides, until Hydra runs them
 _results: list[JobResult] = []  # of the jobs that ran in this process
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Entry point of the console script; leaves with the exit status of the run."""
-    raise SystemExit(run(list(sys.argv[1:] if argv is None else argv)))
 
 
 def run(args: list[str]) -> int:
@@ -79,7 +74,9 @@ def run(args: list[str]) -> int:
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 1
     except KeyboardInterrupt:
-        return max([INTERRUPTED, *(result.exit_code for result in _results)])
+        if not _results:
+            errors.print("mjstack: interrupted before anything ran")
+        return 130
 
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
@@ -120,7 +117,7 @@ def _run_one(hydra: Hydra, overrides: list[str]) -> int:
     checked = _check(cfg, overrides)
     if checked.folder is not None and not any(o.startswith("hydra.run.dir=") for o in overrides):
         cfg.hydra.run.dir = str(checked.folder)
-    check_writable(_folder(cfg, "run"))
+    _check_writable(cfg, "run")
     run_and_report(lambda: hydra.run(CONFIG_NAME, run_job, overrides))
     return max(result.exit_code for result in _results)
 
@@ -137,7 +134,7 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     master = compose(hydra, overrides, RunMode.MULTIRUN)
     for job in jobs:
         _check(compose_job(hydra, master, job), job)
-    check_writable(_folder(master, "sweep"))
+    _check_writable(master, "sweep")
     returned = run_and_report(lambda: hydra.multirun(CONFIG_NAME, run_job, overrides))
     batches = returned if isinstance(returned, list) else []  # a launcher's own processes return
     results = _results or [job.return_value for batch in batches for job in batch]
@@ -166,7 +163,6 @@ def run_job(cfg: DictConfig) -> JobResult:
     """Runs a job in the folder that Hydra made. A launcher may call it in another process, where
     nothing has been checked yet.
     """
-    started()
     own = HydraConfig.get()
     overrides = list(own.overrides.task)
     sources = [s for s in own.runtime.config_sources if s.provider == PROVIDER]
@@ -196,7 +192,7 @@ def _parse(args: list[str]) -> Namespace:
     parser = get_args_parser()
     parser.exit_on_error = False
     known = set(parser._option_string_actions)
-    for number, arg in enumerate(args):
+    for arg in args:
         name = arg.partition("=")[0]
         if name in _OTHER_CONFIG:
             raise CompositionError(
@@ -204,7 +200,7 @@ def _parse(args: list[str]) -> Namespace:
                 " overrides, or add choices with --config-dir DIR."
             )
         if arg.startswith("-") and name not in known:
-            raise _unknown_flag(arg, args[number + 1 : number + 2], known)
+            raise _unknown_flag(arg, known)
     try:
         flags = parser.parse_intermixed_args(args)
     except ArgumentError as error:
@@ -217,13 +213,11 @@ def _parse(args: list[str]) -> Namespace:
     return flags
 
 
-def _unknown_flag(arg: str, follows: list[str], known: set[str]) -> MjstackError:
+def _unknown_flag(arg: str, known: set[str]) -> MjstackError:
     override = arg.lstrip("-")
-    key, given, _ = override.partition("=")
-    if key.partition(".")[0] not in {field.name for field in fields(Config)}:
+    if re.split(r"[.=]", override)[0] not in {field.name for field in fields(Config)}:
         return UnknownName("flag", arg, known)
-    usable = follows and not follows[0].startswith("-") and "=" not in follows[0]
-    meant = override if given else f"{key}={follows[0] if usable else 'VALUE'}"
+    meant = override if "=" in override else f"{override}=VALUE"
     return CompositionError(
         f"flag '{arg}' does not exist. Write {meant}, an override without dashes."
     )
@@ -249,30 +243,23 @@ def _expand(overrides: Sequence[str]) -> list[list[str]]:
     return [list(job) for batch in batches for job in batch]
 
 
-def _folder(cfg: DictConfig, kind: str) -> Path:
-    """The folder that Hydra will make for ``run`` or ``sweep``."""
+def _check_writable(cfg: DictConfig, kind: str) -> None:
+    """Check that the folder that Hydra will make for ``run`` or ``sweep`` can be written, by a file
+    that is gone at once.
+    """
     try:
-        return Path(cfg.hydra[kind].dir)
+        existing = folder = Path(cfg.hydra[kind].dir).absolute()
+        while not existing.exists():
+            existing = existing.parent
+        tempfile.TemporaryFile(dir=existing).close()
     except OmegaConfBaseException as error:
         raise CompositionError(
             f"hydra.{kind}.dir cannot be used: {str(error).splitlines()[0]}."
         ) from error
-
-
-def check_writable(folder: Path) -> None:
-    """Checks that a folder can be made and written, by a file that is gone at once."""
-    existing = folder.absolute()
-    try:
-        while not existing.exists():
-            existing = existing.parent
-        if not existing.is_dir():
-            raise NotADirectoryError(20, "Not a directory")
-        with tempfile.TemporaryFile(dir=existing):
-            pass
     except OSError as error:
         raise CompositionError(
             f"outputs folder {folder}: {existing} cannot be written ({error.strerror}), expected a"
-            " writable folder. Run from another folder, or set hydra.run.dir."
+            f" writable folder. Run from another folder, or set hydra.{kind}.dir."
         ) from error
 
 
@@ -281,15 +268,8 @@ def _print_sweep(outcomes: list[JobResult]) -> None:
     names = list(dict.fromkeys(gate.name for outcome in outcomes for gate in outcome.gates))
     rows = []
     for number, outcome in enumerate(outcomes):
-        by_name = {gate.name: gate for gate in outcome.gates}
-        cells = [
-            (
-                f"{by_name[name].status.value}: {by_name[name].reason}"
-                if name in by_name
-                else "not run"
-            )
-            for name in names
-        ]
+        found = {gate.name: f"{gate.status.value}: {gate.reason}" for gate in outcome.gates}
+        cells = [found.get(name, "not run") for name in names]
         rows.append([str(number), " ".join(outcome.overrides), *cells, outcome.status.value])
     title = f"sweep of {len(outcomes)} jobs"
     table = Table(title=title, header=["job", "overrides", *names, "status"], rows=rows)

@@ -29,10 +29,14 @@ class MjstackError(Exception):
     exit_code = 1
 
 
-class ConfigError(MjstackError):
-    """A value in the configuration cannot be used. Raised before anything is written."""
+class InputError(MjstackError):
+    """Bad configuration or input. Raised before anything is written."""
 
     exit_code = 2
+
+
+class ConfigError(InputError):
+    """A value in the configuration cannot be used."""
 
     def __init__(self, key: str, value: object, expected: str, fix: str = "") -> None:
         """Builds the message.
@@ -43,8 +47,7 @@ class ConfigError(MjstackError):
             expected: What would have been accepted.
             fix: What to do about it, a sentence without its full stop.
         """
-        message = f"{key}={value}: expected {expected}."
-        super().__init__(message + (f" {fix}." if fix else ""))
+        super().__init__(_sentences(f"{key}={value}: expected {expected}", fix))
         self.key = key
         self._facts = (value, expected, fix)
 
@@ -53,37 +56,27 @@ class ConfigError(MjstackError):
         return ConfigError(key, *self._facts)
 
 
-class CompositionError(MjstackError):
+class CompositionError(InputError):
     """Overrides do not fit the configuration files."""
 
-    exit_code = 2
 
-
-class UnknownName(MjstackError):
+class UnknownName(InputError):
     """A name that does not exist, listed with the ones that do."""
-
-    exit_code = 2
 
     def __init__(self, what: str, name: str, available: Iterable[str]) -> None:
         super().__init__(f"{what} '{name}' does not exist. {suggest(name, available)}")
 
 
-class SourceError(MjstackError):
+class SourceError(InputError):
     """A robot description that cannot be fetched, found or read."""
 
-    exit_code = 2
 
-
-class DeviceError(MjstackError):
+class DeviceError(InputError):
     """A compute device that was asked for and is not there."""
 
-    exit_code = 2
 
-
-class RunError(MjstackError):
+class RunError(InputError):
     """The folder of an earlier run that cannot be read, or has not what is asked for."""
-
-    exit_code = 2
 
 
 class UnsupportedModel(MjstackError):
@@ -96,10 +89,8 @@ class UnsupportedModel(MjstackError):
         )
 
 
-class TermError(MjstackError):
+class TermError(InputError):
     """A term of a manager that cannot be found, built or used."""
-
-    exit_code = 2
 
     def __init__(self, label: str, problem: str) -> None:
         """Builds the message from the term's dotted configuration key and what is wrong with it."""
@@ -107,19 +98,10 @@ class TermError(MjstackError):
         self.label = label
 
 
-class ParameterError(MjstackError):
-    """A value that a term cannot use. The manager turns it into a `ConfigError` that has the term's
-    key.
+class ParameterError(ConfigError):
+    """A value that a term cannot use, by the parameter's name. The manager raises it `at` the
+    term's key.
     """
-
-    exit_code = 2
-
-    def __init__(self, name: str, value: object, expected: str, fix: str = "") -> None:
-        """Keeps the parameter's name, its value, what would have been accepted, and what to do
-        about it.
-        """
-        super().__init__(f"{name}={value}: expected {expected}." + (f" {fix}." if fix else ""))
-        self.facts = (name, value, expected, fix)
 
 
 class FaultError(MjstackError):
@@ -129,34 +111,28 @@ class FaultError(MjstackError):
         """Builds the message from what went wrong and what to do, each a sentence without its full
         stop.
         """
-        super().__init__(f"{what}. {fix}.")
+        super().__init__(_sentences(what, fix))
 
 
-class Unreachable(MjstackError):
+class Unreachable(InputError):
     """The arm cannot bring its grasp point to a target."""
-
-    exit_code = 2
 
     def __init__(
         self, world: int, phase: str, target: Sequence[float], distance: float, tolerance: float
     ) -> None:
-        where = ", ".join(f"{x:.3f}" for x in target)
-        super().__init__(
-            f"world {world}, phase {phase}: target ({where}) m is {1e3 * distance:.1f} mm out of"
-            f" reach of the grasp_point centre, expected at most {1e3 * tolerance:.1f} mm. Move the"
-            f" cube closer, or change controller.phases.{phase}."
-        )
+        super().__init__(world, phase, target, distance, tolerance)  # a process hands them on
         self.world = world
         self.phase = phase
         self.distance = distance
-        self._facts = (world, phase, target, distance, tolerance)
 
-    def __reduce__(
-        self,
-    ) -> tuple[
-        type[Unreachable], tuple
-    ]:  # by default an exception is made again from its message alone
-        return type(self), self._facts
+    def __str__(self) -> str:
+        world, phase, target, distance, tolerance = self.args
+        where = ", ".join(f"{x:.3f}" for x in target)
+        return (
+            f"world {world}, phase {phase}: target ({where}) m is {1e3 * distance:.1f} mm out of"
+            f" reach of the grasp point, expected at most {1e3 * tolerance:.1f} mm. Move the object"
+            f" closer, or change controller.phases.{phase}."
+        )
 
 
 class WorkerLost(MjstackError):
@@ -220,10 +196,8 @@ class CaptureError(MjstackError):
         self.culprit = culprit
 
 
-class ArgumentError(MjstackError):
+class ArgumentError(InputError):
     """An argument of a function cannot be used."""
-
-    exit_code = 2
 
     def __init__(self, name: str, found: object, expected: str, fix: str = "") -> None:
         """Builds the message.
@@ -234,18 +208,13 @@ class ArgumentError(MjstackError):
             expected: What would have been accepted.
             fix: What to do about it, a sentence without its full stop.
         """
-        super().__init__(
-            f"{name}: found {found}, expected {expected}." + (f" {fix}." if fix else "")
-        )
-        self.name = name
+        super().__init__(_sentences(f"{name}: found {found}, expected {expected}", fix))
 
 
-class DatasetError(MjstackError):
+class DatasetError(InputError):
     """A dataset of demonstrations that cannot be opened or read, or an episode that does not fit
     into it.
     """
-
-    exit_code = 2
 
     def __init__(self, message: str) -> None:
         """Takes the message without its full stop: what is wrong with its value, what was expected,
@@ -272,15 +241,17 @@ class UnwrittenError(MjstackError):
         )
 
 
-class MissingExtra(MjstackError):
+class MissingExtra(InputError):
     """A package that is not installed, because it comes with an extra."""
-
-    exit_code = 2
 
     def __init__(self, what: str, package: str, extra: str) -> None:
         super().__init__(
             f"{what} needs {package}, which is not installed: run pip install 'mjstack[{extra}]'."
         )
+
+
+def _sentences(problem: str, fix: str) -> str:
+    return f"{problem}. {fix}." if fix else f"{problem}."
 
 
 def suggest(name: str, available: Iterable[str]) -> str:

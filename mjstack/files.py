@@ -13,7 +13,8 @@ from pathlib import Path
 def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a file beside its place and move it there.
 
-    A full disk or a kill leaves the old file.
+    A full disk or a kill leaves the old file. Files that are written one after the other outlast a
+    power cut in this order.
 
     Raises:
         OSError: The file cannot be written.
@@ -29,6 +30,11 @@ def write_atomic(path: Path, content: str | bytes) -> None:
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
 
 
 def to_csv(columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:

@@ -8,9 +8,9 @@ from functools import cache
 from typing import Any
 
 import mjstack
-from mjstack.config.overrides import parse
+from mjstack.config.check import validate
+from mjstack.config.explain import parse
 from mjstack.config.schema import Config
-from mjstack.config.validate import validate
 from mjstack.envs import Env, build_env
 from mjstack.tasks.check import make_check
 

@@ -181,7 +181,7 @@ for args in (["robo=so101"], ["nworld=many"], ["--nworld=3"], ["--version"], ["-
     ("args", "wrong", "meant"),
     [
         (["--gate.batch.seeds=[1]"], "--gate.batch.seeds=[1]", "gate.batch.seeds=[1]"),
-        (["--nworld", "64"], "--nworld", "nworld=64"),
+        (["--nworld", "64"], "--nworld", "nworld=VALUE"),
         (["--seed", "nworld=2"], "--seed", "seed=VALUE"),
     ],
 )

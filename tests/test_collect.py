@@ -21,14 +21,14 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from compositions import load_config, put
+from dataset_checker import check_dataset
 from environments import at_double_speed
 from stubs import episodes_of, fake_demonstrations, pairs
 
 from mjstack.cli import run
 from mjstack.config.fingerprint import config_hash
 from mjstack.config.schema import Backend, Config
-from mjstack.datasets import DatasetWriter, Feature, read_dataset
-from mjstack.datasets.shard import Shard
+from mjstack.datasets import DatasetWriter, Feature
 from mjstack.envs import build_env, demonstration_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import CommandRecorder
@@ -111,8 +111,8 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 
 def test_the_dataset_keeps_its_promises(demos: SimpleNamespace) -> None:
     assert demos.code == 0
-    stored = read_dataset(demos.dataset)
-    assert len(stored.episodes["length"]) == 4
+    stored = check_dataset(demos.dataset)
+    assert len(stored.episodes) == 4
     assert report_of(demos.home)["status"] == "pass"
 
 
@@ -498,7 +498,7 @@ def test_seeds_go_on_until_the_episodes_are_there(
         9,
         2,
     )
-    read_dataset(folder / "dataset")
+    check_dataset(folder / "dataset")
 
 
 LAYOUT = """world,red_x_m,red_y_m,red_yaw_rad,blue_x_m,blue_y_m,blue_yaw_rad
@@ -651,10 +651,10 @@ def test_ctrl_c_keeps_finished_batches(folder: Path, monkeypatch: pytest.MonkeyP
 def test_a_full_disk_is_one_line(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    add = Shard.add
+    add = DatasetWriter._write
 
-    def full(self: Shard, *args: object) -> None:
-        if self.number == 1 and len(self) == 1:
+    def full(self: DatasetWriter, *args: object) -> None:
+        if self._shards == 1 and self.pending == 1:
             raise OSError(28, "No space left on device")
         add(self, *args)  # type: ignore[arg-type]
 
@@ -662,7 +662,7 @@ def test_a_full_disk_is_one_line(
     monkeypatch.setattr(
         collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
     )
-    monkeypatch.setattr(Shard, "add", full)
+    monkeypatch.setattr(DatasetWriter, "_write", full)
     assert collect(*args) == 1
     err = capsys.readouterr().err.strip()
     assert len(err.splitlines()) == 1
@@ -670,7 +670,7 @@ def test_a_full_disk_is_one_line(
     assert "2 committed episodes are kept" in err
     assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
     assert report_of(folder)["status"] == "fail"
-    monkeypatch.setattr(Shard, "add", add)
+    monkeypatch.setattr(DatasetWriter, "_write", add)
     assert collect(*args) == 0
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
 
@@ -684,20 +684,20 @@ def test_a_kill_in_the_middle_of_a_batch(folder: Path, monkeypatch: pytest.Monke
 import os, signal
 from functools import partial
 from mjstack.cli import run
-from mjstack.datasets.shard import Shard
+from mjstack.datasets import DatasetWriter
 from mjstack.jobs import collection
 from stubs import fake_demonstrations
 
 collection.play_demonstrations = fake_demonstrations(lambda seed, world: world == 1, noise=True)
 collection.DatasetWriter = partial(collection.DatasetWriter, file_mb=1)
-add = Shard.add
+add = DatasetWriter._write
 
 def killed(self, *args):
     add(self, *args)
-    if self.number == 1:
+    if self._shards == 1:
         os.kill(os.getpid(), signal.SIGKILL)
 
-Shard.add = killed
+DatasetWriter._write = killed
 run(ARGS)
 """
     args = ["nworld=7", "job.episodes=8"]
@@ -731,7 +731,7 @@ run(ARGS)
     assert run([*COMMAND, *args]) == 0
     assert pairs(folder / "dataset") == whole
     assert before.items() <= contents(folder / "dataset" / "data").items()
-    read_dataset(folder / "dataset")
+    check_dataset(folder / "dataset")
     batches = json.loads((folder / FILE).read_text())
     assert [(batch["worlds"], batch["succeeded"], batch["kept"]) for batch in batches] == [
         (7, 6, 6),
@@ -800,8 +800,8 @@ def test_mjwarp_demonstrations(folder: Path) -> None:
         )
         == 0
     )
-    stored = read_dataset(folder / "dataset")
-    assert stored.episodes["success"] == [True]
+    stored = check_dataset(folder / "dataset")
+    assert [row["success"] for row in stored.episodes] == [True]
     steps = steps_of(folder / "dataset", 0)
     # The servos follow, once they are on their way: a joint is close to what the step before
     # commanded.
@@ -828,4 +828,4 @@ def test_demonstrations_on_cuda(folder: Path) -> None:
         for name in ("observation.state", "action", "observation.policy"):
             assert np.allclose(a[name][:100], b[name][:100], atol=2e-3), name
         assert a["next.success"][-1]
-    read_dataset(captured)
+    check_dataset(captured)

@@ -17,19 +17,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from dataset_checker import check_dataset
 from environments import configure
 from stubs import episodes_of, fake_demonstrations, pairs
 
 from mjstack.cli import run
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import CollectJobCfg
-from mjstack.datasets import DatasetWriter, lerobot, read_dataset
-from mjstack.datasets.shard import Shard
-from mjstack.datasets.staging import Staging
+from mjstack.datasets import DatasetWriter, lerobot
 from mjstack.envs import build_env, demonstration_config
 from mjstack.episodes.context import RunContext, Stage
 from mjstack.errors import DatasetError, UnwrittenError
-from mjstack.jobs import collection, demonstration_spec
+from mjstack.jobs import collect_record, collection, demonstration_spec
 from mjstack.jobs.collect_record import FILE
 from mjstack.jobs.collection import Collection, CollectPlan
 from mjstack.jobs.demonstration import play_demonstrations
@@ -172,16 +171,16 @@ def test_figures_of_the_uninterrupted_one(whole: dict[str, Any]) -> None:
 
 def interrupt_at(call: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C comes while an episode is written."""
-    add = Shard.add
+    add = DatasetWriter._write
     calls = []
 
-    def interrupted(self: Shard, *args: Any) -> None:
+    def interrupted(self: DatasetWriter, *args: Any) -> None:
         calls.append(args)
         if len(calls) == call:
             os.kill(os.getpid(), signal.SIGINT)
         add(self, *args)
 
-    monkeypatch.setattr(Shard, "add", interrupted)
+    monkeypatch.setattr(DatasetWriter, "_write", interrupted)
 
 
 def play_interrupted(home: Path, call: int, **kwargs: Any) -> GateResult:
@@ -211,7 +210,7 @@ def test_ctrl_c_in_an_episode(call: int, whole: dict[str, Any], tmp_path: Path) 
     assert_same(
         left_in(tmp_path, collect(tmp_path, keep_failures=whole["keep_failures"])), whole["left"]
     )
-    read_dataset(tmp_path / "dataset")
+    check_dataset(tmp_path / "dataset")
 
 
 def test_ctrl_c_after_ctrl_c(tmp_path: Path) -> None:
@@ -257,7 +256,7 @@ def test_a_kill_between_any_two_files(
     home = tmp_path / "home"
     copies = tmp_path / "copies"
     replace_file = os.replace
-    add = Shard.add
+    add = DatasetWriter._write
 
     def copied() -> None:
         shutil.copytree(home, copies / str(len(list(copies.iterdir()))))
@@ -266,14 +265,14 @@ def test_a_kill_between_any_two_files(
         copied()
         replace_file(*args)
 
-    def added(self: Shard, *args: Any) -> None:
+    def added(self: DatasetWriter, *args: Any) -> None:
         add(self, *args)
         copied()
 
     copies.mkdir()
     with monkeypatch.context() as context:
         context.setattr(os, "replace", replaced)
-        context.setattr(Shard, "add", added)
+        context.setattr(DatasetWriter, "_write", added)
         collect(home, keep_failures=whole["keep_failures"])
     copied()
     found = sorted(copies.iterdir(), key=lambda path: int(path.name))
@@ -286,17 +285,17 @@ def test_a_kill_between_any_two_files(
         assert_same(
             left_in(path, collect(path, keep_failures=whole["keep_failures"])), whole["left"]
         )
-    read_dataset(found[0] / "dataset")
+    check_dataset(found[0] / "dataset")
 
 
 @pytest.mark.parametrize("call", [1, 6, 10])
 def test_a_full_disk_in_a_batch(
     call: int, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    add = Shard.add
+    add = DatasetWriter._write
     calls = []
 
-    def full(self: Shard, *args: Any) -> None:
+    def full(self: DatasetWriter, *args: Any) -> None:
         calls.append(args)
         if len(calls) == call:
             raise OSError(28, "No space left on device")
@@ -304,7 +303,7 @@ def test_a_full_disk_in_a_batch(
 
     playing = collection_at(tmp_path, keep_failures=whole["keep_failures"])
     with monkeypatch.context() as context:
-        context.setattr(Shard, "add", full)
+        context.setattr(DatasetWriter, "_write", full)
         with pytest.raises(UnwrittenError, match="No space left"):
             playing.play()
     kept = pairs(tmp_path / "dataset") if playing.committed else []
@@ -321,19 +320,18 @@ def test_no_room_for_the_notes(
     call: int, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither before a batch's episodes nor after them."""
-    commit = Staging.commit
+    write = collect_record.write_atomic
     calls = []
 
-    def full(self: Staging) -> None:
-        if any(path.name == FILE for _, _, path in self._files):
-            calls.append(self)
-            if len(calls) >= call:
-                raise OSError(28, "No space left on device")
-        commit(self)
+    def full(path: Path, content: str) -> None:
+        calls.append(path)
+        if len(calls) >= call:
+            raise OSError(28, "No space left on device")
+        write(path, content)
 
     playing = collection_at(tmp_path, keep_failures=whole["keep_failures"])
     with monkeypatch.context() as context:
-        context.setattr(Staging, "commit", full)
+        context.setattr(collect_record, "write_atomic", full)
         with pytest.raises(UnwrittenError, match=rf"{FILE}: cannot be written"):
             playing.play()
     assert len(calls) == call + 1  # it is tried once more on the way out
@@ -497,4 +495,4 @@ def test_ctrl_c_on_cuda() -> None:
     assert [note["kept"] for note in notes] == [
         sum(seed == note["seed"] for seed, _ in found) for note in notes
     ]
-    read_dataset(home / "dataset")
+    check_dataset(home / "dataset")

@@ -12,7 +12,7 @@ import mjstack
 ROOT = Path(mjstack.__file__).parent
 # A module may import from its own layer and from earlier ones.
 LAYERS = [
-    {"errors", "math", "rng", "startup", "files"},
+    {"errors", "math", "rng", "files"},
     {"config"},
     {"robots"},
     {"scene"},

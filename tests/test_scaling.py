@@ -461,7 +461,6 @@ BAD = [
     ["video=true"],
     ["task=reach"],
     ["gate.throughput.measurements=[physic]"],
-    ["gate.throughput.measurements=[]"],
     ["job.backends=[mjwarp]", "sim.device=cuda:77"],
     ["hydra.run.dir=afile/below"],
 ]

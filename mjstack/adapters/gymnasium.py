@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from mjstack.adapters import MissingExtra
 from mjstack.envs import Env
-from mjstack.errors import ArgumentError, UnknownName
+from mjstack.errors import ArgumentError, MissingExtra, UnknownName
 
 try:
     import gymnasium
@@ -19,7 +18,7 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise MissingExtra("mjstack.adapters.gymnasium", "gymnasium>=1.1", error) from error
+    raise MissingExtra("mjstack.adapters.gymnasium", str(error.name), "train") from error
 
 Observation = np.ndarray | dict[str, np.ndarray]
 
@@ -82,10 +81,11 @@ class GymnasiumVectorEnv(VectorEnv):
         Raises:
             MjstackError: The seed or an option cannot be used.
         """
-        mask = _reset_mask(_checked(options, ("reset_mask",)), self.num_envs)
-        obs, _ = self.inner.reset(
-            seed=seed, mask=None if mask is None else torch.from_numpy(mask).to(self.inner.device)
-        )
+        _check_options(options, ("reset_mask",))
+        mask = (options or {}).get("reset_mask")
+        if mask is not None:
+            mask = torch.as_tensor(mask, device=self.inner.device)
+        obs, _ = self.inner.reset(seed=seed, mask=mask)
         super().reset(
             seed=seed
         )  # after the environment, whose message about a wrong seed says more
@@ -189,7 +189,7 @@ class GymnasiumEnv(gymnasium.Env):
         Raises:
             MjstackError: The seed or an option cannot be used.
         """
-        _checked(options, ())
+        _check_options(options, ())
         first = self._first
         if seed is not None or first is None:
             first, _ = self.inner.reset(seed=seed)
@@ -280,23 +280,7 @@ def _tensor(action: Any, space: spaces.Space, device: torch.device) -> torch.Ten
     return torch.from_numpy(array).to(device)
 
 
-def _checked(options: dict[str, Any] | None, known: tuple[str, ...]) -> dict[str, Any]:
-    options = options or {}
-    for name in options:
+def _check_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
+    for name in options or ():
         if name not in known:
             raise UnknownName("reset option", name, known)
-    return options
-
-
-def _reset_mask(options: dict[str, Any], num_envs: int) -> np.ndarray | None:
-    mask = options.get("reset_mask")
-    if mask is None:
-        return None
-    expected = f"a bool array of shape ({num_envs},)"
-    if not isinstance(mask, np.ndarray):
-        raise ArgumentError("options['reset_mask']", type(mask).__name__, expected)
-    if mask.shape != (num_envs,) or mask.dtype != np.bool_:
-        raise ArgumentError(
-            "options['reset_mask']", f"{mask.dtype} of shape {mask.shape}", expected
-        )
-    return mask

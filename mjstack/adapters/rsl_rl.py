@@ -6,16 +6,15 @@ from typing import Any
 
 import torch
 
-from mjstack.adapters import MissingExtra
 from mjstack.config.schema import Config
 from mjstack.envs import Env
-from mjstack.errors import ArgumentError
+from mjstack.errors import MissingExtra
 
 try:
     from rsl_rl.env import VecEnv
     from tensordict import TensorDict
 except ImportError as error:
-    raise MissingExtra("mjstack.adapters.rsl_rl", "rsl-rl-lib>=5", error) from error
+    raise MissingExtra("mjstack.adapters.rsl_rl", str(error.name), "train") from error
 
 
 class RslRlVecEnv(VecEnv):
@@ -44,10 +43,8 @@ class RslRlVecEnv(VecEnv):
                 for the device. The runner's ``num_steps_per_env`` gives one reading per iteration.
 
         Raises:
-            MjstackError: The interval is out of range, or the worlds cannot start.
+            MjstackError: The worlds cannot start.
         """
-        if log_interval < 1:
-            raise ArgumentError("log_interval", log_interval, "an integer of at least 1")
         self.env = env
         self.num_envs: int = env.nworld
         self.num_actions: int = env.action_manager.action_dim
@@ -71,15 +68,6 @@ class RslRlVecEnv(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
-        if not isinstance(value, torch.Tensor) or value.shape != self.env.episode_step.shape:
-            found = (
-                f"shape {tuple(value.shape)}"
-                if isinstance(value, torch.Tensor)
-                else type(value).__name__
-            )
-            raise ArgumentError(
-                "episode_length_buf", found, f"a tensor of shape ({self.num_envs},)"
-            )
         self.env.episode_step.copy_(value)
 
     def get_observations(self) -> TensorDict:

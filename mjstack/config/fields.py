@@ -15,7 +15,7 @@ import ast
 import inspect
 import math
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from enum import EnumMeta
 from functools import cache
@@ -30,6 +30,8 @@ from mjstack.errors import ConfigError
 MOST_WORLDS = (1 << 31) - 1  # Warp counts them with 32 bits
 MOST_SEEDS = 1 << 32  # seeds are 32-bit
 _SPEC = "mjstack"  # key of a field's metadata
+_NOUNS = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
+_PLURALS = {int: "integers", float: "numbers", str: "names"}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,7 +42,6 @@ class Range:
         unit: Such as ``m``, ``rad`` or ``steps``; empty for a count or a name.
         gt: Values are greater than this.
         ge: Values are at least this.
-        lt: Values are less than this.
         le: Values are at most this.
         length: Number of items of a list.
         choices: The only values.
@@ -50,7 +51,6 @@ class Range:
     unit: str = ""
     gt: float | None = None
     ge: float | None = None
-    lt: float | None = None
     le: float | None = None
     length: int | None = None
     choices: tuple[object, ...] = ()
@@ -62,61 +62,44 @@ class Range:
             return False
         if isinstance(value, bool) or not isinstance(value, int | float):
             return True
-        return not (
-            math.isnan(value)
-            or (self.finite and math.isinf(value))
-            or (self.gt is not None and not value > self.gt)
-            or (self.ge is not None and not value >= self.ge)
-            or (self.lt is not None and not value < self.lt)
-            or (self.le is not None and not value <= self.le)
+        return (
+            (math.isfinite(value) or (math.isinf(value) and not self.finite))
+            and (self.gt is None or value > self.gt)
+            and (self.ge is None or value >= self.ge)
+            and (self.le is None or value <= self.le)
         )
 
 
-def spec(
-    default: Any = MISSING,
-    *,
-    factory: Callable[[], Any] | None = None,
-    unit: str = "",
-    gt: float | None = None,
-    ge: float | None = None,
-    lt: float | None = None,
-    le: float | None = None,
-    length: int | None = None,
-    choices: Sequence[object] = (),
-    finite: bool = True,
-) -> Any:
-    """Declare a configuration field with its unit and range; see `Range`.
+def spec(default: Any = MISSING, *, factory: Callable[[], Any] | None = None, **limits: Any) -> Any:
+    """Declare a configuration field with its unit and range.
 
     Args:
         default: Its value where the YAML has none; without one, the YAML must have it.
         factory: Makes the default, where that is a list or a mapping.
-        unit: Unit of its numbers.
-        gt: Values are greater than this.
-        ge: Values are at least this.
-        lt: Values are less than this.
-        le: Values are at most this.
-        length: Number of items of a list.
-        choices: The only values.
-        finite: Whether infinity is refused.
+        limits: Attributes of its `Range`.
     """
-    limits = Range(
-        unit=unit,
-        gt=gt,
-        ge=ge,
-        lt=lt,
-        le=le,
-        length=length,
-        choices=tuple(choices),
-        finite=finite,
-    )
+    metadata = {_SPEC: Range(**limits)}
     if factory is not None:
-        return field(default_factory=factory, metadata={_SPEC: limits})
-    return field(default=default, metadata={_SPEC: limits})
+        return field(default_factory=factory, metadata=metadata)
+    return field(default=default, metadata=metadata)
 
 
 def field_range(item: Field) -> Range:
     """The range of a dataclass's field; of one without `spec`, that numbers are finite."""
     return item.metadata.get(_SPEC, Range())
+
+
+def find_field(owner: type, key: str) -> tuple[type, Field] | None:
+    """The dataclass and the field of a dotted key below a dataclass; None if there is none."""
+    name, _, rest = key.partition(".")
+    item = next((item for item in fields(owner) if item.name == name), None)
+    if item is None:
+        return None
+    kind, several = _kind(_hints(owner)[name])
+    if not (isinstance(kind, type) and is_dataclass(kind)) or not rest:
+        return owner, item
+    below = rest.partition(".")[2] if several else rest  # several are by name
+    return find_field(kind, below) if below else (owner, item)
 
 
 def check_fields(key: str, value: object) -> None:
@@ -145,8 +128,7 @@ def _check(path: str, value: object, owner: type, item: Field) -> None:
         for name, part in value.items():
             _check(f"{path}.{name}", part, owner, item)
     elif isinstance(value, list | tuple):
-        wrong_length = limits.length is not None and len(value) != limits.length
-        if wrong_length or not all(isinstance(part, list) or limits.holds(part) for part in value):
+        if limits.length not in (None, len(value)) or not all(map(limits.holds, value)):
             raise ConfigError(path, value, accepted(owner, item))
     elif value is not None and not limits.holds(value):
         raise ConfigError(path, value, accepted(owner, item))
@@ -155,40 +137,27 @@ def _check(path: str, value: object, owner: type, item: Field) -> None:
 def accepted(owner: type, item: Field) -> str:
     """Values that a field accepts, in words: ``a number above 0 [s]``."""
     hint = _hints(owner)[item.name]
-    null = " or null" if NoneType in get_args(hint) else ""
-    return _accepted(field_range(item), hint) + null
-
-
-def _accepted(limits: Range, hint: Any) -> str:
-    hint, several, mapping = _kind(hint)
-    if limits.choices or isinstance(hint, EnumMeta):
-        choices = limits.choices or hint.__members__
-        return f"{'some' if several else 'one'} of {', '.join(map(str, choices))}"
-    if hint is bool:
-        return "true or false"
-    noun = {int: "integer", float: "number", str: "name"}.get(hint, "value")
-    if several:
-        of = "keys and " if mapping else "a list of "
-        noun = f"{of}{'' if limits.length is None else f'{limits.length} '}{noun}s"
-    elif noun == "name":
-        noun = "text"
+    kind, several = _kind(hint)
+    limits = field_range(item)
+    if limits.choices or isinstance(kind, EnumMeta):
+        choices = limits.choices or kind.__members__
+        words = f"{'some' if several else 'one'} of {', '.join(map(str, choices))}"
+    elif several or is_dataclass(kind):
+        mapping = get_origin(hint) is dict or is_dataclass(kind)
+        count = "" if limits.length is None else f"{limits.length} "
+        words = f"{'keys and' if mapping else 'a list of'} {count}{_PLURALS.get(kind, 'values')}"
     else:
-        noun = f"{'an' if noun == 'integer' else 'a'} {noun}"
-    bounds = [
-        f"{word} {bound:.10g}"
-        for word, bound in (("above", limits.gt), ("below", limits.lt))
-        if bound is not None
-    ]
-    if limits.ge is not None and limits.le is not None:
-        bounds.append(f"from {limits.ge:.10g} to {limits.le:.10g}")
-    elif limits.ge is not None:
-        bounds.append(f"of at least {limits.ge:.10g}")
+        words = _NOUNS.get(kind, "a value")
+    if limits.gt is not None:
+        words += f" above {limits.gt:.10g}"
+    if limits.ge is not None:
+        low = f"{limits.ge:.10g}"
+        words += f" of at least {low}" if limits.le is None else f" from {low} to {limits.le:.10g}"
     elif limits.le is not None:
-        bounds.append(f"of at most {limits.le:.10g}")
-    if hint is float and not bounds and limits.finite and limits.length is None:
-        noun = noun.replace("number", "finite number")
+        words += f" of at most {limits.le:.10g}"
     unit = f" [{limits.unit}]" if limits.unit else ""
-    return " ".join([noun, " and ".join(bounds)]).rstrip() + unit
+    null = " or null" if NoneType in get_args(hint) else ""
+    return words + unit + null
 
 
 def field_docs(owner: type) -> dict[str, str]:
@@ -206,13 +175,8 @@ def _own_docs(cls: type) -> dict[str, str]:
     body = tree.body if isinstance(tree, ast.ClassDef) else []
     docs = {}
     for node, after in pairwise(body):
-        if (
-            isinstance(node, ast.AnnAssign)
-            and isinstance(node.target, ast.Name)
-            and isinstance(after, ast.Expr)
-            and isinstance(after.value, ast.Constant)
-        ):
-            docs[node.target.id] = " ".join(str(after.value.value).split())
+        if isinstance(node, ast.AnnAssign) and isinstance(after, ast.Expr):
+            docs[ast.unparse(node.target)] = " ".join(ast.literal_eval(after.value).split())
     return docs
 
 
@@ -221,15 +185,13 @@ def _hints(owner: type) -> dict[str, Any]:
     return get_type_hints(owner)
 
 
-def _kind(hint: Any) -> tuple[Any, bool, bool]:
-    """The type of a field's single values, whether it holds several, and whether by name."""
+def _kind(hint: Any) -> tuple[Any, bool]:
+    """The type of a field's single values, and whether it holds several."""
     several = False
-    mapping = False
     while get_args(hint):
         if get_origin(hint) in (Union, UnionType):
             hint = next(kind for kind in get_args(hint) if kind is not NoneType)
         else:
-            mapping = mapping or get_origin(hint) is dict
             several = True
             hint = get_args(hint)[-1]
-    return hint, several, mapping
+    return hint, several

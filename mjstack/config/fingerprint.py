@@ -12,8 +12,8 @@ from typing import Any, cast
 
 from omegaconf import OmegaConf
 
+from mjstack.config.check import reads_starts_file
 from mjstack.config.schema import Config
-from mjstack.config.validate import reads_starts_file
 from mjstack.errors import ConfigError
 
 CONTENT = "sha256:"  # in front of what stands for a file

@@ -9,11 +9,12 @@ import json
 import re
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from mjstack.config.fields import accepted, field_docs
-from mjstack.config.schema import JOB_SCHEMAS, Config
+from mjstack.config.schema import Config
 from mjstack.config.session import CONFIG_FOLDER, list_choices
 from mjstack.errors import UnknownName
 
@@ -56,8 +57,7 @@ _FLAGS = (
 _STATUSES = "Exit status: 0 passed, 1 a gate failed, 2 bad configuration or input, 130 interrupted."
 
 
-@dataclass(frozen=True, slots=True)
-class Group:
+class Group(NamedTuple):
     """A configuration group.
 
     Attributes:
@@ -71,8 +71,7 @@ class Group:
     words: str
 
 
-@dataclass(frozen=True, slots=True)
-class Key:
+class Key(NamedTuple):
     """A configuration key.
 
     Attributes:
@@ -150,32 +149,6 @@ def key_help(cfg: Config, prefix: str, width: int) -> str:
     for name, words in rows:
         lines += [name, *textwrap.wrap(words, width, initial_indent="  ", subsequent_indent="  ")]
     return "\n".join(lines)
-
-
-def reference_markdown() -> str:
-    """Every key of the default configuration and of the jobs as Markdown tables, by group."""
-    from mjstack.config.load import load_config  # which needs this module for its errors
-
-    cfg = load_config()
-    words = field_docs(Config)
-    groups = {group.name: group for group in list_groups()}
-    sections: dict[str, list[Key]] = {}
-    for key in list_keys(cfg, named=False):
-        sections.setdefault(key.name.partition(".")[0] if "." in key.name else "", []).append(key)
-    sections["job"] = []
-    for name in JOB_SCHEMAS:
-        own = list_keys(load_config([f"job={name}"]).job, "job", named=False)
-        sections["job"] += [k for k in own if k.name not in ("job.name", "job.func")]
-    text = []
-    for section, keys in sections.items():
-        choices = f" Choices: {', '.join(groups[section].choices)}." if section in groups else ""
-        text += [f"## {section or 'Top level'}", "", words.get(section, "") + choices, ""]
-        text += ["| key | default | accepts | meaning |", "| --- | --- | --- | --- |"]
-        for k in keys:
-            cells = (f"`{k.name}`", f"`{k.value}`" if k.value else "", k.accepts, k.words)
-            text.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
-        text.append("")
-    return "\n".join(text)
 
 
 def help_text(cfg: Config, width: int) -> str:

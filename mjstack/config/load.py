@@ -15,20 +15,18 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from mjstack.config.explain import explain
-from mjstack.config.overrides import check_overrides, parse
-from mjstack.config.robot_file import complete_robot
+from mjstack.config.check import validate
+from mjstack.config.complete import complete
+from mjstack.config.explain import check_overrides, explain, parse
 from mjstack.config.schema import JOB_SCHEMAS, Config
 from mjstack.config.session import (
     CONFIG_NAME,
-    config_folders,
+    check_trusted,
     hydra_session,
     search_path,
+    used_folder,
     without_hydra,
 )
-from mjstack.config.terms import type_terms
-from mjstack.config.trust import check_trusted, used_folder
-from mjstack.config.validate import validate
 from mjstack.errors import CompositionError, ConfigError
 
 _KEEPING = ("job.", "gate.")  # their other keys are no parameters of the function
@@ -169,7 +167,6 @@ def to_config(cfg: DictConfig) -> Config:
         config = cast(Config, OmegaConf.to_object(cfg))
     except (OmegaConfBaseException, AttributeError, TypeError) as error:
         raise explain(error) from error
-    type_terms(config)
-    complete_robot(config.robot, config_folders())
+    complete(config)
     validate(config)
     return config

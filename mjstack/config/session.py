@@ -11,7 +11,7 @@ import copy
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -26,7 +26,7 @@ from hydra.core.object_type import ObjectType
 from hydra.core.singleton import Singleton
 from hydra.types import RunMode
 from hydra.version import setbase
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mjstack.errors import CompositionError
 
@@ -58,7 +58,11 @@ def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
     """
     found = [_entry(str(entry)) for entry in entries]
     token = _added.set(tuple(dict.fromkeys((*_added.get(), *found))))
-    make_importable(found)
+    # The folder beside a configuration folder is importable.
+    for entry in found:
+        parent = str(Path(entry.removeprefix(_FILE)).parent)
+        if entry.startswith(_FILE) and parent not in sys.path:
+            sys.path.insert(0, parent)
     try:
         yield
     finally:
@@ -91,14 +95,6 @@ def _entries() -> list[str]:
     return list(dict.fromkeys((*registered, *_added.get())))
 
 
-def make_importable(entries: Sequence[str]) -> None:
-    """Put the folder beside each configuration folder on Python's import path."""
-    for entry in entries:
-        parent = str(Path(entry.removeprefix(_FILE)).parent)
-        if entry.startswith(_FILE) and parent not in sys.path:
-            sys.path.insert(0, parent)
-
-
 def is_trusted(dotted: str) -> bool:
     """Whether a dotted name is mjstack's, of a registered package, or in the search path.
 
@@ -112,6 +108,43 @@ def is_trusted(dotted: str) -> bool:
     places = [*(found.submodule_search_locations or ()), found.origin or ""] if found else []
     parents = [folder.parent for folder in config_folders()]
     return any(Path(place).resolve().parent in parents for place in places if place)
+
+
+def check_trusted(cfg: DictConfig, saved: Path) -> None:
+    """Check that every function that a saved configuration names is in the current search path.
+
+    Args:
+        cfg: The configuration of an earlier run.
+        saved: The folder that Hydra left in that run's.
+
+    Raises:
+        CompositionError: A function is elsewhere; names it, and the folder that the run had used.
+    """
+    for key, name in _functions("", OmegaConf.to_container(cfg, resolve=False)):
+        if not is_trusted(name):
+            raise CompositionError(
+                f"{key}={name}: expected a name of mjstack, of a package registered under"
+                f" mjstack.configs, or beside a folder of the search path. {used_folder(saved)}"
+            )
+
+
+def used_folder(saved: Path) -> str:
+    """What to do about a name or a file that only the search path of an earlier run has."""
+    had = "had no --config-dir"
+    with suppress(Exception):  # the file may be anything, and this is for the message alone
+        runtime = OmegaConf.select(OmegaConf.load(saved / "hydra.yaml"), "hydra.runtime")
+        used = [str(s.path) for s in runtime.config_sources if s.provider == PROVIDER]
+        had = f"used --config-dir {used[0]}" if used else had
+    return f"The run {had}: if you trust it, add --config-dir DIR."
+
+
+def _functions(prefix: str, node: object) -> Iterator[tuple[str, str]]:
+    """Every dotted name that terms, checks and gates would import, with its key."""
+    for name, value in node.items() if isinstance(node, dict) else ():
+        key = f"{prefix}{name}"
+        if name == "func" and isinstance(value, str):
+            yield key, value
+        yield from _functions(f"{key}.", value)
 
 
 @contextmanager

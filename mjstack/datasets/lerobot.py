@@ -1,7 +1,8 @@
-"""LeRobotDataset v3 on disk: where each file lies, and what is in it.
+"""LeRobotDataset v3 on disk: where each file lies, and its content.
 
     meta/info.json                          what the dataset is, and how much of it counts: written
-    last meta/stats.json                         statistics of all frames, by feature
+                                            last
+    meta/stats.json                         statistics of all frames, by feature
     meta/tasks.parquet                      task texts and their indices
     meta/episodes/chunk-000/file-000.parquet  a row per episode: task, length, place, statistics
     data/chunk-000/file-000.parquet         the frames, a row group per episode
@@ -19,9 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.datasets.arrow import require_pyarrow
 from mjstack.datasets.spec import INDICES, DatasetSpec, Feature
-from mjstack.datasets.statistics import NAMES
+from mjstack.errors import MissingExtra
 
 VERSION = "v3.0"
 CHUNK = 1000  # files in a folder
@@ -31,6 +31,22 @@ EPISODES = f"meta/episodes/{FILE}"
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+STATISTICS = ("min", "max", "mean", "std", *QUANTILES)  # `count` stands beside them
+
+
+def require_pyarrow() -> tuple[Any, Any]:
+    """`pyarrow` and `pyarrow.parquet`, loaded when a dataset is opened, and not before.
+
+    Raises:
+        MissingExtra: pyarrow is not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise MissingExtra("a dataset", "pyarrow", "datasets") from error
+    return pyarrow, pyarrow.parquet
 
 
 def shard_indices(shard: int) -> dict[str, int]:
@@ -52,9 +68,8 @@ def all_features(features: Mapping[str, Feature]) -> dict[str, tuple[str, int]]:
     """Type and dimension of every column of the frames, in the order of info.json and of
     the files.
     """
-    return {name: (f.dtype, f.dim) for name, f in features.items()} | {
-        name: (dtype, 1) for name, dtype in INDICES.items()
-    }
+    own = {name: (feature.dtype, feature.dim) for name, feature in features.items()}
+    return own | {name: (dtype, 1) for name, dtype in INDICES.items()}
 
 
 def make_info(
@@ -73,10 +88,10 @@ def make_info(
         spec: What the dataset is.
         provenance: Of each writer that differed from the one before, with its first episode.
         file_mb: Size of a data file at which the next begins [MiB].
-        episodes: How many there are.
-        frames: Likewise.
-        tasks: Likewise.
-        shards: Likewise; files with higher numbers do not count.
+        episodes: Number of episodes.
+        frames: Number of frames.
+        tasks: Number of tasks.
+        shards: Number of shards; files with higher numbers do not count.
     """
     features: dict[str, Any] = {
         name: {"dtype": feature.dtype, "shape": [feature.dim], "names": list(feature.names)}
@@ -94,9 +109,7 @@ def make_info(
         "total_tasks": tasks,
         "chunks_size": CHUNK,
         "data_files_size_in_mb": file_mb,
-        "video_files_size_in_mb": (
-            200
-        ),  # LeRobot's default: a reader wants a number though there is no video
+        "video_files_size_in_mb": 200,  # LeRobot's default: it wants a number without videos too
         "data_path": DATA,
         "video_path": None,
         "splits": {"train": f"0:{episodes}"},
@@ -111,22 +124,22 @@ def make_info(
     }
 
 
-def to_json(data: Mapping[str, Any]) -> bytes:
+def to_json(data: Mapping[str, Any]) -> str:
     """Text of a JSON file."""
-    return (json.dumps(data, indent=4, ensure_ascii=False, allow_nan=False) + "\n").encode()
+    return json.dumps(data, indent=4, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def frames_schema(spec: DatasetSpec) -> Any:
-    """Arrow schema of the data files, with the types as Hugging Face `datasets` wants them told."""
+    """Arrow schema of the data files, with the types as Hugging Face `datasets` expects them."""
     pa, _ = require_pyarrow()
     columns = []
-    told = {}
+    types = {}
     for name, (dtype, dim) in all_features(spec.features).items():
-        scalar = _arrow_type(dtype)
+        scalar = pa.bool_() if dtype == "bool" else getattr(pa, dtype)()
         value = {"dtype": dtype, "_type": "Value"}
         columns.append(pa.field(name, scalar if dim == 1 else pa.list_(scalar, dim)))
-        told[name] = value if dim == 1 else {"feature": value, "length": dim, "_type": "List"}
-    return pa.schema(columns, metadata={"huggingface": json.dumps({"info": {"features": told}})})
+        types[name] = value if dim == 1 else {"feature": value, "length": dim, "_type": "List"}
+    return pa.schema(columns, metadata={"huggingface": json.dumps({"info": {"features": types}})})
 
 
 def frames_table(schema: Any, columns: Mapping[str, np.ndarray]) -> Any:
@@ -135,10 +148,9 @@ def frames_table(schema: Any, columns: Mapping[str, np.ndarray]) -> Any:
     arrays = []
     for field in schema:
         values = pa.array(columns[field.name].reshape(-1))
-        many = pa.types.is_fixed_size_list(field.type)
-        arrays.append(
-            pa.FixedSizeListArray.from_arrays(values, type=field.type) if many else values
-        )
+        if pa.types.is_fixed_size_list(field.type):
+            values = pa.FixedSizeListArray.from_arrays(values, type=field.type)
+        arrays.append(values)
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
@@ -147,140 +159,84 @@ def tasks_table(tasks: Sequence[str]) -> Any:
     them.
     """
     pa, _ = require_pyarrow()
-    label = {
-        "name": None,
-        "field_name": None,
-        "pandas_type": "unicode",
-        "numpy_type": "object",
-        "metadata": {"encoding": "UTF-8"},
-    }
-    columns = [
-        {
-            "name": "task_index",
-            "field_name": "task_index",
-            "pandas_type": "int64",
-            "numpy_type": "int64",
-            "metadata": None,
-        },
-        {
-            "name": "task",
-            "field_name": "task",
-            "pandas_type": "unicode",
-            "numpy_type": "object",
-            "metadata": None,
-        },
-    ]
+    fields = ("name", "field_name", "pandas_type", "numpy_type", "metadata")
+    columns = (
+        ("task_index", "task_index", "int64", "int64", None),
+        ("task", "task", "unicode", "object", None),
+    )
+    label = (None, None, "unicode", "object", {"encoding": "UTF-8"})
     pandas = {
         "index_columns": ["task"],
-        "column_indexes": [label],
-        "columns": columns,
+        "column_indexes": [dict(zip(fields, label, strict=True))],
+        "columns": [dict(zip(fields, column, strict=True)) for column in columns],
         "pandas_version": "2.3.3",
     }
-    schema = pa.schema(
-        [("task_index", pa.int64()), ("task", pa.string())], metadata={"pandas": json.dumps(pandas)}
-    )
-    return pa.table({"task_index": list(range(len(tasks))), "task": list(tasks)}, schema=schema)
+    table = pa.table({"task_index": range(len(tasks)), "task": list(tasks)})
+    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
-def episodes_table(
-    spec: DatasetSpec,
-    rows: Mapping[str, Sequence[Any]],
-    statistics: Sequence[Mapping[str, np.ndarray]],
-) -> Any:
-    """The rows of some episodes.
+def episode_statistics(frames: np.ndarray) -> np.ndarray:
+    """Statistics of every number over one episode.
 
     Args:
-        spec: What the dataset is.
-        rows: The columns that are no statistics.
-        statistics: Each episode's, over all features one after the other.
+        frames: Shape ``(frames, dim)``, float64.
+
+    Returns:
+        Shape ``(statistics, dim)``, in the order of `STATISTICS`; std is that of these frames
+        (divided by n), quantiles interpolate.
     """
-    pa, _ = require_pyarrow()
-    columns: dict[str, Any] = dict(rows)
-    stacked = {kind: np.stack([episode[kind] for episode in statistics]) for kind in NAMES}
-    starts = np.arange(len(statistics) + 1, dtype=np.int32)
-    lengths = pa.array(np.asarray(rows["length"], dtype=np.int64))
-    for name, part in feature_slices(spec.features).items():
-        for kind in NAMES:
-            values = pa.array(np.ascontiguousarray(stacked[kind][:, part]).reshape(-1))
-            columns[f"stats/{name}/{kind}"] = pa.ListArray.from_arrays(
-                starts * (part.stop - part.start), values
-            )
-        columns[f"stats/{name}/count"] = pa.ListArray.from_arrays(starts, lengths)
-    return pa.table(columns, schema=pa.schema(list(episodes_types(spec).items())))
+    ranked = np.sort(frames, axis=0)
+    at = np.array([*QUANTILES.values()]) * (len(frames) - 1)
+    below = at.astype(int)
+    above = np.minimum(below + 1, len(frames) - 1)
+    quantiles = ranked[below] + (at - below)[:, None] * (ranked[above] - ranked[below])
+    return np.stack([ranked[0], ranked[-1], frames.mean(0), frames.std(0), *quantiles])
 
 
-def episodes_types(spec: DatasetSpec) -> dict[str, Any]:
-    """Arrow types of the episodes' columns, in the order of the files."""
-    pa, _ = require_pyarrow()
-    own = {"success": pa.bool_(), "seed": pa.int64(), "world": pa.int64()}
-    types = {
-        "episode_index": pa.int64(),
-        "tasks": pa.list_(pa.string()),
-        **dict.fromkeys(
-            (
-                "length",
-                "data/chunk_index",
-                "data/file_index",
-                "dataset_from_index",
-                "dataset_to_index",
-            ),
-            pa.int64(),
-        ),
-        **own,
-        **{name: _arrow_type(dtype) for name, dtype in spec.values.items()},
-        **dict.fromkeys(("meta/episodes/chunk_index", "meta/episodes/file_index"), pa.int64()),
-    }
-    for name in all_features(spec.features):
-        types |= {f"stats/{name}/{kind}": pa.list_(pa.float64()) for kind in NAMES}
-        types[f"stats/{name}/count"] = pa.list_(pa.int64())
-    return types
+def merge_statistics(parts: Sequence[np.ndarray], counts: Sequence[int]) -> np.ndarray:
+    """Statistics of all frames, exact but for the quantiles.
+
+    Those are the parts' quantiles weighted by frames, as LeRobot has them: those of all frames
+    would need all frames.
+
+    Args:
+        parts: Statistics of each part, as `episode_statistics` returns them.
+        counts: Frames of each.
+    """
+    stacked = np.stack(parts)
+    weights = np.array(counts) / sum(counts)
+    merged = np.tensordot(weights, stacked, 1)
+    lows, highs, means, stds = stacked[:, :4].swapaxes(0, 1)
+    merged[0] = lows.min(0)
+    merged[1] = highs.max(0)
+    merged[3] = np.sqrt(weights @ (stds**2 + (means - merged[2]) ** 2))
+    return merged
 
 
-def feature_slices(features: Mapping[str, Feature]) -> dict[str, slice]:
-    """Where each feature's numbers lie in statistics over all features."""
-    out = {}
+def name_statistics(
+    features: Mapping[str, Feature], statistics: np.ndarray, count: int
+) -> dict[str, dict[str, list]]:
+    """Statistics by feature and name, and the frames that they are of: the content of stats.json.
+
+    Args:
+        features: Features of the dataset.
+        statistics: Shape ``(statistics, dim)``, over all features one after the other.
+        count: Frames.
+    """
+    named = {}
     start = 0
     for name, (_, dim) in all_features(features).items():
-        out[name] = slice(start, start + dim)
+        values = statistics[:, start : start + dim].tolist()
+        named[name] = dict(zip(STATISTICS, values, strict=True)) | {"count": [count]}
         start += dim
-    return out
+    return named
 
 
-def statistics_of(table: Any, features: Mapping[str, Feature]) -> list[dict[str, np.ndarray]]:
-    """Each episode's statistics from its row, over all features one after the other."""
-    parts = {
-        kind: [
-            table[f"stats/{name}/{kind}"]
-            .combine_chunks()
-            .flatten()
-            .to_numpy()
-            .reshape(len(table), part.stop - part.start)
-            for name, part in feature_slices(features).items()
+def row_statistics(features: Mapping[str, Feature], row: Mapping[str, Any]) -> np.ndarray:
+    """Statistics of an episode from its row, as `episode_statistics` returns them."""
+    return np.array(
+        [
+            np.concatenate([row[f"stats/{name}/{kind}"] for name in all_features(features)])
+            for kind in STATISTICS
         ]
-        for kind in NAMES
-    }
-    joined = {kind: np.concatenate(blocks, axis=1) for kind, blocks in parts.items()}
-    return [{kind: joined[kind][row] for kind in NAMES} for row in range(len(table))]
-
-
-def counts_of(table: Any, features: Mapping[str, Feature]) -> list[set[int]]:
-    """The frames that each episode's statistics are of, as each feature has them."""
-    columns = [table[f"stats/{name}/count"].to_pylist() for name in all_features(features)]
-    return [{count for counted in row for count in counted} for row in zip(*columns, strict=True)]
-
-
-def stats_json(
-    features: Mapping[str, Feature], count: int, statistics: Mapping[str, np.ndarray]
-) -> bytes:
-    """The content of stats.json."""
-    return to_json(
-        {
-            name: {kind: statistics[kind][part].tolist() for kind in NAMES} | {"count": [count]}
-            for name, part in feature_slices(features).items()
-        }
     )
-
-
-def _arrow_type(dtype: str) -> Any:
-    pa, _ = require_pyarrow()
-    return {"bool": pa.bool_(), "string": pa.string()}.get(dtype) or getattr(pa, dtype)()

@@ -7,29 +7,27 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
+import threading
 import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
 from mjstack.datasets import lerobot
-from mjstack.datasets.arrow import require_pyarrow
-from mjstack.datasets.resume import (
+from mjstack.datasets.reader import (
     check_same,
     lock_folder,
     read_info,
-    read_shards,
+    read_rows,
     read_tasks,
     uncommitted,
 )
-from mjstack.datasets.shard import Shard
-from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_arrays, typed_row
-from mjstack.datasets.staging import Staging, interrupts_deferred
-from mjstack.datasets.statistics import RunningStatistics
-from mjstack.errors import ArgumentError, DatasetError, UnwrittenError
+from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData, typed_arrays, typed_values
+from mjstack.errors import DatasetError, UnwrittenError
+from mjstack.files import write_atomic
 
 
 class DatasetWriter:
@@ -53,7 +51,7 @@ class DatasetWriter:
     """
 
     def __init__(self, folder: Path | str, spec: DatasetSpec, *, file_mb: int = 100) -> None:
-        """Opens the folder, and begins a dataset in it if there is none.
+        """Open the folder, and begin a dataset in it if there is none.
 
         Args:
             folder: The dataset's own folder.
@@ -65,42 +63,35 @@ class DatasetWriter:
                 process is writing it.
             UnwrittenError: The folder cannot be written.
         """
-        require_pyarrow()
-        if file_mb < 1:
-            raise ArgumentError("file_mb", file_mb, "at least 1 MiB")
+        self._pa, self._parquet = lerobot.require_pyarrow()
         self.folder = Path(folder)
         self.spec = spec
         self.committed: list[tuple[int, int]] = []
         self.frames = 0
         self._file_mb = file_mb
-        self._shards = 0
         self._open = True
+        self._shards = 0
         self._provenance: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}
-        self._tasks_committed = 0
-        self._statistics = RunningStatistics(
-            sum(dim for _, dim in lerobot.all_features(spec.features).values())
-        )
+        self._statistics = np.empty(0)  # of the committed frames
+        # Since the last commit: a row per episode, and the hidden file of the frames.
+        self._rows: list[dict[str, Any]] = []
+        self._file: Any = None
+        self._frames_writer: Any = None
+        if self.folder.exists() and not self.folder.is_dir():
+            raise DatasetError(f"{folder} is a file, expected a folder. Give another")
         try:
-            if self.folder.exists() and not self.folder.is_dir():
-                raise DatasetError(f"{folder} is a file, expected a folder. Give another")
             self.folder.mkdir(parents=True, exist_ok=True)
             self._unlock = weakref.finalize(self, os.close, lock_folder(self.folder))
             self._resume()
         except OSError as error:
             raise UnwrittenError(str(folder), error, len(self.committed)) from error
-        self._shard = self._next_shard()
 
     def __enter__(self) -> DatasetWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Commits what was added, also where something else went wrong: those episodes are
+    def __exit__(self, *error: object) -> None:
+        """Commit what was added, also where something else went wrong: those episodes are
         finished.
         """
         self.close()
@@ -108,10 +99,10 @@ class DatasetWriter:
     @property
     def pending(self) -> int:
         """Episodes that were added and are not committed yet."""
-        return len(self._shard)
+        return len(self._rows)
 
     def add(self, episodes: Sequence[EpisodeData]) -> None:
-        """Adds finished episodes; a batch that does not fit is refused as a whole.
+        """Add finished episodes; a batch that does not fit is refused as a whole.
 
         Args:
             episodes: One or many; all of them are checked before the first is written.
@@ -123,21 +114,19 @@ class DatasetWriter:
         """
         self._check_open()
         for episode in episodes:
-            typed_row(self.spec, episode)
+            typed_values(self.spec, episode)
             typed_arrays(self.spec, episode)
         for episode in episodes:
-            arrays = typed_arrays(self.spec, episode)
-            with interrupts_deferred(), self._guarded():
-                self._shard.add(
-                    arrays, episode, self._tasks.setdefault(episode.task, len(self._tasks))
-                )
-            if (
-                self._shard.size * (1.0 + 1.0 / self.pending) > self._file_mb * 2**20
-            ):  # one more like these is too much
+            with self._guarded():
+                if self._file is None:
+                    self._begin_file()
+                self._write(episode)
+            # One more like these is too much.
+            if self._file.tell() * (1.0 + 1.0 / self.pending) > self._file_mb * 2**20:
                 self.flush()
 
     def flush(self) -> None:
-        """Commits what was added.
+        """Commit what was added.
 
         Raises:
             UnwrittenError: It cannot be written; the writer is closed, and what was committed
@@ -145,11 +134,11 @@ class DatasetWriter:
         """
         self._check_open()
         if self.pending:
-            with interrupts_deferred(), self._guarded():
+            with self._guarded():
                 self._commit()
 
     def close(self) -> None:
-        """Commits what was added, and lets another writer in."""
+        """Commit what was added, and let another writer in."""
         try:
             if self._open:
                 self.flush()
@@ -158,73 +147,134 @@ class DatasetWriter:
             self._unlock()
 
     def _resume(self) -> None:
-        """Takes in what is committed, and clears away what is not."""
+        """Count what is committed, and clear away what is not."""
         info = read_info(self.folder)
         if info is not None:
             check_same(self.folder, info, self.spec)
             self._tasks = {task: index for index, task in enumerate(read_tasks(self.folder, info))}
             self._provenance = info["mjstack"]["provenance"]
-            for shard in read_shards(self.folder, info, self.spec):
-                self._take_in(shard.rows, shard.statistics)
+            for row in read_rows(self.folder, info):
+                self._count(row)
+            self._shards = info["mjstack"]["shards"]
         for path in uncommitted(self.folder, self._shards):
             path.unlink()
         # Where the last writer and this one differ, such as in a version, both are on record.
         while self._provenance and self._provenance[-1]["from_episode"] == len(self.committed):
             del self._provenance[-1]
         now = json.loads(json.dumps(dict(self.spec.provenance)))
-        if not self._provenance or {**self._provenance[-1], "from_episode": 0} != {
-            **now,
-            "from_episode": 0,
-        }:
+        last = self._provenance[-1] if self._provenance else {"from_episode": 0}
+        if last != {"from_episode": last["from_episode"], **now}:
             self._provenance.append({"from_episode": len(self.committed), **now})
-        staging = Staging()
-        try:
-            self._stage_totals(staging)
-            staging.commit()
-        finally:
-            staging.discard()
+        self._write_totals()
 
-    def _next_shard(self) -> Shard:
-        return Shard(self.folder, self.spec, self._shards, len(self.committed), self.frames)
+    def _hidden(self) -> Path:
+        """The data file of the next shard until it is committed."""
+        path = lerobot.data_path(self.folder, self._shards)
+        return path.with_name(f".{path.name}")
+
+    def _begin_file(self) -> None:
+        """Begin a data file."""
+        self._hidden().parent.mkdir(parents=True, exist_ok=True)
+        self._file = open(self._hidden(), "wb")  # noqa: SIM115
+        # Few floats occur twice: a dictionary of them takes three times the time and half again
+        # the room.
+        self._frames_writer = self._parquet.ParquetWriter(
+            self._file,
+            lerobot.frames_schema(self.spec),
+            compression="snappy",
+            use_dictionary=list(INDICES),
+        )
+
+    def _write(self, episode: EpisodeData) -> None:
+        """Write an episode as a row group, so that it can be read without the others."""
+        columns = typed_arrays(self.spec, episode)
+        number = len(self.committed) + self.pending
+        start = self._rows[-1]["dataset_to_index"] if self._rows else self.frames
+        length = len(next(iter(columns.values())))
+        frame = np.arange(length)
+        indices = {
+            "timestamp": (frame / self.spec.fps).astype(np.float32),
+            "frame_index": frame,
+            "episode_index": np.full(length, number),
+            "index": start + frame,
+            "task_index": np.full(length, self._tasks.setdefault(episode.task, len(self._tasks))),
+        }
+        columns |= {name: values[:, None] for name, values in indices.items()}
+        table = lerobot.frames_table(self._frames_writer.schema, columns)
+        self._frames_writer.write_table(table, row_group_size=length)
+        # float64 holds every type's values exactly, but int64's beyond 2^53.
+        joined = np.concatenate([columns[name] for name in table.column_names], axis=1, dtype=float)
+        named = lerobot.name_statistics(
+            self.spec.features, lerobot.episode_statistics(joined), length
+        )
+        place = lerobot.shard_indices(self._shards)
+        self._rows.append(
+            {
+                "episode_index": number,
+                "tasks": [episode.task],
+                "length": length,
+                **{f"data/{name}": index for name, index in place.items()},
+                "dataset_from_index": start,
+                "dataset_to_index": start + length,
+                **typed_values(self.spec, episode),
+                **{f"meta/episodes/{name}": index for name, index in place.items()},
+                **{
+                    f"stats/{name}/{kind}": values
+                    for name, kinds in named.items()
+                    for kind, values in kinds.items()
+                },
+            }
+        )
 
     def _commit(self) -> None:
-        shard = self._shard
-        shard.finish(list(self._tasks) if len(self._tasks) > self._tasks_committed else None)
-        self._take_in(shard.rows, shard.statistics)
-        self._stage_totals(shard.staging)
-        shard.staging.commit()
-        self._shard = self._next_shard()
-
-    def _take_in(
-        self, rows: dict[str, list[Any]], statistics: Sequence[dict[str, np.ndarray]]
-    ) -> None:
-        """Counts a shard's episodes."""
-        for length, episode in zip(rows["length"], statistics, strict=True):
-            self._statistics.add(length, episode)
-        self.frames += sum(rows["length"])
-        self.committed += zip(rows["seed"], rows["world"], strict=True)
-        self._tasks_committed = len(self._tasks)
+        """Put the frames to their place, then what says what is in them, and info.json last."""
+        self._frames_writer.close()
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        os.replace(self._hidden(), lerobot.data_path(self.folder, self._shards))
+        self._write_table(lerobot.tasks_table(list(self._tasks)), self.folder / lerobot.TASKS)
+        rows = self._pa.Table.from_pylist(self._rows)
+        self._write_table(rows, lerobot.episodes_path(self.folder, self._shards))
+        for row in self._rows:
+            self._count(row)
         self._shards += 1
+        self._write_totals()
+        self._rows = []
+        self._file = None
 
-    def _stage_totals(self, staging: Staging) -> None:
-        """Statistics, and last the file that says what counts."""
+    def _write_table(self, table: Any, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        buffer = self._pa.BufferOutputStream()
+        self._parquet.write_table(table, buffer)
+        write_atomic(path, buffer.getvalue().to_pybytes())
+
+    def _count(self, row: dict[str, Any]) -> None:
+        """Count an episode by its row."""
+        statistics = lerobot.row_statistics(self.spec.features, row)
+        if self.frames:
+            parts = (self._statistics, statistics)
+            statistics = lerobot.merge_statistics(parts, (self.frames, row["length"]))
+        self._statistics = statistics
+        self.frames += row["length"]
+        self.committed.append((row["seed"], row["world"]))
+
+    def _write_totals(self) -> None:
+        """Write statistics, and last the file that says what counts."""
+        (self.folder / "meta").mkdir(exist_ok=True)
         if self.committed:
-            staging.write(
-                self.folder / lerobot.STATS,
-                lerobot.stats_json(
-                    self.spec.features, self._statistics.count, self._statistics.read()
-                ),
-            )
+            stats = lerobot.name_statistics(self.spec.features, self._statistics, self.frames)
+            write_atomic(self.folder / lerobot.STATS, lerobot.to_json(stats))
         info = lerobot.make_info(
             self.spec,
             provenance=self._provenance,
             file_mb=self._file_mb,
             episodes=len(self.committed),
             frames=self.frames,
-            tasks=self._tasks_committed,
+            tasks=len(self._tasks),
             shards=self._shards,
         )
-        staging.write(self.folder / lerobot.INFO, lerobot.to_json(info))
+        write_atomic(self.folder / lerobot.INFO, lerobot.to_json(info))
 
     def _check_open(self) -> None:
         if not self._open:
@@ -235,18 +285,43 @@ class DatasetWriter:
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Closes the writer if something goes wrong in the middle of a file, and removes what was
-        on its way.
+        """Let Ctrl-C wait until the block has ended, so that an episode is written as a whole or
+        not at all. If something goes wrong, close the writer and remove what is not committed.
         """
         kept = len(self.committed)
         frames = self.frames
-        try:
-            yield
-        except BaseException as error:
-            self._open = False
-            self._shard.discard()
-            del self.committed[kept:]
-            self.frames, self._shard = frames, self._next_shard()
-            if isinstance(error, OSError):
-                raise UnwrittenError(str(self.folder), error, kept) from error
-            raise
+        with _interrupts_deferred():
+            try:
+                yield
+            except BaseException as error:
+                self._open = False
+                self._rows = []
+                del self.committed[kept:]
+                self.frames = frames
+                if self._frames_writer is not None:
+                    self._frames_writer.is_open = False  # its destructor would complete the file
+                if self._file is not None:
+                    with contextlib.suppress(OSError):  # closing writes what is buffered
+                        self._file.close()
+                info = read_info(self.folder)
+                for path in uncommitted(self.folder, info["mjstack"]["shards"] if info else 0):
+                    path.unlink()
+                if isinstance(error, OSError):
+                    raise UnwrittenError(str(self.folder), error, kept) from error
+                raise
+
+
+@contextlib.contextmanager
+def _interrupts_deferred() -> Iterator[None]:
+    """Let Ctrl-C wait until the block has ended."""
+    if threading.current_thread() is not threading.main_thread():  # which alone is interrupted
+        yield
+        return
+    caught: list[tuple] = []
+    before = signal.signal(signal.SIGINT, lambda *args: caught.append(args))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if caught and callable(before):
+            before(*caught[0])

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import torch
 
+from mjstack.config.check import PARITY_FIELDS
 from mjstack.config.schema import Config
-from mjstack.config.validate import PARITY_FIELDS
 from mjstack.episodes.context import RunContext, judge_one, needs_episode
 from mjstack.episodes.observers import WorldRecorder
 from mjstack.episodes.rollout import NOMINAL, State, restore

@@ -7,9 +7,9 @@ import time
 import traceback
 from collections.abc import Callable
 
+from mjstack.config.complete import typed
 from mjstack.config.fields import check_fields
 from mjstack.config.schema import Config
-from mjstack.config.terms import typed
 from mjstack.episodes.context import RunContext, lacks_episode
 from mjstack.errors import MjstackError, is_out_of_memory
 from mjstack.managers.term import resolve_func

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mjstack.config.check import places_objects, reads_starts_file
 from mjstack.config.schema import Config
-from mjstack.config.validate import places_objects, reads_starts_file
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext, needs_episode

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from mjstack.config.check import reads_starts_file
 from mjstack.config.schema import Config, TermCfg
-from mjstack.config.validate import reads_starts_file
 from mjstack.errors import ConfigError, RunError
 from mjstack.files import write_atomic
 

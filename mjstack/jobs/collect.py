@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from mjstack.config.fingerprint import CONTENT, config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
 from mjstack.datasets import DatasetSpec, require_pyarrow
-from mjstack.datasets.resume import check_same, lock_folder, read_committed, read_info
+from mjstack.datasets.reader import check_same, lock_folder, read_info, read_rows
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.context import RunContext, require_episode
 from mjstack.errors import ConfigError, DatasetError, UnwrittenError
@@ -183,7 +183,8 @@ def _check_folder(home: Path, spec: DatasetSpec) -> None:
             f" to another folder{_way_back(home, difference)}"
         )
     check_same(home / DATASET, info, spec)
-    read_batches(home, read_committed(home / DATASET, info))
+    rows = read_rows(home / DATASET, info, ["seed", "world"])
+    read_batches(home, [(row["seed"], row["world"]) for row in rows])
 
 
 def _way_back(home: Path, difference: Difference) -> str:

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from mjstack.datasets.staging import Staging
 from mjstack.errors import DatasetError
+from mjstack.files import write_atomic
 
 FILE = "batches.json"
 
@@ -85,12 +85,5 @@ def read_batches(folder: Path, committed: Sequence[tuple[int, int]]) -> list[Col
 
 def write_batches(folder: Path, batches: Sequence[CollectedBatch]) -> None:
     """Replace the file in one step that outlasts a power cut."""
-    staging = Staging()
-    try:
-        staging.write(
-            folder / FILE,
-            (json.dumps([asdict(batch) for batch in batches], indent=1) + "\n").encode(),
-        )
-        staging.commit()
-    finally:
-        staging.discard()
+    text = json.dumps([asdict(batch) for batch in batches], indent=1)
+    write_atomic(folder / FILE, text + "\n")

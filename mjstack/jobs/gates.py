@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from mjstack.config.check import reads_starts_file
 from mjstack.config.schema import Backend, Config
-from mjstack.config.validate import reads_starts_file
 from mjstack.drivers.tilt import turn_sign
 from mjstack.envs import build_env
 from mjstack.episodes.context import RunContext

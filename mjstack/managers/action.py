@@ -66,11 +66,9 @@ class ActionManager:
             TermError: A term cannot be found, built, or is no `ActionTerm`.
         """
         self._env = env
+        self._cfg = dict(cfg)
         self.terms: dict[str, ActionTerm] = {}
-        self._slices: list[tuple[ActionTerm, slice]] = []
-        self._rows: list[tuple[object, ...]] = []
         driven: dict[int, str] = {}
-        start = 0
         for name, term_cfg in cfg.items():
             label = f"action.{name}"
             cls = resolve_func(label, term_cfg.func)
@@ -90,17 +88,15 @@ class ActionManager:
                     )
                 driven[actuator] = label
             self.terms[name] = term
-            self._slices.append((term, slice(start, start + term.dim)))
-            self._rows.append((name, term.dim, term.unit, show_params(dict(term_cfg.params))))
-            start += term.dim
-        self.action_dim = start
-        zeros = torch.zeros((env.nworld, start), dtype=env.sim.qpos.dtype, device=env.device)
-        self.action = zeros
-        self.previous_action = zeros.clone()
-        self._processed = zeros.clone()
-        bounds = [(term.low, term.high) for term, _ in self._slices]
-        self.low = torch.cat([low for low, _ in bounds]) if bounds else zeros[0]
-        self.high = torch.cat([high for _, high in bounds]) if bounds else zeros[0]
+        terms = self.terms.values()
+        self._dims = [term.dim for term in terms]
+        self.action_dim = sum(self._dims)
+        shape = (env.nworld, self.action_dim)
+        self.action = torch.zeros(shape, dtype=env.sim.qpos.dtype, device=env.device)
+        self.previous_action = self.action.clone()
+        self._processed = self.action.clone()
+        self.low = torch.cat([term.low for term in terms]) if terms else self.action[0]
+        self.high = torch.cat([term.high for term in terms]) if terms else self.action[0]
         self.not_finite = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
 
     def process(self, action: torch.Tensor) -> None:
@@ -134,9 +130,10 @@ class ActionManager:
         self.previous_action.copy_(self.action)
         torch.nan_to_num(self._processed, 0.0, 0.0, 0.0, out=self.action)
         self.not_finite |= (self.action != self._processed).any(1)
-        for (name, term), (_, part) in zip(self.terms.items(), self._slices, strict=True):
+        parts = self.action.split(self._dims, dim=1)
+        for (name, term), part in zip(self.terms.items(), parts, strict=True):
             current_term.label = f"action.{name}"
-            term.write_commands(self.action[:, part])
+            term.write_commands(part)
 
     def check(self, action: torch.Tensor) -> None:
         """Raises an `ArgumentError` for an action of wrong type, shape, dtype or device."""
@@ -146,12 +143,13 @@ class ActionManager:
         )
         if not isinstance(action, torch.Tensor):
             raise ArgumentError("action", type(action).__name__, expected)
-        if tuple(action.shape) != (self._env.nworld, self.action_dim):
-            raise ArgumentError("action", f"shape {tuple(action.shape)}", expected)
-        if action.dtype not in (torch.float32, torch.float64):
-            raise ArgumentError("action", f"dtype {action.dtype}", expected)
-        if action.device != self._env.device:
-            raise ArgumentError("action", f"device {action.device}", expected)
+        if (
+            action.shape != self.action.shape
+            or action.dtype not in (torch.float32, torch.float64)
+            or action.device != self._env.device
+        ):
+            found = f"shape {tuple(action.shape)}, dtype {action.dtype}, device {action.device}"
+            raise ArgumentError("action", found, expected)
 
     def reset(self, mask: torch.Tensor) -> None:
         """Zero the actions of the masked worlds."""
@@ -159,6 +157,10 @@ class ActionManager:
         self.previous_action.masked_fill_(mask[:, None], 0.0)
 
     def __str__(self) -> str:
+        rows = [
+            (name, term.dim, term.unit, show_params(self._cfg[name].params))
+            for name, term in self.terms.items()
+        ]
         return render_table(
-            f"action: {self.action_dim} numbers", ("term", "dim", "range", "parameters"), self._rows
+            f"action: {self.action_dim} numbers", ("term", "dim", "range", "parameters"), rows
         )

@@ -5,7 +5,7 @@ and history.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 
@@ -19,12 +19,6 @@ class _Part:
     """One term of a group."""
 
     def __init__(self, label: str, cfg: ObservationTermCfg, env: EnvView) -> None:
-        if cfg.history < 1:
-            raise TermError(label, f"history={cfg.history}: expected an integer of at least 1")
-        if not (math.isfinite(cfg.noise) and cfg.noise >= 0.0):
-            raise TermError(label, f"noise={cfg.noise}: expected a number that is not negative")
-        if not math.isfinite(cfg.scale):
-            raise TermError(label, f"scale={cfg.scale}: expected a finite number")
         if cfg.clip is not None and not (len(cfg.clip) == 2 and cfg.clip[0] < cfg.clip[1]):
             raise TermError(
                 label, f"clip={list(cfg.clip)}: expected two numbers, the smaller one first"
@@ -42,10 +36,6 @@ class _Part:
         self.width = 1 if value.dim() == 1 else value.shape[1]
         self.dim = self.width * cfg.history
 
-    def spread(self, value: float) -> list[float]:
-        """A number for each column of one step."""
-        return [value] * self.width
-
 
 class _Group:
     """The terms of one group: noise, clipping and scaling are done for all columns at once."""
@@ -62,62 +52,50 @@ class _Group:
                 f"observation.{name}", "has no terms: expected at least one, or no such group"
             )
         parts = self.parts.values()
-
-        def row(values: Callable[[_Part], float]) -> torch.Tensor:
-            return torch.tensor(
-                [x for p in parts for x in p.spread(values(p))],
-                dtype=torch.float32,
-                device=env.device,
-            )
-
         self.dim = sum(part.dim for part in parts)
-        noise = [x for part in parts for x in part.spread(part.cfg.noise if cfg.noise else 0.0)]
+
+        def indices(columns: Sequence[int]) -> torch.Tensor:
+            return torch.tensor(columns, dtype=torch.int64, device=env.device)
+
+        widths = indices([part.width for part in parts])
+
+        def row(values: Iterable[float]) -> torch.Tensor:
+            """A number for each column of one step, from one for each part."""
+            numbers = torch.tensor([*values], dtype=torch.float32, device=env.device)
+            return numbers.repeat_interleave(widths)
+
         # Only columns with noise get numbers: where one stands in the draw follows from them alone.
-        columns = [i for i, x in enumerate(noise) if x > 0.0]
-        self._noise = torch.tensor(
-            [noise[i] for i in columns], dtype=torch.float32, device=env.device
-        )
-        self._noise_columns = torch.tensor(columns, dtype=torch.int64, device=env.device)
-        clips = any(part.cfg.clip is not None for part in parts)
-        self._low = (
-            row(lambda p: -math.inf if p.cfg.clip is None else p.cfg.clip[0]) if clips else None
-        )
-        self._high = (
-            row(lambda p: math.inf if p.cfg.clip is None else p.cfg.clip[1]) if clips else None
-        )
-        self._scale = (
-            row(lambda p: p.cfg.scale) if any(part.cfg.scale != 1.0 for part in parts) else None
-        )
-        # Where each frame of the history stands in the group: all columns of the last one, and for
+        noise = row(part.cfg.noise if cfg.noise else 0.0 for part in parts)
+        self._noise_columns = noise.nonzero()[:, 0]
+        self._noise = noise[self._noise_columns]
+        clips = [part.cfg.clip or (-math.inf, math.inf) for part in parts]
+        self._clips = any(part.cfg.clip for part in parts)
+        self._low = row(low for low, _ in clips)
+        self._high = row(high for _, high in clips)
+        self._scales = any(part.cfg.scale != 1.0 for part in parts)
+        self._scale = row(part.cfg.scale for part in parts)
+        # Where each step of the history stands in the group: all columns of the newest one, and for
         # older ones those that have a history that long. A step moves to where the next older one
         # was.
-        starts = []
-        at = 0
+        newest: list[int] = []
+        older: list[int] = []
+        following: list[int] = []
+        repeat: list[int] = []
+        first = 0  # of the part's columns within one step
         for part in parts:
-            starts.append(at)
-            at += part.dim
-        newest = [
-            s + p.dim - p.width + i
-            for p, s in zip(parts, starts, strict=True)
-            for i in range(p.width)
-        ]
-        older = [s + i for p, s in zip(parts, starts, strict=True) for i in range(p.dim - p.width)]
-        widths = [p.width for p in parts for _ in range(p.dim - p.width)]
-        self._newest = torch.tensor(newest, device=env.device) if older else None
+            start = len(newest) + len(older)
+            columns = range(start, start + part.dim)
+            newest += columns[-part.width :]
+            older += columns[: -part.width]
+            following += columns[part.width :]
+            repeat += [*range(first, first + part.width)] * part.cfg.history
+            first += part.width
+        self._has_history = bool(older)
+        self._newest = indices(newest)
+        self._older = indices(older)
+        self._next = indices(following)
+        self._repeat = indices(repeat)
         self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
-        self._older = torch.tensor(older, dtype=torch.int64, device=env.device)
-        self._next = torch.tensor(
-            [i + w for i, w in zip(older, widths, strict=True)],
-            dtype=torch.int64,
-            device=env.device,
-        )
-        source = [
-            i
-            for p, first in _first_columns(parts)
-            for _ in range(p.cfg.history)
-            for i in range(first, first + p.width)
-        ]
-        self._repeat = torch.tensor(source, dtype=torch.int64, device=env.device)
 
     def compute(self) -> torch.Tensor:
         """One step of every world, shape ``(nworld, sum of widths)``."""
@@ -132,14 +110,14 @@ class _Group:
                 self._env, f"observation.{self.name}", size, step=self._env.episode_step
             ).float()
             step.index_add_(1, self._noise_columns, self._noise * draw)
-        if self._low is not None:
+        if self._clips:
             step.clamp_(self._low, self._high)
-        return step if self._scale is None else step.mul_(self._scale)
+        return step.mul_(self._scale) if self._scales else step
 
     def append(self, out: torch.Tensor) -> None:
         """Takes in a new step of every world, and forgets the oldest."""
         step = self.compute()
-        if self._newest is None:
+        if not self._has_history:
             out.copy_(step)
             return
         self._past[:, self._older] = self._past.index_select(1, self._next)
@@ -149,19 +127,11 @@ class _Group:
     def restart(self, out: torch.Tensor, mask: torch.Tensor) -> None:
         """The whole history of the masked worlds becomes the current step."""
         step = self.compute()
-        if self._newest is None:
+        if not self._has_history:
             torch.where(mask[:, None], step, out, out=out)
             return
         torch.where(mask[:, None], step.index_select(1, self._repeat), self._past, out=self._past)
         out.copy_(self._past)
-
-
-def _first_columns(parts: Iterable[_Part]) -> Iterator[tuple[_Part, int]]:
-    """Each part with its first column within one step."""
-    first = 0
-    for part in parts:
-        yield part, first
-        first += part.width
 
 
 class ObservationManager:

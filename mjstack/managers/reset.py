@@ -8,7 +8,7 @@ import torch
 
 from mjstack.config.schema import TermCfg
 from mjstack.errors import MjstackError, TermError
-from mjstack.managers.term import Term, render_table, resolve_func, show_params
+from mjstack.managers.term import Term, raised, render_table, resolve_func, show_params
 from mjstack.managers.view import EnvView
 
 
@@ -43,8 +43,7 @@ class ResetManager:
             except MjstackError:
                 raise
             except Exception as error:
-                reason = str(error).splitlines()[0] if str(error) else "no message"
-                raise TermError(term.label, f"raised {type(error).__name__}: {reason}") from error
+                raise raised(term.label, error) from error
 
     def __str__(self) -> str:
         rows = [

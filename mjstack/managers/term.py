@@ -8,6 +8,7 @@ import io
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -15,6 +16,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from mjstack.config.fields import check_fields
 from mjstack.config.schema import TermCfg
 from mjstack.errors import ConfigError, MjstackError, ParameterError, TermError, suggest
 from mjstack.managers.view import EnvView
@@ -141,25 +143,37 @@ def build_instance(
         ConfigError: One of its parameters has a value that it cannot use.
         TermError: It raised an error of its own.
     """
-    try:
+    with blamed(label):
         instance = cls(env, **params)
-    except ParameterError as error:
-        raise _located(label, error) from error
-    except ConfigError:  # names its key itself
-        raise
-    except MjstackError as error:
-        raise TermError(label, str(error)) from error
-    except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else "no message"
-        raise TermError(label, f"raised {type(error).__name__}: {reason}") from error
     if hasattr(cls, "label"):
         instance.label = label
     return instance
 
 
-def _located(label: str, error: ParameterError) -> ConfigError:
-    name, value, expected, fix = error.facts
-    return ConfigError(f"{label}.params.{name}", value, expected, fix)
+@contextmanager
+def blamed(label: str) -> Iterator[None]:
+    """Raise what a term raises under its dotted configuration key.
+
+    Raises:
+        ConfigError: One of its parameters has a value that it cannot use.
+        TermError: It raised an error of its own.
+    """
+    try:
+        yield
+    except ParameterError as error:
+        raise error.at(f"{label}.params.{error.key}") from error
+    except ConfigError:  # names its key itself
+        raise
+    except MjstackError as error:
+        raise TermError(label, str(error)) from error
+    except Exception as error:
+        raise raised(label, error) from error
+
+
+def raised(label: str, error: Exception) -> TermError:
+    """The error of a term that raised one that is not mjstack's."""
+    reason = str(error).splitlines()[0] if str(error) else "no message"
+    return TermError(label, f"raised {type(error).__name__}: {reason}")
 
 
 class CurrentTerm:
@@ -217,6 +231,12 @@ def shared(key: Any, compute: Callable[[], torch.Tensor]) -> torch.Tensor:
 class Term:
     """A term ready to be called: a function with its parameters, or an instance of a class built
     with them.
+
+    Attributes:
+        label: Dotted configuration key, for errors.
+        params: Its parameters.
+        model_fields: Per-world model fields that it writes.
+        has_memory: Whether it keeps something from step to step.
     """
 
     def __init__(self, label: str, cfg: TermCfg, env: EnvView, *, masked: bool = False) -> None:
@@ -232,35 +252,27 @@ class Term:
             TermError: The name or a parameter is wrong.
         """
         self.label = label
+        check_fields(label, cfg)
         func = resolve_func(label, cfg.func)
         self.params = dict(cfg.params)
         is_class = inspect.isclass(func)
         check_params(label, func, self.params, 1 if is_class or not masked else 2)
         self.model_fields: Sequence[str] = getattr(func, "model_fields", ())
-        self._reset: Callable[[torch.Tensor], None] | None = None
-        if is_class:
-            self._call = build_instance(label, func, env, self.params)
-            self.params_of_call: dict[str, Any] = {}
-            self._reset = getattr(self._call, "reset", None)
-        else:
-            self._call = func
-            self.params_of_call = self.params
+        self._call = build_instance(label, func, env, self.params) if is_class else func
+        self._call_params = {} if is_class else self.params
+        self._reset = getattr(self._call, "reset", None) if is_class else None
+        self.has_memory = self._reset is not None
         # Two groups may ask for the same: a function of the state gives both the same answer.
         # Others may keep something.
         self._shared_by = None if is_class or masked else (func, repr(sorted(self.params.items())))
-
-    @property
-    def has_memory(self) -> bool:
-        """Whether the term keeps something from step to step."""
-        return self._reset is not None
 
     def __call__(self, *args: Any) -> Any:
         """Calls the term with the environment, and a mask if it takes one."""
         current_term.label = self.label
         if self._shared_by is None:
-            return self._call(*args, **self.params_of_call)
+            return self._call(*args, **self._call_params)
         return shared(
-            (id(args[0]), *self._shared_by), lambda: self._call(*args, **self.params_of_call)
+            (id(args[0]), *self._shared_by), partial(self._call, *args, **self._call_params)
         )
 
     def reset(self, mask: torch.Tensor) -> None:
@@ -269,53 +281,35 @@ class Term:
             self._reset(mask)
 
 
-def check_value(
-    label: str, value: Any, env: EnvView, *, dims: tuple[int, ...], boolean: bool = False
+def first_value(
+    term: Term, env: EnvView, *, dims: tuple[int, ...], boolean: bool = False
 ) -> torch.Tensor:
-    """Holds a term's first value against what its manager needs.
+    """Call a value term for the first time and check what it returns.
 
     Args:
-        label: Dotted configuration key.
-        value: What the term returned.
+        term: The term.
         env: Whose worlds they are.
         dims: Allowed numbers of dimensions.
         boolean: Whether truth values are expected, not numbers.
 
     Raises:
-        TermError: Not a tensor, or wrong shape, dtype or device.
+        TermError: It raised something of its own, or returned no tensor, or one of a wrong shape,
+            dtype or device.
     """
+    with blamed(term.label):
+        value = term(env)
     shape = f"({env.nworld},)" if dims == (1,) else f"({env.nworld},) or ({env.nworld}, d)"
     kind = "bool" if boolean else "floating point"
     expected = f"expected a {kind} tensor of shape {shape} on {env.device}"
     if not isinstance(value, torch.Tensor):
-        raise TermError(label, f"returned {type(value).__name__}, {expected}")
+        raise TermError(term.label, f"returned {type(value).__name__}, {expected}")
     if value.dim() not in dims or value.shape[0] != env.nworld:
-        raise TermError(label, f"returned shape {tuple(value.shape)}, {expected}")
+        raise TermError(term.label, f"returned shape {tuple(value.shape)}, {expected}")
     if value.dtype is not torch.bool if boolean else not value.dtype.is_floating_point:
-        raise TermError(label, f"returned {value.dtype}, {expected}")
+        raise TermError(term.label, f"returned {value.dtype}, {expected}")
     if value.device != env.device:
-        raise TermError(label, f"returned a tensor on {value.device}, {expected}")
+        raise TermError(term.label, f"returned a tensor on {value.device}, {expected}")
     return value
-
-
-def first_value(
-    term: Term, env: EnvView, *, dims: tuple[int, ...], boolean: bool = False
-) -> torch.Tensor:
-    """Calls a value term for the first time and checks what it returns.
-
-    Raises:
-        TermError: It raised something of its own, or returned what its manager cannot use.
-    """
-    try:
-        value = term(env)
-    except ParameterError as error:
-        raise _located(term.label, error) from error
-    except MjstackError as error:
-        raise TermError(term.label, str(error)) from error
-    except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else "no message"
-        raise TermError(term.label, f"raised {type(error).__name__}: {reason}") from error
-    return check_value(term.label, value, env, dims=dims, boolean=boolean)
 
 
 def render_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

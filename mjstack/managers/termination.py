@@ -39,7 +39,9 @@ class TerminationManager:
         def flags(*shape: int) -> torch.Tensor:
             return torch.zeros((env.nworld, *shape), dtype=torch.bool, device=env.device)
 
-        self.terminated, self.truncated, self.values = flags(), flags(), flags(len(self.names))
+        self.terminated = flags()
+        self.truncated = flags()
+        self.values = flags(len(self.names))
         self._ends = torch.tensor(
             [not cfg[name].time_out for name in self.names], dtype=torch.bool, device=env.device
         )

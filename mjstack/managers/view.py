@@ -60,18 +60,6 @@ class EnvView(Protocol):
         """Whether the task is achieved."""
 
 
-def uses_fields(*names: str) -> Callable[[Any], Any]:
-    """Marks a reset term that writes per-world model fields, so that the simulation is built with
-    them.
-    """
-
-    def mark(term: Any) -> Any:
-        term.model_fields = names
-        return term
-
-    return mark
-
-
 def offers(**attributes: Any) -> Callable[[Any], Any]:
     """Marks a term with what others may ask of it.
 
@@ -92,6 +80,13 @@ def offers(**attributes: Any) -> Callable[[Any], Any]:
         return term
 
     return mark
+
+
+def uses_fields(*names: str) -> Callable[[Any], Any]:
+    """Marks a reset term that writes per-world model fields, so that the simulation is built with
+    them.
+    """
+    return offers(model_fields=names)
 
 
 def random_uniform(

@@ -28,9 +28,9 @@ from typing import Any, ClassVar, cast
 import numpy as np
 import torch
 
+from mjstack.config.complete import typed
 from mjstack.config.fields import check_fields, field_range
 from mjstack.config.schema import Config
-from mjstack.config.terms import typed
 from mjstack.errors import ConfigError, TermError, UnknownName
 from mjstack.managers.term import resolve_func
 from mjstack.managers.view import EnvView

@@ -6,15 +6,20 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
-from mjstack.config.schema.gate import GateCfg
-from mjstack.config.schema.job import JobCfg
-from mjstack.config.schema.physics import BatchCfg, GraphMode, SimCfg, SolverCfg, TimingCfg
-from mjstack.config.schema.robot import ModelCfg, RobotCfg
-from mjstack.config.schema.scene import SceneCfg
+from mjstack.config.schema.run import (
+    BatchCfg,
+    GateCfg,
+    GraphMode,
+    JobCfg,
+    SimCfg,
+    SolverCfg,
+    TimingCfg,
+)
+from mjstack.config.schema.scene import ModelCfg, RobotCfg, SceneCfg
 from mjstack.config.schema.task import ControllerCfg, TaskCfg
 
 
-@dataclass(kw_only=True, slots=True)
+@dataclass(slots=True)
 class Config:
     """Everything a run needs."""
 
@@ -32,9 +37,7 @@ class Config:
     """MJWarp's buffer sizes."""
     sim: SimCfg = field(default_factory=SimCfg)
     """Physics engine and device."""
-    # Terms by name. OmegaConf would not let a command line add a term to a typed dict, so
-    # `type_terms` types them: ActionTermCfg, ObservationGroupCfg, TermCfg, TerminationTermCfg and
-    # RewardTermCfg.
+    # Terms by name, which `complete` types.
     action: dict[str, Any] = spec(factory=dict)
     """Action of a policy."""
     observation: dict[str, Any] = spec(factory=dict)
@@ -55,7 +58,7 @@ class Config:
     """Work of the command."""
     nworld: int = spec(unit="worlds", ge=1, le=MOST_WORLDS)
     """Worlds of the batch, capacity and throughput gates."""
-    seed: int = spec(ge=0, lt=MOST_SEEDS)
+    seed: int = spec(ge=0, le=MOST_SEEDS - 1)
     """Seed of every random number."""
     gates: list[str] = spec()
     """Gates that run; their order is fixed. There is also success."""

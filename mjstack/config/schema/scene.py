@@ -1,9 +1,12 @@
-"""The scene: a table, objects and places on it, and perhaps a box."""
+"""The robot and the scene: table, objects, places and perhaps a box."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from enum import Enum
+
+from omegaconf import MISSING
 
 from mjstack.config.fields import spec
 
@@ -14,7 +17,7 @@ def _friction() -> list[float]:
     return [1.0, 0.005, 0.0005]
 
 
-@dataclass(kw_only=True, slots=True)
+@dataclass(slots=True)
 class BoxCfg:
     """A receiving box on the table: a floor and four walls around it, fixed to the world."""
 
@@ -38,7 +41,7 @@ class BoxCfg:
     """Contact parameters of the walls."""
 
 
-@dataclass(kw_only=True, slots=True)
+@dataclass(slots=True)
 class ObjectCfg:
     """An object that stands on the table at the start."""
 
@@ -87,7 +90,7 @@ class ObjectCfg:
         return math.hypot(*(half / self.size[0] for half in self.size)) * self.size[0]
 
 
-@dataclass(kw_only=True, slots=True)
+@dataclass(slots=True)
 class PlaceCfg:
     """A named spot on the table."""
 
@@ -97,7 +100,7 @@ class PlaceCfg:
     """Half-widths of the region from which each episode draws it; 0: always at ``xy``."""
 
 
-@dataclass(kw_only=True, slots=True)
+@dataclass(slots=True)
 class SceneCfg:
     """A table, objects and places on it, and perhaps a box."""
 
@@ -126,3 +129,118 @@ class SceneCfg:
     def free(self) -> dict[str, ObjectCfg]:
         """The objects that move."""
         return {name: thing for name, thing in self.objects.items() if not thing.fixed}
+
+
+class RobotSource(Enum):
+    """Where the robot's MJCF file comes from."""
+
+    builtin = "builtin"
+    menagerie = "menagerie"
+
+
+@dataclass(slots=True)
+class ModelCfg:
+    """Source of the robot's MJCF file."""
+
+    source: RobotSource = MISSING
+    """``builtin``: ``robot.file``, or mjstack's own file of the robot. ``menagerie``: MuJoCo
+    Menagerie's."""
+
+
+@dataclass(slots=True)
+class PlacementsCfg:
+    """Where a scene's objects stand for one robot, and the buffer sizes its contacts need."""
+
+    table_center: list[float] = spec(unit="m", length=3)
+    """Centre of the table."""
+    table_half: list[float] = spec(unit="m", length=3, gt=0.0)
+    """Half sizes of the table."""
+    objects: dict[str, list[float]] = spec(factory=dict, unit="m", length=2)
+    """Nominal x and y of each object."""
+    places: dict[str, list[float]] = spec(factory=dict, unit="m", length=2)
+    """x and y of each place."""
+    random_xy: list[float] = spec(unit="m", length=2, ge=0.0)
+    """How far ``reset=randomized`` moves each object, plus or minus."""
+    box_center: list[float] | None = spec(None, unit="m", length=2)
+    """Centre of the box."""
+    grasp_offset: float = spec(0.0, unit="m")
+    """How far above an object's centre it is held."""
+    home: list[float] | None = spec(None, unit="rad, m")
+    """Home command of a scene in whose way the usual one is."""
+    nconmax: int = spec(128, ge=1)
+    """Contacts per world while a driver does the task."""
+    njmax: int = spec(300, ge=1)
+    """Constraint rows per world while a driver does the task."""
+    env_nconmax: int = spec(128, ge=1)
+    """Contacts per world under random actions."""
+    env_njmax: int = spec(768, ge=1)
+    """Constraint rows per world under random actions."""
+
+
+@dataclass(slots=True)
+class RobotCfg:
+    """An arm with a gripper: names in its MJCF file, and joint targets of its tasks.
+
+    Every joint named here has a position servo, and a range. Joint values are rad, or m for slides.
+    """
+
+    name: str = MISSING
+    """The robot's name."""
+    title: str = ""
+    """The name in tables and reports. Empty: ``name``."""
+    file: str | None = None
+    """An MJCF file: an absolute path, or one relative to the YAML that names it, or to the working
+    folder. null: mjstack's own file of the robot."""
+    menagerie_name: str = ""
+    """The robot's folder in MuJoCo Menagerie, for ``model=menagerie``."""
+    menagerie_file: str = ""
+    """Its file there."""
+    replace_collision: bool = False
+    """Whether ``model=menagerie`` gets the collision geoms of mjstack's own file."""
+
+    arm_joints: list[str] = spec()
+    """Joints of the arm, from the base on."""
+    gripper_joints: list[str] = MISSING
+    """Joints of the gripper."""
+    jaw_bodies: list[str] = MISSING
+    """Bodies that touch a grasped object. A sensor measures the force of each on each object."""
+    grasp_sites: list[str] = spec(length=2)
+    """Two sites, one on each jaw. Their midpoint is the grasp point."""
+    grasp_parts: dict[str, list[str]] = field(default_factory=dict)
+    """Where a grasp site goes that the file lacks: the mean of these geoms or bodies of one jaw."""
+    home: list[float] = spec(unit="rad, m")
+    """Joint values at which the scripted task begins."""
+    start: list[float] = spec(factory=list, unit="rad, m")
+    """Joint values at which environments begin, clear of the table. Empty: ``home``."""
+    gripper_open: list[float] = spec(unit="rad, m")
+    """Joint targets of the open gripper."""
+    gripper_closed: list[float] = spec(unit="rad, m")
+    """Joint targets of the gripper around an object."""
+    arm_force_limit: float | None = spec(None, unit="N m, N", gt=0.0)
+    """Largest force of the arm's servos. null: the file's own."""
+
+    locked: dict[str, float] = spec(factory=dict, unit="rad, m")
+    """Arm joints that inverse kinematics holds, with their values."""
+    ik_joints: list[str] = field(default_factory=list)
+    """Arm joints that inverse kinematics moves. Empty: all that are not locked."""
+    approach_body: str = ""
+    """Body with the approach axis: the last that carries both jaws. Empty: the body of the last arm
+    joint."""
+    approach_axis: list[float] = spec(factory=lambda: [0.0, 0.0, -1.0], length=3)
+    """Direction from the wrist towards the grasped object, in that body's frame."""
+    roll_joint: str | None = None
+    """Arm joint that turns the gripper about the approach axis. null: there is none, and no yaw
+    alignment."""
+    posture_gain: float = spec(0.0, ge=0.0, le=1.0)
+    """Closed loop: share per iteration of the way to the nominal joint values, in the null
+    space."""
+    approach_gain: float = spec(0.0, unit="rad", ge=0.0, le=1.0)
+    """Closed loop: turn per iteration of the approach axis towards the desired one."""
+    yaw_alignment: float = spec(0.0, ge=0.0, le=1.0)
+    """Closed loop: how far the jaws turn to an object's nearest face."""
+    approach_height: float = spec(0.1, unit="m", gt=0.0)
+    """Height above an object at which a grasp begins."""
+    finger_room: float = spec(0.01, unit="m", ge=0.0)
+    """Free room around an object for the open jaws."""
+    placements: dict[str, PlacementsCfg] = field(default_factory=dict)
+    """Where the objects of each scene stand for this robot."""

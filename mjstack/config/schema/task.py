@@ -1,4 +1,4 @@
-"""The task, and the scripted motion that does it."""
+"""The managers' terms, and the task with the scripted motion that does it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,64 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mjstack.config.fields import spec
-from mjstack.config.schema.term import TermCfg
-
-LEVELS = ("center", "table", "on_top")
 
 
-@dataclass(kw_only=True, slots=True)
+@dataclass(slots=True)
+class TermCfg:
+    """A function or class, and the values of its keyword parameters."""
+
+    func: str = spec()
+    """Dotted name of the function or class."""
+    params: dict[str, Any] = spec(factory=dict, finite=False)
+    """Keyword parameters."""
+
+
+@dataclass(slots=True)
+class ActionTermCfg(TermCfg):
+    """A part of the action vector; ``func`` names a subclass of ``ActionTerm``."""
+
+
+@dataclass(slots=True)
+class ObservationTermCfg(TermCfg):
+    """A part of an observation group: value, plus noise, clipped, times scale."""
+
+    scale: float = spec(1.0)
+    """Factor, applied last."""
+    clip: list[float] | None = spec(None, unit="the term's", length=2, finite=False)
+    """Smallest and largest value."""
+    noise: float = spec(0.0, unit="the term's", ge=0.0)
+    """Half-width of uniform noise, added first."""
+    history: int = spec(1, unit="steps", ge=1)
+    """Steps that are kept, oldest first."""
+
+
+@dataclass(slots=True)
+class ObservationGroupCfg:
+    """Terms that are concatenated into one tensor."""
+
+    noise: bool = True
+    """Whether its terms have their noise."""
+    terms: dict[str, Any] = spec(factory=dict)
+    """Its terms, by name."""
+
+
+@dataclass(slots=True)
+class RewardTermCfg(TermCfg):
+    """A reward per second of simulated time."""
+
+    weight: float = spec()
+    """Each step adds weight x value x step_dt."""
+
+
+@dataclass(slots=True)
+class TerminationTermCfg(TermCfg):
+    """A reason for which an episode ends."""
+
+    time_out: bool = False
+    """Whether the episode is truncated then, not terminated."""
+
+
+@dataclass(slots=True)
 class TaskCfg:
     """What has to be achieved, sampled at step ends."""
 
@@ -33,13 +85,13 @@ class TaskCfg:
     """Term that tells when the task is achieved; null: it never is."""
 
 
-@dataclass(kw_only=True, slots=True)
+@dataclass(slots=True)
 class PhaseCfg:
     """One phase of the scripted motion: where it brings the grasp point, and the gripper."""
 
     anchor: str | None = None
     """Object or place from which the target counts; null: the last target holds."""
-    level: str = spec("center", choices=LEVELS)
+    level: str = spec("center", choices=("center", "table", "on_top"))
     """Height of the target: center (of the anchor as it stands; a place is on the table), table
     (its surface at the anchor), or on_top (centre of the object grasped last, standing on the
     anchor).
@@ -66,7 +118,7 @@ class PhaseCfg:
     """With controller=closed_loop: phase to go back to if they do not."""
 
 
-@dataclass(kw_only=True, slots=True)
+@dataclass(slots=True)
 class ControllerCfg:
     """The scripted motion. Its commands go through the action terms of ``action``."""
 

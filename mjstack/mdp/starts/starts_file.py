@@ -78,9 +78,8 @@ class FromStartsFile:
         try:
             self._read(env, path, pose, mass, friction, gain)
         except ParameterError as error:
-            name, value, expected, fix = error.facts
-            if name == "path" and path == env.cfg.starts:
-                raise ConfigError("starts", value, expected, fix) from error
+            if error.key == "path" and path == env.cfg.starts:
+                raise error.at("starts") from error
             raise
 
     def _read(

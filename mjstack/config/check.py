@@ -1,0 +1,238 @@
+"""Checks values that types and ranges cannot: how they fit together."""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import math
+import re
+from collections.abc import Mapping, Sequence
+
+from mjstack.config.fields import check_fields
+from mjstack.config.schema import SHAPES, BoxCfg, Config, SceneCfg, TermCfg
+from mjstack.errors import ConfigError, UnknownName
+
+PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
+_DEVICE = re.compile(r"auto|cpu|cuda:\d+")
+_WORLD = re.compile(r"((batch|success):)?(\d+:)?\d+")
+_TAKEN = ("world", "floor", "table")
+
+
+def validate(cfg: Config) -> None:
+    """Raise a `ConfigError` or `UnknownName` for the first value that cannot be used."""
+    check_fields("", cfg)
+    known = cfg.gate.functions()
+    if not cfg.gates:
+        raise ConfigError("gates", "[]", f"at least one of {', '.join(known)}")
+    for name in (*cfg.gates, *cfg.gate.added):  # a misspelt one has no function
+        _require("gate", name, known)
+    if not _DEVICE.fullmatch(cfg.sim.device):
+        raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N, such as cuda:0")
+    step_dt = 1.0 / cfg.task.control_hz
+    if not math.isclose(cfg.timing.step_dt, step_dt, rel_tol=1e-9):
+        raise ConfigError(
+            "timing.physics_dt x timing.decimation",
+            f"{cfg.timing.step_dt:g}",
+            f"{step_dt:g} s, because task '{cfg.task.name}' is controlled at"
+            f" {cfg.task.control_hz:g} Hz",
+            "Change both together",
+        )
+    _replay(cfg)
+    _robot(cfg)
+    _scene(cfg.scene)
+    _phases(cfg)
+    _gates(cfg)
+    _success(cfg)
+
+
+def reads_starts_file(reset: Mapping[str, TermCfg]) -> bool:
+    """Whether worlds start as a file says."""
+    return any("path" in term.params and _offers(term, "reads_file") for term in reset.values())
+
+
+def places_objects(term: TermCfg) -> bool:
+    """Whether a reset term puts objects anywhere in a region, its parameter ``xy``."""
+    return "xy" in term.params and _offers(term, "places_objects")
+
+
+def _offers(term: TermCfg, name: str) -> bool:
+    """Whether a term's function has an attribute; see `mjstack.managers.offers`. One that cannot be
+    imported has none: its manager says why.
+    """
+    module, _, attribute = term.func.rpartition(".")
+    try:
+        func = getattr(importlib.import_module(module), attribute, None)
+    except Exception:
+        return False
+    return bool(getattr(func, name, False))
+
+
+def _require(what: str, name: str | None, known: Mapping | Sequence) -> None:
+    if name is not None and name not in known:
+        raise UnknownName(what, name, known)
+
+
+def _replay(cfg: Config) -> None:
+    """Keys that only one job or one group reads."""
+    if cfg.world is not None and not _WORLD.fullmatch(cfg.world):
+        expected = "a world such as 17, or a seed and a world such as 3:17"
+        raise ConfigError("world", cfg.world, expected)
+    for key in ("run", "world"):
+        if getattr(cfg, key) is not None and cfg.job.name != "replay":
+            expected = "null, because it is for job=replay alone"
+            raise ConfigError(key, getattr(cfg, key), expected, "Add job=replay")
+    if cfg.starts is not None and not reads_starts_file(cfg.reset):
+        expected = "null, because no reset term reads it"
+        raise ConfigError("starts", cfg.starts, expected, "Add reset=starts_file")
+
+
+def _robot(cfg: Config) -> None:
+    """The robot's lists have its joints' length, and its names are its joints'."""
+    robot = cfg.robot
+    grip = len(robot.gripper_joints)
+    joints = len(robot.arm_joints) + grip
+    lengths = {"home": joints, "start": joints, "gripper_open": grip, "gripper_closed": grip}
+    for key, size in lengths.items():
+        values = getattr(robot, key)
+        if len(values) != size:
+            raise ConfigError(f"robot.{key}", values, f"{size} numbers, one per joint")
+    if abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3:
+        expected = "a vector of length 1, such as [0, 0, -1]"
+        raise ConfigError("robot.approach_axis", robot.approach_axis, expected)
+    for name in (*robot.ik_joints, *robot.locked):
+        _require("robot.ik_joints, robot.locked: arm joint", name, robot.arm_joints)
+    _require("robot.roll_joint: arm joint", robot.roll_joint, robot.arm_joints)
+    if cfg.controller.yaw_alignment > 0.0 and robot.roll_joint is None:
+        expected = "0, because robot.roll_joint is null"
+        raise ConfigError("controller.yaw_alignment", cfg.controller.yaw_alignment, expected)
+
+
+def _scene(scene: SceneCfg) -> None:
+    """Objects, places and the box are on the table and clear of each other."""
+    for name, thing in scene.objects.items():
+        key = f"scene.objects.{name}"
+        if name in _TAKEN:
+            raise ConfigError(key, name, f"a name other than {', '.join(_TAKEN)}")
+        if len(thing.size) != SHAPES[thing.shape]:
+            raise ConfigError(f"{key}.size", thing.size, f"{SHAPES[thing.shape]} numbers")
+        edge = min(thing.size[:2]) if thing.shape == "box" else thing.footprint
+        _on_table(scene, f"{key}.xy", thing.xy, (edge, edge))
+    for name, place in scene.places.items():
+        if name in scene.objects:
+            raise ConfigError(f"scene.places.{name}", name, "a name that no object has")
+        _on_table(scene, f"scene.places.{name}.xy", place.xy, place.random_xy)
+    for (one, first), (other, second) in itertools.combinations(scene.objects.items(), 2):
+        if math.dist(first.xy, second.xy) < first.footprint + second.footprint:
+            expected = f"a position clear of {other}, which is at {second.xy}"
+            raise ConfigError(f"scene.objects.{one}.xy", first.xy, expected)
+    if scene.box is not None:
+        _box(scene, scene.box)
+
+
+def _on_table(scene: SceneCfg, key: str, xy: list[float], edge: Sequence[float]) -> None:
+    for axis, name in enumerate("xy"):
+        center = scene.table_center[axis]
+        reach = scene.table_half[axis] - edge[axis]
+        if abs(xy[axis] - center) > reach + 1e-9:
+            low = center - reach
+            expected = f"{name} within [{low:.3f}, {center + reach:.3f}] m, so that it is"
+            raise ConfigError(key, xy, f"{expected} on the table")
+
+
+def _box(scene: SceneCfg, box: BoxCfg) -> None:
+    if box.height <= box.floor:
+        expected = f"more than the floor's thickness, {box.floor:g} m"
+        raise ConfigError("scene.box.height", box.height, expected)
+    outer = [half + box.wall for half in box.half]
+    _on_table(scene, "scene.box.center", box.center, outer)
+    for name, thing in scene.objects.items():
+        away = (abs(thing.xy[i] - box.center[i]) - outer[i] for i in (0, 1))
+        if max(away) < thing.size[0]:
+            raise ConfigError(f"scene.objects.{name}.xy", thing.xy, "a position beside the box")
+
+
+def _phases(cfg: Config) -> None:
+    """The scripted phases, and how their targets are followed."""
+    controller = cfg.controller
+    if (
+        max(controller.posture_gain, controller.approach_gain) > 0
+        and controller.step_iterations < 4
+    ):
+        expected = "at least 4 with a posture_gain or an approach_gain"
+        raise ConfigError("controller.step_iterations", controller.step_iterations, expected)
+    phases = controller.phases
+    names = list(phases)
+    closed_loop = controller.name == "closed_loop" or "success" in cfg.gates
+    observed = set(cfg.scene.places)
+    grasped = False
+    for number, (name, phase) in enumerate(phases.items()):
+        key = f"controller.phases.{name}"
+        _require(f"{key}.grasps: object", phase.grasps, cfg.scene.objects)
+        _require(f"{key}.retry: phase", phase.retry, phases)
+        for source in filter(None, (phase.anchor, phase.toward)):
+            known = [*cfg.scene.objects, *cfg.scene.places]
+            _require(f"{key}.anchor, {key}.toward: object or place", source, known)
+            if phase.observe:
+                observed.add(source)
+            elif closed_loop and source not in observed:
+                expected = "true here or in a phase before, because controller=closed_loop does not"
+                raise ConfigError(
+                    f"{key}.observe", "false", f"{expected} know yet where {source} is"
+                )
+        if phase.level == "on_top" and not grasped:
+            expected = "center or table, as no phase before grasps"
+            raise ConfigError(f"{key}.level", "on_top", expected)
+        grasped = grasped or phase.grasps is not None
+        if phase.retry is not None and phase.grasps is None:
+            expected = f"null, or {key}.grasps=OBJECT, whose empty grasp is tried again"
+            raise ConfigError(f"{key}.retry", phase.retry, expected)
+        if phase.retry is not None and names.index(phase.retry) > number:
+            raise ConfigError(f"{key}.retry", phase.retry, "this phase or one before it")
+        steps = phase.seconds / cfg.timing.step_dt
+        if abs(steps - round(steps)) > 1e-6:
+            expected = f"a multiple of the step, {cfg.timing.step_dt:g} s"
+            raise ConfigError(f"{key}.seconds", phase.seconds, expected)
+    if phases and phases[names[0]].anchor is None:
+        raise ConfigError("controller.phases", names[0], "a first phase with an anchor")
+
+
+def _gates(cfg: Config) -> None:
+    """Names of phases and fields in the gates' parameters."""
+    gate = cfg.gate
+    for name in gate.parity.states.values():
+        _require("gate.parity.states: phase", name, cfg.controller.phases)
+    _require("gate.throughput.from_phase: phase", gate.throughput.from_phase, cfg.controller.phases)
+    for name in ("step1", "step50"):
+        limits = getattr(gate.parity, name)
+        if set(limits) != set(PARITY_FIELDS):
+            expected = f"a number for each of {', '.join(PARITY_FIELDS)}"
+            raise ConfigError(f"gate.parity.{name}", list(limits), expected)
+
+
+def _success(cfg: Config) -> None:
+    """Seeds and region of the success gate fit its starts."""
+    success = cfg.gate.success
+    from_file = reads_starts_file(cfg.reset)
+    if from_file and success.seeds > 1:
+        expected = "1, because with reset=starts_file worlds start alike under every seed"
+        raise ConfigError("gate.success.seeds", success.seeds, expected)
+    if success.region is None:
+        return
+    if from_file or not any(map(places_objects, success.reset.values())):
+        expected = "null, because no reset term of the success gate has a region"
+        raise ConfigError("gate.success.region", success.region, expected)
+    scene = cfg.scene
+    for axis, name in enumerate("xy"):
+        # An object of any yaw is a disc.
+        most = min(
+            scene.table_half[axis]
+            - thing.footprint
+            - abs(thing.xy[axis] - scene.table_center[axis])
+            for thing in scene.free.values()
+        )
+        if success.region[axis] > most:
+            expected = (
+                f"half-widths that leave every object on the table, {name} from 0 to"
+                f" {max(most, 0.0):.3f} m"
+            )
+            raise ConfigError("gate.success.region", success.region, expected)

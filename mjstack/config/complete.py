@@ -1,0 +1,125 @@
+"""Complete a composed configuration: terms as dataclasses, and what follows from other values."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields
+from functools import cache
+from pathlib import Path
+from typing import Any, cast
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from mjstack.config.fields import accepted
+from mjstack.config.schema import (
+    ActionTermCfg,
+    Config,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    RobotCfg,
+    SolverCfg,
+    StudyJobCfg,
+    TermCfg,
+    TerminationTermCfg,
+)
+from mjstack.config.session import config_folders
+from mjstack.errors import ConfigError, TermError, UnknownName
+
+# Terms are untyped in the schema: OmegaConf would not let a command line add one to a typed dict.
+_TERMS = {
+    "action": ActionTermCfg,
+    "controller.action": ActionTermCfg,
+    "reset": TermCfg,
+    "gate.capacity.reset": TermCfg,
+    "gate.success.reset": TermCfg,
+    "termination": TerminationTermCfg,
+    "reward": RewardTermCfg,
+    "observation": ObservationGroupCfg,
+}
+
+
+def complete(cfg: Config) -> None:
+    """Give every term and every variant of the solver its type, and fill in the robot, in place. A
+    term that is null is left out.
+
+    Raises:
+        MjstackError: A term has an unknown key, lacks one, or a value has the wrong type; or
+            ``robot.file`` is in none of the folders.
+    """
+    known = {field.name for field in fields(cfg.gate)}
+    for name in vars(cfg.gate).keys() - known:
+        cfg.gate.added[name] = vars(cfg.gate).pop(name)
+    for key, kind in _TERMS.items():
+        parent: Any = cfg
+        *path, last = key.split(".")
+        for name in path:
+            parent = getattr(parent, name)
+        setattr(parent, last, _typed_all(key, getattr(parent, last), kind))
+    for name, group in cfg.observation.items():
+        group.terms = _typed_all(f"observation.{name}.terms", group.terms, ObservationTermCfg)
+    if isinstance(cfg.job, StudyJobCfg):
+        variants = {
+            name: asdict(cfg.solver) | node if isinstance(node, dict) else node
+            for name, node in cfg.job.variants.items()
+        }
+        cfg.job.variants = _typed_all("job.variants", variants, SolverCfg)
+    _complete_robot(cfg.robot)
+
+
+def _typed_all(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
+    return {
+        name: typed(f"{key}.{name}", node, kind) for name, node in nodes.items() if node is not None
+    }
+
+
+def typed(key: str, node: Any, kind: type) -> Any:
+    """A mapping of a composed configuration as a dataclass.
+
+    Args:
+        key: Its dotted key, for errors.
+        node: The mapping.
+        kind: The dataclass.
+
+    Raises:
+        MjstackError: A key is unknown or missing, or a value has the wrong type.
+    """
+    items = {field.name: field for field in fields(kind)}
+    if not isinstance(node, dict):
+        raise ConfigError(key, node, f"a mapping with some of {', '.join(items)}")
+    typed = _schema(kind).copy()
+    for name, value in node.items():
+        if name not in items:
+            raise UnknownName(f"{key}: key", str(name), items)
+        try:
+            typed.merge_with({name: value})
+        except OmegaConfBaseException as error:
+            raise ConfigError(f"{key}.{name}", value, accepted(kind, items[name])) from error
+    missing = sorted(OmegaConf.missing_keys(typed))
+    if missing:
+        raise TermError(key, f"'{missing[0]}' is missing: set {key}.{missing[0]}")
+    return OmegaConf.to_object(typed)
+
+
+@cache
+def _schema(kind: type) -> DictConfig:
+    """A dataclass as OmegaConf has it, made once: terms are many."""
+    return cast(DictConfig, OmegaConf.structured(kind))
+
+
+def _complete_robot(robot: RobotCfg) -> None:
+    """Fill in what a robot's YAML left out, and find its file: relative to the ``robot`` group of a
+    search path, or to the working folder.
+    """
+    robot.title = robot.title or robot.name
+    robot.start = robot.start or list(robot.home)
+    robot.ik_joints = robot.ik_joints or [n for n in robot.arm_joints if n not in robot.locked]
+    if robot.file is None:
+        return
+    tried = [*(folder / "robot" / robot.file for folder in config_folders()), Path(robot.file)]
+    paths = list(dict.fromkeys(path.resolve() for path in tried))
+    found = next((path for path in paths if path.is_file()), None)
+    if found is None:
+        expected = f"an MJCF file; there is no {' and no '.join(map(str, paths))}"
+        raise ConfigError("robot.file", robot.file, expected)
+    robot.file = str(found)

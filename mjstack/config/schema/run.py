@@ -1,0 +1,313 @@
+"""A run: physics, the gates and their parameters, and the jobs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from mjstack.config.fields import MOST_WORLDS, spec
+
+
+class Backend(Enum):
+    """Which physics engine steps the worlds of batch and throughput."""
+
+    auto = "auto"
+    native = "native"
+    mjwarp = "mjwarp"
+
+
+class GraphMode(Enum):
+    """Whether control steps are captured into a graph and replayed."""
+
+    auto = "auto"
+    require = "require"
+    off = "off"
+
+
+class Cone(Enum):
+    """Shape of the friction cone."""
+
+    elliptic = "elliptic"
+    pyramidal = "pyramidal"
+
+
+@dataclass(slots=True)
+class TimingCfg:
+    """Physics step and control interval."""
+
+    physics_dt: float = spec(unit="s", gt=0.0)
+    """Duration of one physics step."""
+    decimation: int = spec(unit="physics steps", ge=1)
+    """Physics steps of one control step."""
+
+    @property
+    def step_dt(self) -> float:
+        """Time between two commands [s]."""
+        return self.physics_dt * self.decimation
+
+
+@dataclass(slots=True)
+class SolverCfg:
+    """Constraint solver. null keeps the model file's own value."""
+
+    iterations: int | None = spec(None, ge=1)
+    """Most iterations of the solver."""
+    ls_iterations: int | None = spec(None, ge=1)
+    """Most iterations of its line search."""
+    impratio: float | None = spec(None, gt=0.0)
+    """Ratio of frictional to normal constraint impedance."""
+    tolerance: float | None = spec(None, gt=0.0)
+    """Improvement below which the solver stops."""
+    cone: Cone = Cone.elliptic
+    """Shape of the friction cone."""
+    gripper_condim: int | None = spec(None, choices=(1, 3, 4, 6))
+    """Contact dimension of the geoms of ``robot.jaw_bodies``."""
+
+
+@dataclass(slots=True)
+class BatchCfg:
+    """MJWarp's buffer sizes. null takes the default of this robot and scene (nconmax, njmax) or of
+    MJWarp.
+    """
+
+    auto: bool = False
+    """Whether sizes that are null are measured first, as ``gate.capacity`` says."""
+    nconmax: int | None = spec(None, unit="contacts per world", ge=1)
+    """Contacts, as a mean over the worlds."""
+    naconmax: int | None = spec(None, unit="contacts", ge=1)
+    """Contacts of all worlds; takes precedence over nconmax."""
+    njmax: int | None = spec(None, unit="rows per world", ge=1)
+    """Constraint rows."""
+    nccdmax: int | None = spec(None, unit="pairs per world", ge=1)
+    """Pairs of convex geoms in collision, as a mean over the worlds."""
+    naccdmax: int | None = spec(None, unit="pairs", ge=1)
+    """Such pairs of all worlds; takes precedence over nccdmax."""
+
+
+@dataclass(slots=True)
+class SimCfg:
+    """Backend and device."""
+
+    backend: Backend = spec()
+    """Physics engine of batch and throughput: auto is MJWarp where there is CUDA."""
+    device: str = spec()
+    """auto, cpu or cuda:N."""
+
+
+@dataclass(slots=True)
+class GateFuncCfg:
+    """A gate: a function of the run's context, and its parameters."""
+
+    func: str = spec()
+    """Dotted name of the function: ``func(context) -> list[GateResult]``."""
+
+
+@dataclass(slots=True)
+class ParityCfg(GateFuncCfg):
+    """Tolerances of MJWarp against native MuJoCo."""
+
+    states: dict[str, str] = spec()
+    """States from which both step: a name, and the phase at whose end the state is taken."""
+    step1: dict[str, float] = spec(unit="SI", ge=0.0)
+    """Largest difference of each field after one physics step."""
+    step50: dict[str, float] = spec(unit="SI", ge=0.0)
+    """Largest difference of each field after 50 physics steps."""
+    object_position: float = spec(unit="m", ge=0.0)
+    """Largest difference of an object's position after the whole task."""
+    object_rotation_deg: float = spec(unit="deg", ge=0.0)
+    """Largest difference of an object's orientation after the whole task."""
+
+
+@dataclass(slots=True)
+class CapacityCfg(GateFuncCfg):
+    """How buffers are sized."""
+
+    cpu_nworld: int = spec(unit="worlds", ge=1)
+    """Worlds that size the buffers on a CPU; on CUDA all nworld do."""
+    margin: float = spec(ge=1.0)
+    """Recommended sizes over the peaks."""
+    random_steps: int | None = spec(None, unit="steps", ge=1)
+    """Steps of random actions; null: one whole episode."""
+    probe_nworld: int = spec(unit="worlds", ge=1)
+    """Most worlds that size an environment with ``batch=auto`` on CUDA; on a CPU, cpu_nworld."""
+    probe_steps: int = spec(unit="steps", ge=1)
+    """Steps of random actions that size an environment with ``batch=auto``."""
+    reset: dict[str, Any] = spec(factory=dict)
+    """Reset terms of the workload with randomised starts."""
+
+
+@dataclass(slots=True)
+class BatchGateCfg(GateFuncCfg):
+    """The batch gate plays every world of some seeds and judges them together."""
+
+    seeds: int = spec(unit="seeds", ge=1)
+    """Seeds that are played: the configured one and those after it."""
+    failed_worlds: int = spec(unit="worlds", ge=0)
+    """Worlds that may fail, over all seeds."""
+    distinct_fraction: float = spec(ge=0.0, le=1.0)
+    """Smallest share of distinct final states."""
+
+
+@dataclass(slots=True)
+class ThroughputCfg(GateFuncCfg):
+    """How throughput is measured."""
+
+    measurements: list[str] = spec(choices=("physics", "episode", "env_step"))
+    """Measurements that are made."""
+    repetitions: int = spec(ge=1)
+    """Repetitions of each measurement."""
+    steps: int = spec(unit="steps", ge=1)
+    """physics: control steps per repetition."""
+    env_steps: int = spec(unit="steps", ge=1)
+    """env_step: steps per repetition."""
+    max_seconds: float = spec(unit="s", gt=0.0)
+    """Time budget of each measurement on CUDA."""
+    cpu_max_seconds: float = spec(unit="s", gt=0.0)
+    """Time budget of each measurement on a CPU."""
+    from_phase: str = spec()
+    """Phase at whose start physics begins; it holds the joint target from there."""
+    start_worlds: int = spec(unit="worlds", ge=1)
+    """Worlds that are played to that phase where the batch gate has not; the others are copies."""
+    native_baseline: bool = spec()
+    """Whether native MuJoCo is measured too on CUDA machines."""
+
+
+@dataclass(slots=True)
+class SuccessGateCfg(GateFuncCfg):
+    """The success gate plays episodes from randomised starts and needs a success rate."""
+
+    seeds: int = spec(unit="seeds", ge=1)
+    """Seeds of nworld episodes each: the configured one and those after it."""
+    rate: float = spec(ge=0.0, le=1.0)
+    """Share of the episodes that must succeed."""
+    region: list[float] | None = spec(None, unit="m", length=2, ge=0.0)
+    """Half-widths of the objects' region in x and y; null: as ``reset`` has them."""
+    cell: float = spec(unit="m", gt=0.0)
+    """Width of the cells in which start positions are counted, in x and y."""
+    yaw_cell_deg: float = spec(unit="deg", gt=0.0, le=90.0)
+    """Width of the bins of an object's yaw relative to its direction as seen from the base."""
+    cell_episodes: int = spec(unit="episodes", ge=1)
+    """Episodes below which a cell has no rate."""
+    worst_regions: int = spec(unit="cells", ge=1)
+    """Worst cells in report.md."""
+    reset: dict[str, Any] = spec(factory=dict)
+    """Reset terms, unless ``reset=starts_file`` names a file."""
+
+
+@dataclass  # without slots: OmegaConf sets what is no field, see `complete`
+class GateCfg:
+    """The gates by name, in the order in which they run; those of the search path come last."""
+
+    baseline: GateFuncCfg = field(default_factory=GateFuncCfg)
+    """A single native world."""
+    parity: ParityCfg = field(default_factory=ParityCfg)
+    """MJWarp against native MuJoCo."""
+    capacity: CapacityCfg = field(default_factory=CapacityCfg)
+    """Buffer sizes."""
+    batch: BatchGateCfg = field(default_factory=BatchGateCfg)
+    """Every world of a batch."""
+    throughput: ThroughputCfg = field(default_factory=ThroughputCfg)
+    """Speed."""
+    success: SuccessGateCfg = field(default_factory=SuccessGateCfg)
+    """Success rate from randomised starts."""
+    added: dict[str, Any] = spec(factory=dict)
+    """Gates of the search path by name; their keys are ``gate.NAME.KEY``."""
+
+    def __getitem__(self, name: str) -> Any:
+        """The parameters of a gate."""
+        return self.added[name] if name in self.added else getattr(self, name)
+
+    def functions(self) -> dict[str, str]:
+        """Dotted name of every gate's function, by the gate's name."""
+        funcs = {}
+        for name, gate in {**vars(self), **self.added}.items():
+            if isinstance(gate, GateFuncCfg):
+                funcs[name] = gate.func
+            elif isinstance(gate, dict) and "func" in gate:
+                funcs[name] = gate["func"]
+        return funcs
+
+
+@dataclass(slots=True)
+class JobCfg:
+    """A job: the work of one command."""
+
+    name: str = spec()
+    """Its name."""
+    func: str = spec()
+    """Dotted name of its ``mjstack.jobs.Job``."""
+
+
+@dataclass(slots=True)
+class ScalingJobCfg(JobCfg):
+    """Throughput over numbers of worlds, each in a process."""
+
+    nworlds: list[int] = spec(unit="worlds", ge=1, le=MOST_WORLDS)
+    """Numbers of worlds, each once."""
+    backends: list[str] | None = spec(None, choices=("mjwarp", "native"))
+    """Backends; null: native, and MJWarp where there is CUDA, as far as ``sim`` allows."""
+    repetitions: int = spec(ge=1)
+    """Repetitions of each measurement."""
+    large: int = spec(unit="worlds", ge=1)
+    """A run of more worlds makes ``repetitions_large`` repetitions."""
+    repetitions_large: int = spec(ge=1)
+    """Repetitions of each measurement of a large run."""
+    native_steps: int = spec(unit="steps", ge=1)
+    """Physics steps per repetition on native MuJoCo, whose worlds play no episode."""
+    native_env_steps: int = spec(unit="steps", ge=1)
+    """Environment steps per repetition on native MuJoCo."""
+    run_minutes: float = spec(unit="min", gt=0.0)
+    """A run that takes longer has failed."""
+    max_minutes: float | None = spec(None, unit="min", gt=0.0)
+    """Time budget of a call; the next one goes on. null: unlimited."""
+    retry: bool = spec()
+    """Whether runs that failed are repeated."""
+
+
+@dataclass(slots=True)
+class StudyJobCfg(JobCfg):
+    """Cost and success of settings of the solver."""
+
+    repetitions: int = spec(ge=1)
+    """Repetitions of each variant."""
+    steps: int = spec(unit="steps", ge=1)
+    """Control steps per repetition, or as many as fit into ``max_seconds``."""
+    max_seconds: float = spec(unit="s", gt=0.0)
+    """Time budget of a repetition."""
+    # Variants are untyped until `complete`, so that the command line may add one.
+    variants: dict[str, Any] = spec(factory=dict)
+    """Variants by name: the keys of ``solver`` that each changes."""
+
+
+@dataclass(slots=True)
+class ReachabilityJobCfg(JobCfg):
+    """A map of the positions that the arm reaches, and the largest region for random starts."""
+
+    step: float = spec(unit="m", gt=0.0)
+    """Distance of the map's points."""
+    margin: float = spec(unit="m", ge=0.0)
+    """A region counts as reached if it is still reached with this margin all round."""
+
+
+@dataclass(slots=True)
+class CollectJobCfg(JobCfg):
+    """Demonstrations of the closed-loop expert, as a dataset."""
+
+    episodes: int = spec(unit="episodes", ge=1)
+    """Episodes of the dataset; a call adds the missing ones."""
+    keep_failures: bool = spec()
+    """Whether failed episodes are kept too, marked; they count."""
+    folder: str | None = spec(None)
+    """Folder of the dataset; null: ``outputs/collect/<hash>`` of everything episodes depend on."""
+    buffer_gib: float = spec(unit="GiB", gt=0.0)
+    """Device memory for the steps of one batch of worlds; more worlds are played in turns."""
+
+
+# Jobs with keys of their own; the others have `JobCfg`.
+JOB_SCHEMAS = {
+    "study": StudyJobCfg,
+    "scaling": ScalingJobCfg,
+    "reachability": ReachabilityJobCfg,
+    "collect": CollectJobCfg,
+}

@@ -1,0 +1,114 @@
+"""Holds a whole dataset to what its files say of each other, in NumPy, beside the writer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from mjstack.datasets import StoredDataset, read_dataset
+
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+
+
+def check_dataset(folder: Path) -> StoredDataset:
+    """Types and dimensions are those of info.json; indices, timestamps and places run on without a
+    gap; every number is finite; tasks, lengths and totals agree; the statistics of each episode and
+    of all are those of its frames.
+    """
+    stored = read_dataset(folder)
+    features = stored.info["features"]
+    every: list[dict[str, np.ndarray]] = []
+    episode = frame = 0
+    for shard in range(stored.info["mjstack"]["shards"]):
+        place = {"chunk_index": shard // 1000, "file_index": shard % 1000}
+        name = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet".format(**place)
+        data = pq.ParquetFile(folder / "data" / name)
+        rows = pq.read_table(folder / "meta/episodes" / name).to_pylist()
+        assert data.schema_arrow.names == list(features)
+        told = json.loads(data.schema_arrow.metadata[b"huggingface"])["info"]["features"]
+        assert list(told) == list(features)
+        assert data.num_row_groups == len(rows)
+        for group, row in enumerate(rows):
+            table = data.read_row_group(group)
+            columns = {one: column(table, one, features[one]) for one in features}
+            length = len(table)
+            assert row["episode_index"] == episode
+            assert (row["length"], row["dataset_from_index"]) == (length, frame)
+            assert row["dataset_to_index"] == frame + length
+            for key, index in place.items():
+                assert row[f"data/{key}"] == row[f"meta/episodes/{key}"] == index
+            assert {int(i) for i in columns["task_index"][:, 0]} == {
+                stored.tasks.index(row["tasks"][0])
+            }
+            expected = {
+                "timestamp": (np.arange(length) / stored.info["fps"]).astype(np.float32),
+                "frame_index": np.arange(length),
+                "episode_index": np.full(length, episode),
+                "index": frame + np.arange(length),
+            }
+            for one, values in expected.items():
+                assert np.array_equal(columns[one][:, 0], values), one
+            for one, values in columns.items():
+                found = {kind: row[f"stats/{one}/{kind}"] for kind in (*exact(values), *QUANTILES)}
+                quantiles = {
+                    kind: np.quantile(values.astype(float), quantile, axis=0)
+                    for kind, quantile in QUANTILES.items()
+                }
+                assert_close(found, exact(values) | quantiles, values)
+                assert row[f"stats/{one}/count"] == [length]
+            every.append(columns)
+            episode += 1
+            frame += length
+    assert (episode, frame) == (stored.info["total_episodes"], stored.info["total_frames"])
+    assert stored.info["total_tasks"] == len(stored.tasks)
+    if every:
+        stats = json.loads((folder / "meta/stats.json").read_text())
+        assert list(stats) == list(features)
+        for one in features:
+            values = np.concatenate([columns[one] for columns in every])
+            assert_close(stats[one], exact(values), values)
+            assert stats[one]["count"] == [frame]
+            assert np.array_equal(stored.frames(one), values)
+    return stored
+
+
+def column(table: pa.Table, name: str, feature: dict[str, Any]) -> np.ndarray:
+    """A column's numbers, shape ``(frames, dim)``, in its type."""
+    (dim,) = feature["shape"]
+    kind = table.schema.field(name).type
+    assert pa.types.is_fixed_size_list(kind) == (dim > 1)
+    numbers = table[name].combine_chunks()
+    if dim > 1:
+        assert kind.list_size == dim
+        numbers = numbers.flatten()
+    assert numbers.null_count == 0
+    values = numbers.to_numpy(zero_copy_only=False).reshape(len(table), dim)
+    assert values.dtype == np.dtype(feature["dtype"])
+    assert np.isfinite(values).all()
+    return values
+
+
+def exact(values: np.ndarray) -> dict[str, np.ndarray]:
+    """Statistics that are exact over all frames too."""
+    numbers = values.astype(np.float64)
+    return {
+        "min": numbers.min(0),
+        "max": numbers.max(0),
+        "mean": numbers.mean(0),
+        "std": numbers.std(0),
+    }
+
+
+def assert_close(
+    found: dict[str, Any], expected: dict[str, np.ndarray], values: np.ndarray
+) -> None:
+    """Sums in another order differ by rounding."""
+    scale = np.abs(values.astype(np.float64)).max(0)
+    for kind, numbers in expected.items():
+        assert np.all(np.abs(np.asarray(found[kind]) - numbers) <= 1e-9 * scale + 1e-300), kind
