@@ -68,9 +68,6 @@ task:
   name: mine
   control_hz: 50.0
   episode_steps: 100
-gate:
-  parity: {states: {before_contact: approach, in_grasp: push, stacked: done}}
-  throughput: {from_phase: push}
 """
 OBSERVATION = """
 policy:

@@ -120,6 +120,15 @@ def test_a_file_that_does_not_fit_the_profile_is_refused(
     assert caught.value.exit_code == 2
 
 
+@pytest.mark.parametrize("name", ["floor", "table", "red"])
+def test_a_file_with_a_name_of_the_scene_is_refused(name: str, tmp_path: Path) -> None:
+    geom = f'<worldbody><geom name="{name}" size="0.01" pos="0 0 2"/>'
+    with pytest.raises(SourceError, match=f"scene stack: repeated name '{name}'") as caught:
+        build_model(changed(tmp_path, "<worldbody>", geom))
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
 def test_a_servo_is_found_by_its_joint_and_limited_as_the_joint_is(tmp_path: Path) -> None:
     cfg = changed(tmp_path, '<position name="elbow"', '<position name="motor_2" inheritrange="0"')
     model = build_model(cfg)

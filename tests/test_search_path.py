@@ -113,6 +113,27 @@ def test_help_and_cfg_see_the_folder(lean: Path, capsys: pytest.CaptureFixture[s
     assert "Did you mean 'lean'?" in refused(["-cd", str(lean), "task=lea"], capsys)
 
 
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("task: {epsiode_steps: 3}", "Did you mean 'task.episode_steps'?"),
+        ("taks: {a: 1}", "Did you mean 'task'?"),
+        ("scene: {objects: {puck: {szie: [1]}}}", "Did you mean 'scene.objects.puck.size'?"),
+        ("controller: {phases: {go: {secnds: 2}}}", "Did you mean 'controller.phases.go.seconds'?"),
+        ("task: {episode_steps: many}", "task.episode_steps: Value 'many'"),
+        ("reward: [", "while parsing"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_named(
+    text: str, part: str, lean: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = lean / "task" / "lean.yaml"
+    file.write_text(f"{TASK.partition('task:')[0]}{text}\n")
+    line = refused(["--config-dir", str(lean), "task=lean"], capsys)
+    assert str(file) in line
+    assert part in line
+
+
 @pytest.mark.full
 def test_a_sweep_and_a_replay(
     lean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

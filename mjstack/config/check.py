@@ -199,9 +199,11 @@ def _phases(cfg: Config) -> None:
 def _gates(cfg: Config) -> None:
     """Names of phases and fields in the gates' parameters."""
     gate = cfg.gate
+    phases = cfg.controller.phases
     for name in gate.parity.states.values():
-        _require("gate.parity.states: phase", name, cfg.controller.phases)
-    _require("gate.throughput.from_phase: phase", gate.throughput.from_phase, cfg.controller.phases)
+        _require("gate.parity.states: phase", name, phases)
+    if phases:
+        _require("gate.throughput.from_phase: phase", gate.throughput.from_phase, phases)
     for name in ("step1", "step50"):
         limits = getattr(gate.parity, name)
         if set(limits) != set(PARITY_FIELDS):

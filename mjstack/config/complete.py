@@ -40,8 +40,8 @@ _TERMS = {
 
 
 def complete(cfg: Config) -> None:
-    """Give every term and every variant of the solver its type, and fill in the robot, in place. A
-    term that is null is left out.
+    """Give every term and every variant of the solver its type, and fill in the robot and the
+    phases that gates name, in place. A term that is null is left out.
 
     Raises:
         MjstackError: A term has an unknown key, lacks one, or a value has the wrong type; or
@@ -65,6 +65,7 @@ def complete(cfg: Config) -> None:
         }
         cfg.job.variants = _typed_all("job.variants", variants, SolverCfg)
     _complete_robot(cfg.robot)
+    _choose_phases(cfg)
 
 
 def _typed_all(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
@@ -123,3 +124,24 @@ def _complete_robot(robot: RobotCfg) -> None:
         expected = f"an MJCF file; there is no {' and no '.join(map(str, paths))}"
         raise ConfigError("robot.file", robot.file, expected)
     robot.file = str(found)
+
+
+def _choose_phases(cfg: Config) -> None:
+    """Fill in the phases that gates name, where the task's YAML leaves them open."""
+    phases = list(cfg.controller.phases.values())
+    if not phases:
+        return
+    names = list(cfg.controller.phases)
+    grasps = [k for k, phase in enumerate(phases) if phase.grasps is not None]
+    closed = [k for k, phase in enumerate(phases) if phase.gripper == "closed"]
+    # A grasped object is in the hand after its grasp, a pushed one at the jaws until they open.
+    held = grasps[0] + 1 if grasps else max(closed, default=0)
+    contact = names[min(held, len(names) - 1)]
+    loaded = names[min(held if grasps else held + 1, len(names) - 1)]
+    parity = cfg.gate.parity
+    parity.states = parity.states or {
+        "before_contact": names[0],
+        "in_contact": contact,
+        "at_end": names[-1],
+    }
+    cfg.gate.throughput.from_phase = cfg.gate.throughput.from_phase or loaded

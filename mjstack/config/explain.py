@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import fields, is_dataclass
 from difflib import SequenceMatcher
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -18,7 +19,7 @@ from omegaconf.errors import ConfigKeyError
 
 from mjstack.config.fields import accepted, find_field
 from mjstack.config.schema import JOB_SCHEMAS, Config
-from mjstack.config.session import compose_raw, list_choices
+from mjstack.config.session import compose_raw, config_folders, list_choices
 from mjstack.errors import CompositionError, MjstackError, UnknownName, suggest
 
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
@@ -67,12 +68,24 @@ def parse(override: str) -> Override:
 
 def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     """The error that a user is shown for one of Hydra's or OmegaConf's, made with these
-    overrides.
+    overrides; it begins with the file that does not fit, if it is one.
     """
+    found = _explain(error, overrides)
+    inside = re.match(r"In '([^']+)': ", str(error))
+    if inside is None:
+        return found
+    name = f"{inside[1]}.yaml"
+    paths = [folder / name for folder in config_folders() if (folder / name).is_file()]
+    return CompositionError(f"{paths[0] if paths else name}: {found}")
+
+
+def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return UnknownName(f"{group}={name}:", name, list_choices().get(group, ()))
-    cause = error.__cause__ or error
+    # Hydra raises its own inside of the handler of one of OmegaConf's, which knows the key.
+    cause = error.__cause__ or (error.__context__ if str(error).startswith("In '") else None)
+    cause = cause or error
     text = (str(cause).splitlines() or [type(cause).__name__])[0].rstrip(".")
     key = getattr(cause, "full_key", None) or ""
     deleted = re.match(r"Could not delete from config\. '([^']+)'", text)
@@ -82,7 +95,9 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
         beside = [name for name in there if name.rpartition(".")[0] == key.rpartition(".")[0]]
         return CompositionError(f"~{key}: there is none to leave out. {suggest(key, beside)}")
     if key and isinstance(cause, ConfigKeyError | AttributeError):
-        return _unknown_key(key, overrides)
+        owner = getattr(cause, "object_type", None)
+        known = [field.name for field in fields(owner)] if is_dataclass(owner) else []
+        return _unknown_key(key, known, overrides)
     schemas = [JOB_SCHEMAS[name] for name in JOB_SCHEMAS if f"job={name}" in overrides]
     field = (
         find_field(schemas[-1], key.removeprefix("job."))
@@ -96,8 +111,10 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     return CompositionError(f"{where}: {text}.")
 
 
-def _unknown_key(key: str, overrides: Sequence[str]) -> CompositionError:
-    """A key that does not exist, with the one that may have been meant."""
+def _unknown_key(key: str, known: Sequence[str], overrides: Sequence[str]) -> CompositionError:
+    """A key that does not exist, with the one that may have been meant: one beside it (*known*), or
+    one elsewhere.
+    """
     jobs = [override for override in overrides if override.removeprefix("job=") in JOB_SCHEMAS]
     parent, _, leaf = key.rpartition(".")
     if parent == "job":
@@ -111,7 +128,7 @@ def _unknown_key(key: str, overrides: Sequence[str]) -> CompositionError:
                 f"{key} is a key of {' and '.join(owners)}, and this is"
                 f" {jobs[-1] if jobs else 'job=gates'}. Set {owners[0]}."
             )
-    keys = [*_keys(jobs), *list_choices()]
+    keys = [*_keys(jobs), *list_choices(), *(f"{parent}.{name}".lstrip(".") for name in known)]
 
     def likeness(name: str) -> tuple[float, float]:
         return (

@@ -14,6 +14,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError  # type: ignore[import-untyped]
 
 from mjstack.config.check import validate
 from mjstack.config.complete import complete
@@ -129,6 +130,8 @@ def _explained(overrides: Sequence[str]) -> Iterator[None]:
         yield
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error
+    except YAMLError as error:
+        raise CompositionError(f"{' '.join(str(error).split())}.") from error
 
 
 def load_saved(path: Path) -> Config:

@@ -99,9 +99,11 @@ class ClosedLoopDriver:
         tensors = robot(env)
         self._n_arm = env.index.n_arm
         self._nominal = torch.as_tensor(nominal, dtype=torch.float32, device=device)
+        # Where nothing is carried, the gripper points down as far as it can.
+        carries = any(phase.grasps is not None for phase in c.phases.values())
         self._tilt = (
             CarryTilt(env.sim.model, cfg, self.phases, self._ik, self._nominal)
-            if c.approach_gain > 0.0
+            if c.approach_gain > 0.0 and carries
             else None
         )
         self._home_grip = tensors.home[self._n_arm :].float()

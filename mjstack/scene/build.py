@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import mujoco
 
 from mjstack.config.schema import BoxCfg, Config, ObjectCfg, SceneCfg, SolverCfg, TimingCfg
+from mjstack.errors import SourceError
 from mjstack.robots import robot_spec
 
 WORLD = "world"  # MuJoCo's name of the body that never moves
@@ -24,11 +25,23 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
         cfg: The configuration.
         visuals: Keep geoms that only pictures need. The physics is the same without them, and steps
             faster.
+
+    Raises:
+        SourceError: The robot's file does not fit the scene, such as one with a geom named table.
     """
     spec = robot_spec(cfg.robot, cfg.model)
-    return build_scene(
-        spec, cfg.scene, cfg.timing, cfg.solver, jaw_bodies=cfg.robot.jaw_bodies, visuals=visuals
-    )
+    jaws = cfg.robot.jaw_bodies
+    try:
+        return build_scene(
+            spec, cfg.scene, cfg.timing, cfg.solver, jaw_bodies=jaws, visuals=visuals
+        )
+    except ValueError as error:
+        problem = str(error).splitlines()[0].removeprefix("Error: ")
+        raise SourceError(
+            f"robot {cfg.robot.name} in scene {cfg.scene.name}: {problem}, expected a robot whose"
+            " names are not the scene's (floor, table and the objects). Rename it in the robot's"
+            " file."
+        ) from error
 
 
 def build_scene(

@@ -331,7 +331,7 @@ class EpisodeCheck(ABC):
 
     def headline(self, values: Mapping[str, float]) -> str:
         """A world's values in a few words."""
-        return ", ".join(f"{name} {value:.3g}" for name, value in values.items())
+        return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
 
 
 def check_class(cfg: Config) -> type[EpisodeCheck] | None:

@@ -108,7 +108,10 @@ class ParityCfg(GateFuncCfg):
     """Tolerances of MJWarp against native MuJoCo."""
 
     states: dict[str, str] = spec()
-    """States from which both step: a name, and the phase at whose end the state is taken."""
+    """States from which both step: a name, and the phase at whose end the state is taken. Empty:
+    the first phase, the one after the first grasp (without grasps, the last with a closed gripper),
+    and the last.
+    """
     step1: dict[str, float] = spec(unit="SI", ge=0.0)
     """Largest difference of each field after one physics step."""
     step50: dict[str, float] = spec(unit="SI", ge=0.0)
@@ -166,7 +169,9 @@ class ThroughputCfg(GateFuncCfg):
     cpu_max_seconds: float = spec(unit="s", gt=0.0)
     """Time budget of each measurement on a CPU."""
     from_phase: str = spec()
-    """Phase at whose start physics begins; it holds the joint target from there."""
+    """Phase at whose start physics begins; it holds the joint target from there. Empty: the one
+    after the first grasp, or without grasps after the last phase with a closed gripper.
+    """
     start_worlds: int = spec(unit="worlds", ge=1)
     """Worlds that are played to that phase where the batch gate has not; the others are copies."""
     native_baseline: bool = spec()

@@ -1,0 +1,145 @@
+"""The examples, each from its own folder: the gates pass, and a check fails what it must."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+
+from mjstack.cli import run
+from mjstack.config import load_config
+from mjstack.config.schema import Config
+from mjstack.episodes.context import RunContext
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+ROBOTS = ("so101", "rebot")
+
+
+@cache
+def arguments(example: str, robot: str) -> tuple[str, ...]:
+    """A command line on native MuJoCo; of the long task, with phases of half their time."""
+    folder = EXAMPLES / example / "conf"
+    flags = (f"--config-dir={folder}", f"robot={robot}", "sim=native")
+    if example == "scara":
+        return flags
+    flags = (*flags, f"task={example}")
+    if example == "push":
+        return flags
+    cfg = load_config([f"task={example}"], config_dir=folder)
+    return (
+        *flags,
+        f"task.episode_steps={cfg.task.episode_steps // 2}",
+        *(
+            f"controller.phases.{name}.seconds={phase.seconds / 2}"
+            for name, phase in cfg.controller.phases.items()
+        ),
+    )
+
+
+def configure(example: str, robot: str, *overrides: str) -> Config:
+    flag, *others = arguments(example, robot)
+    return load_config([*others, *overrides], config_dir=flag.removeprefix("--config-dir="))
+
+
+def play_gates(example: str, robot: str, folder: Path, *overrides: str) -> dict[str, dict]:
+    """The gates' results by name, all of which must have passed."""
+    assert run([*arguments(example, robot), f"hydra.run.dir={folder}", *overrides]) == 0
+    gates = json.loads((folder / "report.json").read_text())["gates"]
+    assert {gate["status"] for gate in gates} == {"pass"}
+    return {gate["name"]: gate for gate in gates}
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_tower_stands(robot: str, tmp_path: Path) -> None:
+    gates = play_gates("tower", robot, tmp_path, "nworld=4", "gates=[batch]")
+    assert gates["batch"]["metrics"]["succeeded"] == 4
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_tower_stands_alike_on_both_engines(robot: str, tmp_path: Path) -> None:
+    play_gates("tower", robot, tmp_path, "gates=[baseline,parity]")
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_puck_is_pushed_alike_on_both_engines(robot: str, tmp_path: Path) -> None:
+    gates = play_gates("push", robot, tmp_path, "nworld=4", "gates=[baseline,parity,batch]")
+    assert gates["batch"]["metrics"]["succeeded"] == 4
+    compared = {name.partition(".")[0] for name in gates["parity"]["metrics"] if ".step1." in name}
+    assert compared == {"before_contact", "in_contact", "at_end"}
+
+
+def test_a_robot_of_ones_own_stacks(tmp_path: Path) -> None:
+    wanted = ("nworld=4", "gates=[baseline,batch,success]")
+    gates = play_gates("scara", "scara", tmp_path, *wanted)
+    assert gates["success"]["metrics"]["succeeded"] == 4
+
+
+def test_a_dataset_and_a_replay(tmp_path: Path) -> None:
+    flags = arguments("push", "so101")
+    out = tmp_path / "out"
+    command = [*flags, "job=collect", "job.episodes=2", "nworld=2", f"job.folder={tmp_path / 'd'}"]
+    assert run([*command, f"hydra.run.dir={tmp_path / 'collect'}"]) == 0
+    info = json.loads((tmp_path / "d" / "dataset" / "meta" / "info.json").read_text())
+    assert info["total_episodes"] == 2
+    play_gates("push", "so101", out, "nworld=2", "gates=[batch]")
+    replay = [flags[0], "job=replay", f"run={out}", "world=1"]
+    assert run([*replay, f"hydra.run.dir={tmp_path / 'replay'}"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("example", "threshold", "rules"),
+    [
+        ("push", "within=1e-6", ["AT_GOAL"]),
+        ("tower", "xy_err=1e-6", ["RED", "GREEN"]),
+    ],
+)
+def test_what_nothing_can_meet_fails_by_its_own_rule(
+    example: str, threshold: str, rules: list[str]
+) -> None:
+    cfg = configure(example, "rebot", "nworld=2", f"task.check.{threshold}")
+    context = RunContext(cfg)
+    played = context.play(context.batch_simulation(2), cfg.reset)
+    assert context.check.rules.failing(played.result.failed.numpy()) == {
+        name: [0, 1] for name in rules
+    }
+
+
+class Still:
+    """A driver without phases, which holds the arm where it starts."""
+
+    def __init__(self, cfg: Config) -> None:
+        self.phases: list = []
+        self.steps = cfg.task.episode_steps
+        self.phase = torch.zeros(cfg.nworld, dtype=torch.int64)
+        self.error = torch.zeros(cfg.nworld)
+        self.retries = torch.zeros(cfg.nworld, dtype=torch.int32)
+        self._command = torch.tensor(cfg.robot.start).expand(cfg.nworld, -1)
+
+    def rewind(self) -> Still:
+        return self
+
+    def command(self) -> torch.Tensor:
+        return self._command
+
+
+@pytest.mark.parametrize(("example", "rules"), [("push", ["AT_GOAL"]), ("tower", ["RED", "GREEN"])])
+def test_worlds_that_are_not_driven_fail(example: str, rules: list[str]) -> None:
+    cfg = configure(example, "so101", "nworld=2", "reset=randomized")
+    context = RunContext(cfg)
+    played = context.play(context.batch_simulation(2), cfg.reset, repeat=Still(cfg))
+    assert context.check.rules.failing(played.result.failed.numpy()) == {
+        name: [0, 1] for name in rules
+    }
+
+
+@pytest.mark.parametrize(("example", "most"), [("push", 120), ("tower", 80), ("scara", 40)])
+def test_an_example_is_short(example: str, most: int) -> None:
+    folder = EXAMPLES / example
+    files = [*folder.rglob("*.yaml"), *folder.rglob("*.py")]
+    assert 0 < sum(len(file.read_text().splitlines()) for file in files) <= most
+    assert len((folder / "README.md").read_text().splitlines()) <= 12
+    assert (folder / f"{example}.png").stat().st_size < 150_000
