@@ -14,27 +14,17 @@ import numpy as np
 import pytest
 import torch
 from check_cases import limits
-from environments import actions, configure, mask_of, new_sim, on_shared_sim, returned
+from environments import actions, configure, on_shared_sim, returned
 from stack_checker import BLUE, RED, lowest_corner
 
-from mjstack import make_env
 from mjstack.config.schema import Config
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
-from mjstack.managers import (
-    ActionManager,
-    ObservationManager,
-    ResetManager,
-    RewardManager,
-    TerminationManager,
-)
-from mjstack.managers.term import Term
 from mjstack.mdp import observation as observation_terms
 from mjstack.mdp import reset as reset_terms
 from mjstack.mdp import reward as reward_terms
 from mjstack.mdp import termination as termination_terms
 from mjstack.mdp.geometry import source_xy
-from mjstack.scene import SceneIndex
 from mjstack.tasks.reach import ReachSuccess
 from mjstack.tasks.stack import StackSuccess
 
@@ -786,172 +776,3 @@ def test_object_off_table_at_its_threshold(robot: str) -> None:
             env.sim.reset()
             env.sim.qpos[0, a + 2] = table_top(env.cfg) + by
             assert term(env).tolist() == [out, False, False]
-
-
-# Managers without an environment
-
-
-class Bench:
-    """The smallest thing that managers work on: see mjstack.managers.EnvView."""
-
-    def __init__(self, cfg: Config, backend: str, nworld: int) -> None:
-        self.cfg = cfg
-        self.nworld = nworld
-        self.seed = cfg.seed
-        self.sim = new_sim(backend, nworld, cfg.robot.name)
-        self.index = SceneIndex(self.sim.model, cfg.robot, cfg.scene)
-        self.device = self.sim.device
-        self.world = torch.arange(nworld, device=self.device)
-        self.episode, self.episode_step = torch.zeros_like(self.world), torch.zeros_like(self.world)
-        self.success = torch.zeros(nworld, dtype=torch.bool, device=self.device)
-        self.given_places: dict[str, torch.Tensor] = {}
-        self.actions: ActionManager | None = None
-
-    @property
-    def action(self) -> torch.Tensor:
-        assert self.actions is not None
-        return self.actions.action
-
-    @property
-    def previous_action(self) -> torch.Tensor:
-        assert self.actions is not None
-        return self.actions.previous_action
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("kind", ["native", "mjwarp"])
-def test_managers_work_on_any_object_of_that_shape(kind: str) -> None:
-    """And do there what they do in an environment: the same numbers from the same seed."""
-    cfg = configure("task=reach", "reset=randomized", "action=joint_delta")
-    cfg.task.success = None
-    cfg.reward.pop("success"), cfg.termination.pop("success")
-    env = on_shared_sim(kind, 3, cfg)
-    moves = actions(env, 5)
-    start = returned(env.reset())
-    expected = [returned(env.step(move)) for move in moves]
-
-    bench = Bench(cfg, kind, 3)
-    resets = ResetManager(bench, cfg.reset)
-    everyone = torch.ones(3, dtype=torch.bool)
-    resets.reset(everyone)
-    bench.sim.kinematics()
-    bench.actions = ActionManager(bench, cfg.action)
-    ends = TerminationManager(bench, cfg.termination)
-    rewards = RewardManager(bench, cfg.reward)
-    observations = ObservationManager(bench, cfg.observation)
-    for group, value in observations.refresh(everyone).items():
-        assert torch.equal(value, start[f"obs.{group}"])
-    for move, row in zip(moves, expected, strict=True):
-        bench.actions.process(move)
-        bench.actions.apply()
-        bench.sim.step(cfg.timing.decimation, kinematics=True)
-        bench.episode_step += 1
-        ends.compute()
-        assert torch.equal(rewards.compute(), row["reward"])
-        assert torch.equal(ends.terminated, row["terminated"])
-        for group, value in observations.compute().items():
-            assert torch.equal(value, row[f"final.{group}"])
-    torch.testing.assert_close(
-        rewards.episode_sums.sum(1), torch.stack([row["reward"] for row in expected]).sum(0)
-    )
-    before = {name: getattr(bench.sim, name).clone() for name in ("qpos", "qvel", "ctrl")}
-    bench.episode += mask_of(env, 1)
-    resets.reset(mask_of(env, 1))
-    for name, value in before.items():
-        now = getattr(bench.sim, name)
-        assert torch.equal(now[[0, 2]], value[[0, 2]])
-        assert not torch.equal(now[1], value[1])
-
-    for manager, names in (
-        (resets, cfg.reset),
-        (bench.actions, cfg.action),
-        (ends, cfg.termination),
-        (rewards, cfg.reward),
-        (
-            observations,
-            [
-                *cfg.observation,
-                *(name for group in cfg.observation.values() for name in group.terms),
-            ],
-        ),
-    ):
-        text = str(manager)
-        for name in names:
-            assert name in text, f"{name} is not in\n{text}"
-
-
-def test_tables_show_settings_and_the_environment_shows_all_tables() -> None:
-    env = on_shared_sim("native", 3, configure("task=stack"))
-    shown = str(env)
-    assert "stack with SO-101: 3 worlds, MuJoCo" in shown
-    scale = env.cfg.action["arm"].params["scale"]
-    for text in (
-        "action: 6 numbers",
-        f"joints=arm, mode=relative, pose=start, scale={scale}",
-        "privileged",
-        "weight per s",
-        "truncated",
-    ):
-        assert text in shown
-    for manager in (
-        env.action_manager,
-        env.reset_manager,
-        env.termination_manager,
-        env.reward_manager,
-        env.observation_manager,
-    ):
-        assert str(manager) in shown
-    (row,) = [line for line in str(env.reward_manager).splitlines() if "│ lift " in line]
-    assert "2.0" in row
-    assert "height=0.05" in row
-
-
-@pytest.mark.full
-def test_overrides_change_exactly_what_they_name() -> None:
-    env = make_env(
-        ["sim=native", "action=ee_delta", "reset=nominal", "~reward.grasp", "reward.lift.weight=3"],
-        nworld=2,
-        seed=5,
-    )
-    expected = configure("sim=native")
-    expected.nworld = 2
-    expected.seed = 5
-    expected.action = configure("action=ee_delta").action
-    expected.reset = configure("reset=nominal").reset
-    expected.reward.pop("grasp")
-    expected.reward["lift"].weight = 3.0
-    assert env.cfg == expected
-    assert env.cfg.action != configure("sim=native").action
-    assert list(env.action_manager.terms) == ["arm", "gripper"]
-    assert type(env.action_manager.terms["arm"]).__name__ == "EndEffectorDelta"
-    assert env.action_manager.action_dim == 4
-    assert env.reward_manager.names == [
-        "reach",
-        "lift",
-        "place",
-        "success",
-        "action_rate",
-        "joint_vel",
-    ]
-    assert "3.0" in next(line for line in str(env.reward_manager).splitlines() if "lift" in line)
-    assert (env.nworld, env.seed) == (2, 5)
-    env.reset()
-    env.step(torch.zeros(2, 4))
-    # Lift is worth three instead of two per second.
-    env.sim.qpos[:, env.index.object_qpos[0] + 2] += 0.2
-    env.step(torch.zeros(2, 4))
-    column = env.reward_manager.values[:, 1]
-    torch.testing.assert_close(column, torch.full_like(column, 3.0 * env.cfg.timing.step_dt))
-    env.close()
-
-
-def test_terms_with_parameters_are_built_once() -> None:
-    """A class is built with its parameters, a function is called with them."""
-    env = on_shared_sim("native", 3, configure())
-    cfg = env.cfg.termination
-    limit = Term("a", cfg["joint_limit"], env)
-    clock = Term("b", cfg["time_out"], env)
-    env.episode_step.copy_(torch.tensor([599, 600, 601]))
-    assert clock(env).tolist() == [False, True, True]
-    assert limit(env).tolist() == [False] * 3
-    limit.reset(mask_of(env, 1))  # no memory, nothing to forget
