@@ -318,7 +318,7 @@ def test_sweep_reports_each_job_and_exits_with_its_worst(folder: Path) -> None:
     rows = summary.read_text().splitlines()
     assert len(rows) == 4
     assert "xy_err=0.015" in rows[2]
-    assert "xy_err=1e-6" in rows[3]
+    assert "xy_err=1e-06" in rows[3]
 
 
 def test_cfg_prints_and_writes_nothing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
