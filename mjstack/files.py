@@ -6,7 +6,7 @@ import csv
 import io
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 
@@ -37,15 +37,16 @@ def write_atomic(path: Path, content: str | bytes) -> None:
         os.close(folder)
 
 
-def to_csv(columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:
+def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) -> str:
     """Rows as CSV text; a value that is missing or None is an empty cell.
 
     Args:
-        columns: Names of the columns, in their order; other keys of the rows are left out.
         rows: Values by column.
+        columns: The first columns. Other keys of the rows follow, in order of appearance.
     """
+    columns = list(dict.fromkeys([*columns, *(name for row in rows for name in row)]))
     out = io.StringIO()
-    writer = csv.DictWriter(out, columns, extrasaction="ignore", lineterminator="\n")
+    writer = csv.DictWriter(out, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return out.getvalue()

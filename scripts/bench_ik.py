@@ -2,7 +2,7 @@
 --iterations 4 8``.
 """
 
-from mjstack.bench.cli import bench_ik
+from mjstack.bench.cli import main
 
 if __name__ == "__main__":
-    bench_ik()
+    main("ik")

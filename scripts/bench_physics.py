@@ -2,7 +2,7 @@
 robot=so101 nworld=2048``.
 """
 
-from mjstack.bench.cli import bench_physics
+from mjstack.bench.cli import main
 
 if __name__ == "__main__":
-    bench_physics()
+    main("physics")

@@ -13,6 +13,7 @@ import torch
 
 from mjstack.episodes.context import RunContext
 from mjstack.jobs.demonstration import Played, StepRecorder
+from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation
 
 LAYOUT = {
@@ -40,13 +41,9 @@ def fake_demonstrations(
             world.
     """
 
-    def play(
-        context: RunContext,
-        sim: Simulation,
-        seed: int,
-        values: torch.Tensor,
-        worlds: int,
-    ) -> Played:
+    def play(context: RunContext, sim: Simulation, seed: int) -> Played:
+        worlds = sim.nworld
+        values = torch.zeros((build_phases(context.cfg)[-1].stop, worlds, sum(LAYOUT.values())))
         for world in range(worlds):
             values[:, world] = 1e-3 * seed + 1e-6 * world
             if noise:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import gc
-import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -18,7 +16,8 @@ from compositions import load_config
 from ik_arm import CUDA, DEVICES, Arm, results, tensors
 from test_robot_models import REPO, upstream
 
-from mjstack.bench.cli import bench_ik
+from mjstack.bench import cli
+from mjstack.bench.timing import Measurement
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.mink_ik import GraspIk
@@ -830,43 +829,29 @@ def test_a_cuda_graph_holds_it(arm: Arm, cuda: str, gain: float) -> None:
 
 
 @pytest.mark.full
-def test_the_benchmark_prints_a_table_and_writes_its_figures(
-    tmp_path: Path, capsys: pytest.CaptureFixture
+def test_the_benchmark_prints_a_table(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    out = tmp_path / "ik.json"
-    arguments = [
-        "sim.device=cpu",
-        "--nworld",
-        "8",
-        "--iterations",
-        "4",
-        "8",
-        "--repetitions",
-        "2",
-        "--out",
-        str(out),
-    ]
-    bench_ik(arguments)
+    measure = cli.ik.measure_solve
+    results = []
+
+    def kept(*args: object, **kwargs: object) -> Measurement:
+        results.append(measure(*args, **kwargs))  # type: ignore[arg-type]
+        return results[-1]
+
+    monkeypatch.setattr(cli.ik, "measure_solve", kept)
+    small = ["sim.device=cpu", "--nworld", "8", "--repetitions", "2"]
+    cli.main("ik", [*small, "--iterations", "4", "8"])
     assert "SO-101, cpu" in capsys.readouterr().out
-    results = json.loads(out.read_text())["results"]
-    assert [(r["facts"]["iterations"], r["facts"]["gained"]) for r in results] == [
-        (4, False),
-        (4, True),
-        (8, False),
-        (8, True),
-    ]
+    cases = [(r.facts["iterations"], r.facts["gained"]) for r in results]
+    assert cases == [(4, False), (4, True), (8, False), (8, True)]
     for result in results:
-        assert list(result["samples"]) == ["eager_ms"]
-        assert len(result["samples"]["eager_ms"]) == 2
-        assert min(result["samples"]["eager_ms"]) > 0.0
-    assert results[2]["facts"]["reached"] == 1.0
-    for bad in (
-        ["--repetitions", "0"],
-        ["--nworld", "0"],
-        ["--iterations", "3"],
-        ["--out", str(tmp_path / "no" / "file")],
-    ):
+        assert list(result.samples) == ["eager_ms"]
+        assert len(result.samples["eager_ms"]) == 2
+        assert min(result.samples["eager_ms"]) > 0.0
+    assert results[2].facts["reached"] == 1.0
+    for bad in (["--repetitions", "0"], ["--nworld", "0"], ["--iterations", "3"]):
         with pytest.raises(SystemExit) as caught:
-            bench_ik(["sim.device=cpu", "--nworld", "2", *bad])
+            cli.main("ik", ["sim.device=cpu", "--nworld", "2", *bad])
         assert caught.value.code == 2
         assert capsys.readouterr().err.count("\n") == 1

@@ -27,10 +27,9 @@ from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetWriter, lerobot
 from mjstack.envs import build_env, demonstration_config
 from mjstack.episodes.context import RunContext, Stage
-from mjstack.errors import DatasetError, UnwrittenError
-from mjstack.jobs import collect_record, collection, demonstration_spec
-from mjstack.jobs.collect_record import FILE
-from mjstack.jobs.collection import Collection, CollectPlan
+from mjstack.errors import UnwrittenError
+from mjstack.jobs import collection, demonstration_spec
+from mjstack.jobs.collection import FILE, Collection, CollectPlan
 from mjstack.jobs.demonstration import play_demonstrations
 from mjstack.jobs.runner import run_provenance
 from mjstack.report.record import GateResult, Status
@@ -222,9 +221,9 @@ def test_ctrl_c_after_ctrl_c(tmp_path: Path) -> None:
     played = []
     play = fake_demonstrations(some_fail, noise=True)
 
-    def told(context: Any, sim: Any, seed: int, values: torch.Tensor, worlds: int) -> Any:
-        played.append((seed, worlds))
-        return play(context, sim, seed, values, worlds)
+    def told(context: Any, sim: Any, seed: int) -> Any:
+        played.append((seed, sim.nworld))
+        return play(context, sim, seed)
 
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(collection, "play_demonstrations", told)
@@ -320,21 +319,21 @@ def test_no_room_for_the_notes(
     call: int, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither before a batch's episodes nor after them."""
-    write = collect_record.write_atomic
+    write = collection.write_atomic
     calls = []
 
     def full(path: Path, content: str) -> None:
-        calls.append(path)
+        calls.append(path.name)
         if len(calls) >= call:
             raise OSError(28, "No space left on device")
         write(path, content)
 
     playing = collection_at(tmp_path, keep_failures=whole["keep_failures"])
     with monkeypatch.context() as context:
-        context.setattr(collect_record, "write_atomic", full)
-        with pytest.raises(UnwrittenError, match=rf"{FILE}: cannot be written"):
+        context.setattr(collection, "write_atomic", full)
+        with pytest.raises(OSError, match="No space left on device"):
             playing.play()
-    assert len(calls) == call + 1  # it is tried once more on the way out
+    assert calls == [FILE] * (call + 1)  # it is tried once more on the way out
     assert_same(
         left_in(tmp_path, collect(tmp_path, keep_failures=whole["keep_failures"])), whole["left"]
     )
@@ -403,10 +402,7 @@ def test_notes_that_were_removed(tmp_path: Path) -> None:
     assert found[:3] == [(0, 0), (0, 2), (0, 3)]
     assert [seed for seed, _ in found[3:]] == [1] * 6 + [2]
     assert result.metrics["episodes_without_note"] == 3
-    assert (
-        "; 3 episodes are of seeds that batches.json does not have, and in no success rate"
-        in result.reason
-    )
+    assert "; 3 episodes are of seeds that batches.json does not have" in result.reason
     assert (result.metrics["worlds_played"], result.metrics["succeeded"]) == (10, 7)
 
 
@@ -422,27 +418,6 @@ def test_a_dataset_that_was_removed(tmp_path: Path) -> None:
 @pytest.fixture
 def _in_tmp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.mark.usefixtures("_in_tmp")
-def test_notes_of_other_episodes_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    home = Path("demos")
-    collect(home)
-    notes = json.loads((home / FILE).read_text())
-    notes[1]["kept"] = 9
-    (home / FILE).write_text(json.dumps(notes))
-    before = {path: path.read_bytes() for path in home.rglob("*") if path.is_file()}
-    assert run([*COMMAND, "job.folder=demos", "nworld=9", "job.episodes=11"]) == 2
-    assert (
-        capsys.readouterr().err.strip()
-        == "mjstack: demos/batches.json has 9 episodes of seed 1, expected 3 as in the dataset."
-        " Restore what was changed. Or: remove batches.json: the dataset stands, and the"
-        " expert's success rate is counted from then on."
-    )
-    assert {path: path.read_bytes() for path in home.rglob("*") if path.is_file()} == before
-    with pytest.raises(DatasetError, match="has 9 episodes of seed 1"):
-        collection_at(home).play()
-    assert {path: path.read_bytes() for path in home.rglob("*") if path.is_file()} == before
 
 
 def test_real_worlds_are_the_same_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

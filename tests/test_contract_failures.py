@@ -14,6 +14,7 @@ from check_cases import rules_of
 from comparison import assert_same_run
 from environments import at_double_speed
 
+from mjstack.config import Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes import context as gate_module
@@ -21,8 +22,9 @@ from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Episode, Hook, play_episode
 from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import run_capacity
+from mjstack.gates.runner import run_guarded
 from mjstack.gates.throughput import run_throughput
-from mjstack.report.record import Status
+from mjstack.report.record import GateResult, Status
 from mjstack.sim import Overflow, Simulation
 from mjstack.tasks.check import make_check
 
@@ -229,3 +231,24 @@ def test_batch_gate_refuses_identical_worlds(new_context: Callable[..., RunConte
     assert batch.status is Status.failed
     assert batch.metrics["distinct_final_states"] == 1
     assert "reset=jitter" in batch.reason
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("Unable to allocate 9 GiB"),
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9 GiB"),
+        RuntimeError("Failed to allocate 99 bytes on device 'cuda:0'"),
+        RuntimeError(
+            "[enforce fail at alloc_cpu.cpp:118] DefaultCPUAllocator: can't allocate memory: you"
+            " tried to"
+        ),
+    ],
+)
+def test_memory_that_runs_out_is_said(error: Exception, so101_cfg: Config) -> None:
+    def gate(context: RunContext) -> list[GateResult]:
+        raise error
+
+    (result,) = run_guarded(RunContext(cfg=so101_cfg), "batch", gate)
+    assert result.status is Status.failed
+    assert result.reason.startswith(f"out of memory ({error}). Run fewer worlds")

@@ -109,7 +109,7 @@ def test_third_party_packages_have_one_home() -> None:
 
 
 OF_TASKS = re.compile(r"(.*_)?(red|blue)(_.*)?|xy_err.*|slot_err.*|dz_m|'(stack|reach)'")
-COLORS = {"jobs/result.py": "red"}  # of the terminal
+COLORS = {"jobs/progress.py": "red"}  # of the terminal
 
 
 def words(path: Path) -> Iterator[tuple[int, str]]:

@@ -397,7 +397,7 @@ def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
 
 def level(cfg: Config, reached: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> ReachLevel:
     x, y = np.meshgrid(*reachability.axes(cfg))
-    tilt = np.where(reached(x, y), 0.3, np.nan)
+    tilt = np.where(reached(x, y), 17.0, np.nan)
     return ReachLevel(
         name="grasp", height=0.0, gripper="open", residual=np.zeros_like(tilt), tilt=tilt
     )
@@ -414,7 +414,7 @@ def test_regions_stay_inside_what_is_reached() -> None:
     assert 0.0 <= 0.07 - region.largest[0] <= 0.005
     assert 0.0 <= 0.08 - region.largest[1] <= 0.005
     assert region.reached
-    assert region.tilt == pytest.approx(0.3)
+    assert region.tilt == 17.0
     near = level(cfg, lambda x, y: x <= x0 + 0.055)
     assert not find_region(cfg, [half_plane, near], "red").reached
     island = find_region(cfg, [level(cfg, lambda x, y: x < x0 - 0.05)], "red")
@@ -474,11 +474,9 @@ def test_the_job_leaves_a_map(
         distance = float(reach.solve(point).distance[0])
         assert (row["grasp_reached"] == "1") is (distance <= 5e-4)
         assert float(row["grasp_residual_m"]) == pytest.approx(distance, rel=0.01, abs=2e-6)
-        assert (row["grasp_tilt_deg"] != "") is (row["grasp_reached"] == "1")
-    held = np.load(tmp_path / "reachability.npz")
-    assert held["reached"].shape == (3, len(held["y_m"]), len(held["x_m"]))
-    assert int(held["reached"][0].sum()) == sum(row["grasp_reached"] == "1" for row in rows)
-    assert gates["grasp"]["metrics"]["reached_fraction"] == pytest.approx(held["reached"][0].mean())
+        assert (row["grasp_tilt_deg"] != "nan") is (row["grasp_reached"] == "1")
+    share = np.mean([row["grasp_reached"] == "1" for row in rows])
+    assert gates["grasp"]["metrics"]["reached_fraction"] == pytest.approx(share)
     text = (tmp_path / "reachability.md").read_text()
     assert "| red | (" in text
     assert "![reachability.png](reachability.png)" in text

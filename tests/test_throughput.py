@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,8 +18,8 @@ from environments import at_double_speed
 from mjstack.bench import cli, env_step, episode, physics, power
 from mjstack.bench.env_step import measure_env_step
 from mjstack.bench.power import EnergyMeter
-from mjstack.bench.timing import Measurement, capture_problem, steps_that_fit, timed
-from mjstack.config.schema import GraphMode
+from mjstack.bench.timing import Measurement, steps_that_fit, timed
+from mjstack.config.schema import Config, GraphMode
 from mjstack.envs import Env, build_env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import State
@@ -172,8 +170,12 @@ def test_warm_up_and_capture_are_apart_on_mjwarp(new_context: Callable[..., RunC
 def test_eager_work_is_void_where_it_should_be_captured(
     device: str, mode: GraphMode, captured: bool, void: bool
 ) -> None:
-    sim: Any = SimpleNamespace(device=torch.device(device))
-    assert bool(capture_problem(sim, mode, captured)) is void
+    sim: Any = SimpleNamespace(device=torch.device(device), graph_of=lambda *_, **__: None)
+    cfg: Any = SimpleNamespace(graph=mode, timing=SimpleNamespace(decimation=10))
+    measured = Measurement(name="m")
+    measured.add_capture(sim, cfg, captured, [])
+    assert bool(measured.problem) is void
+    assert measured.facts == {"warm_up_s": 0.0, "capture_s": 0.0, "captured": captured}
 
 
 @pytest.mark.full
@@ -286,7 +288,7 @@ def test_broken_measurement_leaves_the_others(
     )
     assert result.status is Status.failed
     assert (
-        "env_step: no figure: MemoryError: Unable to allocate 9 GiB (run.log has the traceback)"
+        "env_step: no figure: out of memory (Unable to allocate 9 GiB). Run fewer worlds"
         in result.reason
     )
     assert speeds(result, "env_step") == []
@@ -373,27 +375,6 @@ def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., RunCo
     assert speeds(result, "physics") == []
 
 
-class Witness:
-    """A baseline that only looks: where the physics under the recorded commands ends."""
-
-    def __init__(self, sim: Simulation) -> None:
-        self.sim = sim
-        self.ends = []
-        self.steps = 0
-
-    def begin(self) -> None:
-        self.steps = 0
-
-    def record(self) -> None:
-        self.steps += 1
-
-    def play(self) -> None:
-        pass
-
-    def check(self) -> None:
-        self.ends.append((self.steps, self.sim.qpos.clone()))
-
-
 @pytest.mark.full
 def test_the_parts_play_one_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Physics alone ends where the whole step ended, except in worlds that were reset meanwhile, of
@@ -409,25 +390,33 @@ def test_the_parts_play_one_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
         return wholes[-1][0]
 
     monkeypatch.setattr(env_step, "snapshot", keep)
-    witness = Witness(env.sim)
-    times = measure_env_step(env, steps=4, repetitions=3, baseline=witness)
+    ends = []  # of physics alone
+    lost = env_step.lost_worlds
+
+    def look(sim: Simulation, steps: int) -> torch.Tensor:
+        ends.append((steps, sim.qpos.clone()))
+        return lost(sim, steps)
+
+    monkeypatch.setattr(env_step, "lost_worlds", look)
+    times = measure_env_step(env, steps=4, repetitions=3)
     figures = times.samples
     names = ("ms_per_env_step", "physics_ms_per_step", "managers_ms_per_step")
     repetitions = list(zip(*(figures[name] for name in names), strict=True))
-    assert len(repetitions) == len(figures["baseline_over_physics"]) == 3
+    assert len(repetitions) == 3
     for number, (whole_ms, physics_ms, managers_ms) in enumerate(repetitions):
-        assert figures["managers_over_physics"][number] == whole_ms / physics_ms - 1.0
-        assert figures["managers_alone_over_physics"][number] == managers_ms / physics_ms
+        over, alone = whole_ms / physics_ms - 1.0, managers_ms / physics_ms
+        assert figures["managers_over_physics"][number] == pytest.approx(over)
+        assert figures["managers_alone_over_physics"][number] == pytest.approx(alone)
         residual = figures["residual_ms_per_step"][number]
         assert residual + physics_ms + managers_ms == pytest.approx(whole_ms)
     assert times.problem == ""
     ended = 0
     for (_, before), (whole, after), (steps, alone) in zip(
-        wholes[:-1], wholes[1:], witness.ends, strict=True
+        wholes[:-1], wholes[1:], ends, strict=True
     ):
         same = (before == after).numpy()
         ended += int((after - before).sum())
-        assert steps == 4
+        assert steps == 4 * cfg.timing.decimation
         assert same.any()
         assert np.array_equal(whole.qpos[same], alone.numpy()[same])
         assert not np.array_equal(whole.qpos[~same], alone.numpy()[~same])
@@ -527,41 +516,37 @@ def test_missing_power_says_why(
     assert why in text
 
 
-@pytest.mark.parametrize(
-    "args", [["--steps", "0"], ["--many", "3", "0"], ["--out", "/nowhere/at/all.json"]]
-)
+@pytest.mark.parametrize("args", [["--steps", "0"], ["--many", "3", "0"]])
 def test_bad_options_of_a_benchmark_are_one_line(
-    args: list[str], capsys: pytest.CaptureFixture[str]
+    args: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def never(*_: object) -> Any:
         raise AssertionError("started")
 
+    numbers: cli.Numbers = {"steps": (10, "steps"), "many": ([1], "numbers")}
+    monkeypatch.setitem(cli.BENCHMARKS, "mine", (never, "text", numbers))
     with pytest.raises(SystemExit) as stopped:
-        cli._main("text", {"steps": (10, "steps"), "many": ([1], "numbers")}, never, args)
+        cli.main("mine", args)
     assert stopped.value.code == 2
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
     assert err.startswith(f"mjstack: {args[0]}=")
 
 
-def test_a_benchmark_prints_its_table_and_keeps_its_figures(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_benchmark_prints_its_table(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def work(args: argparse.Namespace, progress: Callable[[str], None]) -> tuple[Table, object]:
+    def work(args: argparse.Namespace, cfg: Config, progress: Callable[[str], None]) -> Table:
         progress("working")
-        table = Table(title="T", header=["steps", "overrides"], rows=[[str(args.steps), "a|b"]])
-        return table, {"overrides": args.overrides, "many": args.many_numbers}
+        row = [str(args.steps), f"{cfg.robot.name}|{cfg.nworld}", str(args.many_numbers)]
+        return Table(title="T", header=["steps", "robot", "many"], rows=[row])
 
-    numbers: dict[str, tuple[int | list[int], str]] = {
-        "steps": (10, "steps"),
-        "many-numbers": ([1, 2], "numbers"),
-    }
-    out = tmp_path / "figures.json"
-    cli._main("text", numbers, work, ["robot=rebot", "--steps", "3", "--out", str(out)])
-    assert "a|b" in capsys.readouterr().out
-    data = json.loads(out.read_text())
-    assert data["results"] == {"overrides": ["robot=rebot"], "many": [1, 2]}
-    assert data["versions"]["mujoco"]
+    numbers: cli.Numbers = {"steps": (10, "steps"), "many-numbers": ([1, 2], "numbers")}
+    monkeypatch.setitem(cli.BENCHMARKS, "mine", (work, "text", numbers))
+    cli.main("mine", ["robot=rebot", "--steps", "3"])
+    out = capsys.readouterr().out
+    for cell in ("3", "rebot|256", "[1, 2]"):
+        assert f" {cell} " in out
 
 
 @pytest.mark.full

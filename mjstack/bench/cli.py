@@ -1,121 +1,67 @@
-"""Command lines of the benchmark scripts: one harness, and what each measures."""
+"""Command lines of the benchmark scripts: one harness, and the measurements of each."""
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import statistics
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
-from pathlib import Path
+from collections.abc import Callable, Sequence
 
+import numpy as np
 from rich.console import Console
 
 from mjstack.bench import env_step, ik, physics
-from mjstack.bench.baseline import RolloutBaseline
 from mjstack.bench.timing import Measurement
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import build_env
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.report.provenance import collect_provenance
 from mjstack.report.table import Table
 from mjstack.sim import resolve_device
 
 Progress = Callable[[str], None]
-Work = Callable[[argparse.Namespace, Progress], tuple[Table, object]]
+Work = Callable[[argparse.Namespace, Config, Progress], Table]
 
 
-def bench_env_step(argv: Sequence[str] | None = None) -> None:
-    """Entry point of scripts/bench_env_step.py."""
-    numbers = {
-        "steps": (10, "control steps per repetition"),
-        "repetitions": (9, "measured repetitions"),
-        "cpu-nworld": (64, "most worlds of MJWarp where it has no GPU"),
-    }
-    _main(env_step.__doc__, numbers, _env_step, argv)
-
-
-def bench_physics(argv: Sequence[str] | None = None) -> None:
-    """Entry point of scripts/bench_physics.py."""
-    numbers = {
-        "steps": (20, "control steps per repetition"),
-        "repetitions": (5, "measured repetitions"),
-    }
-    _main(physics.measure_arrangements.__doc__, numbers, _physics, argv)
-
-
-def bench_ik(argv: Sequence[str] | None = None) -> None:
-    """Entry point of scripts/bench_ik.py."""
-    numbers: dict[str, tuple[int | list[int], str]] = {
-        "nworld": ([256, 2048, 8192], "numbers of worlds"),
-        "iterations": ([4, 8, 16, 40], "iterations per solve"),
-        "block-dim": ([32], "CUDA threads per block"),
-        "repetitions": (20, f"measurements of {ik.SOLVES} solves each"),
-    }
-    _main(ik.__doc__, numbers, _ik, argv)
-
-
-def _main(
-    description: str | None,
-    numbers: Mapping[str, tuple[int | list[int], str]],
-    work: Work,
-    argv: Sequence[str] | None,
-) -> None:
-    """Parse a command line, do the work, print its table and write its figures.
+def main(name: str, argv: Sequence[str] | None = None) -> None:
+    """Run a benchmark from its command line, and print its table.
 
     Args:
-        description: Text of ``--help``.
-        numbers: Options that are integers of at least 1, or lists of them: default and help.
-        work: Measures; gets the arguments and a function that shows progress.
+        name: Of the benchmark in `BENCHMARKS`.
         argv: The command line, if not the process's.
     """
+    work, description, numbers = BENCHMARKS[name]
     parser = argparse.ArgumentParser(
         description=(description or "").partition("Args:")[0],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     help_text = "as for run.py, such as robot=rebot nworld=1024 (default nworld=256)"
     parser.add_argument("overrides", nargs="*", help=help_text)
-    for name, (default, text) in numbers.items():
+    for option, (default, text) in numbers.items():
         many = "+" if isinstance(default, list) else None
-        shown = " ".join(map(str, default)) if isinstance(default, list) else default
-        parser.add_argument(
-            f"--{name}", type=int, nargs=many, default=default, help=f"{text} ({shown})"
-        )
-    parser.add_argument("--out", type=Path, help="also write the figures to this JSON file")
+        shown = f"{text} (%(default)s)"
+        parser.add_argument(f"--{option}", type=int, nargs=many, default=default, help=shown)
     args = parser.parse_args(argv)
-    console = Console(soft_wrap=True)
     try:
-        for name in numbers:
-            value = getattr(args, name.replace("-", "_"))
-            if min(value if isinstance(value, list) else [value]) < 1:
-                raise ConfigError(f"--{name}", value, "an integer of at least 1")
-        if args.out is not None and not args.out.absolute().parent.is_dir():
-            raise ConfigError("--out", args.out, "a file in a folder that exists")
+        for option in numbers:
+            value = getattr(args, option.replace("-", "_"))
+            if np.min(value) < 1:
+                raise ConfigError(f"--{option}", value, "an integer of at least 1")
+        console = Console(soft_wrap=True)
+        cfg = load_config(["nworld=256", *args.overrides])
         with console.status("preparing") as status:
-            table, results = work(args, status.update)
+            table = work(args, cfg, status.update)
     except MjstackError as error:
         Console(stderr=True, soft_wrap=True, markup=False).print(f"mjstack: {error}")
         raise SystemExit(error.exit_code) from error
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     console.print(table.to_console())
-    if args.out is not None:
-        provenance = collect_provenance(config_yaml="", model_text="", device="", driver="")
-        data = {"command": sys.argv, "versions": provenance["versions"], "results": results}
-        args.out.write_text(json.dumps(data, indent=2) + "\n")
 
 
-def _config(args: argparse.Namespace) -> Config:
-    return load_config(["nworld=256", *args.overrides])
-
-
-def _env_step(args: argparse.Namespace, progress: Progress) -> tuple[Table, object]:
-    """``env.step`` on both backends; native MuJoCo beside ``mujoco.rollout``."""
-    cfg = _config(args)
+def _env_step(args: argparse.Namespace, cfg: Config, progress: Progress) -> Table:
+    """``env.step`` on both backends."""
     results = {}
     for backend in (Backend.native, Backend.mjwarp):
         device = "cpu" if backend is Backend.native else resolve_device(cfg.sim.device)
@@ -123,13 +69,10 @@ def _env_step(args: argparse.Namespace, progress: Progress) -> tuple[Table, obje
         nworld = min(cfg.nworld, args.cpu_nworld) if slow else cfg.nworld
         env = build_env(cfg, nworld=nworld, backend=backend, device=device)
         title = f"{env.sim.description}, {nworld} worlds"
-        # mujoco.rollout has one model for all worlds.
-        plain = backend is Backend.native and not env.sim.fields
         result = env_step.measure_env_step(
             env,
             steps=args.steps,
             repetitions=args.repetitions,
-            baseline=RolloutBaseline(env) if plain else None,
             progress=lambda done, title=title: progress(  # type: ignore[misc]
                 f"{title}: repetition {done} of {args.repetitions}"
             ),
@@ -149,12 +92,11 @@ def _env_step(args: argparse.Namespace, progress: Progress) -> tuple[Table, obje
     )
     ended = [str(r.facts["episodes_ended"]) for r in results.values()]
     table.rows.append(["episodes that ended and were reset", *ended])
-    return table, [asdict(result) | {"backend": name} for name, result in results.items()]
+    return table
 
 
-def _physics(args: argparse.Namespace, progress: Progress) -> tuple[Table, object]:
+def _physics(args: argparse.Namespace, cfg: Config, progress: Progress) -> Table:
     """The captured physics step in each arrangement."""
-    cfg = _config(args)
     progress("playing the task up to the grasp")
     times = physics.measure_arrangements(
         RunContext(cfg=cfg),
@@ -163,7 +105,7 @@ def _physics(args: argparse.Namespace, progress: Progress) -> tuple[Table, objec
         progress=lambda done: progress(f"repetition {done} of {args.repetitions}"),
     )
     bare = times[physics.BARE]
-    table = Table(
+    return Table(
         title=(
             f"a captured physics step: {cfg.robot.title}, {cfg.nworld:,} worlds, from"
             f" {cfg.gate.throughput.from_phase}"
@@ -174,12 +116,10 @@ def _physics(args: argparse.Namespace, progress: Progress) -> tuple[Table, objec
             for name, ms in times.items()
         ],
     )
-    return table, {"ms_per_step": times}
 
 
-def _ik(args: argparse.Namespace, progress: Progress) -> tuple[Table, object]:
+def _ik(args: argparse.Namespace, cfg: Config, progress: Progress) -> Table:
     """Batched inverse kinematics, in every combination of the options."""
-    cfg = _config(args)
     device = resolve_device(cfg.sim.device)
     cases = list(itertools.product(args.nworld, args.iterations, args.block_dim, (False, True)))
     results = []
@@ -206,7 +146,7 @@ def _ik(args: argparse.Namespace, progress: Progress) -> tuple[Table, object]:
         "gains": lambda r: f"{ik.GAIN if r.facts['gained'] else 0.0}",
     }
     title = f"BatchedIk.solve: {cfg.robot.title}, {device}"
-    return Table.of(title, columns, results), [asdict(result) for result in results]
+    return Table.of(title, columns, results)
 
 
 def _spread(values: list[float] | None) -> str:
@@ -214,3 +154,36 @@ def _spread(values: list[float] | None) -> str:
     if not values:
         return "-"
     return f"{statistics.median(values):.4g} ({min(values):.4g} to {max(values):.4g})"
+
+
+Numbers = dict[str, tuple[int | list[int], str]]
+_STEPS = "control steps per repetition"
+_REPETITIONS = "measured repetitions"
+BENCHMARKS: dict[str, tuple[Work, str | None, Numbers]] = {
+    "env_step": (
+        _env_step,
+        env_step.__doc__,
+        {
+            "steps": (10, _STEPS),
+            "repetitions": (9, _REPETITIONS),
+            "cpu-nworld": (64, "most worlds of MJWarp where it has no GPU"),
+        },
+    ),
+    "physics": (
+        _physics,
+        physics.measure_arrangements.__doc__,
+        {"steps": (20, _STEPS), "repetitions": (5, _REPETITIONS)},
+    ),
+    "ik": (
+        _ik,
+        ik.__doc__,
+        {
+            "nworld": ([256, 2048, 8192], "numbers of worlds"),
+            "iterations": ([4, 8, 16, 40], "iterations per solve"),
+            "block-dim": ([32], "CUDA threads per block"),
+            "repetitions": (20, f"measurements of {ik.SOLVES} solves each"),
+        },
+    ),
+}
+"""By name: what measures, text of ``--help``, and options that are integers of at least 1, or lists
+of them, with default and help."""

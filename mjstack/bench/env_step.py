@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Protocol
 
 import torch
 
@@ -27,8 +26,6 @@ from mjstack.bench.power import EnergyMeter
 from mjstack.bench.timing import (
     WARM_UP,
     Measurement,
-    capture_facts,
-    capture_problem,
     describe_lost,
     lost_worlds,
     steps_that_fit,
@@ -41,29 +38,12 @@ from mjstack.managers.term import resolve_func
 _COST = 4.0  # of a repetition over that of its whole steps from the start, when fewer things touch
 
 
-class Baseline(Protocol):
-    """Other code that plays a repetition's physics, to be timed beside it."""
-
-    def begin(self) -> None:
-        """Take the simulation's state as the start."""
-
-    def record(self) -> None:
-        """Record the joint targets and the state before a step."""
-
-    def play(self) -> None:
-        """Play the steps; this is timed."""
-
-    def check(self) -> None:
-        """Raise unless it ended where the simulation did."""
-
-
 def measure_env_step(
     env: Env,
     *,
     steps: int,
     repetitions: int,
     max_seconds: float | None = None,
-    baseline: Baseline | None = None,
     meter: EnergyMeter | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Measurement:
@@ -74,28 +54,25 @@ def measure_env_step(
         steps: Control steps per repetition.
         repetitions: Measured repetitions; one before them warms up.
         max_seconds: Shortens the repetitions so that all of them take about this long [s].
-        baseline: Timed beside the physics.
         meter: Measures the energy of the whole steps.
         progress: Gets the number of repetitions done.
 
     Returns:
         Samples of the whole step (``ms_per_env_step``), its physics and its managers.
-        ``managers_over_physics`` is the whole's time over that of physics, less 1;
-        ``baseline_over_physics`` is there where a baseline is.
+        ``managers_over_physics`` is the whole's time over that of physics, less 1.
 
     Raises:
         FaultError: Physics was lost.
     """
     sim = env.sim
     decimation = env.cfg.timing.decimation
-    parts = _Parts(env, baseline)
+    parts = _Parts(env)
     step_seconds = parts.warm_up()
     if max_seconds is not None:
         steps = steps_that_fit(steps, max_seconds, _COST * (repetitions + 1) * step_seconds)
-    graph = env.graph if parts.on_cuda else sim.graph_of(decimation, kinematics=True)
 
     # The repetitions
-    times: dict[str, list[float]] = {}
+    times: list[tuple[float, float, float]] = []
     ended = 0.0
     if meter is not None:
         meter.clear()
@@ -104,44 +81,33 @@ def measure_env_step(
         start, seconds, episodes = parts.play(start, steps, meter if repetition else None)
         if repetition:  # the first one warms up
             ended += episodes
-            for part, spent in seconds.items():
-                times.setdefault(part, []).append(spent)
+            times.append(seconds)
             if progress is not None:
                 progress(repetition)
 
     # The result
     out = Measurement(name="env_step")
-    out.add_env_rates(times["env"], env.nworld, steps)
-    out.add_rates(times["env"], env.nworld, steps, decimation=decimation)
-    env_ms, physics_ms, managers_ms, *others = (
-        [1e3 * s / steps for s in spent] for spent in times.values()
-    )
-    pairs = list(zip(env_ms, physics_ms, managers_ms, strict=True))
+    whole = [env_seconds for env_seconds, _, _ in times]
+    out.add_env_rates(whole, env.nworld, steps)
+    out.add_rates(whole, env.nworld, steps, decimation=decimation)
+    ms = 1e3 / steps
     out.samples |= {
-        "physics_ms_per_step": physics_ms,
-        "managers_ms_per_step": managers_ms,
-        "managers_over_physics": [e / p - 1.0 for e, p, _ in pairs],
-        "managers_alone_over_physics": [m / p for _, p, m in pairs],
-        "residual_ms_per_step": [e - p - m for e, p, m in pairs],
+        "physics_ms_per_step": [ms * p for _, p, _ in times],
+        "managers_ms_per_step": [ms * m for _, _, m in times],
+        "managers_over_physics": [e / p - 1.0 for e, p, _ in times],
+        "managers_alone_over_physics": [m / p for _, p, m in times],
+        "residual_ms_per_step": [ms * (e - p - m) for e, p, m in times],
     }
-    if others:
-        out.samples["baseline_over_physics"] = [
-            b / p for b, p in zip(others[0], physics_ms, strict=True)
-        ]
-    captured = env.graph.captured and parts.captured
-    out.facts = {
+    out.facts |= {
         "steps_per_repetition": steps,
         "repetitions": repetitions,
         "episodes_ended": int(ended),
-        "warm_up_s": 0.0 if graph is None else graph.warm_up_seconds,
-        "capture_s": 0.0 if graph is None else graph.capture_seconds,
-        "captured": captured,
     }
-    out.facts |= capture_facts(sim, decimation)
+    graph = env.graph if parts.on_cuda else sim.graph_of(decimation, kinematics=True)
+    captured = env.graph.captured and parts.captured
+    out.add_capture(sim, env.cfg, captured, [] if graph is None else [graph])
     out.add_resources(sim, meter)
-    out.problem = (
-        describe_lost(parts.lost) or parts.problem or capture_problem(sim, env.cfg.graph, captured)
-    )
+    out.problem = describe_lost(parts.lost) or parts.problem or out.problem
     out.headline = (
         f"{out.median('env_steps_per_s'):,.0f} env-steps/s, managers"
         f" {100.0 * out.median('managers_over_physics'):+.1f} % (alone"
@@ -158,11 +124,10 @@ class _Parts:
         problem: The terminations by which physics was lost in the whole steps; empty where none.
     """
 
-    def __init__(self, env: Env, baseline: Baseline | None) -> None:
+    def __init__(self, env: Env) -> None:
         """Prepare random actions, with a generator that no one else uses."""
         manager = env.action_manager
         self._env = env
-        self._baseline = baseline
         self._generator = torch.Generator().manual_seed(0)
         self._low = manager.low.float().cpu()
         self._span = manager.high.float().cpu() - self._low
@@ -191,12 +156,12 @@ class _Parts:
 
     def play(
         self, start: State, steps: int, meter: EnergyMeter | None
-    ) -> tuple[State, dict[str, float], float]:
+    ) -> tuple[State, tuple[float, float, float], float]:
         """Play one repetition.
 
         Returns:
-            The state after the whole steps; seconds of env, physics, managers and baseline; and
-            the number of episodes that ended.
+            The state after the whole steps; seconds of env, physics and managers; and the number
+            of episodes that ended.
         """
         env = self._env
         sim = env.sim
@@ -207,7 +172,7 @@ class _Parts:
         # The whole step
         restore(sim, start)
         env.read_statistics()
-        seconds = {"env": timed(sim, lambda: self._whole(actions, targets), meter)}
+        whole = timed(sim, lambda: self._whole(actions, targets), meter)
         counted = env.read_statistics()
         self._find_losses(counted)
         end = snapshot(sim)
@@ -215,21 +180,16 @@ class _Parts:
 
         # Physics alone, with the same joint targets
         restore(sim, start)
-        if self._baseline is not None:
-            baseline = self._play_baseline(self._baseline, targets)
-            restore(sim, start)
-        seconds["physics"] = timed(sim, lambda: self._physics(targets))
+        physics = timed(sim, lambda: self._physics(targets))
         self.lost |= lost_worlds(sim, steps * env.cfg.timing.decimation)
 
         # The managers alone
         restore(sim, start)
         self._set_ages(*ages)
-        seconds["managers"] = timed(sim, lambda: self._managers(actions))
+        managers = timed(sim, lambda: self._managers(actions))
         env.raise_faults()
         self._set_ages(*later_ages)
-        if self._baseline is not None:
-            seconds["baseline"] = baseline
-        return end, seconds, counted["episodes"]
+        return end, (whole, physics, managers), counted["episodes"]
 
     def _actions(self, count: int) -> list[torch.Tensor]:
         shape = (count, self._env.nworld, len(self._span))
@@ -251,18 +211,6 @@ class _Parts:
         for action in actions:
             self._env.action_manager.process(action)
             self._halves.managers()
-
-    def _play_baseline(self, baseline: Baseline, targets: list[torch.Tensor]) -> float:
-        """The baseline's seconds, with the joint targets of this repetition."""
-        sim = self._env.sim
-        baseline.begin()
-        for target in targets:
-            sim.ctrl.copy_(target)
-            baseline.record()
-            sim.step(self._env.cfg.timing.decimation)
-        seconds = timed(sim, baseline.play)
-        baseline.check()
-        return seconds
 
     def _ages(self) -> tuple[torch.Tensor, torch.Tensor]:
         return self._env.episode_step.clone(), self._env.episode.clone()

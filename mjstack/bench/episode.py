@@ -11,8 +11,6 @@ from mjstack.bench.power import EnergyMeter, EnergyObserver
 from mjstack.bench.timing import (
     WARM_UP,
     Measurement,
-    capture_facts,
-    capture_problem,
     lost_worlds,
 )
 from mjstack.config.schema import GraphMode
@@ -85,7 +83,6 @@ def measure_episode(
         return out
 
     # The result
-    captured = all(p.captured for p in played)
     failed = sorted({world for p in played for world in p.failed})
     times = [p.seconds for p in played]
     out.samples = {"seconds": times, **out.samples}
@@ -96,16 +93,10 @@ def measure_episode(
         "of_the_batch_gate": sum(p is before for p in played),
         "steps": steps,
         "succeeded": sim.nworld - len(failed),
-        # The most of all: where physics alone is captured, on Warp's CPU device, one episode does
-        # it for all.
-        "warm_up_s": max(p.warm_up_seconds for p in played),
-        "capture_s": max(p.capture_seconds for p in played),
-        "captured": captured,
     }
-    out.facts |= capture_facts(sim, cfg.timing.decimation)
+    out.add_capture(sim, cfg, all(p.captured for p in played), played)
     if any(p is not before for p in played):
         out.add_resources(sim, meter)
-    out.problem = out.problem or capture_problem(sim, cfg.graph, captured)
     out.headline = f"{statistics.median(times):.3g} s"
     if "bare_ratio" in out.samples:
         out.headline += f" ({out.median('bare_ratio'):.3f} x bare steps)"

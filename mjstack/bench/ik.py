@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -113,16 +114,12 @@ def _problem(cfg: Config, ik: BatchedIk) -> tuple[torch.Tensor, torch.Tensor]:
 
 def _time(work: Callable[[], None], device: str, repetitions: int) -> list[float]:
     """Milliseconds per solve of each repetition; one before them warms up."""
+    wait = partial(torch.cuda.synchronize, device) if device.startswith("cuda") else lambda: None
     times = []
     for _ in range(repetitions + 1):
-        _synchronize(device)
+        wait()
         began = time.perf_counter()
         work()
-        _synchronize(device)
+        wait()
         times.append(1e3 * (time.perf_counter() - began) / SOLVES)
     return times[1:]
-
-
-def _synchronize(device: str) -> None:
-    if device.startswith("cuda"):
-        torch.cuda.synchronize(device)

@@ -12,7 +12,6 @@ from mjstack.bench.power import EnergyMeter
 from mjstack.bench.timing import (
     WARM_UP,
     Measurement,
-    capture_problem,
     describe_lost,
     lost_worlds,
     steps_that_fit,
@@ -109,19 +108,17 @@ def measure_physics(
 
     # The result
     graph = sim.graph_of(held.decimation)
-    captured = graph is not None and graph.captured
     out.add_rates(times, sim.nworld, steps, decimation=held.decimation)
     out.facts |= {
         "steps_per_repetition": steps,
         "repetitions": repetitions,
-        "warm_up_s": 0.0 if graph is None else graph.warm_up_seconds,
-        "capture_s": 0.0 if graph is None else graph.capture_seconds,
-        "captured": captured,
         "peak_contacts_per_world": int(sim.peak_contacts.max()),
         "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
     }
+    captured = graph is not None and graph.captured
+    out.add_capture(sim, context.cfg, captured, [] if graph is None else [graph])
     out.add_resources(sim, meter)
-    out.problem = describe_lost(held.lost) or capture_problem(sim, context.cfg.graph, captured)
+    out.problem = describe_lost(held.lost) or out.problem
     out.headline = (
         f"{out.median('world_steps_per_s'):,.0f} world-steps/s,"
         f" {out.median('ms_per_batched_step'):.3g} ms per step of {sim.nworld} worlds"

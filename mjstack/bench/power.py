@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from collections.abc import Callable
+from functools import partial
 
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
@@ -28,9 +29,8 @@ class EnergyMeter:
         Args:
             device: ``cpu`` or ``cuda:N``.
         """
-        self._nvml: Any = None
-        self._handle: Any = None
-        self._began = self._read_first = 0.0
+        self._counter: Callable[[], float] = lambda: 0.0  # [mJ]
+        self._began = self._first = 0.0
         self.clear()
         self.reason = ""
         self._cpu = device == "cpu"
@@ -38,17 +38,16 @@ class EnergyMeter:
             return
         try:
             import pynvml
+
+            pynvml.nvmlInit()
+            handle = pynvml.nvmlDeviceGetHandleByUUID(cuda_uuid(device))
+            pynvml.nvmlDeviceGetTotalEnergyConsumption(handle)
         except ImportError:
             self.reason = "nvidia-ml-py is not installed: pip install 'mjstack[gpu]'"
-            return
-        try:
-            pynvml.nvmlInit()
-            self._handle = pynvml.nvmlDeviceGetHandleByUUID(cuda_uuid(device))
-            pynvml.nvmlDeviceGetTotalEnergyConsumption(self._handle)
         except pynvml.NVMLError as error:  # a part of a GPU, or an old one, has no counter
             self.reason = f"NVML: {error}"
-            return
-        self._nvml = pynvml
+        else:
+            self._counter = partial(pynvml.nvmlDeviceGetTotalEnergyConsumption, handle)
 
     def clear(self) -> None:
         """Clear what was added up."""
@@ -57,13 +56,13 @@ class EnergyMeter:
 
     def start(self) -> None:
         """Begin a stretch of work, the device idle."""
-        self._read_first = self._read()
+        self._first = self._counter()
         self._began = time.perf_counter()
 
     def stop(self) -> None:
-        """End it, the device idle again, and adds it."""
+        """End it, the device idle again, and add it."""
         self._seconds += time.perf_counter() - self._began
-        self._joules += self._read() - self._read_first
+        self._joules += 1e-3 * (self._counter() - self._first)
         self._stretches += 1
 
     @property
@@ -83,17 +82,6 @@ class EnergyMeter:
     def notes(self) -> dict[str, str]:
         """Why they are missing."""
         return {"gpu_power_mean_w": f"not measured: {self.missing}"} if self.missing else {}
-
-    def _read(self) -> float:
-        """The counter [J]; 0 where there is none."""
-        if self._nvml is None:
-            return 0.0
-        try:
-            return 1e-3 * float(self._nvml.nvmlDeviceGetTotalEnergyConsumption(self._handle))
-        except self._nvml.NVMLError as error:
-            self._nvml = None
-            self.reason = f"NVML: {error}"
-            return 0.0
 
 
 class EnergyObserver(Observer):

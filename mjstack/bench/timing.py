@@ -4,17 +4,30 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import torch
 
 from mjstack.bench.power import EnergyMeter
-from mjstack.config.schema import GraphMode
+from mjstack.config.schema import Config, GraphMode
 from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS, Simulation, device_memory
 
 WARM_UP = 3  # calls: eager, captured, replayed
+
+
+class Captured(Protocol):
+    """Work that is captured into a graph at its second call."""
+
+    @property
+    def warm_up_seconds(self) -> float:
+        """Wall time of the eager first call [s]."""
+
+    @property
+    def capture_seconds(self) -> float:
+        """Wall time of the capture alone [s]."""
 
 
 @dataclass(kw_only=True, slots=True)
@@ -78,6 +91,35 @@ class Measurement:
             self.facts["gpu_memory_arrays_mib"] = used[0] / 2**20
             self.facts["gpu_memory_whole_gpu_mib"] = used[1] / 2**20
 
+    def add_capture(
+        self, sim: Simulation, cfg: Config, captured: bool, work: Sequence[Captured]
+    ) -> None:
+        """Add whether the work was replayed from a graph, and the time that its capture took.
+
+        On CUDA, work that should have been captured and ran eagerly has no figure.
+
+        Args:
+            sim: The worlds.
+            cfg: Their configuration.
+            captured: Whether whole steps were replayed.
+            work: What was captured; the slowest counts.
+        """
+        cuda = sim.device.type == "cuda"
+        self.facts |= {
+            "warm_up_s": max((one.warm_up_seconds for one in work), default=0.0),
+            "capture_s": max((one.capture_seconds for one in work), default=0.0),
+            "captured": captured,
+        }
+        # On Warp's CPU device, whole steps are never captured: whether their physics was
+        graph = None if cuda else sim.graph_of(cfg.timing.decimation, kinematics=True)
+        if graph is not None:
+            self.facts["physics_captured"] = graph.captured
+        if cuda and not captured and cfg.graph is not GraphMode.off:
+            self.problem = self.problem or (
+                "it was not captured and ran eagerly (run.log says why); graph=off measures it like"
+                " that"
+            )
+
     def metrics(self) -> dict[str, float]:
         """All numbers that count, under the measurement's name: median and range of samples."""
         shown = dict(self.facts)
@@ -126,22 +168,6 @@ def describe_lost(lost: torch.Tensor) -> str:
     """The number of lost worlds in a sentence; empty where there are none. Waits for the device."""
     count = int(lost.sum())
     return f"{count} worlds overflowed, diverged or were not stepped" if count else ""
-
-
-def capture_problem(sim: Simulation, mode: GraphMode, captured: bool) -> str:
-    """Why work that ran eagerly has no figure: on CUDA it should have been captured.
-
-    Empty where it has one.
-    """
-    if captured or sim.device.type != "cuda" or mode is GraphMode.off:
-        return ""
-    return "it was not captured and ran eagerly (run.log says why); graph=off measures it like that"
-
-
-def capture_facts(sim: Simulation, decimation: int) -> dict[str, float]:
-    """On Warp's CPU device, where whole steps never are captured: whether their physics was."""
-    graph = None if sim.device.type == "cuda" else sim.graph_of(decimation, kinematics=True)
-    return {} if graph is None else {"physics_captured": graph.captured}
 
 
 def steps_that_fit(most: int, budget: float, seconds_per_step: float) -> int:

@@ -145,8 +145,7 @@ class EpisodeRecord:
         failed: Bits of the task's rules, shape ``(nworld,)``, int32.
         values: Measurements of the check, by name with unit, each ``(nworld,)``.
         qpos: Final positions, shape ``(nworld, nq)``, in the backend's precision.
-        start: Positions at the start, of the same shape; None in records of runs that did not keep
-            them.
+        start: Positions at the start, of the same shape.
         circumstances: Starts, retries and signs of failure; None where nothing looked on.
     """
 
@@ -156,7 +155,7 @@ class EpisodeRecord:
     failed: np.ndarray
     values: dict[str, np.ndarray]
     qpos: np.ndarray
-    start: np.ndarray | None = None
+    start: np.ndarray
     circumstances: Circumstances | None = None
 
     @classmethod
@@ -207,7 +206,7 @@ class EpisodeRecord:
                     failed=held["failed"],
                     values={name.removeprefix("value."): held[name] for name in values},
                     qpos=held["qpos"],
-                    start=held["start_qpos"] if "start_qpos" in held.files else None,
+                    start=held["start_qpos"],
                 )
         except Exception as error:  # numpy and zipfile fail in their own ways
             raise RunError(
@@ -228,7 +227,7 @@ class EpisodeRecord:
             "device": self.device,
             "failed": self.failed,
             "qpos": self.qpos,
-            **({} if self.start is None else {"start_qpos": self.start}),
+            "start_qpos": self.start,
             **{f"value.{name}": values for name, values in self.values.items()},
             **({} if self.circumstances is None else self.circumstances.arrays()),
         }

@@ -51,7 +51,7 @@ def save_regions(
     assert folder is not None
     lost = []
     try:
-        rows = to_csv([f.name for f in fields(Region)], map(asdict, regions))
+        rows = to_csv([asdict(region) for region in regions], [f.name for f in fields(Region)])
         write_atomic(folder / REGIONS, rows)
     except OSError as error:
         log.exception("%s was not written", REGIONS)

@@ -29,26 +29,6 @@ _NATIVE = "native MuJoCo has no fixed buffers"
 _NO_ORDER = "on CUDA sums have no fixed order"
 
 
-@dataclass(slots=True)
-class _Shortage:
-    """Something that does not fit: the keys that limit it, and a sentence."""
-
-    keys: tuple[str, ...]
-    text: str
-
-
-@dataclass(slots=True)
-class _Trial:
-    """What came of a second run, at exactly the recommended sizes: figures, and what was wrong or
-    is to be known.
-    """
-
-    metrics: dict[str, float]
-    notes: dict[str, str]
-    problem: str = ""
-    remark: str = ""
-
-
 @dataclass(kw_only=True, slots=True)
 class _Group:
     """Workloads whose worlds have the same buffer sizes.
@@ -85,8 +65,7 @@ def run_capacity(context: RunContext) -> list[GateResult]:
     nworld = measuring_worlds(context)
     how = f"batch=auto: gate capacity, {nworld} worlds, times {t.margin:g}"
     how = how if cfg.batch.auto else "gate capacity"
-    details: list[str] = []
-    problems: list[str] = []
+    result = GateResult(name="capacity", status=Status.passed, metrics={"worlds": nworld})
 
     # Environments. Each start is planned once, for both of its runs, and the task's last: its plan
     # is kept for the gates that follow.
@@ -94,59 +73,51 @@ def run_capacity(context: RunContext) -> list[GateResult]:
     try:
         runs["randomized"] = measure_task(context, t.reset)
     except Unreachable as error:  # starts of the user's own; the other workloads stand
-        details.append(f"randomised starts: not measured: {error}")
+        result.details.append(f"randomised starts: not measured: {error}")
     title = "environments (random actions, randomised starts)"
     env = _group(cfg, title, "recommended_env", runs, resolve_env_sizes(cfg), how)
-    trials = _try(context, env)
+    broken = _try(context, env, result)
 
     # The driven task
     task_run = measure_task(context, cfg.reset)
     task = _group(cfg, "scripted task", "recommended", {"task": task_run}, resolve_sizes(cfg), how)
-    trials += _try(context, task)
+    broken += _try(context, task, result)
 
     # Problems. Motion that lost physics sizes nothing that follows.
     context.artifacts.sizes = None if task.lost else task.wanted
     context.artifacts.env_sizes = None if env.lost else env.wanted
-    problems += [task.lost] if task.lost else [found.text for found in _shortages(cfg, task)]
-    problems += [f"environments: {env.lost}"] if env.lost else []
-    for shortage in [] if env.lost else _shortages(cfg, env):
+    problems = [task.lost] if task.lost else [text for _, text in _shortages(cfg, task)]
+    if env.lost:
+        problems.append(f"environments: {env.lost}")
+    for keys, text in [] if env.lost else _shortages(cfg, env):
         # Sizes that were set may be meant for the batch alone; those of the robot's profile should
         # do for both.
-        chosen = any(getattr(cfg.batch, key) is not None for key in shortage.keys)
-        (details if chosen else problems).append(f"environments: {shortage.text}")
-    problems += [trial.problem for trial in trials if trial.problem]
-    details += [trial.remark for trial in trials if trial.remark]
+        chosen = any(getattr(cfg.batch, key) is not None for key in keys)
+        (result.details if chosen else problems).append(f"environments: {text}")
+    problems += broken
     if nworld < cfg.nworld:
-        details.append(
+        result.details.append(
             f"from {nworld} worlds: more of them meet rarer peaks, above all under random actions"
         )
 
     # Report
     share = task.sizes.contact_pool(cfg.nworld) / cfg.nworld
     peaks = task.peaks
-    result = GateResult(
-        name="capacity",
-        status=Status.failed if problems else Status.passed,
-        reason="; ".join(problems)
-        or (
-            f"{peaks.contacts.max()} of {share:g} contacts, {peaks.rows.max()} of"
-            f" {task.sizes.njmax} rows, at most, in {nworld} worlds"
-        ),
-        thresholds={"contacts_per_world": share, "njmax": task.sizes.njmax, "margin": t.margin},
-        metrics={"worlds": nworld},
-        notes={"backend": task_run.description, "sizes_from": task.sizes.source},
-    )
+    used = f"{peaks.contacts.max()} of {share:g} contacts, {peaks.rows.max()} of {task.sizes.njmax}"
+    result.reason = "; ".join(problems) or f"{used} rows, at most, in {nworld} worlds"
+    result.status = Status.failed if problems else Status.passed
+    result.thresholds = {
+        "contacts_per_world": share,
+        "njmax": task.sizes.njmax,
+        "margin": t.margin,
+    }
+    result.notes |= {"backend": task_run.description, "sizes_from": task.sizes.source}
     for group in (task, env):
         _report(context, group, result)
-    for trial in trials:
-        result.metrics |= trial.metrics
-        result.notes |= trial.notes
     if task_run.sizes is None:
         result.notes["rerun"] = f"sizes were not tried: {_NATIVE}"
-        result.notes["memory"] = f"not reported: {_NATIVE}"
     elif task.lost or env.lost:
         result.notes["rerun"] = "sizes were not tried where peaks are not known"
-    result.details += details
     return [result]
 
 
@@ -173,12 +144,12 @@ def _group(
     )
 
 
-def _try(context: RunContext, group: _Group) -> list[_Trial]:
-    """Play the workloads again at exactly the recommended sizes, on MJWarp."""
+def _try(context: RunContext, group: _Group, result: GateResult) -> list[str]:
+    """Play the workloads again at exactly the recommended sizes, on MJWarp; return the problems."""
     cfg = context.cfg
     exact = not context.backend[1].startswith("cuda")
     starts = {"task": cfg.reset, "randomized": cfg.gate.capacity.reset}
-    trials = []
+    problems = []
     for name, first in reversed(group.runs.items()):
         if first.sizes is None or group.lost:
             continue
@@ -186,101 +157,15 @@ def _try(context: RunContext, group: _Group) -> list[_Trial]:
             again = play_task(context, starts[name], group.wanted)
         else:
             again = play_random(context, group.wanted)
-        trials.append(_compare(name, first, again, judged=name in starts, exact=exact))
-    return trials
+        problem = _compare(name, first, again, result, judged=name in starts, exact=exact)
+        problems += [problem] if problem else []
+    return problems
 
 
-def _report(context: RunContext, group: _Group, result: GateResult) -> None:
-    """Add a group's peaks, recommended sizes and memory to the result."""
-    cfg = context.cfg
-    native = any(run.sizes is None for run in group.runs.values())
-    for name, run in group.runs.items():
-        prefix = "" if name == "task" else f"{name}."
-        result.metrics |= _peak_metrics(prefix, run)
-        if run.peaks.pool_pairs is None or run.peaks.pool_ccd_pairs is None:
-            who = " by native MuJoCo" if native else ""
-            result.notes[f"{prefix}pool_pairs"] = f"pairs are not all counted{who}"
-    line = f"{group.title}: {_overrides(cfg, group.wanted)}"
-    if group.lost:
-        line = f"{group.title}: not known, physics was lost"
-    elif native and "task" in group.runs:
-        line += (
-            " (contacts alone: native MuJoCo does not count the collision pairs that share their"
-            " pool)"
-        )
-    context.say(line)
-    result.details.append(line)
-    if group.lost:
-        return
-    wanted = group.wanted
-    result.metrics |= {
-        f"{group.prefix}.nconmax": wanted.nconmax,
-        f"{group.prefix}.naconmax": wanted.contact_pool(cfg.nworld),
-        f"{group.prefix}.njmax": wanted.njmax,
-    }
-    if wanted.nccdmax:
-        result.metrics[f"{group.prefix}.nccdmax"] = wanted.nccdmax
-    else:
-        result.notes[f"{group.prefix}.nccdmax"] = "not counted: MJWarp's default"
-    if not native:
-        from mjstack.sim.usage import data_bytes  # loads Warp, which native runs do not need
-
-        key = "task" if "task" in group.runs else "env"
-        for which, sizes in (("current", group.sizes), ("recommended", wanted)):
-            size = data_bytes(context.model, cfg.nworld, sizes)
-            result.metrics[f"memory.{key}.{which}_mb"] = size / 1e6
-
-
-def _shortages(cfg: Config, group: _Group) -> list[_Shortage]:
-    """Buffers in force that are too small for a group's peaks. Exactly at capacity fits."""
-    peaks = group.peaks
-    sizes = group.sizes
-    wanted = group.wanted
-    nworld = peaks.nworld
-    out = []
-    over = np.flatnonzero(peaks.rows > sizes.njmax).tolist()
-    if over:
-        out.append(
-            _Shortage(
-                ("njmax",),
-                f"njmax overflow in {name_worlds(over, nworld)}; njmax={sizes.njmax}, most needed"
-                f" {peaks.rows.max()}. Raise it: batch.njmax={wanted.njmax}",
-            )
-        )
-    # MJWarp counts what all worlds hold at once. Fewer worlds than the batch has have fewer peaks
-    # to even out.
-    share = sizes.contact_pool(cfg.nworld) / cfg.nworld
-    need = peaks.pool / nworld
-    if need > share:
-        worlds = np.flatnonzero(peaks.contacts > share).tolist()
-        fix = f"batch.nconmax={wanted.nconmax}"
-        if sizes.naconmax is not None:
-            fix = f"batch.naconmax={wanted.contact_pool(cfg.nworld)}"
-        out.append(
-            _Shortage(
-                ("nconmax", "naconmax"),
-                f"contact pool overflow in {name_worlds(worlds, nworld)}; {share:g} per world,"
-                f" {need:.1f} needed. Raise it: {fix}",
-            )
-        )
-    convex = None if peaks.pool_ccd_pairs is None else peaks.pool_ccd_pairs / nworld
-    share = sizes.convex_pool(cfg.nworld) / cfg.nworld
-    if convex is not None and convex > share:
-        fix = f"batch.nccdmax={wanted.nccdmax}"
-        if sizes.naccdmax is not None:
-            fix = f"batch.naccdmax={wanted.convex_pool(cfg.nworld)}"
-        out.append(
-            _Shortage(
-                ("nccdmax", "naccdmax", "nconmax", "naconmax"),
-                f"convex pairs overflow; room for {share:g} per world, {convex:.1f} needed. Raise"
-                f" it: {fix}",
-            )
-        )
-    return out
-
-
-def _compare(name: str, first: Workload, again: Workload, *, judged: bool, exact: bool) -> _Trial:
-    """Holds a run at exactly the recommended sizes against the first one.
+def _compare(
+    name: str, first: Workload, again: Workload, result: GateResult, *, judged: bool, exact: bool
+) -> str:
+    """Hold a run at exactly the recommended sizes against the first one.
 
     Nothing may be lost. Where runs repeat bit for bit, the outcome is to be the same too; where
     they do not, a world near a threshold may fall on its other side, which is reported.
@@ -289,65 +174,143 @@ def _compare(name: str, first: Workload, again: Workload, *, judged: bool, exact
         name: The workload.
         first: The run with room to spare.
         again: The second one.
+        result: Gets the figures.
         judged: Whether the check judges it.
         exact: Whether runs repeat bit for bit, as they do on any CPU.
+
+    Returns:
+        The problem, if any.
     """
     assert again.sizes is not None, "native MuJoCo has no sizes to try"
-    at = f"{name} at {again.sizes.as_overrides()}"
+    sizes = again.sizes.as_overrides()
     count = len(first.failed)
-    key = f"rerun.{name}"
     lost = np.flatnonzero(again.peaks.overflow).tolist()
     flipped = np.flatnonzero((first.failed == 0) != (again.failed == 0)).tolist()
-    moved = np.flatnonzero(
-        ~np.isclose(first.final, again.final, rtol=0.0, atol=0.0, equal_nan=True).all(1)
-    ).tolist()
-    trial = _Trial(
-        {
-            f"{key}.overflow_worlds": len(lost),
-            f"{key}.peak_constraint_rows_per_world": int(again.peaks.rows.max()),
-        },
-        {f"{key}.sizes": again.sizes.as_overrides()},
-    )
-    if judged:
-        trial.metrics |= {
-            f"{key}.succeeded": again.succeeded,
-            f"{key}.flipped_worlds": len(flipped),
-        }
-    if exact:
-        trial.metrics[f"{key}.same_final_state"] = not moved
-    else:
-        trial.notes[f"{key}.same_final_state"] = f"not compared: {_NO_ORDER}"
-    flip = f"{at}: another result in {name_worlds(flipped, count)}" if judged and flipped else ""
-    if lost:
-        trial.problem = f"{at}: overflow in {name_worlds(lost, count)}"
-    elif exact and flip:
-        trial.problem = flip
-    elif exact and moved:
-        trial.problem = f"{at}: another final state in {name_worlds(moved, count)}"
-    if flip and not exact:
-        trial.remark = f"{flip}: {_NO_ORDER}"
-    for part, run in (("measuring", first), ("rerun", again)):
-        cost = {
-            "data": run.data_bytes,
-            "device": run.device_bytes,
-        }
-        for what, size in cost.items():
-            if size is not None:
-                trial.metrics[f"memory.{name}.{part}.{what}_mb"] = size / 1e6
-    return trial
+    same = (first.final == again.final) | (np.isnan(first.final) & np.isnan(again.final))
+    moved = np.flatnonzero(~same.all(1)).tolist()
 
-
-def _peak_metrics(prefix: str, run: Workload) -> dict[str, float]:
-    """The peaks that were counted; native MuJoCo counts no pairs."""
-    peaks = run.peaks
-    found = {
-        "peak_contacts_per_world": int(peaks.contacts.max()),
-        "pool_contacts": peaks.pool_contacts,
-        "pool_pairs": peaks.pool_pairs,
-        "pool_ccd_pairs": peaks.pool_ccd_pairs,
-        "peak_constraint_rows_per_world": int(peaks.rows.max()),
+    # Figures
+    metrics: dict[str, float] = {
+        "overflow_worlds": len(lost),
+        "peak_constraint_rows_per_world": int(again.peaks.rows.max()),
     }
-    return {f"{prefix}{name}": value for name, value in found.items() if value is not None}
+    if judged:
+        metrics |= {"succeeded": again.succeeded, "flipped_worlds": len(flipped)}
+    if exact:
+        metrics["same_final_state"] = not moved
+    result.metrics |= {f"rerun.{name}.{key}": value for key, value in metrics.items()}
+    result.notes[f"rerun.{name}.sizes"] = sizes
+    for part, run in (("measuring", first), ("rerun", again)):
+        for what in ("data", "device"):
+            if (size := getattr(run, f"{what}_bytes")) is not None:
+                result.metrics[f"memory.{name}.{part}.{what}_mb"] = size / 1e6
+
+    # Problems
+    at = f"{name} at {sizes}"
+    if lost:
+        return f"{at}: overflow in {name_worlds(lost, count)}"
+    if judged and flipped:
+        flip = f"{at}: another result in {name_worlds(flipped, count)}"
+        if exact:
+            return flip
+        result.details.append(f"{flip}: {_NO_ORDER}")
+    elif exact and moved:
+        return f"{at}: another final state in {name_worlds(moved, count)}"
+    return ""
+
+
+def _report(context: RunContext, group: _Group, result: GateResult) -> None:
+    """Add a group's peaks, recommended sizes and memory to the result."""
+    cfg = context.cfg
+    native = any(run.sizes is None for run in group.runs.values())
+    for name, run in group.runs.items():
+        prefix = "" if name == "task" else f"{name}."
+        peaks = run.peaks
+        found = {
+            "peak_contacts_per_world": int(peaks.contacts.max()),
+            "pool_contacts": peaks.pool_contacts,
+            "pool_pairs": peaks.pool_pairs,
+            "pool_ccd_pairs": peaks.pool_ccd_pairs,
+            "peak_constraint_rows_per_world": int(peaks.rows.max()),
+        }
+        result.metrics |= {f"{prefix}{key}": n for key, n in found.items() if n is not None}
+    wanted = group.wanted
+    line = f"{group.title}: {_overrides(cfg, wanted)}"
+    if group.lost:
+        line = f"{group.title}: not known, physics was lost"
+    elif native:
+        line += " (contacts alone: native MuJoCo does not count the pairs that share their pool)"
+    context.say(line)
+    result.details.append(line)
+    if group.lost:
+        return
+    sizes = {
+        "nconmax": wanted.nconmax,
+        "naconmax": wanted.contact_pool(cfg.nworld),
+        "njmax": wanted.njmax,
+        "nccdmax": wanted.nccdmax,
+    }
+    result.metrics |= {f"{group.prefix}.{key}": n for key, n in sizes.items() if n is not None}
+    if not native:
+        from mjstack.sim.usage import data_bytes  # loads Warp, which native runs do not need
+
+        key = "task" if "task" in group.runs else "env"
+        for which, some in (("current", group.sizes), ("recommended", wanted)):
+            size = data_bytes(context.model, cfg.nworld, some)
+            result.metrics[f"memory.{key}.{which}_mb"] = size / 1e6
+
+
+def _shortages(cfg: Config, group: _Group) -> list[tuple[tuple[str, ...], str]]:
+    """Buffers in force that are too small for a group's peaks: the keys that limit each, and a
+    sentence. Exactly at capacity fits.
+    """
+    n = cfg.nworld
+    peaks = group.peaks
+    sizes = group.sizes
+    wanted = group.wanted
+    # MJWarp counts what all worlds hold at once. Fewer worlds than the batch has have fewer peaks
+    # to even out.
+    room = sizes.contact_pool(n) / n
+    contacts = f"nconmax={wanted.nconmax}"
+    if sizes.naconmax is not None:
+        contacts = f"naconmax={wanted.contact_pool(n)}"
+    convex = f"nccdmax={wanted.nccdmax}"
+    if sizes.naccdmax is not None:
+        convex = f"naccdmax={wanted.convex_pool(n)}"
+    pool = ("nconmax", "naconmax")
+    pairs = (peaks.pool_ccd_pairs or 0) / peaks.nworld
+    # By buffer: keys, room of a world, most needed, worlds that need more, and the remedy
+    buffers: dict[str, tuple[tuple[str, ...], float, float, np.ndarray, str]] = {
+        "njmax": (
+            ("njmax",),
+            sizes.njmax,
+            peaks.rows.max(),
+            peaks.rows > sizes.njmax,
+            f"njmax={wanted.njmax}",
+        ),
+        "contact pool": (
+            pool,
+            room,
+            peaks.pool / peaks.nworld,
+            peaks.contacts > room,
+            contacts,
+        ),
+        "convex pairs": (
+            ("nccdmax", "naccdmax", *pool),
+            sizes.convex_pool(n) / n,
+            pairs,
+            np.zeros(0),
+            convex,
+        ),
+    }
+    out = []
+    for name, (keys, there, need, over, fix) in buffers.items():
+        if need > there:
+            worlds = np.flatnonzero(over).tolist()
+            where = f" in {name_worlds(worlds, peaks.nworld)}" if worlds else ""
+            fit = f"room for {there:g} per world, {need:g} needed"
+            out.append((keys, f"{name} overflow{where}; {fit}. Raise it: batch.{fix}"))
+    return out
 
 
 def _overrides(cfg: Config, wanted: BatchSizes) -> str:

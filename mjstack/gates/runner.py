@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-import traceback
 from collections.abc import Callable
 
 from mjstack.config.complete import typed
@@ -80,21 +79,24 @@ def run_guarded(
         lack = lacks_episode(context.cfg) if getattr(run, "needs_episode", False) else ""
         skipped = [GateResult(name=name, status=Status.skipped, reason=lack)]
         results = skipped if lack else run(context)
-    except MjstackError as error:
-        results = [GateResult(name=name, status=Status.failed, reason=str(error))]
     except Exception as error:
-        log.error("gate %s broke:\n%s", name, traceback.format_exc())
-        first = (str(error).splitlines() or [""])[0].rstrip(".")
-        reason = f"internal error, {type(error).__name__}: {first} (run.log has the traceback)"
-        if is_out_of_memory(f"{type(error).__name__}: {error}"):
-            smaller = "Run fewer worlds, or with smaller buffers (batch.nconmax, batch.njmax)"
-            reason = f"out of memory ({first or type(error).__name__}). {smaller}"
-        results = [GateResult(name=name, status=Status.failed, reason=reason)]
+        results = [GateResult(name=name, status=Status.failed, reason=describe_error(error))]
     seconds = time.perf_counter() - began
     for result in results:
         if result.status is not Status.skipped and not result.seconds:
             result.seconds = seconds
         context.artifacts.results[result.name] = result
-        log.info("gate %s: %s %s", result.name, result.status.value, result.reason)
         on_result(result)
     return results
+
+
+def describe_error(error: Exception) -> str:
+    """An error in one line. The traceback of an unexpected one goes to run.log."""
+    if isinstance(error, MjstackError):
+        return str(error)
+    log.error("unexpected error", exc_info=error)
+    first = (str(error).splitlines() or ["no message"])[0].rstrip(".")
+    if is_out_of_memory(f"{type(error).__name__}: {error}"):
+        smaller = "Run fewer worlds, or with smaller buffers (batch.nconmax, batch.njmax)"
+        return f"out of memory ({first}). {smaller}"
+    return f"{type(error).__name__}: {first} (run.log has the traceback)"

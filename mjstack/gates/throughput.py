@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import gc
-import logging
 import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -20,11 +20,8 @@ from mjstack.bench.timing import Measurement
 from mjstack.config.schema import Backend
 from mjstack.envs import build_env
 from mjstack.episodes.context import RunContext, lacks_episode
-from mjstack.errors import MjstackError
+from mjstack.gates.runner import describe_error
 from mjstack.report.record import GateResult, Status
-from mjstack.sim import Simulation
-
-log = logging.getLogger(__name__)
 
 CUDA = "throughput_cuda"
 _UNVERIFIED = "a figure counts only where the task was verified"
@@ -54,16 +51,15 @@ def run_throughput(context: RunContext) -> list[GateResult]:
 
 @dataclass(kw_only=True, slots=True)
 class _Bench:
-    """One backend, and facts on it.
+    """One backend, and the result that its measurements add to.
 
     Attributes:
         context: The run.
-        backend: What is measured.
+        backend: The backend that is measured.
         device: ``"cpu"`` or ``"cuda:N"``.
         seconds: Time budget of each measurement [s].
         meter: Energy of the GPU.
-        facts: Numbers on the machine and the worlds.
-        notes: The same in words.
+        result: Gets facts on the machine and the worlds.
     """
 
     context: RunContext
@@ -71,30 +67,18 @@ class _Bench:
     device: str
     seconds: float
     meter: EnergyMeter
-    facts: dict[str, float]
-    notes: dict[str, str] = field(default_factory=dict)
-
-    def note_worlds(self, sim: Simulation, began: float) -> None:
-        """Note backend, sizes and the time that building the worlds took."""
-        self.facts["build_and_compile_s"] = time.perf_counter() - began
-        self.notes["backend"] = sim.description
-        if (sizes := sim.sizes) is not None:
-            self.facts |= {
-                "nconmax": sizes.nconmax,
-                "naconmax": sizes.contact_pool(sim.nworld),
-                "njmax": sizes.njmax,
-            }
-            self.notes["sizes_from"] = sizes.source
+    result: GateResult
 
 
 def _measure(context: RunContext, name: str, backend: Backend, device: str) -> GateResult:
     """Measure one backend. A measurement that breaks leaves the others their figures."""
     cfg = context.cfg
     t = cfg.gate.throughput
+    result = GateResult(name=name, status=Status.failed)
     batch = context.artifacts.results.get("batch")
     if batch is not None and batch.status is Status.failed:
-        reason = f"no figure: the batch gate failed, and {_UNVERIFIED}"
-        return GateResult(name=name, status=Status.failed, reason=reason)
+        result.reason = f"no figure: the batch gate failed, and {_UNVERIFIED}"
+        return result
     began = time.perf_counter()
     on_cuda = device.startswith("cuda")
     seconds = t.max_seconds if on_cuda else t.cpu_max_seconds
@@ -104,12 +88,13 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
         device=device,
         seconds=seconds,
         meter=EnergyMeter(device),
-        facts={
-            "worlds": cfg.nworld,
-            "cpu_count": os.cpu_count() or 1,
-            "time_budget_s": seconds,
-        },
+        result=result,
     )
+    result.metrics = {
+        "worlds": cfg.nworld,
+        "cpu_count": os.cpu_count() or 1,
+        "time_budget_s": seconds,
+    }
 
     # The measurements
     found: dict[str, Measurement] = {}
@@ -118,8 +103,8 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
     if "env_step" in t.measurements:
         found["env_step"] = _guarded("env_step", lambda: _on_environment(bench))
     if not on_cuda:
-        bench.facts |= _peak_memory()
-        bench.notes["gpu_power_and_memory"] = "not measured: no GPU"
+        result.metrics |= _peak_memory()
+        result.notes["gpu_power_and_memory"] = "not measured: no GPU"
 
     # Whether they count
     episode = found.get("episode")
@@ -128,22 +113,16 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
             one.problem = one.problem or f"the episode failed, and {_UNVERIFIED}"
     verified = batch is not None and batch.status is Status.passed
     verified |= episode is not None and bool(episode.samples) and not episode.problem
-    reason = "; ".join(f"{key}: {_describe(one, on_cuda)}" for key, one in found.items())
+    result.reason = "; ".join(f"{key}: {_describe(one, on_cuda)}" for key, one in found.items())
     if not verified:
-        reason += " (the task was not verified in this run: add batch to gates)"
-    status = Status.skipped
-    if any(one.problem for one in found.values()):
-        status = Status.failed
-    elif any(one.samples for one in found.values()):
-        status = Status.passed
-
-    result = GateResult(
-        name=name, status=status, reason=reason, metrics=bench.facts, notes=bench.notes
-    )
+        result.reason += " (the task was not verified in this run: add batch to gates)"
     for one in found.values():
         result.metrics |= one.metrics()
         result.notes |= one.named_notes()
-    if status is not Status.skipped:
+    if not any(one.problem for one in found.values()):
+        measured = any(one.samples for one in found.values())
+        result.status = Status.passed if measured else Status.skipped
+    if result.status is not Status.skipped:
         result.seconds = time.perf_counter() - began
     return result
 
@@ -168,33 +147,34 @@ def _on_driven_worlds(bench: _Bench) -> dict[str, Measurement]:
     try:
         sim = context.simulation(context.cfg.nworld, bench.backend, bench.device)
     except Exception as error:
-        return {name: Measurement(name=name, problem=_explain(name, error)) for name in wanted}
-    bench.note_worlds(sim, began)
-    step_seconds: float | None = None
-
-    def physics() -> Measurement:
-        return measure_physics(
-            context, sim, seconds=bench.seconds, repetitions=t.repetitions, meter=bench.meter
-        )
-
-    def episode() -> Measurement:
-        return measure_episode(
-            context,
-            sim,
-            seconds=bench.seconds,
-            repetitions=t.repetitions,
-            meter=bench.meter,
-            step_seconds=step_seconds,
-        )
-
+        problem = describe_error(error)
+        return {name: Measurement(name=name, problem=problem) for name in wanted}
+    result = bench.result
+    result.metrics["build_and_compile_s"] = time.perf_counter() - began
+    result.notes["backend"] = sim.description
+    if (sizes := sim.sizes) is not None:
+        result.metrics |= {
+            "nconmax": sizes.nconmax,
+            "naconmax": sizes.contact_pool(sim.nworld),
+            "njmax": sizes.njmax,
+        }
+        result.notes["sizes_from"] = sizes.source
     found = {}
+    step_seconds: float | None = None
+    budget: dict[str, Any] = {
+        "seconds": bench.seconds,
+        "repetitions": t.repetitions,
+        "meter": bench.meter,
+    }
     if "physics" in wanted:
-        found["physics"] = _guarded("physics", physics)
+        found["physics"] = _guarded("physics", lambda: measure_physics(context, sim, **budget))
         if found["physics"].samples:
             step_ms = found["physics"].median("ms_per_batched_step")
             step_seconds = 1e-3 * step_ms * context.cfg.timing.decimation
     if "episode" in wanted:
-        found["episode"] = _guarded("episode", episode)
+        found["episode"] = _guarded(
+            "episode", lambda: measure_episode(context, sim, step_seconds=step_seconds, **budget)
+        )
     sim.close()
     return found
 
@@ -213,7 +193,7 @@ def _on_environment(bench: _Bench) -> Measurement:
         sizes=context.env_sizes,
     )
     build_seconds = time.perf_counter() - began
-    bench.notes.setdefault("backend", env.sim.description)
+    bench.result.notes.setdefault("backend", env.sim.description)
     try:
         found = measure_env_step(
             env,
@@ -236,23 +216,14 @@ def _guarded(name: str, measure: Callable[[], Measurement]) -> Measurement:
     try:
         return measure()
     except Exception as error:
-        return Measurement(name=name, problem=_explain(name, error))
-
-
-def _explain(name: str, error: Exception) -> str:
-    """An error in one line. Tracebacks of unexpected errors go to run.log."""
-    if isinstance(error, MjstackError):
-        return str(error).rstrip(".")
-    log.error("%s broke", name, exc_info=error)
-    first = (str(error) or "no message").splitlines()[0]
-    return f"{type(error).__name__}: {first} (run.log has the traceback)"
+        return Measurement(name=name, problem=describe_error(error).rstrip("."))
 
 
 def _peak_memory() -> dict[str, float]:
-    """The most memory that this process has held so far."""
+    """The most memory that this process has held so far, where the system tells (not Windows)."""
     try:
         import resource
-    except ImportError:  # not on Windows
+    except ImportError:
         return {}
     unit = 1 if sys.platform == "darwin" else 1024
     return {"process_peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20}

@@ -7,45 +7,32 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import cast
 
 import numpy as np
-import torch
 
 from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetSpec, DatasetWriter, EpisodeData, lerobot
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
-from mjstack.errors import UnwrittenError
+from mjstack.errors import ConfigError, DatasetError
 from mjstack.files import write_atomic
-from mjstack.jobs.collect_record import (
-    FILE,
-    CollectedBatch,
-    count_kept,
-    read_batches,
-    write_batches,
-)
-from mjstack.jobs.demonstration import (
-    ACTION,
-    STATE,
-    Played,
-    column_widths,
-    most_worlds,
-    play_demonstrations,
-    steps_block,
-)
+from mjstack.jobs.demonstration import ACTION, STATE, Played, column_widths, play_demonstrations
 from mjstack.jobs.demonstration_spec import make_spec
 from mjstack.jobs.runner import run_provenance
 from mjstack.math import wilson_interval
-from mjstack.report.collect import ColumnRange, to_markdown
+from mjstack.report.collect import to_markdown
 from mjstack.report.record import GateResult, Status
 from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation
 
 DATASET = "dataset"  # within the job's folder
+FILE = "batches.json"
 _SPARE = 1.05  # worlds played over episodes that are missing: some fail
 _GIVE_UP = 3  # batches in a row without an episode
 
@@ -58,15 +45,13 @@ class CollectPlan:
         context: Configuration, scene and plan.
         home: The job's folder.
         spec: The dataset's columns and provenance.
-        most: Largest number of worlds of a batch.
-        dim: Numbers in a step.
+        most: Largest number of worlds of a batch: those whose steps fit into the buffer.
     """
 
     context: RunContext
     home: Path
     spec: DatasetSpec
     most: int
-    dim: int
 
     @classmethod
     def of(cls, context: RunContext, home: Path, env: Env) -> CollectPlan:
@@ -76,16 +61,73 @@ class CollectPlan:
             ConfigError: The steps of not even one world fit into the buffer, or a column's name is
                 taken.
         """
-        provenance = run_provenance(context.cfg, context)
+        cfg = context.cfg
+        gib = cast(CollectJobCfg, cfg.job).buffer_gib
+        world = 4.0 * build_phases(cfg)[-1].stop * sum(column_widths(env).values()) / 2**30
+        if gib < world:
+            expected = f"at least {world:.2g}, which the steps of one world take"
+            raise ConfigError("job.buffer_gib", gib, expected)
+        provenance = run_provenance(cfg, context)
         # They differ between calls that make the same episodes.
         del provenance["date"], provenance["config_sha256"]
-        return cls(
-            context=context,
-            home=home,
-            spec=make_spec(env, context.cfg, provenance),
-            most=most_worlds(context.cfg, env),
-            dim=sum(column_widths(env).values()),
-        )
+        spec = make_spec(env, cfg, provenance)
+        return cls(context=context, home=home, spec=spec, most=min(cfg.nworld, int(gib / world)))
+
+
+@dataclass(kw_only=True, slots=True)
+class CollectedBatch:
+    """One seed, played in some worlds.
+
+    Attributes:
+        seed: The seed.
+        worlds: Number of worlds.
+        keep: Number of episodes that are to be kept.
+        succeeded: Number of worlds that the check passed.
+        kept: Episodes of it that are in the dataset; fewer than ``keep`` if it is unfinished.
+        not_finite: Episodes that are left out only because a number in them is not finite.
+        retries: Grasps that were tried again, in all worlds.
+        broken: How many worlds broke each rule, by its words.
+    """
+
+    seed: int
+    worlds: int
+    keep: int
+    succeeded: int
+    kept: int = 0
+    not_finite: int = 0
+    retries: int = 0
+    broken: dict[str, int] = field(default_factory=dict)
+
+
+def read_batches(folder: Path, committed: Sequence[tuple[int, int]]) -> list[CollectedBatch]:
+    """The batches of earlier calls.
+
+    Args:
+        folder: The job's folder.
+        committed: Seed and world of every episode of the dataset.
+
+    Raises:
+        DatasetError: The file cannot be read.
+    """
+    path = folder / FILE
+    if not path.exists():
+        return []
+    try:
+        batches = [CollectedBatch(**batch) for batch in json.loads(path.read_text())]
+    except (OSError, ValueError, TypeError) as error:
+        raise DatasetError(
+            f"{path} cannot be read ({type(error).__name__}), expected what job=collect wrote."
+            f" Remove {FILE}: the dataset stands, and the expert's success rate is counted from"
+            " then on"
+        ) from error
+    _count_kept(batches, committed)
+    return batches
+
+
+def _count_kept(batches: Sequence[CollectedBatch], committed: Sequence[tuple[int, int]]) -> None:
+    counts = Counter(seed for seed, _ in committed)
+    for batch in batches:
+        batch.kept = counts[batch.seed]
 
 
 class Collection:
@@ -100,31 +142,24 @@ class Collection:
     counts in the success rate, and every episode has the result of its own play.
 
     Attributes:
-        home: The job's folder.
         path: The dataset.
-        spec: Its columns and provenance.
         batches: All that were played, in earlier calls too; read by `play`.
         committed: Number of episodes of the dataset.
-        steps: Number of their steps.
     """
 
     def __init__(self, plan: CollectPlan, context: RunContext) -> None:
-        """Takes a plan and the run's context."""
+        """Take a plan and the run's context."""
         self._context = context
-        self._cfg = context.cfg
+        self._plan = plan
         self._job = cast(CollectJobCfg, context.cfg.job)
-        self._most = plan.most
-        self._dim = plan.dim
-        self.spec = plan.spec
-        self.home = plan.home
+        self._record_path = plan.home / FILE
         self.path = plan.home / DATASET
         self.batches: list[CollectedBatch] = []
         self.committed = 0
-        self.steps = 0
+        self._steps = 0
         self._before = 0
-        self._seconds = {"simulation": 0.0, "copy": 0.0, "writing": 0.0}  # of this call
+        self._seconds = {"simulation": 0.0, "writing": 0.0}  # of this call
         self._sim: Simulation | None = None
-        self._block: torch.Tensor | None = None
 
     def play(self) -> str:
         """Play and write until the episodes are there.
@@ -135,65 +170,63 @@ class Collection:
         Raises:
             DatasetError: The folder has another dataset.
             UnwrittenError: The dataset cannot be written any further; what was committed is kept.
+            OSError: The record of the batches cannot be written; what was committed is kept.
         """
         if not (self.path / lerobot.INFO).exists():
-            (self.home / FILE).unlink(missing_ok=True)  # of a dataset that was removed
-        writer = DatasetWriter(self.path, self.spec)
-        self._count(writer)
-        self._before = self.committed
+            self._record_path.unlink(missing_ok=True)  # of a dataset that was removed
+        writer = DatasetWriter(self.path, self._plan.spec)
+        self._before = self.committed = len(writer.committed)
         try:
             with writer:
-                self.batches = read_batches(self.home, writer.committed)
+                self.batches = read_batches(self._plan.home, writer.committed)
                 return self._play(writer)
         finally:
-            self._count(writer)
+            self.committed = len(writer.committed)
+            self._steps = writer.frames
             if self.batches:
-                with suppress(UnwrittenError):  # the next call counts again
+                with suppress(OSError):  # the next call counts again
                     self._record(writer)
-            self._close_worlds()
+            if self._sim is not None:
+                self._sim.close()
 
     def _play(self, writer: DatasetWriter) -> str:
         empty = 0
         while (wanted := self._job.episodes - len(writer.committed)) > 0:
+            # A batch that was begun, or the next seed
             begun = next((batch for batch in self.batches if batch.kept < batch.keep), None)
             if begun is not None:
                 seed = begun.seed
                 worlds = begun.worlds
             else:
                 seeds = [seed for seed, _ in writer.committed] + [b.seed for b in self.batches]
-                seed = max([self._cfg.seed - 1, *seeds]) + 1
+                seed = max([self._context.cfg.seed - 1, *seeds]) + 1
                 spare = 1.0 if self._job.keep_failures else _SPARE
-                worlds = min(self._most, math.ceil(spare * wanted))
-            sim, block = self._worlds(worlds)
-            played = play_demonstrations(self._context, sim, seed, block, worlds)
+                worlds = min(self._plan.most, math.ceil(spare * wanted))
+            played = play_demonstrations(self._context, self._worlds(worlds), seed)
             self._seconds["simulation"] += played.seconds
 
+            # The episodes that are kept
             batch, usable = self._judge(played, wanted)
-            done = f"{batch.succeeded} of {batch.worlds} worlds succeeded"
             if begun is None:
                 self.batches.append(batch)
                 self._record(writer)
             else:
                 batch = begun
-                done = f"{worlds} worlds played again"
                 there = {world for other, world in writer.committed if other == seed}
                 usable = [world for world in usable if world not in there]
                 batch.keep = min(batch.keep, batch.kept + len(usable))
             self._add(writer, played, usable[: min(batch.keep - batch.kept, wanted)])
-            self._count(writer)
+            del played.steps.values  # the device's memory, before the next batch takes as much
             self._context.say(
-                f"collect, seed {seed}: {done}, {self.committed} of {self._job.episodes} episodes"
-                " there"
+                f"collect, seed {seed}: {batch.succeeded} of {worlds} worlds succeeded,"
+                f" {len(writer.committed)} of {self._job.episodes} episodes there"
             )
             empty = 0 if batch.kept else empty + 1
             if empty == _GIVE_UP:
-                counts = batch.broken | (
-                    {"a number that is not finite": batch.not_finite} if batch.not_finite else {}
-                )
-                why = "; ".join(
-                    f"{text} in {count} of {batch.worlds} worlds" for text, count in counts.items()
-                )
-                return f"{_GIVE_UP} seeds in a row brought no episode, the last because of: {why}"
+                counts = batch.broken | {"a number that is not finite": batch.not_finite}
+                why = [f"{text} in {n} of {batch.worlds} worlds" for text, n in counts.items() if n]
+                reason = f"{_GIVE_UP} seeds in a row brought no episode, the last because of: "
+                return reason + "; ".join(why)
         return ""
 
     def _judge(self, played: Played, wanted: int) -> tuple[CollectedBatch, list[int]]:
@@ -201,6 +234,7 @@ class Collection:
         rules = self._context.check.rules
         good = np.flatnonzero((played.failed == 0) | self._job.keep_failures).tolist()
         usable = [world for world in good if played.finite(world)]
+        failing = rules.failing(played.failed)
         batch = CollectedBatch(
             seed=played.seed,
             worlds=len(played.failed),
@@ -208,10 +242,7 @@ class Collection:
             succeeded=int((played.failed == 0).sum()),
             not_finite=len(good) - len(usable),
             retries=int(played.retries.sum()),
-            broken={
-                rules.texts[name]: len(worlds)
-                for name, worlds in rules.failing(played.failed).items()
-            },
+            broken={rules.texts[name]: len(worlds) for name, worlds in failing.items()},
         )
         return batch, usable
 
@@ -219,72 +250,47 @@ class Collection:
         """Commit the episodes of some worlds, and record it."""
         began = time.perf_counter()
         for count, (world, arrays) in enumerate(played.episodes(worlds), 1):
-            copied = time.perf_counter()
-            self._seconds["copy"] += copied - began
             writer.add([self._episode(played, world, arrays)])
             self._context.tell(f"episodes of seed {played.seed}", count, len(worlds))
-            began = time.perf_counter()
-            self._seconds["writing"] += began - copied
         writer.flush()
         self._seconds["writing"] += time.perf_counter() - began
         self._record(writer)
 
     def _record(self, writer: DatasetWriter) -> None:
         """Write the record of all batches."""
-        count_kept(self.batches, writer.committed)
-        try:
-            write_batches(self.home, self.batches)
-        except OSError as error:
-            raise UnwrittenError(str(self.home / FILE), error, len(writer.committed)) from error
+        _count_kept(self.batches, writer.committed)
+        records = [asdict(batch) for batch in self.batches]
+        write_atomic(self._record_path, json.dumps(records, indent=1) + "\n")
 
     def _episode(self, played: Played, world: int, arrays: dict[str, np.ndarray]) -> EpisodeData:
         """A world's steps and its result. `next.success` is true in the last step of a successful
         episode alone.
         """
+        task = self._context.cfg.task
         broken = self._context.check.rules.describe(int(played.failed[world]))
         last = np.arange(len(arrays[STATE])) == len(arrays[STATE]) - 1
         return EpisodeData(
             arrays={**arrays, "next.done": last, "next.success": last & (not broken)},
-            task=self._cfg.task.instruction or self._cfg.task.name,
+            task=task.instruction or task.name,
             success=not broken,
             seed=played.seed,
             world=world,
             values={
                 "retries": int(played.retries[world]),
                 "failed_rules": broken,
-                "config_sha256": self.spec.config_sha256,
+                "config_sha256": self._plan.spec.config_sha256,
             },
         )
 
-    def _worlds(self, n: int) -> tuple[Simulation, torch.Tensor]:
-        """As many worlds as are asked for, with room for their steps.
-
-        MJWarp's are kept where there are more than that: fewer are hardly faster, and new ones have
-        to be set up.
-        """
-        sim = self._sim
-        block = self._block
-        if (
-            sim is None
-            or block is None
-            or not (sim.nworld == n or (sim.backend == "mjwarp" and sim.nworld > n))
-        ):
-            self._close_worlds()
-            sim = self._sim = self._context.batch_simulation(n)
-            block = self._block = steps_block(sim, build_phases(self._cfg)[-1].stop, self._dim)
-        return sim, block
-
-    def _close_worlds(self) -> None:
-        if self._sim is not None:
-            self._sim.close()
-        self._sim = self._block = None
-
-    def _count(self, writer: DatasetWriter) -> None:
-        self.committed = len(writer.committed)
-        self.steps = writer.frames
+    def _worlds(self, n: int) -> Simulation:
+        if self._sim is None or self._sim.nworld != n:
+            if self._sim is not None:
+                self._sim.close()
+            self._sim = self._context.batch_simulation(n)
+        return self._sim
 
     def result(self, status: Status, problem: str, seconds: float) -> GateResult:
-        """What there is now, as a result of the report.
+        """The dataset and the expert's success, as a result of the report.
 
         Args:
             status: How it ended.
@@ -294,42 +300,35 @@ class Collection:
         asked = self._job.episodes
         new = self.committed - self._before
         size = sum(path.stat().st_size for path in self.path.rglob("*") if path.is_file()) / 1e6
-        notes = {"dataset": str(self.path), "config_sha256": self.spec.config_sha256}
+        notes = {"dataset": str(self.path), "config_sha256": self._plan.spec.config_sha256}
         metrics: dict[str, float] = {
             "episodes": self.committed,
             "episodes_of_this_call": new,
-            "steps": self.steps,
+            "steps": self._steps,
             "megabytes": size,
         }
-        reason = (
-            f"{self.committed:,} episodes, {asked:,} asked for ({self.steps:,} steps,"
-            f" {size:.1f} MB)"
-        )
+        reasons = [problem] if problem else []
+        steps = f"{self._steps:,} steps, {size:.1f} MB"
+        reasons.append(f"{self.committed:,} episodes, {asked:,} asked for ({steps})")
         details = []
+
+        # The expert, in the batches that are on record
         if self.batches:
-            worlds, succeeded = (
-                sum(getattr(batch, key) for batch in self.batches)
-                for key in ("worlds", "succeeded")
-            )
-            rate, (low, high) = succeeded / worlds, wilson_interval(succeeded, worlds)
-            seeds = [batch.seed for batch in self.batches]
-            notes["seeds"] = f"{min(seeds)} to {max(seeds)}"
+            worlds = sum(batch.worlds for batch in self.batches)
+            succeeded = sum(batch.succeeded for batch in self.batches)
+            low, high = wilson_interval(succeeded, worlds)
+            notes["seeds"] = f"{self.batches[0].seed} to {self.batches[-1].seed}"
             metrics |= {
                 "worlds_played": worlds,
                 "succeeded": succeeded,
-                "success_rate": rate,
+                "success_rate": succeeded / worlds,
                 "success_rate_low95": low,
                 "success_rate_high95": high,
                 "retries": sum(batch.retries for batch in self.batches),
             }
-            reason += (
-                f"; the expert succeeded in {succeeded:,} of {worlds:,} worlds"
-                f" ({100.0 * rate:.4g} %)"
-            )
-            broken: dict[str, int] = {}
-            for batch in self.batches:
-                for text, count in batch.broken.items():
-                    broken[text] = broken.get(text, 0) + count
+            share = f"{succeeded:,} of {worlds:,} worlds ({100.0 * succeeded / worlds:.4g} %)"
+            reasons.append(f"the expert succeeded in {share}")
+            broken = sum((Counter(batch.broken) for batch in self.batches), Counter())
             details += [f"{text}: {count} of {worlds} worlds" for text, count in broken.items()]
             if lost := sum(batch.not_finite for batch in self.batches):
                 details.append(
@@ -343,22 +342,19 @@ class Collection:
             ]
         if unknown := self.committed - sum(batch.kept for batch in self.batches):
             metrics["episodes_without_note"] = unknown
-            reason += (
-                f"; {unknown:,} episodes are of seeds that {FILE} does not have, and in no success"
-                " rate"
-            )
+            reasons.append(f"{unknown:,} episodes are of seeds that {FILE} does not have")
+
+        # This call
         if new:
-            metrics |= {f"{name}_s": value for name, value in self._seconds.items()} | {
-                "episodes_per_s": new / seconds
-            }
-            times = ", ".join(f"{name} {value:.1f} s" for name, value in self._seconds.items())
-            reason += f"; {times}, {new / seconds:.3g} episodes/s in all"
+            metrics |= {f"{name}_s": value for name, value in self._seconds.items()}
+            metrics["episodes_per_s"] = new / seconds
+            reasons.append(f"{new / seconds:.3g} episodes/s in all")
         elif self.committed >= asked:
-            reason += "; they were there already"
+            reasons.append("they were there already")
         return GateResult(
             name="collect",
             status=status,
-            reason=f"{problem}; {reason}" if problem else reason,
+            reason="; ".join(reasons),
             seconds=seconds,
             thresholds={"episodes": asked},
             metrics=metrics,
@@ -366,24 +362,16 @@ class Collection:
             details=details,
         )
 
-    def write_table(self, folder: Path, result: GateResult) -> bool:
-        """Writes dataset.md, and says whether there was anything to write of."""
-        if not self.committed:
-            return False
+    def write_table(self, folder: Path, result: GateResult) -> None:
+        """Write dataset.md: facts, and the range of every joint and its target."""
+        cfg = self._context.cfg
         statistics = json.loads((self.path / lerobot.STATS).read_text())
-        ranges = [
-            ColumnRange(name=f"{name} {joint}", unit=unit, low=low, mean=mean, high=high)
-            for name in (STATE, ACTION)
-            for joint, unit, low, mean, high in zip(
-                self.spec.features[name].names,
-                self.spec.features[name].units,
-                *(statistics[name][key] for key in ("min", "mean", "max")),
-                strict=True,
-            )
-        ]
-        title = f"{self._cfg.robot.title}, task {self._cfg.task.name}: demonstrations"
-        write_atomic(
-            folder / "dataset.md",
-            to_markdown(title, {**result.notes, **result.metrics}, ranges, str(self.path)),
-        )
-        return True
+        ranges = []
+        for name in (STATE, ACTION):
+            feature = self._plan.spec.features[name]
+            columns = [statistics[name][key] for key in ("min", "mean", "max")]
+            for joint, unit, *values in zip(feature.names, feature.units, *columns, strict=True):
+                ranges.append([f"{name} {joint}", unit, *(f"{value:.4f}" for value in values)])
+        title = f"{cfg.robot.title}, task {cfg.task.name}: demonstrations"
+        facts = {**result.notes, **result.metrics}
+        write_atomic(folder / "dataset.md", to_markdown(title, facts, ranges, str(self.path)))

@@ -7,18 +7,15 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 import torch
 
-from mjstack.config.schema import CollectJobCfg, Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import play_episode
 from mjstack.episodes.rollout import Observer, reset_worlds
-from mjstack.errors import ConfigError
 from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation
 
@@ -49,13 +46,18 @@ class StepRecorder(Observer):
         layout: How many numbers of each kind there are, in order.
     """
 
-    def __init__(self, values: torch.Tensor) -> None:
-        """Takes the block, which is written from its first step on."""
-        self.values = values
+    values: torch.Tensor
+    layout: dict[str, int]
+
+    def __init__(self, steps: int) -> None:
+        """``steps`` is the length of an episode."""
+        self._steps = steps
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         self.layout = column_widths(env)
+        shape = (self._steps, env.nworld, sum(self.layout.values()))
+        self.values = torch.zeros(shape, device=env.device)
         self._env = env
         self._robot = env.index.on(env.device, env.sim.qpos.dtype)
         seen = self.layout[STATE] + sum(env.observation_manager.group_dims.values())
@@ -86,7 +88,7 @@ class Played:
 
     Attributes:
         seed: What it was played with.
-        steps: All steps, on the device; along the worlds the first ones count.
+        steps: All steps, on the device.
         failed: Bits of the task's rules, shape ``(worlds,)``, int32.
         retries: Grasps that were tried again, shape ``(worlds,)``.
         seconds: Wall time, from the reset to the result [s].
@@ -114,50 +116,21 @@ class Played:
                 yield world, dict(zip(self.steps.layout, np.split(row, ends, axis=1), strict=True))
 
 
-def most_worlds(cfg: Config, env: Env) -> int:
-    """Worlds whose steps fit into the buffer, at most nworld.
-
-    Args:
-        cfg: The job's configuration.
-        env: An environment of its demonstrations, with any number of worlds.
-
-    Raises:
-        ConfigError: Not even one world's do.
-    """
-    gib = cast(CollectJobCfg, cfg.job).buffer_gib
-    world = 4.0 * build_phases(cfg)[-1].stop * sum(column_widths(env).values()) / 2**30
-    if gib < world:
-        raise ConfigError(
-            "job.buffer_gib", gib, f"at least {world:.2g}, which the steps of one world take"
-        )
-    return min(cfg.nworld, int(gib / world))
-
-
-def steps_block(sim: Simulation, steps: int, dim: int) -> torch.Tensor:
-    """Room for the steps of a batch, on its device."""
-    return torch.zeros((steps, sim.nworld, dim), dtype=torch.float32, device=sim.device)
-
-
-def play_demonstrations(
-    context: RunContext, sim: Simulation, seed: int, values: torch.Tensor, worlds: int
-) -> Played:
-    """Play the configured driver once in the first worlds of a seed, and judge it by the task's
-    check.
+def play_demonstrations(context: RunContext, sim: Simulation, seed: int) -> Played:
+    """Play the configured driver once from the starts of a seed, and judge it by the task's check.
 
     Nothing ends an episode: worlds go on to its end, so all have as many steps.
 
     Args:
         context: Configuration, scene and planner.
-        sim: Room for the worlds; more of them are played as well and not looked at.
+        sim: The worlds.
         seed: Seed of the starts.
-        values: Room for the steps, shape ``(steps, nworld, dim)``; see `steps_block`.
-        worlds: Number of worlds.
     """
     began = time.perf_counter()
     cfg = demonstration_config(replace(context.cfg, seed=seed))
     env = Env(sim, context.index, cfg, check_faults=False)  # the check names lost worlds
     reset_worlds(env, seed)
-    recorder = StepRecorder(values)
+    recorder = StepRecorder(build_phases(cfg)[-1].stop)
     episode = play_episode(
         env,
         context.driver(env),
@@ -168,7 +141,7 @@ def play_demonstrations(
     return Played(
         seed=seed,
         steps=recorder,
-        failed=episode.result.failed.cpu().numpy()[:worlds],
-        retries=episode.retries[:worlds],
+        failed=episode.result.failed.cpu().numpy(),
+        retries=episode.retries,
         seconds=time.perf_counter() - began,
     )

@@ -4,9 +4,7 @@ episodes depend on.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, cast
 
 import mujoco
@@ -55,59 +53,24 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     return config
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Difference:
-    """Where two configurations differ first. Its text is ``key=found, expected value``, or the
-    names that a group has.
-
-    Attributes:
-        key: What differs.
-        found: What the one has: a value, or a group with other names in it.
-        expected: What the other has.
-        alone: Whether it is one value, and nothing else differs.
-    """
-
-    key: str
-    found: Any
-    expected: Any
-    alone: bool
-
-    def __str__(self) -> str:
-        if isinstance(self.found, Mapping) and isinstance(self.expected, Mapping):
-            found, expected = (
-                ", ".join(map(str, group)) or "nothing" for group in (self.found, self.expected)
-            )
-            return f"{self.key or 'the configuration'} has {found}, expected {expected}"
-        return f"{self.key}={as_override(self.found)}, expected {as_override(self.expected)}"
+def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
+    """Keys in which two configurations differ, such as ``seed=1, expected 2``."""
+    before = dict(_flat(theirs))
+    now = dict(_flat(ours))
+    return [
+        f"{key}={before.get(key, 'missing')}, expected {now.get(key, 'none')}"
+        for key in before | now
+        if before.get(key) != now.get(key)
+    ]
 
 
-def first_difference(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> Difference | None:
-    """Where two configurations differ first; None if they are the same."""
-    all_of_them = list(_differences(theirs, ours))
-    if not all_of_them:
-        return None
-    key, found, expected = all_of_them[0]
-    alone = len(all_of_them) == 1 and not isinstance(found, Mapping)
-    return Difference(key=key, found=found, expected=expected, alone=alone)
-
-
-def as_override(value: Any) -> str:
-    """A value of a configuration as one types it."""
-    return value if isinstance(value, str) else json.dumps(value)
-
-
-def _differences(theirs: Any, ours: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """The keys whose values differ, and the groups that have other names in them, with what each
-    side has.
-    """
-    if not (isinstance(theirs, Mapping) and isinstance(ours, Mapping)):
-        if theirs != ours:
-            yield key, theirs, ours
-    elif theirs.keys() != ours.keys():
-        yield key, theirs, ours
+def _flat(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and their values."""
+    if isinstance(node, Mapping) and node:
+        for name, value in node.items():
+            yield from _flat(value, f"{key}.{name}" if key else name)
     else:
-        for name in ours:
-            yield from _differences(theirs[name], ours[name], f"{key}.{name}" if key else name)
+        yield key, node
 
 
 def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSpec:

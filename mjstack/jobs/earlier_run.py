@@ -1,18 +1,21 @@
-"""What an earlier run left in its folder: its configuration, its report, and its batch's worlds."""
+"""The folder of an earlier run: its configuration, report, records, and copies of starts files."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-
+from mjstack.config.check import reads_starts_file
 from mjstack.config.load import load_saved
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, TermCfg
 from mjstack.episodes.record import EpisodeRecord
-from mjstack.errors import MjstackError, RunError
+from mjstack.errors import ConfigError, MjstackError, RunError
+from mjstack.files import write_atomic
+
+STEM = "starts_played"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -31,35 +34,21 @@ class EarlierRun:
 
     @classmethod
     def read(cls, name: str) -> EarlierRun:
-        """Reads a run's folder.
+        """Read a run's folder.
 
         Raises:
             RunError: There is no such run; the message says what is missing.
         """
         folder = Path(name)
-        expected = (
-            "expected the folder of a run, such as outputs/2026-11-21/04-02-05 (of a sweep: one of"
-            " its jobs')"
-        )
-        if not folder.is_dir():
-            raise RunError(f"run={name}: no such folder, {expected}. Name an existing one.")
         saved = folder / ".hydra" / "config.yaml"
         report = folder / "report.json"
         for path in (saved, report):
             if not path.is_file():
                 raise RunError(
-                    f"run={name}: has no {path.relative_to(folder)}, {expected}. Name another"
-                    " folder."
+                    f"run={name}: has no {path.relative_to(folder)}, expected the folder of a run,"
+                    " such as outputs/2026-11-21/04-02-05 (of a sweep: one of its jobs'). Name"
+                    " another folder."
                 )
-        try:
-            job = OmegaConf.select(OmegaConf.load(saved), "job.name")
-        except Exception:  # what is wrong with the file, `load_saved` says
-            job = None
-        if job not in (None, "gates"):
-            raise RunError(
-                f"run={name}: is a run of job={job}, expected one of job=gates. Name that run's"
-                " folder."
-            )
         try:
             cfg = load_saved(saved)
         except MjstackError as error:
@@ -67,10 +56,13 @@ class EarlierRun:
                 f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error} Use"
                 " the one that ran it."
             ) from error
+        if cfg.job.name != "gates":
+            raise RunError(
+                f"run={name}: is a run of job={cfg.job.name}, expected one of job=gates. Name that"
+                " run's folder."
+            )
         try:
-            provenance = json.loads(report.read_text())["provenance"]
-            if not isinstance(provenance, dict):
-                raise TypeError(provenance)
+            provenance = dict(json.loads(report.read_text())["provenance"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise RunError(
                 f"run={name}: report.json cannot be read ({type(error).__name__}), expected"
@@ -78,17 +70,82 @@ class EarlierRun:
             ) from error
         return cls(folder=folder, cfg=cfg, provenance=provenance)
 
-    def record(self, seed: int, gate: str) -> EpisodeRecord | None:
-        """The record of a gate under a seed; None if the gate did not get there.
+    def record(self, seed: int, gate: str) -> EpisodeRecord:
+        """The record of a gate under a seed.
 
         Raises:
-            RunError: The record cannot be read, or is not this run's.
+            RunError: The gate did not get there, or the record cannot be read or is of another
+                number of worlds.
         """
         record = EpisodeRecord.read(self.folder, seed, gate)
-        if record is not None and (record.seed != seed or len(record.failed) != self.cfg.nworld):
+        found = "no record" if record is None else f"a record of {len(record.failed)} worlds"
+        if record is None or len(record.failed) != self.cfg.nworld:
             raise RunError(
-                f"run={self.folder}: the record of seed {seed} has {len(record.failed)} worlds of"
-                f" seed {record.seed}, expected {self.cfg.nworld}, the run's nworld. Run that gate"
-                " again."
+                f"run={self.folder}: gate {gate} has left {found} of seed {seed}, expected one of"
+                f" {self.cfg.nworld} worlds. Run that gate again."
             )
         return record
+
+
+def archive_starts(cfg: Config, folder: Path) -> Config:
+    """Copy every starts file that worlds start from, byte for byte, for the run and its replays.
+
+    Args:
+        cfg: The run's configuration.
+        folder: The run's folder.
+
+    Returns:
+        The configuration with the copies as its terms' files.
+
+    Raises:
+        ConfigError: A file cannot be read.
+        OSError: A copy cannot be written.
+    """
+    names = copy_names(cfg)
+    for path, name in names.items():
+        try:
+            content = Path(path).read_bytes()
+        except OSError as error:
+            expected = f"a file that can be read ({error.strerror})"
+            raise ConfigError("starts", path, expected) from error
+        write_atomic(folder / name, content)
+    return _from_copies(cfg, folder, names)
+
+
+def archived_starts(cfg: Config, folder: Path) -> Config:
+    """An earlier run's configuration, with the copies in its folder as its terms' files.
+
+    Raises:
+        RunError: A copy is missing.
+    """
+    names = copy_names(cfg)
+    for path, name in names.items():
+        if not (folder / name).is_file():
+            raise RunError(
+                f"run={folder}: has no {name}, expected a copy of the starts file that it started"
+                f" from, {path}. Put one there, unchanged."
+            )
+    return _from_copies(cfg, folder.resolve(), names)
+
+
+def copy_names(cfg: Config) -> dict[str, str]:
+    """The name of the copy of each file that worlds of a gate start from; empty if none does."""
+    reset = cfg.reset
+    if "success" in cfg.gates and not reads_starts_file(reset):
+        reset = cfg.gate.success.reset
+    files = [term.params.get("path") for term in reset.values() if reads_starts_file({"": term})]
+    paths = dict.fromkeys(path for path in files if path is not None)
+    return {path: f"{STEM}{f'_{n}' if n > 1 else ''}.csv" for n, path in enumerate(paths, 1)}
+
+
+def _from_copies(cfg: Config, folder: Path, names: Mapping[str, str]) -> Config:
+    def swap(reset: Mapping[str, TermCfg]) -> dict[str, TermCfg]:
+        out = dict(reset)
+        for key, term in reset.items():
+            name = names.get(term.params.get("path", ""))
+            if name is not None and reads_starts_file({"": term}):
+                out[key] = replace(term, params=term.params | {"path": str(folder / name)})
+        return out
+
+    success = replace(cfg.gate.success, reset=swap(cfg.gate.success.reset))
+    return replace(cfg, reset=swap(cfg.reset), gate=replace(cfg.gate, success=success))

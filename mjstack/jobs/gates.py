@@ -14,11 +14,9 @@ from mjstack.episodes.record import clear_records
 from mjstack.errors import ConfigError
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
-from mjstack.jobs.archived_starts import archive_starts
-from mjstack.jobs.job import Job
-from mjstack.jobs.memory_check import check_room
+from mjstack.jobs.earlier_run import archive_starts
+from mjstack.jobs.job import Job, JobResult
 from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, check_showing, run_reported
 from mjstack.sim import resolve_backend
 
@@ -65,8 +63,6 @@ def check_task(context: RunContext) -> None:
     if cfg.controller.phases:
         _ = context.planner  # reads the robot, and reaches every nominal target
     check_env(context, cfg)
-    if cfg.job.name in ("gates", "study"):
-        check_room(cfg, context.model)
     if cfg.controller.phases and cfg.controller.approach_gain > 0.0:
         turn_sign(context.model, cfg)
 
@@ -79,17 +75,15 @@ def check_env(context: RunContext, cfg: Config) -> None:
 def run_gates_job(context: RunContext, folder: Path, overrides: list[str]) -> JobResult:
     """Run the gates of one configuration, and write its report after each; see `run_reported`."""
     cfg = context.cfg
-    title = f"task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)}"
-    return run_reported(context, folder, overrides, title, _run)
 
-
-def _run(context: RunContext, bar: ProgressBar, record: Record) -> None:
-    folder = context.folder
-    if folder is not None:
-        context = replace(context, cfg=archive_starts(context.cfg, folder))
+    def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
+        context = replace(context, cfg=archive_starts(cfg, folder))
         starts = context.cfg.starts
         clear_records(folder, keep=None if starts is None else Path(starts))
-    run_gates(context, bar.start, record)
+        run_gates(context, bar.start, record)
+
+    title = f"task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)}"
+    return run_reported(context, folder, overrides, title, work)
 
 
-JOB = Job(check_machine, run_gates_job)
+JOB = Job(check_machine, run_gates_job, shows=True)

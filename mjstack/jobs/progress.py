@@ -8,27 +8,32 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
+    MofNCompleteColumn,
     Progress,
     TaskID,
-    TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 
-from mjstack.jobs.result import STATUS_COLOR
-from mjstack.report.record import GateResult
+from mjstack.report.record import GateResult, Status
+
+STATUS_COLOR = {
+    Status.passed: "green",
+    Status.failed: "red",
+    Status.skipped: "yellow",
+    Status.interrupted: "red",
+}
 
 
 class ProgressBar:
     """A bar per gate with rate and time left on a terminal; a line now and then elsewhere."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
         self._progress = Progress(
-            TextColumn("{task.description}"),
+            "{task.description}",
             BarColumn(),
-            TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[unit]}"),
-            TextColumn("{task.fields[rate]}"),
+            MofNCompleteColumn(),
+            "{task.fields[rate]}",
             TimeElapsedColumn(),
             TimeRemainingColumn(),
             console=console,
@@ -54,27 +59,22 @@ class ProgressBar:
     def start(self, gate: str) -> None:
         """Begin something with a name."""
         self._gate = gate
-        self._drop()
-        self._task = self._progress.add_task(
-            gate, total=1, unit="", rate="starting (MJWarp compiles at its first use)"
-        )
+        self._unit = ""
         self._spoke = time.monotonic()
+        self._show(gate, 1, "starting (MJWarp compiles at its first use)")
 
     def advance(self, unit: str, done: int, total: int) -> None:
         """Show how much of something is done."""
         now = time.monotonic()
         if unit != self._unit or done <= 1 or self._task is None:
-            self._drop()
             self._unit = unit
             self._began = now
-            self._task = self._progress.add_task(
-                f"{self._gate}: {unit}", total=total, unit="", rate=""
-            )
+            self._task = self._show(f"{self._gate}: {unit}", total)
         rate = f"{done / (now - self._began):.1f}/s" if now > self._began and done > 1 else ""
         self._progress.update(self._task, completed=done, rate=rate)
         if self._progress.disable and done > 1 and now - self._spoke > 15.0:
             self._spoke = now
-            left = (total - done) * (now - self._began) / max(done, 1)
+            left = (total - done) * (now - self._began) / done
             self.say(f"{self._gate}: {unit} {done}/{total}, {rate}, {left:.0f} s left")
 
     def finish(self, result: GateResult) -> None:
@@ -85,6 +85,12 @@ class ProgressBar:
             f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s):"
             f" {escape(result.reason or 'ok')}"
         )
+
+    def _show(self, text: str, total: int, rate: str = "") -> TaskID:
+        """Replace the bar."""
+        self._drop()
+        self._task = self._progress.add_task(text, total=total, rate=rate)
+        return self._task
 
     def _drop(self) -> None:
         if self._task is not None:

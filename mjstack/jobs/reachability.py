@@ -6,32 +6,28 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import cast
 
 import numpy as np
+from rich.markup import escape
 
 from mjstack.config.schema import Config, ReachabilityJobCfg
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError
-from mjstack.files import write_atomic
-from mjstack.jobs.job import Job
+from mjstack.jobs.job import Job, JobResult
 from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, run_reported
 from mjstack.kinematics.reach import PointReach
 from mjstack.report.reachability import (
     ObjectRegion,
     ReachLevel,
-    ReachMap,
+    points_csv,
+    reach_tables,
     save_map,
-    to_csv,
-    to_markdown,
-    to_npz,
 )
 from mjstack.report.record import GateResult, Status
-from mjstack.report.write import safely_draw
+from mjstack.report.write import write_tables
 from mjstack.scene import table_top
 from mjstack.scene.phases import object_targets
 from mjstack.sim import resolve_backend
@@ -41,66 +37,50 @@ _SHARE = 500  # points between two looks at the clock
 _FINE = 0.001  # [m] to which regions are given
 
 
-def check_reachability(cfg: Config) -> None:
-    """Raises for what cannot be done, before anything is written."""
-    for key in ("view", "video"):
-        if getattr(cfg, key):
-            raise ConfigError(
-                key, "true", "false with job=reachability, which moves nothing", "Leave it out"
-            )
+def check_reachability(cfg: Config) -> RunContext:
+    """Raise for what cannot be done, before anything is written."""
     resolve_backend(cfg)
     find_levels(cfg)
-    job = cast(ReachabilityJobCfg, cfg.job)
+    step = cast(ReachabilityJobCfg, cfg.job).step
     half = cfg.scene.table_half
-    points = math.prod(2 * int(half[k] / job.step) + 1 for k in (0, 1))
-    if points > _MOST_POINTS or job.step > min(half[:2]):
+    points = math.prod(2 * int(half[k] / step) + 1 for k in (0, 1))
+    if points > _MOST_POINTS or step > min(half[:2]):
         least = math.sqrt(4.0 * half[0] * half[1] / _MOST_POINTS)
-        raise ConfigError(
-            "job.step",
-            job.step,
-            f"{least:.4f} to {min(half[:2]):g} m; this table would have {points} points",
-        )
+        expected = f"{least:.4f} to {min(half[:2]):g} m; this table would have {points} points"
+        raise ConfigError("job.step", step, expected)
+    return RunContext(cfg)
 
 
-def run_reachability_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
-    """Draws the map and leaves reachability.csv, .npz, .md, .png and the report.
+def run_reachability_job(context: RunContext, folder: Path, overrides: list[str]) -> JobResult:
+    """Draw the map and leave reachability.csv, .md, .png and the report.
 
     Args:
-        cfg: The configuration.
+        context: The configuration.
         folder: Where they go.
-        overrides: What was asked for on the command line.
+        overrides: The command line.
 
     Returns:
         How it ended: a pass if the region of ``reset=randomized`` is reached with the margin,
         around every object's position.
     """
+    cfg = context.cfg
 
     def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
         levels: list[ReachLevel] = []
         for name, (height, gripper) in find_levels(cfg).items():
             bar.start(name)
             began = time.perf_counter()
-            levels.append(
-                map_level(
-                    context,
-                    name,
-                    height,
-                    gripper,
-                    lambda done, total: bar.advance("points", done, total),
-                )
-            )
-            _write(context, folder, levels, [])
+            levels.append(map_level(context, name, height, gripper))
+            _write(cfg, folder, levels, [])
             record(_level_result(levels[-1], time.perf_counter() - began))
-        began = time.perf_counter()
         regions = [find_region(cfg, levels, name) for name in cfg.scene.free]
-        _write(context, folder, levels, regions)
+        if problem := _write(cfg, folder, levels, regions, draw=True):
+            bar.say(escape(problem))
         for region in regions:
-            record(_region_result(cfg, region, time.perf_counter() - began))
-        _draw(context, folder, levels, regions)
+            record(_region_result(cfg, region))
 
-    return run_reported(
-        RunContext(cfg), folder, overrides, f"task {cfg.task.name}, what the arm reaches", work
-    )
+    title = f"task {cfg.task.name}, what the arm reaches"
+    return run_reported(context, folder, overrides, title, work)
 
 
 def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
@@ -127,47 +107,37 @@ def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
     }
 
 
-def axes(cfg: Config) -> tuple[np.ndarray, np.ndarray]:
+def axes(cfg: Config) -> list[np.ndarray]:
     """The map's columns and rows: x and y [m] of points on the table, one in its middle."""
     step = cast(ReachabilityJobCfg, cfg.job).step
-    scene = cfg.scene
-    counts = [int(scene.table_half[k] / step + 1e-9) for k in (0, 1)]
-    x, y = (scene.table_center[k] + step * np.arange(-counts[k], counts[k] + 1) for k in (0, 1))
-    return x, y
+    center, half = cfg.scene.table_center, cfg.scene.table_half
+    counts = [int(half[k] / step + 1e-9) for k in (0, 1)]
+    return [center[k] + step * np.arange(-n, n + 1) for k, n in enumerate(counts)]
 
 
-def map_level(
-    context: RunContext,
-    name: str,
-    height: float,
-    gripper: str,
-    progress: Callable[[int, int], object],
-) -> ReachLevel:
-    """Solves every point of one height."""
+def map_level(context: RunContext, name: str, height: float, gripper: str) -> ReachLevel:
+    """Solve every point of one height."""
     cfg = context.cfg
     command = cfg.robot.gripper_open if gripper == "open" else cfg.robot.gripper_closed
     reach = PointReach(context.model, cfg.robot, command)
     tolerance = cfg.controller.ik_tolerance
-    x, y = axes(cfg)
-    level = table_top(cfg.scene) + height
-    points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), level)], axis=-1).reshape(
-        -1, 3
-    )
+    x, y = np.meshgrid(*axes(cfg))
+    level = np.full(x.size, table_top(cfg.scene) + height)
+    points = np.stack([x.ravel(), y.ravel(), level], axis=1)
     residual = np.empty(len(points))
     tilt = np.empty(len(points))
     for first in range(0, len(points), _SHARE):
         part = slice(first, first + _SHARE)
         found = reach.solve_upright(points[part], tolerance)
         residual[part] = found.distance
-        tilt[part] = np.where(found.distance <= tolerance, found.tilt, np.nan)
-        progress(min(first + _SHARE, len(points)), len(points))
-    shape = len(y), len(x)
+        tilt[part] = np.where(found.distance <= tolerance, np.degrees(found.tilt), np.nan)
+        context.tell("points", min(first + _SHARE, len(points)), len(points))
     return ReachLevel(
         name=name,
         height=height,
         gripper=gripper,
-        residual=residual.reshape(shape),
-        tilt=tilt.reshape(shape),
+        residual=residual.reshape(x.shape),
+        tilt=tilt.reshape(x.shape),
     )
 
 
@@ -189,7 +159,8 @@ def find_region(cfg: Config, levels: list[ReachLevel], name: str) -> ObjectRegio
         - job.step
         - job.margin
     )
-    edge = [_map_edge(axis, place[k]) - job.margin for k, axis in enumerate((x, y))]
+    ends = [min(place[k] - axis[0], axis[-1] - place[k]) for k, axis in enumerate((x, y))]
+    edge = [end - job.margin for end in ends]
 
     def most_y(half_x: float) -> float:
         """How far a region of this half-width goes in y; negative where there is none."""
@@ -224,10 +195,6 @@ def find_region(cfg: Config, levels: list[ReachLevel], name: str) -> ObjectRegio
     )
 
 
-def _map_edge(axis: np.ndarray, at: float) -> float:
-    return float(min(at - axis[0], axis[-1] - at))
-
-
 def _level_result(level: ReachLevel, seconds: float) -> GateResult:
     share = float(level.reached.mean())
     metrics: dict[str, float] = {
@@ -240,7 +207,7 @@ def _level_result(level: ReachLevel, seconds: float) -> GateResult:
         " table reached"
     )
     if share:
-        low, high = (float(np.degrees(end(level.tilt))) for end in (np.nanmin, np.nanmax))
+        low, high = level.tilts
         metrics |= {"smallest_tilt_deg": low, "largest_tilt_deg": high}
         reason += f", tilted by {low:.0f} to {high:.0f} degrees at least"
     return GateResult(
@@ -248,59 +215,43 @@ def _level_result(level: ReachLevel, seconds: float) -> GateResult:
     )
 
 
-def _region_result(cfg: Config, region: ObjectRegion, seconds: float) -> GateResult:
+def _region_result(cfg: Config, region: ObjectRegion) -> GateResult:
     margin = cast(ReachabilityJobCfg, cfg.job).margin
+    wide, deep = region.configured
+    x, y = region.largest
     reason = (
-        f"scene.random_xy {region.configured[0]:g} x {region.configured[1]:g} m is"
-        f" {'' if region.reached else 'not '}reached with {1e3 * margin:g} mm to spare; the largest"
-        f" square is {region.square:.3f} m, the largest rectangle {region.largest[0]:.3f} x"
-        f" {region.largest[1]:.3f} m"
+        f"scene.random_xy {wide:g} x {deep:g} m is {'' if region.reached else 'not '}reached with"
+        f" {1e3 * margin:g} mm to spare; the largest square is {region.square:.3f} m, the largest"
+        f" rectangle {x:.3f} x {y:.3f} m"
     )
-    metrics: Mapping[str, float] = {
-        "random_x_m": region.configured[0],
-        "random_y_m": region.configured[1],
-        "largest_square_m": region.square,
-        "largest_x_m": region.largest[0],
-        "largest_y_m": region.largest[1],
-        "largest_tilt_in_region_deg": float(np.degrees(region.tilt)),
-    }
-    status = Status.passed if region.reached else Status.failed
-    thresholds = {"margin_m": margin}
     return GateResult(
         name=region.name,
-        status=status,
+        status=Status.passed if region.reached else Status.failed,
         reason=reason,
-        seconds=seconds,
-        thresholds=dict(thresholds),
-        metrics=dict(metrics),
-    )
-
-
-def _map(context: RunContext, levels: list[ReachLevel], regions: list[ObjectRegion]) -> ReachMap:
-    cfg = context.cfg
-    x, y = axes(cfg)
-    return ReachMap(
-        title=f"{cfg.robot.title}, task {cfg.task.name}: what the arm reaches",
-        x=x,
-        y=y,
-        table=(cfg.scene.table_center[:2], cfg.scene.table_half[:2]),
-        levels=levels,
-        regions=regions,
-        colors={name: thing.color for name, thing in cfg.scene.free.items()},
+        thresholds={"margin_m": margin},
+        metrics={
+            "random_x_m": wide,
+            "random_y_m": deep,
+            "largest_square_m": region.square,
+            "largest_x_m": x,
+            "largest_y_m": y,
+            "largest_tilt_in_region_deg": region.tilt,
+        },
     )
 
 
 def _write(
-    context: RunContext,
+    cfg: Config,
     folder: Path,
     levels: list[ReachLevel],
     regions: list[ObjectRegion],
-    picture: str = "",
-) -> None:
-    """The tables, as far as they are known."""
-    found = _map(context, levels, regions)
-    job = cast(ReachabilityJobCfg, context.cfg.job)
-    robot = context.cfg.robot
+    draw: bool = False,
+) -> str:
+    """Write table and picture as far as they are known; return why there is no picture."""
+    job = cast(ReachabilityJobCfg, cfg.job)
+    scene = cfg.scene
+    x, y = axes(cfg)
+    title = f"{cfg.robot.title}, task {cfg.task.name}: what the arm reaches"
     notes = [
         (
             "Half-widths in m, around the position. A region counts as reached if it still is with"
@@ -308,9 +259,8 @@ def _write(
             f" {1e3 * job.step:g} mm apart. Regions keep objects of any yaw on the table."
         ),
         (
-            f"Reached: inverse kinematics of {', '.join(robot.ik_joints)} brings the grasp point"
-            f" within {1e3 * context.cfg.controller.ik_tolerance:g} mm. Collisions are not"
-            " looked at."
+            f"Reached: inverse kinematics of {', '.join(cfg.robot.ik_joints)} brings the grasp"
+            f" point within {1e3 * cfg.controller.ik_tolerance:g} mm. Collisions are not looked at."
         ),
         (
             "Tilt: the smallest angle between the gripper's approach axis and straight down that a"
@@ -319,20 +269,21 @@ def _write(
         ),
         "Reached does not mean grasped: how many worlds succeed, the gate success tells.",
     ]
-    write_atomic(folder / "reachability.csv", to_csv(found))
-    write_atomic(folder / "reachability.npz", to_npz(found))
-    write_atomic(folder / "reachability.md", to_markdown(found, notes, picture))
 
+    def picture(path: Path) -> None:
+        table = (scene.table_center[:2], scene.table_half[:2])
+        colors = {name: thing.color for name, thing in scene.free.items()}
+        save_map(path, title, x, y, levels, regions, table, colors)
 
-def _draw(
-    context: RunContext, folder: Path, levels: list[ReachLevel], regions: list[ObjectRegion]
-) -> None:
-    """Draw the map."""
-    found = _map(context, levels, regions)
-    if problem := safely_draw(folder / "reachability.png", save_map, found):
-        context.say(problem)
-    else:
-        _write(context, folder, levels, regions, "reachability.png")
+    return write_tables(
+        folder,
+        "reachability",
+        title,
+        reach_tables(levels, regions),
+        notes,
+        points_csv(x, y, levels),
+        picture if draw else None,
+    )
 
 
 JOB = Job(check_reachability, run_reachability_job)

@@ -21,8 +21,8 @@ from mjstack.config.schema import Config
 from mjstack.episodes.context import Artifacts, RunContext
 from mjstack.episodes.observers import StepHook
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.result import STATUS_COLOR, JobResult
+from mjstack.jobs.job import JobResult
+from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
 from mjstack.report.markdown import summarize
 from mjstack.report.picture import require_video, save_scene, save_trajectories, save_video
 from mjstack.report.provenance import collect_provenance
@@ -47,11 +47,7 @@ def check_showing(cfg: Config) -> None:
             "view", "true", "a display, and DISPLAY is not set", "Use video=true instead"
         )
     if cfg.video:
-        try:
-            require_video()
-        except MjstackError as error:
-            error.exit_code = 2
-            raise
+        require_video()
 
 
 def run_reported(
@@ -79,6 +75,7 @@ def run_reported(
     def record(result: GateResult) -> None:
         report.gates.append(result)
         write_report(report, folder)
+        log.info("%s: %s %s", result.name, result.status.value, result.reason)
         bar.finish(result)
 
     try:
@@ -116,28 +113,20 @@ def run_reported(
 def run_provenance(cfg: Config, context: RunContext) -> dict:
     """Versions, device, and hashes of configuration and model."""
     backend, device = context.backend
-    driver = "no CUDA device"
-    name = (
-        f"native MuJoCo on {os.cpu_count()} cores"
-        if backend.value == "native"
-        else "Warp's CPU device"
-    )
+    name = "Warp's CPU device"
     if device.startswith("cuda"):
         name = cuda_name(device)
-        driver = cuda_driver()
-    text = model_text(context.model)
-    config = OmegaConf.to_yaml(OmegaConf.structured(cfg))
+    elif backend.value == "native":
+        name = f"native MuJoCo on {os.cpu_count()} cores"
+    # The compiled model's numbers: what the physics sees, whatever file it came from
+    buffer = np.empty(mujoco.mj_sizeModel(context.model), np.uint8)
+    mujoco.mj_saveModel(context.model, None, buffer)
     return collect_provenance(
-        config_yaml=config, model_text=text, device=f"{device}: {name}", driver=driver
+        config_yaml=OmegaConf.to_yaml(OmegaConf.structured(cfg)),
+        model_text=buffer.tobytes().hex(),
+        device=f"{device}: {name}",
+        driver=cuda_driver() if device.startswith("cuda") else "no CUDA device",
     )
-
-
-def model_text(model: mujoco.MjModel) -> str:
-    """The compiled model's numbers as text: what the physics sees, whatever file it came from."""
-    size = mujoco.mj_sizeModel(model)
-    buffer = np.empty(size, np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes().hex()
 
 
 def _draw(context: RunContext, folder: Path, console: Console) -> list[str]:
@@ -151,20 +140,18 @@ def _draw(context: RunContext, folder: Path, console: Console) -> list[str]:
     title = f"{cfg.robot.title}, {cfg.task.name}: {context.artifacts.shown_by}"
     model = context.stage.visual_model
     drawn: dict[str, tuple[Callable[..., object], tuple]] = {
-        "scene.png": (save_scene, (model, episode.qpos[-1], positions[-1], objects, title)),
+        "scene.png": (save_scene, (model, episode.qpos[-1])),
         "trajectories.png": (save_trajectories, (positions, objects, title)),
     }
     if cfg.video:
         drawn["episode.mp4"] = (save_video, (model, episode.qpos, cfg.timing.step_dt))
-    pictures = []
-    for name, (draw, args) in drawn.items():
-        if problem := safely_draw(folder / name, draw, *args):
-            console.print(escape(problem))
-        elif name.endswith(".png"):
-            pictures.append(name)
-        else:
-            console.print(f"video: {folder}/{name}")
-    return pictures
+    problems = {
+        name: safely_draw(folder / name, draw, *args) for name, (draw, args) in drawn.items()
+    }
+    for name, problem in problems.items():
+        if problem or name == "episode.mp4":
+            console.print(escape(problem or f"video: {folder}/{name}"))
+    return [name for name, problem in problems.items() if not problem and name.endswith(".png")]
 
 
 def _viewer(context: RunContext) -> StepHook:

@@ -2,37 +2,36 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import cast
 
-from omegaconf import OmegaConf
-from rich.console import Console
 from rich.markup import escape
 
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.schema import Backend, Config, ScalingJobCfg
-from mjstack.episodes.context import require_episode
-from mjstack.errors import ConfigError
-from mjstack.files import to_csv, write_atomic
+from mjstack.episodes.context import RunContext, require_episode
+from mjstack.files import to_csv
 from mjstack.jobs.gates import check_machine
-from mjstack.jobs.job import Job
-from mjstack.jobs.result import JobResult
-from mjstack.jobs.runner import model_text
-from mjstack.jobs.scaling_run import OutOfTime, is_done, read_run, run_process
-from mjstack.report.curves import save_scaling_curves
-from mjstack.report.provenance import collect_provenance
-from mjstack.report.record import GateResult, Report, Status
-from mjstack.report.scaling import COLUMNS, NOT_RUN, PASS, Row, describe_crossover, to_markdown
-from mjstack.report.write import safely_draw, write_report
-from mjstack.scene import build_model
-from mjstack.sim import cuda_driver, resolve_device
-
-log = logging.getLogger(__name__)
+from mjstack.jobs.job import Job, JobResult
+from mjstack.jobs.progress import ProgressBar
+from mjstack.jobs.runner import Record, run_reported
+from mjstack.jobs.scaling_run import OutOfTime, read_run, run_process
+from mjstack.report.record import GateResult, Status
+from mjstack.report.scaling import (
+    NOT_RUN,
+    PASS,
+    RATE,
+    Row,
+    describe_crossover,
+    save_scaling_curves,
+    scaling_table,
+)
+from mjstack.report.write import write_tables
+from mjstack.sim import resolve_device
 
 # A run sets these itself; the command line's do not reach it.
 _OWN = (
@@ -52,24 +51,17 @@ _OWN_NATIVE = (
     "gate.throughput.env_steps",
 )
 _UNUSED = {"nworld", "gates", "gate.throughput.repetitions"}  # and the user is told
-_GROWTH = 1.5  # of a run's time over the one before, where the last two do not tell
+_GROWTH = 1.5  # of a run's time over that of the one before
 
 Key = tuple[int, str]
 """Number of worlds and backend."""
 
 
-def check_scaling(cfg: Config) -> None:
+def check_scaling(cfg: Config) -> RunContext:
     """Raise for what this machine cannot do, before anything is written."""
-    for key in ("view", "video"):
-        if getattr(cfg, key):
-            raise ConfigError(
-                key, "true", "false with job=scaling, which shows no world", "Leave it out"
-            )
     require_episode(cfg)
-    backends = _backends(cfg)
-    if "mjwarp" in backends:
-        resolve_device(cfg.sim.device)
-    check_machine(replace(cfg, sim=replace(cfg.sim, backend=Backend(backends[0]), device="cpu")))
+    resolve_device(cfg.sim.device)
+    return check_machine(cfg)
 
 
 def scaling_folder(cfg: Config) -> Path:
@@ -84,45 +76,46 @@ def scaling_folder(cfg: Config) -> Path:
     return Path("outputs") / "scaling" / config_hash(config | {"job": job})[:12]
 
 
-def run_scaling_job(cfg: Config, folder: Path, overrides: list[str]) -> JobResult:
+def run_scaling_job(context: RunContext, folder: Path, overrides: list[str]) -> JobResult:
     """Do the runs that are not done, and leave table, plot and report.
 
     `ScalingJobCfg` says what ends a call.
 
     Args:
-        cfg: The configuration.
+        context: The configuration.
         folder: Where everything goes, and where an earlier call's runs are.
         overrides: The command line; the runs get it too.
 
     Returns:
         How it ended: a pass if every run is there and passed.
     """
-    console = Console(highlight=False, soft_wrap=True)
-    outcome = JobResult(status=Status.failed, folder=folder, overrides=overrides)
+    cfg = context.cfg
     keys = [(nworld, backend) for nworld in _job(cfg).nworlds for backend in _backends(cfg)]
     rows = {key: read_run(_folder(folder, key), *key) for key in keys}
-    console.print(
-        f"[bold]{cfg.robot.title}[/], task {cfg.task.name}, scaling: {len(rows)} runs ->"
-        f" {escape(str(folder))}"
-    )
-    for override in overrides:
-        if _key(override) in _UNUSED:
-            console.print(f"{escape(override)} is not used: each run of job=scaling sets it")
-    try:
-        try:
-            incomplete = _run_all(cfg, folder, overrides, rows, console)
-            outcome.gates = _conclude(cfg, folder, list(rows.values()), incomplete, console)
-            if all(row["status"] == PASS for row in rows.values()):
-                outcome.status = Status.passed
-        except KeyboardInterrupt:
-            outcome.status = Status.interrupted
-            outcome.gates = _conclude(cfg, folder, list(rows.values()), "interrupted", console)
-    except OSError as error:
-        Console(stderr=True, soft_wrap=True).print(
-            f"mjstack: {escape(str(folder))} cannot be written: {error.strerror}. Free space, and"
-            " run the same command again."
-        )
-    return outcome
+
+    def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
+        for override in overrides:
+            if _key(override) in _UNUSED:
+                bar.say(f"{escape(override)} is not used: each run of job=scaling sets it")
+        _write(cfg, folder, rows)
+        left = _run_all(cfg, folder, overrides, rows, bar, record)
+        # What is missing, and how to go on
+        missing = [key for key, row in rows.items() if row["status"] == NOT_RUN]
+        for key in missing:
+            record(_as_gate(rows[key], left))
+        if any(row["status"] not in (PASS, NOT_RUN) for row in rows.values()):
+            bar.say("job.retry=true repeats the runs that failed")
+        if missing:
+            counts = f"{len(missing)} of {len(rows)} runs have not run ({escape(left)})"
+            bar.say(f"incomplete: {counts}. The same command goes on with them.")
+        if problem := _write(cfg, folder, rows, draw=True):
+            bar.say(escape(problem))
+        else:
+            context.artifacts.pictures.append("scaling.png")
+        bar.say(describe_crossover(list(rows.values())))
+
+    title = f"task {cfg.task.name}, scaling: {len(rows)} runs"
+    return run_reported(context, folder, overrides, title, work)
 
 
 def run_overrides(cfg: Config, overrides: Sequence[str], nworld: int, backend: str) -> list[str]:
@@ -152,21 +145,24 @@ def run_overrides(cfg: Config, overrides: Sequence[str], nworld: int, backend: s
 
 
 def _run_all(
-    cfg: Config, folder: Path, overrides: list[str], rows: dict[Key, Row], console: Console
+    cfg: Config,
+    folder: Path,
+    overrides: list[str],
+    rows: dict[Key, Row],
+    bar: ProgressBar,
+    record: Record,
 ) -> str:
     """Do the runs that are not done, in order; return why some are left, or nothing."""
     job = _job(cfg)
     until = math.inf if job.max_minutes is None else time.monotonic() + 60.0 * job.max_minutes
-    started = False
-    for number, key in enumerate(rows, 1):
-        label = f"{number}/{len(rows)} {key[1]}, {key[0]} worlds"
-        if is_done(rows[key], job.retry):
-            console.print(f"{label}: {_describe(rows[key])} (done before)")
+    for key, row in rows.items():
+        if row["status"] == PASS or (row["status"] != NOT_RUN and not job.retry):
+            record(_as_gate(row, "done before"))
             continue
         left = until - time.monotonic()
-        if started and _estimate(rows, key) > left:
-            return f"{label} needs more than the {max(left, 0.0):.0f} s that are left"
-        started = True
+        if _estimate(rows, key) > left:
+            return f"{key[1]}, {key[0]} worlds needs more than the {left:.0f} s that are left"
+        bar.start(f"{key[1]}, {key[0]} worlds")
         try:
             rows[key] = run_process(
                 _folder(folder, key),
@@ -177,10 +173,16 @@ def _run_all(
             )
         except OutOfTime as stop:
             return str(stop)
-        log.info("%s: %s", label, rows[key]["status"])
-        console.print(f"{label}: {_describe(rows[key])}")
-        _write_tables(cfg, folder, list(rows.values()))
+        _write(cfg, folder, rows)
+        record(_as_gate(rows[key]))
     return ""
+
+
+def _estimate(rows: dict[Key, Row], key: Key) -> float:
+    """About how long a run takes [s], from those with fewer worlds; 0 where there are none."""
+    nworld, backend = key
+    smaller = [row for (n, kind), row in rows.items() if kind == backend and n < nworld]
+    return _GROWTH * max((row["seconds"] or 0.0 for row in smaller), default=0.0)
 
 
 def _folder(folder: Path, key: Key) -> Path:
@@ -205,43 +207,31 @@ def _backends(cfg: Config) -> list[str]:
     return ["mjwarp", "native"] if resolve_device(cfg.sim.device).startswith("cuda") else ["native"]
 
 
-def _estimate(rows: dict[Key, Row], key: Key) -> float:
-    """About how long a run takes [s], from those with fewer worlds on the same backend.
-
-    0 where there are none.
-    """
-    done = sorted(
-        (row["nworld"], row["seconds"])
-        for row in rows.values()
-        if row["backend"] == key[1] and row["nworld"] < key[0] and row["seconds"] is not None
+def _as_gate(row: Row, note: str = "") -> GateResult:
+    """A row as a result of the report."""
+    reason = row["reason"]
+    if row["status"] == NOT_RUN:
+        reason = "has not run"
+    elif row["status"] == PASS:
+        reason = f"{row[RATE]:,.0f} world-steps/s" if RATE in row else "no figure"
+    return GateResult(
+        name=f"{row['backend']}-{row['nworld']}",
+        status=Status.passed if row["status"] == PASS else Status.failed,
+        reason=f"{reason} ({note})" if note else reason,
+        seconds=row["seconds"] or 0.0,
+        metrics={key: value for key, value in row.items() if isinstance(value, float | int)},
+        notes={key: row[key] for key in ("hardware", "git_commit") if row[key]},
     )
-    if not done:
-        return 0.0
-    growth = done[-1][1] / done[-2][1] if len(done) > 1 else _GROWTH
-    return done[-1][1] * max(1.0, growth)
 
 
-def _describe(row: Row) -> str:
-    if row["status"] != PASS:
-        return f"{row['status']}: {row['reason']}" if row["reason"] else row["status"]
-    rate = row["world_steps_per_s"]
-    figure = "no figure" if rate is None else f"{rate:,.0f} world-steps/s"
-    return f"pass ({row['seconds']:.0f} s): {figure}"
-
-
-def _write_tables(cfg: Config, folder: Path, rows: list[Row], picture: str = "") -> None:
-    write_atomic(folder / "scaling.csv", to_csv(list(COLUMNS), rows))
-    write_atomic(folder / "scaling.md", to_markdown(rows, _title(cfg), _notes(cfg), picture))
-
-
-def _title(cfg: Config) -> str:
-    return f"{cfg.robot.title}, task {cfg.task.name}: throughput over the number of worlds"
-
-
-def _notes(cfg: Config) -> list[str]:
+def _write(cfg: Config, folder: Path, rows: dict[Key, Row], draw: bool = False) -> str:
+    """Write table and plot of the runs so far; return why there is no plot."""
     job = _job(cfg)
     t = cfg.gate.throughput
-    return [
+    known = list(rows.values())
+    title = f"{cfg.robot.title}, task {cfg.task.name}: throughput over the number of worlds"
+    notes = [
+        describe_crossover(known),
         (
             "ms per step and world-steps/s: physics under a held joint target from"
             f" {t.from_phase} on, object in hand; medians of {job.repetitions} repetitions up to"
@@ -264,54 +254,19 @@ def _notes(cfg: Config) -> list[str]:
             f" is played or judged. Beyond {t.start_worlds} worlds the start states repeat."
         ),
     ]
-
-
-def _conclude(
-    cfg: Config, folder: Path, rows: list[Row], incomplete: str, console: Console
-) -> list[GateResult]:
-    """Write table, plot and report of the runs so far."""
-    picture = "scaling.png"
-    args = (rows, cfg.timing.decimation, _title(cfg))
-    if problem := safely_draw(folder / picture, save_scaling_curves, *args):
-        console.print(escape(problem))
-        picture = ""
-    _write_tables(cfg, folder, rows, picture)
-    provenance = collect_provenance(
-        config_yaml=OmegaConf.to_yaml(OmegaConf.structured(cfg)),
-        model_text=model_text(build_model(cfg)),
-        device="each run's report says",
-        driver=cuda_driver(),
-    )
-    report = Report(provenance=provenance, gates=[_as_gate(row) for row in rows])
-    report.pictures = [picture] if picture else []
-    if not incomplete:
-        report.conclude()
-    write_report(report, folder)
-    # On the terminal: the crossover, the table, and how to go on.
-    missing = sum(row["status"] == NOT_RUN for row in rows)
-    failed = sum(row["status"] not in (PASS, NOT_RUN) for row in rows)
-    console.print(describe_crossover(rows))
-    console.print(f"table: {escape(str(folder))}/scaling.md")
-    if failed:
-        console.print(f"{failed} of {len(rows)} runs failed; job.retry=true repeats them")
-    if missing:
-        console.print(
-            f"incomplete: {missing} of {len(rows)} runs have not run ({escape(incomplete)}). The"
-            " same command goes on with them."
-        )
-    return report.gates
-
-
-def _as_gate(row: Row) -> GateResult:
-    """A row as a result of the report."""
-    status = {PASS: Status.passed, NOT_RUN: Status.skipped}.get(row["status"], Status.failed)
-    return GateResult(
-        name=f"{row['backend']}-{row['nworld']}",
-        status=status,
-        reason="has not run" if row["status"] == NOT_RUN else _describe(row),
-        seconds=row["seconds"] or 0.0,
-        metrics={key: value for key, value in row.items() if isinstance(value, float | int)},
-        notes={key: row[key] for key in ("hardware", "git_commit") if row[key]},
+    for name in ("hardware", "git_commit"):
+        values = sorted({row[name] for row in known if row[name]})
+        notes += [f"{name.removeprefix('git_')}: {value}" for value in values]
+    return write_tables(
+        folder,
+        "scaling",
+        title,
+        [scaling_table(known)],
+        notes,
+        to_csv(known),
+        (lambda path: save_scaling_curves(path, known, cfg.timing.decimation, title))
+        if draw
+        else None,
     )
 
 

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from mjstack.config.session import search_path_override
 from mjstack.errors import MjstackError, is_out_of_memory
 from mjstack.files import write_atomic
-from mjstack.report.scaling import COLUMNS, NOT_RUN, PASS, Row, new_row, take_figures
+from mjstack.report.scaling import NOT_RUN, PASS, Row
 
 RESULT = "run.json"
 _START = "from mjstack.__main__ import main; main()"
-_REFUSED = re.compile(r"that fit into the \d+ GiB")  # by the memory check, before it started
 _GRACE = 20.0  # s, for a process that was asked to stop
 
 
@@ -25,20 +24,21 @@ class OutOfTime(MjstackError):
     """The job's time is over; the run counts as not run."""
 
 
+def new_row(nworld: int, backend: str, **values: Any) -> Row:
+    """A row that has not run, with some values."""
+    empty = {"status": NOT_RUN, "reason": "", "seconds": None, "hardware": "", "git_commit": ""}
+    return {"nworld": nworld, "backend": backend} | empty | values
+
+
 def read_run(folder: Path, nworld: int, backend: str) -> Row:
     """The row of a run, as not run where it has not finished."""
     try:
         row = json.loads((folder / RESULT).read_text())
-        if row.keys() == COLUMNS.keys():
+        if "status" in row:
             return row
-    except (OSError, ValueError, AttributeError):  # not there, or of another version
+    except (OSError, ValueError):  # not there, or of another version
         pass
     return new_row(nworld, backend)
-
-
-def is_done(row: Row, retry: bool) -> bool:
-    """Whether a run need not be repeated."""
-    return row["status"] == PASS or (row["status"] != NOT_RUN and not retry)
 
 
 def run_process(
@@ -50,7 +50,7 @@ def run_process(
     run_seconds: float,
     job_seconds: float,
 ) -> Row:
-    """Start a run's process, wait for it, and keep its row in its folder.
+    """Run the gates in a process and keep the row.
 
     Args:
         folder: The run's folder; its report, log and output go there.
@@ -70,19 +70,14 @@ def run_process(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "report.json").unlink(missing_ok=True)  # an earlier try's
     target = str(folder).replace("\\", "\\\\").replace("'", "\\'")
-    target_override = f"hydra.run.dir='{target}'"
-    command = [
-        sys.executable,
-        "-c",
-        _START,
-        *overrides,
-        *search_path_override(),
-        target_override,
-    ]
+    command = [sys.executable, "-c", _START, *overrides, *search_path_override()]
     began = time.monotonic()
     with (folder / "output.log").open("w") as log:
         process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+            [*command, f"hydra.run.dir='{target}'"],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
         )
         code: int | None = None
         try:
@@ -98,10 +93,7 @@ def run_process(
         raise KeyboardInterrupt
     row = read_report(folder, nworld, backend, code) | {"seconds": seconds}
     if code is None:
-        row |= {
-            "status": "timeout",
-            "reason": f"not done after {seconds:.0f} s (job.run_minutes)",
-        }
+        row["reason"] = f"not done after {seconds:.0f} s (job.run_minutes)"
     write_atomic(folder / RESULT, json.dumps(row, indent=2) + "\n")
     return row
 
@@ -120,44 +112,31 @@ def read_report(folder: Path, nworld: int, backend: str, code: int | None) -> Ro
     except (OSError, ValueError):
         report = {"gates": [], "provenance": {}}
     row = new_row(nworld, backend, git_commit=report["provenance"].get("git_commit", ""))
-    metrics: dict[str, float] = {}
     for gate in report["gates"]:
-        metrics |= gate["metrics"]
         row["hardware"] = gate["notes"].get("backend") or row["hardware"]
-    row |= take_figures(metrics)
+        row |= {name: n for name, n in gate["metrics"].items() if not isinstance(n, str)}
     if code == 0:
         return row | {"status": PASS}
 
     # Why it failed: the gates' reasons, or the last line of its output.
     failed = [f"{g['name']}: {g['reason']}" for g in report["gates"] if g["status"] == "fail"]
     output = (folder / "output.log").read_text(errors="replace").strip()
-    last = output.splitlines()[-1] if output else "no output"
-    status = "fail"
-    reason = "; ".join(failed) or last
-    no_memory = is_out_of_memory(reason) or _REFUSED.search(reason)
-    if no_memory or (code != 2 and is_out_of_memory(output)):
-        status = "out of memory"
-    elif code == -9:
-        status = "out of memory"
-        reason = "killed by signal 9, as the system does when memory runs out"
-    elif code is not None and code < 0:
-        status = "crashed"
-        reason = f"killed by signal {-code}; {last}"
-    return row | {"status": status, "reason": reason}
+    reason = "; ".join(failed) or (output.splitlines() or ["no output"])[-1]
+    if code is not None and code < 0:
+        reason = f"killed by signal {-code}; {reason}"
+    # The system kills (9) where memory runs out.
+    no_memory = code == -9 or is_out_of_memory(reason if code == 2 else f"{reason} {output}")
+    return row | {"status": "out of memory" if no_memory else "fail", "reason": reason}
 
 
 def _stop(process: subprocess.Popen) -> None:
     """Ask a process that still runs to stop, as Ctrl-C would, and end it if it does not."""
-    if process.poll() is not None:
-        return
     try:
         process.wait(1.0)  # a terminal's Ctrl-C has reached it too
-        return
     except subprocess.TimeoutExpired:
-        pass
-    process.terminate() if sys.platform == "win32" else process.send_signal(2)
-    try:
-        process.wait(_GRACE)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+        process.terminate() if sys.platform == "win32" else process.send_signal(2)
+        try:
+            process.wait(_GRACE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

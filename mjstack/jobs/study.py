@@ -5,53 +5,47 @@ It informs, and gates nothing.
 
 from __future__ import annotations
 
-import logging
 import statistics
 import time
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from enum import Enum
 from pathlib import Path
 from typing import cast
+
+from rich.markup import escape
 
 from mjstack.bench.physics import HeldPhysics
 from mjstack.bench.timing import describe_lost, steps_that_fit
 from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
 from mjstack.episodes.context import RunContext, Stage, play_to, require_episode
-from mjstack.errors import ConfigError, MjstackError
-from mjstack.files import to_csv, write_atomic
+from mjstack.errors import MjstackError
+from mjstack.files import to_csv
+from mjstack.gates.runner import describe_error
 from mjstack.jobs.gates import check_machine
-from mjstack.jobs.job import Job
+from mjstack.jobs.job import Job, JobResult
 from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.result import JobResult
 from mjstack.jobs.runner import Record, run_reported
 from mjstack.managers.reset import required_fields
 from mjstack.report.record import GateResult, Status
-from mjstack.report.study import COLUMNS, Row, save_study, to_markdown
-from mjstack.report.write import safely_draw
+from mjstack.report.study import Row, save_study, study_table
+from mjstack.report.write import write_tables
 from mjstack.sim import Simulation, SolverLimit, make_simulation
 from mjstack.sim.sizes import resolve_measuring_sizes
-
-log = logging.getLogger(__name__)
 
 
 def check_study(cfg: Config) -> RunContext:
     """Raise for what this machine cannot do, before anything is written."""
-    for key in ("view", "video"):
-        if getattr(cfg, key):
-            raise ConfigError(
-                key, "true", "false with job=study, which shows no world", "Leave it out"
-            )
     require_episode(cfg)
     return check_machine(cfg)
 
 
 def run_study_job(context: RunContext, folder: Path, overrides: list[str]) -> JobResult:
-    """Measures every variant and leaves study.csv, study.md, study.png and the report.
+    """Measure every variant and leave study.csv, study.md, study.png and the report.
 
     Args:
         context: The configuration, and what its check built.
         folder: Where they go.
-        overrides: What was asked for on the command line.
+        overrides: The command line.
 
     Returns:
         How it ended: a pass if every variant was measured, whatever was found.
@@ -63,71 +57,50 @@ def run_study_job(context: RunContext, folder: Path, overrides: list[str]) -> Jo
         rows: list[Row] = []
         bar.start("base")
         try:
-            base, steps = _prepare(context, job)
+            # The configured solver's worlds are kept beside every variant, so that the repetitions
+            # of both are interleaved and start from one state.
+            sim = _simulation(context)
+            state = play_to(context, sim, cfg.gate.throughput.from_phase)
+            base = HeldPhysics(sim, state, cfg.timing.decimation)
+            steps = steps_that_fit(job.steps, job.max_seconds, base.warm_up())
         except Exception as error:  # nothing can be compared with it
-            log.exception("the configured solver broke")
-            first = (str(error) or type(error).__name__).splitlines()[0]
-            reason = f"the configured solver cannot be timed: {first}"
+            reason = f"the configured solver cannot be timed: {describe_error(error)}"
             record(GateResult(name="base", status=Status.failed, reason=reason))
             return
         try:
             for name, solver in job.variants.items():
                 bar.start(name)
                 began = time.perf_counter()
-                row = _guarded(context, base, steps, name, solver)
-                rows.append(row)
-                _write_tables(context, folder, rows)
-                record(_as_result(row, time.perf_counter() - began))
-            _draw(context, folder, rows)
+                rows.append(_guarded(context, base, steps, name, solver))
+                _write(context, folder, rows)
+                record(_as_result(rows[-1], time.perf_counter() - began))
+            measured = any(row["status"] == "pass" for row in rows)
+            if measured and (problem := _write(context, folder, rows, draw=True)):
+                bar.say(escape(problem))
         finally:
             base.sim.close()
 
-    title = (
-        f"task {cfg.task.name}, {cfg.nworld} worlds, study of {len(job.variants)} variants of the"
-        " solver"
-    )
+    count = len(job.variants)
+    title = f"task {cfg.task.name}, {cfg.nworld} worlds, study of {count} variants of the solver"
     return run_reported(context, folder, overrides, title, work)
-
-
-def _prepare(context: RunContext, job: StudyJobCfg) -> tuple[HeldPhysics, int]:
-    """The configured solver's worlds with the object in hand, and the steps of a repetition.
-
-    They are kept beside every variant, so that the repetitions of both are interleaved and start
-    from one state.
-    """
-    sim = _simulation(context)
-    state = play_to(context, sim, context.cfg.gate.throughput.from_phase)
-    base = HeldPhysics(sim, state, context.cfg.timing.decimation)
-    return base, steps_that_fit(job.steps, job.max_seconds, base.warm_up())
 
 
 def _guarded(
     context: RunContext, base: HeldPhysics, steps: int, name: str, solver: SolverCfg
 ) -> Row:
     """One variant; if it breaks, the others still run."""
-    changes = _changes(context.cfg.solver, solver)
-    row = {"variant": name, "changes": changes or "nothing", "status": "fail", "reason": ""}
+    before = asdict(context.cfg.solver)
+    changes = {key: value for key, value in asdict(solver).items() if value != before[key]}
+    row = {"variant": name, "changes": _text(changes), "status": "fail", "reason": ""}
     if not changes and name != "base":
         return row | {"status": "skip", "reason": "the same as base"}
-    try:
-        row |= _measure(_variant(context, solver), base, steps)
-    except MjstackError as error:
-        row["reason"] = str(error)
-    except Exception as error:
-        log.exception("variant %s broke", name)
-        first = (str(error) or "no message").splitlines()[0]
-        row["reason"] = f"{type(error).__name__}: {first} (run.log has the traceback)"
-    return row
-
-
-def _variant(context: RunContext, solver: SolverCfg) -> RunContext:
-    """The same run with another solver. Its plan is the same too, because inverse kinematics has no
-    contacts.
-    """
     cfg = replace(context.cfg, solver=solver)
     stage = Stage(cfg)
-    stage.planner = context.planner
-    return replace(context, cfg=cfg, stage=stage)
+    stage.planner = context.planner  # inverse kinematics has no contacts
+    try:
+        return row | _measure(replace(context, cfg=cfg, stage=stage), base, steps)
+    except Exception as error:
+        return row | {"reason": describe_error(error)}
 
 
 def _measure(context: RunContext, base: HeldPhysics, steps: int) -> Row:
@@ -195,21 +168,10 @@ def _simulation(context: RunContext) -> Simulation:
     )
 
 
-def _changes(base: SolverCfg, solver: SolverCfg) -> str:
-    """The settings that differ, such as ``iterations=5``."""
-    pairs = (
-        (field.name, getattr(base, field.name), getattr(solver, field.name))
-        for field in fields(SolverCfg)
-    )
-    return ", ".join(f"{name}={_text(new)}" for name, old, new in pairs if new != old)
-
-
-def _text(value: object) -> str:
-    if isinstance(value, Enum):
-        return str(value.value)
-    return (
-        "the model's" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
-    )
+def _text(settings: dict[str, object]) -> str:
+    """Settings such as ``iterations=5, tolerance=1e-06``; null is the value of the robot's file."""
+    shown = {k: v.value if isinstance(v, Enum) else v for k, v in settings.items()}
+    return ", ".join(f"{key}={value}" for key, value in shown.items()) or "nothing"
 
 
 def _as_result(row: Row, seconds: float) -> GateResult:
@@ -231,43 +193,27 @@ def _as_result(row: Row, seconds: float) -> GateResult:
     )
 
 
-def _title(context: RunContext) -> str:
+def _write(context: RunContext, folder: Path, rows: list[Row], draw: bool = False) -> str:
+    """Write the tables and the picture so far; return why there is no picture."""
     cfg = context.cfg
-    return f"{cfg.robot.title}, task {cfg.task.name}: the solver's settings, {cfg.nworld} worlds"
-
-
-def _notes(context: RunContext) -> list[str]:
-    job = cast(StudyJobCfg, context.cfg.job)
-    base = asdict(context.cfg.solver)
     backend, device = context.backend
+    title = f"{cfg.robot.title}, task {cfg.task.name}: the solver's settings, {cfg.nworld} worlds"
     notes = [
-        f"base: {', '.join(f'{name}={_text(value)}' for name, value in base.items())}",
+        f"base: {_text(asdict(cfg.solver))}",
         (
-            f"{backend.value} on {device}. Times: object in hand, joint target held; medians"
-            f" of {job.repetitions} repetitions, interleaved with those of base. A ratio is that of"
-            " two neighbouring repetitions; in brackets the smallest and the largest."
+            f"{backend.value} on {device}. Times: object in hand, joint target held; medians of"
+            f" {cast(StudyJobCfg, cfg.job).repetitions} repetitions, interleaved with those of"
+            " base. A ratio is that of two neighbouring repetitions; in brackets the smallest and"
+            " the largest."
         ),
         "base as a variant is a second copy of it: its ratio shows how far equal runs differ.",
     ]
     if backend.value == "native":
         notes.append("Native MuJoCo does not tell which worlds stopped at a limit of the solver.")
-    return notes
-
-
-def _write_tables(context: RunContext, folder: Path, rows: list[Row], picture: str = "") -> None:
-    write_atomic(folder / "study.csv", to_csv([*COLUMNS, *context.check.summaries], rows))
-    write_atomic(folder / "study.md", to_markdown(rows, _title(context), _notes(context), picture))
-
-
-def _draw(context: RunContext, folder: Path, rows: list[Row]) -> None:
-    """Draw the variants that were measured."""
     done = [row for row in rows if row["status"] == "pass"]
-    if not done:
-        return
-    if problem := safely_draw(folder / "study.png", save_study, done, _title(context)):
-        context.say(problem)
-    else:
-        _write_tables(context, folder, rows, "study.png")
+    picture = (lambda path: save_study(path, done, title)) if draw else None
+    tables = [study_table(rows)]
+    return write_tables(folder, "study", title, tables, notes, to_csv(rows), picture)
 
 
 JOB = Job(check_study, run_study_job)

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 
-from mjstack.errors import MjstackError
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-log = logging.getLogger(__name__)
+from mjstack.errors import MissingExtra, MjstackError
+from mjstack.report.figure import figure
 
 Drawn = tuple[Sequence[float], Sequence[float]]
 
@@ -62,30 +57,13 @@ class SceneCamera:
         self._renderer.close()
 
 
-def save_scene(
-    path: Path,
-    model: mujoco.MjModel,
-    qpos: np.ndarray,
-    positions: np.ndarray,
-    objects: Mapping[str, Drawn],
-    title: str,
-) -> None:
-    """Draw a state; on a machine without OpenGL in lines.
+def save_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
+    """Draw a state, shape ``(nq,)``.
 
-    Args:
-        path: The picture.
-        model: The scene with visuals.
-        qpos: The state, shape ``(nq,)``.
-        positions: Of each object [m], shape ``(objects, 3)``.
-        objects: Half sizes [m] and color of each object, by name.
-        title: What is shown.
+    Raises:
+        MjstackError: This machine cannot draw offscreen.
     """
-    try:
-        camera = SceneCamera(model)
-    except MjstackError as error:
-        log.warning("%s The final scene is plotted instead.", error)
-        _plot_scene(path, model, qpos, positions, objects, title)
-        return
+    camera = SceneCamera(model)
     plt.imsave(path, camera.draw(qpos))
     camera.close()
 
@@ -114,13 +92,15 @@ def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, step_dt: flo
 
 
 def require_video() -> Callable[..., Any]:
-    """The mp4 writer, or one line that says what to install."""
+    """The mp4 writer.
+
+    Raises:
+        MissingExtra: It is not installed.
+    """
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise MjstackError(
-            "video=true needs the extra 'video'. Run: pip install 'mjstack[video]'."
-        ) from error
+        raise MissingExtra("video=true", "imageio-ffmpeg", "video") from error
     return imageio_ffmpeg.write_frames
 
 
@@ -135,67 +115,21 @@ def save_trajectories(
         objects: Half sizes [m] and color of each object, by name.
         title: What is shown.
     """
-    figure, (side, above, height) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
-    for number, (name, (half, color)) in enumerate(objects.items()):
-        mm = 1e3 * positions[:, number]
-        for axes, row in ((side, 2), (above, 0)):
-            axes.plot(mm[:, 1], mm[:, row], color=color, label=name)
-            for at, fill in ((mm[0], False), (mm[-1], True)):
-                corner = (at[1] - 1e3 * half[1], at[row] - 1e3 * half[row])
-                square = plt.Rectangle(
-                    corner,
-                    2e3 * half[1],
-                    2e3 * half[row],
-                    color=color,
-                    fill=fill,
-                    alpha=0.5 if fill else 1.0,
-                )
-                axes.add_patch(square)
-        height.plot(mm[:, 2], color=color, label=name)
-    side.set(
-        xlabel="y [mm]",
-        ylabel="z [mm]",
-        title="from the front (outline: start, filled: end)",
-        aspect="equal",
-    )
-    above.set(xlabel="y [mm]", ylabel="x [mm]", title="from above", aspect="equal")
-    height.set(xlabel="control step", ylabel="z [mm]", title="height of the centre")
-    for axes in (side, above, height):
-        axes.grid(alpha=0.3)
-        axes.margins(0.1)
-    height.legend(frameon=False)
-    figure.suptitle(title)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
-def _plot_scene(
-    path: Path,
-    model: mujoco.MjModel,
-    qpos: np.ndarray,
-    positions: np.ndarray,
-    objects: Mapping[str, Drawn],
-    title: str,
-) -> None:
-    """A drawing in lines for machines without OpenGL: arm joints, table and objects."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_forward(model, data)
-    figure = plt.figure(figsize=(7, 5.5), layout="constrained")
-    axes = figure.add_subplot(projection="3d")
-    anchors = data.xanchor[
-        [j for j in range(model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
-    ]
-    axes.plot(*np.vstack([[0, 0, 0], anchors]).T, "-o", color="0.3")
-    table = model.geom("table").id
-    center = model.geom_pos[table]
-    size = model.geom_size[table]
-    low = center - size
-    extent = 2.0 * size
-    axes.bar3d(*low, *extent, color="#b8a894", alpha=0.4)
-    for pos, (half, color) in zip(positions, objects.values(), strict=True):
-        axes.bar3d(*(pos - half), *(2.0 * np.array(half)), color=color)
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
-    axes.set_aspect("equal")
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with figure(path, title, 3, figsize=(13, 4)) as (_, (side, above, height)):
+        for number, (name, (half, color)) in enumerate(objects.items()):
+            mm = 1e3 * positions[:, number]
+            for axes, row in ((side, 2), (above, 0)):
+                axes.plot(mm[:, 1], mm[:, row], color=color, label=name)
+                width, depth = 2e3 * half[1], 2e3 * half[row]
+                for at, style in ((mm[0], {"fill": False}), (mm[-1], {"alpha": 0.5})):
+                    corner = (at[1] - width / 2, at[row] - depth / 2)
+                    axes.add_patch(plt.Rectangle(corner, width, depth, color=color, **style))
+            height.plot(mm[:, 2], color=color, label=name)
+        front = "from the front (outline: start, filled: end)"
+        side.set(xlabel="y [mm]", ylabel="z [mm]", title=front, aspect="equal")
+        above.set(xlabel="y [mm]", ylabel="x [mm]", title="from above", aspect="equal")
+        height.set(xlabel="control step", ylabel="z [mm]", title="height of the centre")
+        for axes in (side, above, height):
+            axes.grid(alpha=0.3)
+            axes.margins(0.1)
+        height.legend(frameon=False)

@@ -60,20 +60,12 @@ def _git_commit() -> str:
     whatever repository it lies in.
     """
     root = Path(__file__).resolve().parents[2]
-    git = ["git", "-C", str(root)]
+    mark = "--dirty= with changes"
+    git = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--exclude=*", mark]
+    if not (root / ".git").exists():
+        return "no checkout"
     try:
-        top, commit, dirty = (
-            subprocess.run(
-                [*git, *args], capture_output=True, text=True, timeout=10, check=True
-            ).stdout.strip()
-            for args in (
-                ("rev-parse", "--show-toplevel"),
-                ("rev-parse", "HEAD"),
-                ("status", "--porcelain"),
-            )
-        )
+        done = subprocess.run(git, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return "no checkout"
-    if Path(top).resolve() != root:
-        return "no checkout"
-    return commit + (" with changes" if dirty else "")
+    return done.stdout.strip()

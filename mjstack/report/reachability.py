@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-
-from mjstack.report.table import Table, to_document
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 from matplotlib.patches import Rectangle
+
+from mjstack.report.figure import figure
+from mjstack.report.table import Table
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -28,7 +24,7 @@ class ReachLevel:
         height: Of the points above the table [m].
         gripper: ``open`` or ``closed``.
         residual: Distance that is left at each point [m], shape ``(ny, nx)``.
-        tilt: Smallest tilt of the gripper from vertical [rad], NaN where the point is not reached,
+        tilt: Smallest tilt of the gripper from vertical [deg], NaN where the point is not reached,
             shape ``(ny, nx)``.
     """
 
@@ -43,6 +39,12 @@ class ReachLevel:
         """Shape ``(ny, nx)``, bool."""
         return np.isfinite(self.tilt)
 
+    @property
+    def tilts(self) -> tuple[float, float]:
+        """Smallest and largest tilt [deg]; NaN where no point is reached."""
+        some = self.tilt[self.reached]
+        return (float(some.min()), float(some.max())) if len(some) else (np.nan, np.nan)
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ObjectRegion:
@@ -55,7 +57,7 @@ class ObjectRegion:
         square: Largest half-width of a square around the place that is reached with the margin [m];
             0 where none is.
         largest: Half-widths of the largest rectangle that is reached with the margin [m].
-        tilt: Largest of the smallest tilts in the configured region at the grasp [rad]; NaN where
+        tilt: Largest of the smallest tilts in the configured region at the grasp [deg]; NaN where
             some is not reached.
         reached: Whether the configured region is, with the margin.
     """
@@ -69,86 +71,33 @@ class ObjectRegion:
     reached: bool
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ReachMap:
-    """The map.
+def points_csv(x: np.ndarray, y: np.ndarray, levels: Sequence[ReachLevel]) -> str:
+    """A row per point of the map; the tilt is ``nan`` where the arm does not get to.
 
-    Attributes:
-        title: What it is of.
-        x: Columns [m], shape ``(nx,)``.
+    Args:
+        x: Columns of the map [m], shape ``(nx,)``.
         y: Rows [m], shape ``(ny,)``.
-        table: Centre and half size of the table in x and y [m].
         levels: Heights.
-        regions: Where the objects may stand.
-        colors: Red, green, blue and alpha of each object, by name.
     """
-
-    title: str
-    x: np.ndarray
-    y: np.ndarray
-    table: tuple[Sequence[float], Sequence[float]]
-    levels: Sequence[ReachLevel]
-    regions: Sequence[ObjectRegion]
-    colors: Mapping[str, Sequence[float]]
-
-
-def to_csv(found: ReachMap) -> str:
-    """A row per point; the tilt is empty where the arm does not get to."""
+    columns = dict(zip(("x_m", "y_m"), np.meshgrid(x, y), strict=True))
+    for level in levels:
+        columns[f"{level.name}_reached"] = level.reached
+        columns[f"{level.name}_residual_m"] = level.residual
+        columns[f"{level.name}_tilt_deg"] = level.tilt
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    parts = [
-        f"{level.name}_{part}"
-        for level in found.levels
-        for part in ("reached", "residual_m", "tilt_deg")
-    ]
-    writer.writerow(["x_m", "y_m", *parts])
-    for row, y in enumerate(found.y):
-        for column, x in enumerate(found.x):
-            cells = [f"{x:.6g}", f"{y:.6g}"]
-            for level in found.levels:
-                tilt = level.tilt[row, column]
-                reached = np.isfinite(tilt)
-                cells += [
-                    str(int(reached)),
-                    f"{level.residual[row, column]:.3g}",
-                    f"{np.degrees(tilt):.2f}" if reached else "",
-                ]
-            writer.writerow(cells)
+    table = np.stack([column.ravel() for column in columns.values()], axis=1)
+    np.savetxt(out, table, "%.6g", ",", header=",".join(columns), comments="")
     return out.getvalue()
 
 
-def to_npz(found: ReachMap) -> bytes:
-    """The map as arrays, levels first."""
-    out = io.BytesIO()
-    np.savez_compressed(
-        out,
-        x_m=found.x,
-        y_m=found.y,
-        level=np.array([level.name for level in found.levels]),
-        height_above_table_m=np.array([level.height for level in found.levels]),
-        reached=np.array([level.reached for level in found.levels]),
-        residual_m=np.array([level.residual for level in found.levels]),
-        tilt_deg=np.degrees([level.tilt for level in found.levels]),
-    )
-    return out.getvalue()
-
-
-def to_markdown(found: ReachMap, notes: Sequence[str], picture: str = "") -> str:
-    """Both tables and the picture."""
-    tables = [Table.of("", _REGION, found.regions), Table.of("", _LEVEL, found.levels)]
-    return to_document(found.title, tables, notes, picture)
+def reach_tables(levels: Sequence[ReachLevel], regions: Sequence[ObjectRegion]) -> list[Table]:
+    """A table of the regions and one of the levels."""
+    return [Table.of("", _REGION, regions), Table.of("", _LEVEL, levels)]
 
 
 def _configured(region: ObjectRegion) -> str:
     x, y = region.configured
     return f"{x:.3f} x {y:.3f}, {'reached' if region.reached else 'NOT reached'}"
-
-
-def _tilts(level: ReachLevel) -> str:
-    if not level.reached.any():
-        return ""
-    low, high = (np.degrees(end(level.tilt)) for end in (np.nanmin, np.nanmax))
-    return f"{low:.0f}° to {high:.0f}°"
 
 
 _REGION: dict[str, Callable[[ObjectRegion], str]] = {
@@ -157,84 +106,66 @@ _REGION: dict[str, Callable[[ObjectRegion], str]] = {
     "configured": _configured,
     "largest square": lambda region: f"{region.square:.3f}",
     "largest rectangle": lambda region: f"{region.largest[0]:.3f} x {region.largest[1]:.3f}",
-    "tilt at most": lambda region: (
-        f"{np.degrees(region.tilt):.0f}°" if np.isfinite(region.tilt) else ""
-    ),
+    "tilt at most": lambda region: f"{region.tilt:.0f}°",
 }
 _LEVEL: dict[str, Callable[[ReachLevel], str]] = {
     "level": lambda level: level.name,
     "above the table": lambda level: f"{level.height:.3f} m",
     "gripper": lambda level: level.gripper,
     "reached": lambda level: f"{100.0 * level.reached.mean():.1f} %",
-    "tilt": _tilts,
+    "tilt": lambda level: "{:.0f}° to {:.0f}°".format(*level.tilts),
 }
 
 
-def save_map(path: Path, found: ReachMap) -> None:
+def save_map(
+    path: Path,
+    title: str,
+    x: np.ndarray,
+    y: np.ndarray,
+    levels: Sequence[ReachLevel],
+    regions: Sequence[ObjectRegion],
+    table: tuple[Sequence[float], Sequence[float]],
+    colors: Mapping[str, Sequence[float]],
+) -> None:
     """Draw a panel per level: the tilt as colour, hatched where the arm does not get to, table,
     objects and regions.
+
+    Args:
+        path: The picture.
+        title: What is shown.
+        x: Columns of the map [m], shape ``(nx,)``.
+        y: Rows [m], shape ``(ny,)``.
+        levels: Heights.
+        regions: Where the objects may stand.
+        table: Centre and half size of the table in x and y [m].
+        colors: Red, green, blue and alpha of each object, by name.
     """
-    width = found.x[-1] - found.x[0]
-    panel = 3.6 * max(0.6, width / (found.y[-1] - found.y[0])) + 1.0
-    figure, panels = plt.subplots(
-        1, len(found.levels), figsize=(panel * len(found.levels) + 1.2, 5.6), layout="constrained"
+    wide = x[-1] - x[0]
+    deep = y[-1] - y[0]
+    title += (
+        "\nhatched: not reached; squares: objects; solid: configured region; dotted: largest with"
+        " margin"
     )
-    top = max(
-        (np.degrees(np.nanmax(level.tilt)) for level in found.levels if level.reached.any()),
-        default=90.0,
-    )
-    image = None
-    for axes, level in zip(np.atleast_1d(panels), found.levels, strict=True):
-        axes.set_facecolor("0.92")
-        axes.add_patch(
-            _box(
-                _middle(found.x),
-                _middle(found.y),
-                _span(found.x),
-                _span(found.y),
-                hatch="////",
-                ec="0.6",
-                lw=0,
-            )
-        )
-        drawn = np.ma.masked_invalid(np.degrees(level.tilt))
-        image = axes.pcolormesh(
-            found.x, found.y, drawn, vmin=0.0, vmax=top, cmap="viridis", shading="nearest"
-        )
-        (x, y), (half_x, half_y) = found.table
-        axes.add_patch(_box(x, y, half_x, half_y, fill=False, ec="k", lw=1.5))
-        for region in found.regions:
-            color = found.colors[region.name]
-            axes.plot(*region.place, "s", color=color, markersize=7, markeredgecolor="w")
-            axes.add_patch(_box(*region.place, *region.configured, fill=False, ec=color, lw=1.8))
-            axes.add_patch(
-                _box(*region.place, *region.largest, fill=False, ec=color, lw=1.2, ls=":")
-            )
-        axes.set(
-            title=f"{level.name}: {level.height:.3f} m above, {level.gripper}",
-            xlabel="x [m]",
-            aspect="equal",
-        )
-    np.atleast_1d(panels)[0].set_ylabel("y [m]")
-    if image is not None:
-        figure.colorbar(image, ax=panels, label="smallest tilt of the gripper from vertical [deg]")
-    figure.suptitle(
-        f"{found.title}\nhatched: not reached; squares: objects; solid: configured region; dotted:"
-        " largest with margin"
-    )
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    count = len(levels)
+    size = ((3.6 * max(0.6, wide / deep) + 1.0) * count + 1.2, 5.6)
+    with figure(path, title, count, figsize=size) as (drawn, panels):
+        top = np.nanmax([level.tilts[1] for level in levels] + [1.0])
+        for axes, level in zip(np.atleast_1d(panels), levels, strict=True):
+            axes.set_facecolor("0.92")
+            box = ((x[0] + x[-1]) / 2, (y[0] + y[-1]) / 2), (wide / 2, deep / 2)
+            axes.add_patch(_box(*box, hatch="////", ec="0.6", lw=0))
+            image = axes.pcolormesh(x, y, level.tilt, vmin=0.0, vmax=top, shading="nearest")
+            axes.add_patch(_box(*table, ec="k", lw=1.5))
+            for region in regions:
+                color = colors[region.name]
+                axes.plot(*region.place, "s", color=color, markersize=7, markeredgecolor="w")
+                axes.add_patch(_box(region.place, region.configured, ec=color, lw=1.8))
+                axes.add_patch(_box(region.place, region.largest, ec=color, lw=1.2, ls=":"))
+            label = f"{level.name}: {level.height:.3f} m above, {level.gripper}"
+            axes.set(title=label, xlabel="x [m]", ylabel="y [m]", aspect="equal")
+        drawn.colorbar(image, ax=panels, label="smallest tilt of the gripper from vertical [deg]")
 
 
-def _box(x: float, y: float, half_x: float, half_y: float, **style: Any) -> Rectangle:
-    return Rectangle(
-        (x - half_x, y - half_y), 2.0 * half_x, 2.0 * half_y, **({"fill": False} | style)
-    )
-
-
-def _middle(values: np.ndarray) -> float:
-    return float(0.5 * (values[0] + values[-1]))
-
-
-def _span(values: np.ndarray) -> float:
-    return float(0.5 * (values[-1] - values[0]))
+def _box(centre: Sequence[float], half: Sequence[float], **style: Any) -> Rectangle:
+    corner = (centre[0] - half[0], centre[1] - half[1])
+    return Rectangle(corner, 2.0 * half[0], 2.0 * half[1], fill=False, **style)

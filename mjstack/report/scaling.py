@@ -1,83 +1,31 @@
-"""The scaling table: a row per backend and number of worlds, as CSV and as text."""
+"""The scaling table and its curves: a row per backend and number of worlds."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
-from mjstack.report.table import Table, to_document
+from mjstack.report.figure import figure
+from mjstack.report.table import Table
 
 PASS = "pass"
 NOT_RUN = "not run"
+RATE = "physics.world_steps_per_s.median"
 
 Row = dict[str, Any]
-"""One run of the job by the names of `COLUMNS`; a figure that was not measured, or is void, is
-None."""
+"""One run of the job: ``nworld``, ``backend``, ``status`` (pass, fail, out of memory or not run),
+``reason``, ``seconds`` with the start of its process, ``hardware``, ``git_commit``, and every
+metric of its gates by name. A figure that was not measured, or is void, is missing."""
 
-_MEASUREMENTS = ("physics", "episode", "env_step")
-COLUMNS: dict[str, tuple[str, ...]] = {
-    "nworld": (),
-    "backend": (),
-    "status": (),  # pass, fail, out of memory, timeout, crashed, or not run
-    "reason": (),  # in one line; empty for a pass
-    "succeeded": ("succeeded",),  # worlds, in the batch gate
-    # One physics step of all worlds under a held joint target.
-    "ms_per_step": ("physics.ms_per_batched_step.median",),
-    "ms_per_step_min": ("physics.ms_per_batched_step.min",),
-    "ms_per_step_max": ("physics.ms_per_batched_step.max",),
-    "world_steps_per_s": ("physics.world_steps_per_s.median",),
-    "world_steps_per_s_min": ("physics.world_steps_per_s.min",),
-    "world_steps_per_s_max": ("physics.world_steps_per_s.max",),
-    # `env.step` with all managers.
-    "ms_per_env_step": ("env_step.ms_per_env_step.median",),
-    "env_steps_per_s": ("env_step.env_steps_per_s.median",),
-    "env_steps_per_s_min": ("env_step.env_steps_per_s.min",),
-    "env_steps_per_s_max": ("env_step.env_steps_per_s.max",),
-    "managers_over_physics": ("env_step.managers_over_physics.median",),
-    "managers_alone_over_physics": ("env_step.managers_alone_over_physics.median",),
-    # The validated episode; bare_ratio is its time over that of bare steps.
-    "episode_s": ("episode.seconds.median",),
-    "bare_ratio": ("episode.bare_ratio.median",),
-    # The most of all measurements.
-    "gpu_memory_arrays_mib": tuple(f"{name}.gpu_memory_arrays_mib" for name in _MEASUREMENTS),
-    "gpu_memory_whole_gpu_mib": tuple(f"{name}.gpu_memory_whole_gpu_mib" for name in _MEASUREMENTS),
-    "gpu_power_mean_w": ("episode.gpu_power_mean_w",),
-    "process_peak_mib": ("process_peak_mib",),  # host memory
-    "build_s": ("build_and_compile_s",),
-    "warm_up_s": ("episode.warm_up_s",),  # an episode's first step, which runs eagerly
-    "capture_s": ("episode.capture_s",),
-    "seconds": (),  # the whole run, start of its process included
-    "hardware": (),
-    "git_commit": (),
-}
-"""Columns of scaling.csv, each with the metrics of a run's gates that it takes; the largest of
-several."""
-
-
-def new_row(nworld: int, backend: str, **values: Any) -> Row:
-    """A row that has not run, with some values."""
-    empty = dict.fromkeys(COLUMNS) | {"status": NOT_RUN, "reason": ""}
-    return empty | {"nworld": nworld, "backend": backend} | values
-
-
-def take_figures(metrics: Mapping[str, float]) -> Row:
-    """The columns that come from metrics; None where none of theirs is there."""
-    return {
-        column: max((metrics[name] for name in names if name in metrics), default=None)
-        for column, names in COLUMNS.items()
-        if names
-    }
-
-
-def to_markdown(rows: Sequence[Row], title: str, notes: Sequence[str], picture: str = "") -> str:
-    """The table for people, the crossover, and where the rows come from."""
-    lines = [describe_crossover(rows), *notes]
-    for name in ("hardware", "git_commit"):
-        values = sorted({row[name] for row in rows if row[name]})
-        lines += [f"{name.removeprefix('git_')}: {value}" for value in values]
-    return to_document(title, [Table.of("", _SHOWN, rows)], lines, picture)
+# By backend: colour, label, and height at which failed runs are marked (share of the axis).
+_BACKENDS = {"mjwarp": ("#2a7d2e", "MJWarp", 0.02), "native": ("#2457c7", "native MuJoCo", 0.06)}
+_SERIES = (
+    (RATE, "-", "o", "physics"),
+    ("env_step.env_steps_per_s.median", "--", "s", "env.step"),
+)
 
 
 def crossover(rows: Sequence[Row]) -> float | None:
@@ -87,9 +35,9 @@ def crossover(rows: Sequence[Row]) -> float | None:
     that failed do not count. None where the rows do not show it.
     """
     rates = {
-        (row["backend"], row["nworld"]): row["world_steps_per_s"]
+        (row["backend"], row["nworld"]): row[RATE]
         for row in rows
-        if row["status"] == PASS and row["world_steps_per_s"] is not None
+        if row["status"] == PASS and RATE in row
     }
     both = sorted({n for _, n in rates if ("mjwarp", n) in rates and ("native", n) in rates})
     points = [(n, math.log(rates["mjwarp", n] / rates["native", n])) for n in both]
@@ -110,28 +58,82 @@ def describe_crossover(rows: Sequence[Row]) -> str:
     )
 
 
-def _figure(column: str, form: str = ",.0f") -> Callable[[Row], str]:
-    """How a figure is shown; "-" where there is none."""
+def scaling_table(rows: Sequence[Row]) -> Table:
+    """The columns that a reader compares; "-" where a run has no figure."""
+    return Table.of("", _SHOWN, rows)
+
+
+def save_scaling_curves(path: Path, rows: Sequence[Row], decimation: int, title: str) -> None:
+    """Draw throughput and time per step over the number of worlds.
+
+    Args:
+        path: The picture.
+        rows: The table. A run that did not pass interrupts its curves, whatever it has measured,
+            and a cross marks it.
+        decimation: Physics steps in an environment step: both are drawn as world-steps/s.
+        title: What is shown.
+    """
+    with figure(path, f"{title} (x: no figure)", 2, figsize=(12, 4.8)) as (_, (rate, cost)):
+        for backend, (color, label, height) in _BACKENDS.items():
+            mine = sorted(
+                (row for row in rows if row["backend"] == backend), key=lambda row: row["nworld"]
+            )
+            worlds = [row["nworld"] for row in mine]
+            # A curve per series
+            for name, line, marker, series in _SERIES:
+                factor = 1 if name == RATE else decimation
+                values = [
+                    factor * row.get(name, math.nan) if row["status"] == PASS else math.nan
+                    for row in mine
+                ]
+                if all(math.isnan(value) for value in values):
+                    continue
+                steps_ms = [1e3 * n / value for n, value in zip(worlds, values, strict=True)]
+                style: dict[str, Any] = {"marker": marker, "markersize": 4, "color": color}
+                for axes, curve in ((rate, values), (cost, steps_ms)):
+                    axes.plot(worlds, curve, line, label=f"{label}, {series}", **style)
+            # Runs without a figure
+            failed = [row["nworld"] for row in mine if row["status"] != PASS]
+            for axes in (rate, cost):
+                at_height = axes.get_xaxis_transform()
+                axes.plot(failed, [height] * len(failed), "x", color=color, transform=at_height)
+        # Axes
+        at = crossover(rows)
+        ticks = sorted({row["nworld"] for row in rows})
+        for axes, name in ((rate, "world-steps/s"), (cost, "ms per physics step of all worlds")):
+            axes.set(yscale="log", xlabel="worlds", ylabel=name)
+            axes.set_xscale("log", base=2)
+            axes.set_xticks(ticks, [f"{n:,}" for n in ticks], rotation=45)
+            axes.grid(alpha=0.3)
+            if at is not None:
+                axes.axvline(at, color="0.4", linestyle=":", label=f"crossover, {at:,.0f} worlds")
+            if axes.get_legend_handles_labels()[0]:
+                axes.legend(frameon=False, fontsize=8)
+
+
+def _figure(*names: str, form: str = ",.0f") -> Callable[[Row], str]:
+    """How a figure is shown, the largest of several metrics."""
 
     def show(row: Row) -> str:
-        value = row[column]
-        return format(value, form) if isinstance(value, float | int) else "-"
+        found = [row[name] for name in names if name in row]
+        return format(max(found), form) if found else "-"
 
     return show
 
 
+_MEMORY = [f"{name}.gpu_memory_whole_gpu_mib" for name in ("physics", "episode", "env_step")]
 _SHOWN: dict[str, Callable[[Row], str]] = {
     "worlds": _figure("nworld"),
     "backend": lambda row: row["backend"],
     "succeeded": _figure("succeeded"),
-    "ms per step": _figure("ms_per_step", ".4g"),
-    "world-steps/s": _figure("world_steps_per_s"),
-    "env-steps/s": _figure("env_steps_per_s"),
-    "managers": _figure("managers_over_physics", "+.1%"),
-    "managers alone": _figure("managers_alone_over_physics", ".1%"),
-    "episode, s": _figure("episode_s", ".3g"),
-    "over bare steps": _figure("bare_ratio", ".3f"),
-    "GPU memory, MiB": _figure("gpu_memory_whole_gpu_mib"),
-    "capture, s": _figure("capture_s", ".2f"),
+    "ms per step": _figure("physics.ms_per_batched_step.median", form=".4g"),
+    "world-steps/s": _figure(RATE),
+    "env-steps/s": _figure("env_step.env_steps_per_s.median"),
+    "managers": _figure("env_step.managers_over_physics.median", form="+.1%"),
+    "managers alone": _figure("env_step.managers_alone_over_physics.median", form=".1%"),
+    "episode, s": _figure("episode.seconds.median", form=".3g"),
+    "over bare steps": _figure("episode.bare_ratio.median", form=".3f"),
+    "GPU memory, MiB": _figure(*_MEMORY),
+    "capture, s": _figure("episode.capture_s", form=".2f"),
     "status": lambda row: f"{row['status']}: {row['reason']}" if row["reason"] else row["status"],
 }

@@ -6,43 +6,28 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 
+from mjstack.report.figure import figure
 from mjstack.report.markdown import format_value
-from mjstack.report.table import Table, to_document
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from mjstack.report.table import Table
 
 Row = dict[str, Any]
-"""One variant of the solver by the names of `COLUMNS`; columns without a value may be left out."""
+"""One variant of the solver; a value that was not measured is missing.
 
-COLUMNS = (
-    "variant",
-    "changes",
-    "status",  # pass: it was measured; fail, with its reason; skip: it changes nothing
-    "reason",
-    "ms_per_batched_step",  # one step of all worlds, object in hand: median of the repetitions
-    "ms_min",
-    "ms_max",
-    "base_ms",  # the configured solver's in the same interleaved repetitions
-    "ratio",  # of a repetition to the base's beside it: median
-    "ratio_min",
-    "ratio_max",
-    "worlds",
-    "succeeded",  # worlds, in the whole episode
-    "broken_rules",  # by the others, and by how many each
-    "iteration_limit_worlds",  # worlds whose solver stopped at its limit in some step
-    "line_search_limit_worlds",
-    "peak_rows",  # most constraint rows of a world
-)
-"""Columns of study.csv, before those of the task's check."""
+``variant``, ``changes``, ``status`` (pass: it was measured; skip: it changes nothing), ``reason``;
+then, of the whole episode, ``worlds``, ``succeeded``, ``broken_rules``, ``peak_rows`` (most
+constraint rows of a world), the check's summaries, and ``iteration_limit_worlds`` and
+``line_search_limit_worlds`` (worlds whose solver stopped at its limit in some step); then, object
+in hand, ``ms_per_batched_step`` (median of the repetitions, with ``ms_min`` and ``ms_max``),
+``base_ms`` (of the configured solver beside them) and ``ratio`` (of neighbouring repetitions:
+median, ``ratio_min``, ``ratio_max``).
+"""
 
 
-def to_markdown(rows: Sequence[Row], title: str, notes: Sequence[str], picture: str = "") -> str:
+def study_table(rows: Sequence[Row]) -> Table:
     """The columns that a reader compares."""
-    return to_document(title, [Table.of("", _SHOWN, rows)], notes, picture)
+    return Table.of("", _SHOWN, rows)
 
 
 def save_study(path: Path, rows: Sequence[Row], title: str) -> None:
@@ -50,47 +35,42 @@ def save_study(path: Path, rows: Sequence[Row], title: str) -> None:
 
     Args:
         path: The picture.
-        rows: The variants that were measured.
+        rows: The variants that were measured, at least one.
         title: What is shown.
     """
     nworld = rows[0]["worlds"]
-    figure, (time, worlds) = plt.subplots(
-        1, 2, figsize=(11, 1.5 + 0.3 * len(rows)), layout="constrained", sharey=True
-    )
     places = np.arange(len(rows))
     succeeded = [row["succeeded"] for row in rows]
     colors = ["#2457c7" if count == nworld else "#cc2a24" for count in succeeded]
     middle, low, high = (
         np.array([row[key] for row in rows]) for key in ("ratio", "ratio_min", "ratio_max")
     )
-    whiskers = (middle - low, high - middle)
-    time.barh(places, middle, xerr=whiskers, color=colors, ecolor="0.4", capsize=2)
-    time.axvline(1.0, color="0.3", linewidth=1.0)
-    time.set(xlabel="time per step over that of base (whiskers: all repetitions)")
-    time.set_yticks(places, [row["variant"] for row in rows])
-    time.invert_yaxis()
-    worlds.barh(places, succeeded, color=colors)
-    worlds.set(xlabel=f"succeeded of {nworld} worlds (red: not all)", xlim=(0, nworld))
-    for axes in (time, worlds):
-        axes.grid(alpha=0.3, axis="x")
-    figure.suptitle(title)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    size = (11, 1.5 + 0.3 * len(rows))
+    with figure(path, title, 2, figsize=size, sharey=True) as (_, (time, worlds)):
+        whiskers = (middle - low, high - middle)
+        time.barh(places, middle, xerr=whiskers, color=colors, ecolor="0.4", capsize=2)
+        time.axvline(1.0, color="0.3", linewidth=1.0)
+        time.set(xlabel="time per step over that of base (whiskers: all repetitions)")
+        time.set_yticks(places, [row["variant"] for row in rows])
+        time.invert_yaxis()
+        worlds.barh(places, succeeded, color=colors)
+        worlds.set(xlabel=f"succeeded of {nworld} worlds (red: not all)", xlim=(0, nworld))
+        for axes in (time, worlds):
+            axes.grid(alpha=0.3, axis="x")
 
 
-def _ratio(row: Row) -> str:
-    if "ratio" not in row:
-        return ""
-    return f"{row['ratio']:.2f} ({row['ratio_min']:.2f} to {row['ratio_max']:.2f})"
+def _value(name: str, form: str = "{0}") -> Callable[[Row], str]:
+    """How a value is shown; nothing where it was not measured."""
+    return lambda row: form.format(format_value(row[name]), **row) if name in row else ""
 
 
 _SHOWN: dict[str, Callable[[Row], str]] = {
-    "variant": lambda row: row["variant"],
-    "changes": lambda row: row["changes"],
-    "ms per step": lambda row: format_value(row.get("ms_per_batched_step")),
-    "ratio to base": _ratio,
-    "succeeded": lambda row: f"{row['succeeded']} of {row['worlds']}" if "worlds" in row else "",
-    "iteration limit": lambda row: format_value(row.get("iteration_limit_worlds")),
-    "line-search limit": lambda row: format_value(row.get("line_search_limit_worlds")),
+    "variant": _value("variant"),
+    "changes": _value("changes"),
+    "ms per step": _value("ms_per_batched_step"),
+    "ratio to base": _value("ratio", "{ratio:.2f} ({ratio_min:.2f} to {ratio_max:.2f})"),
+    "succeeded": _value("succeeded", "{succeeded} of {worlds}"),
+    "iteration limit": _value("iteration_limit_worlds"),
+    "line-search limit": _value("line_search_limit_worlds"),
     "notes": lambda row: "; ".join(filter(None, (row.get("broken_rules"), row["reason"]))),
 }

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 from matplotlib.collections import PathCollection
 from matplotlib.patches import Rectangle
+
+from mjstack.report.figure import figure
 
 
 def save_places(
@@ -33,52 +31,30 @@ def save_places(
         title: What is shown.
         colors: Red, green, blue and alpha of each object, by name.
     """
-    figure, axes = plt.subplots(figsize=(7.5, 6.5), layout="constrained")
     (x, y), (half_x, half_y) = table
-    # As seen by someone who stands behind the arm: y to the left, x away from the base.
-    axes.add_patch(
-        Rectangle((y - half_y, x - half_x), 2.0 * half_y, 2.0 * half_x, fill=False, ec="k", lw=1.5)
-    )
-    axes.plot(0.0, 0.0, "k^", markersize=9, label="base")
     size, alpha = (12.0, 0.5) if len(places) <= 2000 else (3.0, 0.25)
     failed = places[~succeeded]
-    for number, (name, color) in enumerate(colors.items()):
-        good = places[succeeded, number]
-        axes.scatter(
-            good[:, 1],
-            good[:, 0],
-            s=size,
-            color=color,
-            alpha=alpha,
-            lw=0,
-            label=f"{name}, succeeded: {len(good):,}",
+    with figure(path, title, figsize=(7.5, 6.5)) as (_, axes):
+        # As seen by someone who stands behind the arm: y to the left, x away from the base.
+        corner = (y - half_y, x - half_x)
+        axes.add_patch(Rectangle(corner, 2.0 * half_y, 2.0 * half_x, fill=False, ec="k", lw=1.5))
+        axes.plot(0.0, 0.0, "k^", markersize=9, label="base")
+        for pair in failed:
+            axes.plot(pair[:, 1], pair[:, 0], color="0.3", lw=0.5, alpha=0.6)
+        for number, (name, color) in enumerate(colors.items()):
+            good, bad = (some[:, number] for some in (places[succeeded], failed))
+            label = f"{name}, succeeded: {len(good):,}"
+            axes.scatter(good[:, 1], good[:, 0], size, color, alpha=alpha, lw=0, label=label)
+            label = f"{name}, failed: {len(bad):,}"
+            axes.scatter(bad[:, 1], bad[:, 0], 45.0, "k", "x", lw=2.6)
+            axes.scatter(bad[:, 1], bad[:, 0], 40.0, color, "x", lw=1.2, label=label)
+        axes.set(xlabel="y [m]", ylabel="x [m]", aspect="equal")
+        axes.invert_xaxis()
+        axes.grid(alpha=0.3)
+        legend = axes.legend(
+            frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5
         )
-    for pair in failed:
-        axes.plot(pair[:, 1], pair[:, 0], color="0.3", lw=0.5, alpha=0.6)
-    for number, (name, color) in enumerate(colors.items()):
-        bad = failed[:, number]
-        axes.scatter(bad[:, 1], bad[:, 0], s=45.0, marker="x", color="k", lw=2.6)
-        axes.scatter(
-            bad[:, 1],
-            bad[:, 0],
-            s=40.0,
-            marker="x",
-            color=color,
-            lw=1.2,
-            label=f"{name}, failed: {len(bad):,}",
-        )
-    axes.set(xlabel="y [m]", ylabel="x [m]", aspect="equal")
-    axes.set_title(title, wrap=True)
-    axes.invert_xaxis()
-    axes.grid(alpha=0.3)
-    legend = axes.legend(
-        frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5
-    )
-    for handle in legend.legend_handles:
-        if isinstance(
-            handle, PathCollection
-        ):  # the dots of ten thousand worlds are too small and faint to tell apart here
-            handle.set_sizes([40.0])
-            handle.set_alpha(1.0)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+        for handle in legend.legend_handles:
+            # The dots of ten thousand worlds are too small and faint to tell apart here.
+            if isinstance(handle, PathCollection):
+                handle.set(sizes=[40.0], alpha=1.0)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from mjstack.files import write_atomic
 from mjstack.report.markdown import to_markdown
 from mjstack.report.record import Report
+from mjstack.report.table import Table, to_document
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +56,40 @@ def safely_draw(path: Path, draw: Callable[..., object], *args: object) -> str:
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         return f"no picture {path.name}: {reason}"
     return ""
+
+
+def write_tables(
+    folder: Path,
+    name: str,
+    title: str,
+    tables: Sequence[Table],
+    notes: Sequence[str],
+    csv: str,
+    draw: Callable[[Path], object] | None = None,
+) -> str:
+    """Replace ``name.csv``, ``name.md`` and, where ``draw`` is given, ``name.png``.
+
+    Args:
+        folder: Where they go.
+        name: Of the files.
+        title: Heading of the text.
+        tables: Of the text.
+        notes: Of the text, a line each.
+        csv: All rows.
+        draw: Draws the picture, which may fail.
+
+    Returns:
+        Empty, or one line that says why there is no picture.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
+    picture = folder / f"{name}.png"
+    problem = "" if draw is None else safely_draw(picture, draw)
+    write_atomic(folder / f"{name}.csv", csv)
+    shown = picture.name if picture.exists() else ""
+    write_atomic(folder / f"{name}.md", to_document(title, tables, notes, shown))
+    return problem
 
 
 def _finite(node: object) -> object:

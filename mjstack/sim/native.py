@@ -53,21 +53,6 @@ class _Worker:
     others: list[tuple[np.ndarray, np.ndarray]]
 
 
-def native_bytes(model: mujoco.MjModel, nworld: int) -> int:
-    """Bytes of the state and the poses that a `NativeSimulation` keeps, counted without allocating
-    them.
-    """
-    numbers = (
-        mujoco.mj_stateSize(model, _SPEC)
-        + 7 * model.nbody
-        + 3 * model.nsite
-        + 3 * model.ngeom
-        + model.nv
-        + model.nsensordata
-    )
-    return 8 * nworld * numbers
-
-
 class NativeSimulation(Simulation):
     """`Simulation` on native MuJoCo, float64 on the CPU.
 
