@@ -238,8 +238,11 @@ def _report(context: RunContext, group: _Group, result: GateResult) -> None:
     line = f"{group.title}: {_overrides(cfg, wanted)}"
     if group.lost:
         line = f"{group.title}: not known, physics was lost"
-    elif native:
-        line += " (contacts alone: native MuJoCo does not count the pairs that share their pool)"
+    elif native and "task" in group.runs:
+        line += (
+            " (contacts alone: native MuJoCo does not count the collision pairs that share their"
+            " pool)"
+        )
     context.say(line)
     result.details.append(line)
     if group.lost:
