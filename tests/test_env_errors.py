@@ -501,7 +501,7 @@ def test_reset_term_without_its_fields(cfg: Config) -> None:
     ("key", "value", "words"),
     [
         ("history", 0, ["history=0", "at least 1"]),
-        ("noise", -1.0, ["noise=-1.0", "not negative"]),
+        ("noise", -1.0, ["noise=-1.0", "at least 0"]),
         ("noise", float("nan"), ["noise=nan"]),
         ("scale", float("inf"), ["scale=inf", "finite"]),
         ("clip", [1.0, -1.0], ["clip=[1.0, -1.0]", "smaller one first"]),
@@ -512,12 +512,13 @@ def test_observation_settings_out_of_range(
     cfg: Config, key: str, value: object, words: list[str]
 ) -> None:
     setattr(cfg.observation["policy"].terms["joint_pos"], key, value)
-    fails(TermError, lambda: build(cfg), "observation.policy.terms.joint_pos", *words)
+    kind = TermError if key == "clip" else ConfigError
+    fails(kind, lambda: build(cfg), "observation.policy.terms.joint_pos", *words)
 
 
 def test_reward_weight_that_is_not_finite(cfg: Config) -> None:
     cfg.reward["lift"].weight = float("nan")
-    fails(TermError, lambda: build(cfg), "reward.lift", "weight=nan", "finite")
+    fails(ConfigError, lambda: build(cfg), "reward.lift", "weight=nan", "finite")
 
 
 def test_observation_group_without_terms(cfg: Config) -> None:

@@ -146,6 +146,8 @@ def accepted(owner: type, item: Field) -> str:
         mapping = get_origin(hint) is dict or is_dataclass(kind)
         count = "" if limits.length is None else f"{limits.length} "
         words = f"{'keys and' if mapping else 'a list of'} {count}{_PLURALS.get(kind, 'values')}"
+    elif kind is float and limits == Range(unit=limits.unit):
+        words = "a finite number"
     else:
         words = _NOUNS.get(kind, "a value")
     if limits.gt is not None:
