@@ -22,8 +22,9 @@ from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Episode, play_episode
-from mjstack.episodes.record import FAILING, EpisodeRecord, clear_records, write_failing
+from mjstack.episodes.record import FAILING, EpisodeRecord, clear_records
 from mjstack.errors import RunError
+from mjstack.files import write_atomic
 from mjstack.gates.batch import run_batch
 from mjstack.gates.runner import run_gates
 from mjstack.math import wilson_interval
@@ -223,14 +224,14 @@ def test_full_disk_takes_no_verdict_back(
 
 
 def test_table_is_replaced_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_failing(tmp_path / FAILING, ["seed", "world"], [[0, 1]])
+    write_atomic(tmp_path / FAILING, "seed,world\n0,1\n")
 
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(os, "replace", killed)
     with pytest.raises(KeyboardInterrupt):
-        write_failing(tmp_path / FAILING, ["seed", "world"], [[0, 1], [1, 2]])
+        write_atomic(tmp_path / FAILING, "seed,world\n0,1\n1,2\n")
     assert (tmp_path / FAILING).read_text() == "seed,world\n0,1\n"
     assert [path.name for path in tmp_path.iterdir()] == [FAILING]
 

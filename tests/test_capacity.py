@@ -441,14 +441,14 @@ def test_a_layout_out_of_reach_leaves_the_other_workloads(
     context = new_context(
         "sim=native", "nworld=1", "gate.capacity.random_steps=5", *at_double_speed()
     )
-    measure = capacity_module.measure_task
+    play = capacity_module.play_task
 
     def unreachable(context: RunContext, reset: dict) -> Workload:
         if reset is context.cfg.gate.capacity.reset:
             raise Unreachable(0, "grasp_red", (0.9, 0.0, 0.0), 0.3, 5e-4)
-        return measure(context, reset)
+        return play(context, reset)
 
-    monkeypatch.setattr(capacity_module, "measure_task", unreachable)
+    monkeypatch.setattr(capacity_module, "play_task", unreachable)
     (result,) = run_capacity(context)
     assert result.status is Status.passed
     assert any(
@@ -463,9 +463,7 @@ def workload(**changes: object) -> Workload:
         "sizes": BatchSizes(nconmax=128, njmax=300),
         "final": np.zeros((2, 3)),
         "failed": np.zeros(2, dtype=np.int64),
-        "seconds": 1.0,
-        "data_bytes": 10,
-        "device_bytes": None,
+        "memory": {"data": 10, "device": None},
         "description": "",
     }
     return Workload(**(facts | changes))
@@ -512,18 +510,21 @@ def test_each_workload_is_played_again_and_a_flip_fails_where_runs_repeat(
     played: list[tuple[str, BatchSizes]] = []
     other = context.cfg.gate.capacity.reset
 
-    def play_task(context: RunContext, reset: dict, sizes: BatchSizes) -> Workload:
-        played.append(("randomized" if reset is other else "task", sizes))
+    starts = {"randomized": peaks(rows=200, nworld=2), "task": peaks(rows=100, nworld=2)}
+
+    def play_task(context: RunContext, reset: dict, sizes: BatchSizes | None = None) -> Workload:
+        name = "randomized" if reset is other else "task"
+        if sizes is None:
+            return workload(peaks=starts[name])
+        played.append((name, sizes))
         return workload(sizes=sizes, failed=np.array([0, 4 if reset is other else 0]))
 
-    def play_random(context: RunContext, sizes: BatchSizes) -> Workload:
+    def play_random(context: RunContext, sizes: BatchSizes | None = None) -> Workload:
+        if sizes is None:
+            return workload()
         played.append(("random_actions", sizes))
         return workload(sizes=sizes)
 
-    starts = {"randomized": peaks(rows=200, nworld=2), "task": peaks(rows=100, nworld=2)}
-    measured = lambda _, reset: workload(peaks=starts["randomized" if reset is other else "task"])  # noqa: E731
-    monkeypatch.setattr(capacity_module, "measure_task", measured)
-    monkeypatch.setattr(capacity_module, "measure_random", lambda _: workload())
     monkeypatch.setattr(capacity_module, "play_task", play_task)
     monkeypatch.setattr(capacity_module, "play_random", play_random)
     (result,) = run_capacity(context)
@@ -550,12 +551,13 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
     context.say = said.append
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([0, int(Overflow.NEFC)])))
-    monkeypatch.setattr(capacity_module, "measure_task", lambda _, reset: workload())
-    monkeypatch.setattr(capacity_module, "measure_random", lambda _: lost)
     monkeypatch.setattr(capacity_module, "play_task", lambda *_: workload())
-    monkeypatch.setattr(
-        capacity_module, "play_random", lambda *_: pytest.fail("tried sizes that are not known")
-    )
+
+    def play_random(context: RunContext, *sizes: BatchSizes) -> Workload:
+        assert not sizes, "tried sizes that are not known"
+        return lost
+
+    monkeypatch.setattr(capacity_module, "play_random", play_random)
     (result,) = run_capacity(context)
     assert result.status is Status.failed
     assert result.reason.startswith(
@@ -645,7 +647,7 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
     new_context: NewContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([int(Overflow.NEFC), 0])))
-    monkeypatch.setattr("mjstack.episodes.workloads.measure_task", lambda *_: lost)
+    monkeypatch.setattr("mjstack.episodes.workloads.play_task", lambda *_: lost)
     context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
     with pytest.raises(
         FaultError,

@@ -48,8 +48,7 @@ class PutCheck(EpisodeCheck):
                 self.objects,
                 in_hand(t.object),
                 t.grasp_steps,
-                phases=[["grasp"]],
-                doing="between both jaws",
+                phases=[["grasp_red"]],
             ),
             InWindow("AT_PLACE", f"{t.object} not at {t.place}", self.there, t.window),
             AtRest(t.window, speed=0.05, position=0.005, rotation_deg=3.0),
@@ -92,8 +91,8 @@ def test_a_check_of_ones_own_judges_native_worlds() -> None:
     assert result.values["grasp_steps"].tolist() == [0.0, 0.0, 5.0]
     assert check.placed(check.view(env).step())[:, 0].tolist() == [True, False, True]
     told = check.report({name: float(value[1]) for name, value in result.values.items()})
-    assert told["GRASP"] == ("0 steps between both jaws in a row", "at least 3 in grasp")
-    assert told["AT_PLACE"] == ("in the last 0 steps", "in the last 10")
+    assert told["GRASP"] == ("grasp_steps 0", "at least 3 in grasp_red")
+    assert told["AT_PLACE"] == ("at_place_steps 0", "at least 10")
     sim.close()
 
 

@@ -32,8 +32,7 @@ PATHS: dict[str, list[str] | None] = {
     "envs/faults.py": ["FaultLatch.record"],
     "envs/statistics.py": ["EpisodeStatistics.update"],
     "envs/outputs.py": [
-        f"Outputs.{n}"
-        for n in ("copy", "_views", "write_final", "restore_observations", "returned")
+        f"Outputs.{n}" for n in ("_views", "write_final", "restore_observations", "returned")
     ],
     "managers/action.py": [f"ActionManager.{n}" for n in ("process", "apply", "reset")],
     "managers/observation.py": [
@@ -63,17 +62,10 @@ PATHS: dict[str, list[str] | None] = {
         "EndEffectorDelta.write_commands",
     ],
     "mdp/reset.py": [
-        *("home", "_write", "_write_robot", "_write_object"),
+        *("home", "_write_robot", "_write_object"),
         *(
             f"{name}.__call__"
-            for name in (
-                "JointNoise",
-                "JitterObjects",
-                "RandomizeObjects",
-                "ObjectMass",
-                "ObjectFriction",
-                "ActuatorGains",
-            )
+            for name in ("JointNoise", "JitterObjects", "RandomizeObjects", "_Randomized")
         ),
     ],
     "mdp/starts/randomization.py": [
@@ -85,14 +77,14 @@ PATHS: dict[str, list[str] | None] = {
         *(f"_Elements.{n}" for n in ("read", "write", "scale")),
     ],
     "mdp/starts/starts_file.py": ["FromStartsFile.__call__"],
-    "mdp/starts/placement.py": ["Placement.choose", "Placement._choose"],
+    "mdp/starts/placement.py": ["Placement.choose"],
     "tasks/check.py": ["EpisodeCheck.update"],
     "tasks/view.py": [
         *(f"TaskView.{n}" for n in ("step", "judged", "forget")),
         *(
             f"Step.{n}"
             for n in (
-                *("once", "pose", "pos", "velocity", "turn", "height", "bounds", "speed"),
+                *("pose", "pos", "velocity", "turn", "height", "bounds", "speed"),
                 *("pressed", "in_hand", "untouched", "supported", "judged", "_judged", "_sensed"),
             )
         ),
@@ -100,17 +92,21 @@ PATHS: dict[str, list[str] | None] = {
     "tasks/parts.py": [
         *("airborne", "in_hand", "on_top", "offset", "on_table"),
         *(f"{n}.update" for n in ("Streak", "Carried", "InWindow", "AtRest")),
-        *(f"{n}.held" for n in ("Streak", "Carried", "InWindow")),
-        *("Streak._counts", "RestWindow.append", "RestWindow.compare"),
+        *("AtLeast.held", "InWindow.held"),
+        "Streak._counts",
+        *(f"HeldSuccess.{n}" for n in ("__call__", "_achieved", "reset")),
     ],
-    "tasks/stack.py": ["StackCheck.placed", "StackSuccess.__call__", "StackSuccess.reset"],
+    "tasks/stack.py": [
+        *("StackCheck.placed", "RestWindow.append", "RestWindow.compare", "StackSuccess.__call__")
+    ],
     "tasks/box.py": [
-        *(f"Inside.{n}" for n in ("beyond", "holds", "over")),
         *(f"BoxCheck.{n}" for n in ("airborne", "resting", "placed")),
-        *(f"{n}.update" for n in ("_Grasp", "_CarriedOver", "_Drop", "_Release", "_Settled")),
-        *("corner_speed", "_Order.update", "_Release.held"),
-        "BoxSuccess.__call__",
-        "BoxSuccess.reset",
+        *(f"_{n}.update" for n in ("CarriedOver", "Drop", "Release", "Settled", "Order")),
+        "_Drop.held",
+    ],
+    "tasks/box_geometry.py": [
+        *(f"Inside.{n}" for n in ("beyond", "holds", "over")),
+        "corner_speed",
     ],
     "tasks/box_terms.py": [
         *(f"{n}.__call__" for n in ("ToSlot", "Place", "InBox", "ReachNext", "GraspNext")),

@@ -250,7 +250,7 @@ def test_nothing_starts_in_a_wall(robot: str, euler: float) -> None:
         )
         - 1.0
     )
-    offsets, free = placement._choose(draws)
+    offsets, free = placement.choose(draws)
     assert free.all()
     cube = model.geom("red").id
     data = mujoco.MjData(model)
@@ -271,7 +271,7 @@ def test_nothing_starts_in_a_wall(robot: str, euler: float) -> None:
     without = Placement(
         cfg, build_model(cfg), index, region=(0.05, 0.05), gap=0.01, pose=cfg.robot.start
     )
-    assert float(without._choose(draws)[0][:, 0, 1].max()) > float(offsets[:, 0, 1].max()) + 0.01
+    assert float(without.choose(draws)[0][:, 0, 1].max()) > float(offsets[:, 0, 1].max()) + 0.01
 
 
 def touches_arm(
@@ -309,7 +309,7 @@ def test_nothing_starts_at_the_arm_wherever_noise_puts_it() -> None:
     places = rng.uniform(-1.0, 1.0, (600, 2))
     draws = torch.zeros(600, 2, 1, 2, dtype=torch.float64)
     draws[:, 0, 0] = torch.from_numpy(places)
-    free = placement._choose(draws)[1].numpy()
+    free = placement.choose(draws)[1].numpy()
     assert 0.1 < free.mean() < 0.9
     hit = np.zeros(600, dtype=bool)
     for k, place in enumerate(places * 0.07 + cfg.scene.objects["red"].xy):
@@ -344,7 +344,7 @@ def test_all_of_the_region_is_drawn_from(robot: str, stage: Stage) -> None:
         for cube in (0, 1):
             draws = torch.zeros(len(places), 2, 1, 2, dtype=torch.float64)
             draws[:, cube, 0] = places
-            assert bool(placement._choose(draws)[1].all()), (task, cube)
+            assert bool(placement.choose(draws)[1].all()), (task, cube)
 
 
 @pytest.mark.full
@@ -386,7 +386,7 @@ def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
         )
         - 1.0
     )
-    offsets, free = placement._choose(draws)
+    offsets, free = placement.choose(draws)
     places = offsets + torch.tensor(
         [cfg.scene.objects["red"].xy, cfg.scene.objects["blue"].xy], dtype=torch.float64
     )

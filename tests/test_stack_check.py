@@ -68,6 +68,7 @@ def feed(
         object_address={"red": (1, 1), "blue": (8, 7)}.__getitem__,
         jaw_force=rec.jaw_force,
         support_force={},
+        constant=lambda values, like: torch.tensor(values, dtype=like.dtype),
         fixed={},
     )
     n = len(worlds)

@@ -1,4 +1,4 @@
-"""Layout files: the same worlds again, on both backends, and one line for whatever is wrong with a
+"""Starts files: the same worlds again, on both backends, and one line for whatever is wrong with a
 file.
 """
 
@@ -256,16 +256,19 @@ BAD: dict[str, tuple[Callable[[Rows], Rows], str]] = {
         lambda rows: [{k: v for k, v in row.items() if k != "blue_y_m"} for row in rows],
         (
             ", line 1: expected columns world, red_x_m, red_y_m, red_yaw_rad, blue_x_m, blue_y_m,"
-            " blue_yaw_rad; blue_y_m is"
+            " blue_yaw_rad; blue_y_m missing."
         ),
     ),
     "unknown column": (
         column("red_friktion", "1"),
-        ", line 1: expected no column 'red_friktion'. Did you mean 'red_friction'?",
+        (
+            ", line 1: expected columns separated by commas, each once; 'red_friktion' is wrong."
+            " Did you mean 'red_friction'?"
+        ),
     ),
     "nameless column": (
         column("", "1"),
-        ", line 1: expected a name in every cell of the header, cell 8 is empty.",
+        ", line 1: expected columns separated by commas, each once; '' is wrong.",
     ),
     "no number": (
         change(1, red_x_m="left"),
@@ -273,7 +276,7 @@ BAD: dict[str, tuple[Callable[[Rows], Rows], str]] = {
     ),
     "two lines in a cell": (
         change(1, red_x_m="le\nft"),
-        ", line 3, column red_x_m: expected a finite number, 'le ft' is none.",
+        ", line 4, column red_x_m: expected a finite number, 'le\\nft' is none.",
     ),
     "decimal comma": (
         change(1, red_x_m="0,33"),
@@ -281,7 +284,7 @@ BAD: dict[str, tuple[Callable[[Rows], Rows], str]] = {
     ),
     "empty cell": (
         change(1, red_x_m=""),
-        ", line 3, column red_x_m: expected a finite number, the cell is empty.",
+        ", line 3, column red_x_m: expected a finite number, '' is none.",
     ),
     "not finite": (
         change(2, red_yaw_rad="nan"),
@@ -289,31 +292,31 @@ BAD: dict[str, tuple[Callable[[Rows], Rows], str]] = {
     ),
     "world twice": (
         change(2, world="1"),
-        ", line 4, column world: expected each world once, 1 is in line 3 already.",
+        ", column world: expected worlds numbered from 0, a row each; 2 is missing.",
     ),
     "world missing": (
         change(3, world="7"),
-        ", column world: expected worlds 0 to 3 in its 4 rows; world 3 is missing.",
+        ", column world: expected worlds numbered from 0, a row each; 3 is missing.",
     ),
     "half a world": (
         change(3, world="0.5"),
-        ", line 5, column world: expected an integer of at least 0, it is 0.5.",
+        ", column world: expected worlds numbered from 0, a row each; 3 is missing.",
     ),
     "too few": (
         lambda rows: rows[:3],
         ": expected at least 4 worlds, it has 3. Add rows, or set nworld=3.",
     ),
-    "none": (lambda rows: [], ": expected at least one world below the header."),
+    "none": (
+        lambda rows: [],
+        ", column world: expected worlds numbered from 0, a row each; 0 is missing.",
+    ),
     "off the table": (
         change(1, red_x_m="0.2", red_yaw_rad="0.785"),
-        (
-            ", line 3, column red_x_m: expected 0.222 to 0.478, so that red is on the table,"
-            " turned as it is; 0.2 is 21.1 mm"
-        ),
+        ", line 3, column red_x_m: expected all of red above the table, 21.1 mm are not. Move it.",
     ),
     "over the edge": (
         change(0, blue_y_m="0.3"),
-        ", line 2, column blue_y_m: expected -0.269 to 0.189, so that blue is on",
+        ", line 2, column blue_y_m: expected all of blue above the table, 110.8 mm are not.",
     ),
     "touching": (
         change(3, blue_x_m="0.33", blue_y_m="-0.09", blue_yaw_rad="0.8"),
@@ -380,39 +383,23 @@ HEADER = "world,red_x_m,red_y_m,red_yaw_rad,blue_x_m,blue_y_m,blue_yaw_rad\n"
     [
         (
             b"",
-            (
-                ": expected a CSV file with a header and one row per world; it is empty. Write the"
-                f" header {HEADER.strip()} and"
-            ),
+            f", line 1: expected columns {', '.join(HEADER.strip().split(','))}; world, red_x_m,",
         ),
-        (b"\xef\xbb\xbf \n\n", "; it is empty."),
-        (b"\xff\xfe\x00", "; it is no text."),
-        (
-            b"world,red_x_m,red_x_m\n",
-            ", line 1: expected column red_x_m once, it is there 2 times.",
-        ),
-        (
-            f"{HEADER}0,1\n".encode(),
-            ", line 2: expected 7 cells separated by commas, as in the header; it has 2.",
-        ),
+        (b"\xff\xfe\x00", "it cannot be read ('utf-8' codec can't decode"),
+        (b"world,red_x_m,red_x_m\n", ", line 1: expected columns separated by commas, each once; "),
+        (f"{HEADER}0,1\n".encode(), ", line 2: expected 7 cells as in the header, it has 2."),
         (
             f"{HEADER}0,0,33,-0,13,0,0,33,0,06,0\n".encode(),
-            ", line 2: expected 7 cells separated by commas, as in the header; it ",
+            ", line 2: expected 7 cells as in the header, it has 11. Correct it; the decimal mark",
         ),
-        (f'{HEADER}0,"1\n1,1\n'.encode(), ", line 2: expected 7 cells separated by commas"),
-        (
-            HEADER.replace(",", ";").encode(),
-            ", line 1: expected a header with commas between the columns, it has semicolons.",
-        ),
+        (f'{HEADER}0,"1\n1,1\n'.encode(), ", line 3: expected 7 cells as in the header"),
+        (HEADER.replace(",", ";").encode(), "columns separated by commas, each once; 'world;red_"),
         (
             HEADER.replace(",", "\t").encode(),
-            ", line 1: expected a header with commas between the columns, it has tabs.",
+            "columns separated by commas, each once; 'world\\tred",
         ),
-        (
-            b"0,0.33,-0.13,0,0.33,0.06,0\n",
-            ", line 1: expected a header, there are numbers. Put world,red_x_m,",
-        ),
-        (None, ": expected an existing file, there is none in /"),
+        (b"0,0.33,-0.13,0,0.33,0.06,0\n", "columns separated by commas, each once; '0' is wrong."),
+        (None, "it cannot be read (No such file or directory). Name a file: starts=worlds.csv"),
     ],
 )
 def test_no_layout_file_at_all(content: bytes | None, says: str, tmp_path: Path) -> None:
@@ -431,7 +418,7 @@ def test_a_file_that_the_term_alone_names_is_called_by_its_key(tmp_path: Path) -
     cfg = from_file(tmp_path / "worlds.csv")
     cfg.starts = None
     with pytest.raises(
-        ConfigError, match=r"^reset\.starts\.params\.path=.*/worlds\.csv: expected an existing file"
+        ConfigError, match=r"^reset\.starts\.params\.path=.*/worlds\.csv: expected a CSV file"
     ):
         on_shared_sim("native", N, cfg)
 

@@ -26,8 +26,7 @@ from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.observers import Episode, Hook, play_episode
 from mjstack.episodes.record import FAILING, PICTURE, REGIONS, EpisodeRecord, clear_records
-from mjstack.episodes.region_report import regions_table
-from mjstack.episodes.regions import Region, find_regions, radial_yaw_deg
+from mjstack.episodes.regions import Region, find_regions, radial_yaw_deg, regions_table
 from mjstack.gates.success import run_success, success_config
 from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval

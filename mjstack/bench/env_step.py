@@ -138,7 +138,7 @@ class _Parts:
     @property
     def captured(self) -> bool:
         """Whether physics and managers were replayed."""
-        return self._halves.physics.captured and self._halves.managers.captured
+        return all(half.captured for half in self._halves)
 
     def warm_up(self) -> float:
         """Start worlds at random ages, compile and capture; return the seconds of a step."""
@@ -149,7 +149,7 @@ class _Parts:
         seconds = [timed(env.sim, partial(env.step, action)) for action in self._actions(WARM_UP)]
         self._halves = env.halves()
         if self.on_cuda:  # a repetition may be too short to warm them up
-            for half in (self._halves.physics, self._halves.managers):
+            for half in self._halves:
                 for _ in range(WARM_UP):
                     half()
         return seconds[-1]
@@ -205,12 +205,12 @@ class _Parts:
     def _physics(self, targets: list[torch.Tensor]) -> None:
         for target in targets:
             self._env.sim.ctrl.copy_(target)
-            self._halves.physics()
+            self._halves[0]()
 
     def _managers(self, actions: list[torch.Tensor]) -> None:
         for action in actions:
             self._env.action_manager.process(action)
-            self._halves.managers()
+            self._halves[1]()
 
     def _ages(self) -> tuple[torch.Tensor, torch.Tensor]:
         return self._env.episode_step.clone(), self._env.episode.clone()

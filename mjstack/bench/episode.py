@@ -59,7 +59,7 @@ def measure_episode(
     # About how long a repetition takes
     estimate = 0.0 if step_seconds is None else step_seconds * steps
     if before is not None:
-        estimate = max(estimate, before.seconds)
+        estimate = max(estimate, before.timing.seconds)
     if mjwarp:
         estimate *= 2
 
@@ -84,7 +84,8 @@ def measure_episode(
 
     # The result
     failed = sorted({world for p in played for world in p.failed})
-    times = [p.seconds for p in played]
+    timings = [p.timing for p in played]
+    times = [timing.seconds for timing in timings]
     out.samples = {"seconds": times, **out.samples}
     out.add_rates(times, sim.nworld, steps, decimation=cfg.timing.decimation)
     out.add_env_rates(times, sim.nworld, steps)
@@ -94,7 +95,7 @@ def measure_episode(
         "steps": steps,
         "succeeded": sim.nworld - len(failed),
     }
-    out.add_capture(sim, cfg, all(p.captured for p in played), played)
+    out.add_capture(sim, cfg, all(p.captured for p in timings), timings)
     if any(p is not before for p in played):
         out.add_resources(sim, meter)
     out.headline = f"{statistics.median(times):.3g} s"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 
 import torch
+from torch import Tensor
 
 from mjstack.errors import ArgumentError
 
@@ -24,14 +25,14 @@ def check_seed(seed: int, *, masked: bool) -> int:
     return number
 
 
-def check_mask(mask: torch.Tensor, nworld: int, device: torch.device, *, started: bool) -> None:
+def check_mask(mask: Tensor, nworld: int, device: torch.device, *, started: bool) -> None:
     """Check a mask of worlds.
 
     Raises:
         ArgumentError: It has a wrong type, shape, dtype or device, or no world has started yet.
     """
     expected = f"a bool tensor of shape ({nworld},) on {device}"
-    if not isinstance(mask, torch.Tensor):
+    if not isinstance(mask, Tensor):
         raise ArgumentError("mask", type(mask).__name__, expected)
     if tuple(mask.shape) != (nworld,) or mask.dtype is not torch.bool or mask.device != device:
         found = f"{mask.dtype} of shape {tuple(mask.shape)} on {mask.device}"

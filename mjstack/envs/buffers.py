@@ -9,6 +9,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,7 +17,8 @@ import torch
 
 from mjstack.config.schema import Backend, Config
 from mjstack.envs.env import Env
-from mjstack.errors import FaultError, name_worlds
+from mjstack.envs.faults import NO_KEY, POOL, describe_loss
+from mjstack.errors import FaultError
 from mjstack.managers.reset import required_fields
 from mjstack.managers.view import random_uniform
 from mjstack.scene import SceneIndex
@@ -25,7 +27,6 @@ from mjstack.sim import (
     BatchSizes,
     Overflow,
     Simulation,
-    describe_overflow,
     make_simulation,
 )
 from mjstack.sim.sizes import apply_configured, resolve_env_sizes, resolve_measuring_sizes
@@ -33,7 +34,6 @@ from mjstack.sim.sizes import apply_configured, resolve_env_sizes, resolve_measu
 log = logging.getLogger(__name__)
 
 ROWS = int(Overflow.NEFC | Overflow.NJMAX_NNZ)
-POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
 SIZED = ROWS | POOL | int(Overflow.CCD)
 _GROWTHS = 3  # of the room to measure in, each by 2
 _STEP = 8  # sizes are multiples of this
@@ -77,18 +77,16 @@ class Peaks:
 def read_peaks(sim: Simulation) -> Peaks:
     """The peaks since the simulation's last full reset. Waits for the device."""
     contacts = sim.most_contacts.cpu().numpy().astype(np.int64)
-    pool: list[int | None] = [int(contacts.sum())]
-    if (counted := sim.peak_pool) is not None:
-        pool = counted.tolist()
-    used, pairs, convex, *_ = [*pool, None, None]
+    counted = sim.peak_pool
+    pool: list[Any] = [int(contacts.sum()), None, None] if counted is None else counted.tolist()
     return Peaks(
         nworld=sim.nworld,
         contacts=contacts,
         rows=sim.most_constraints.cpu().numpy().astype(np.int64),
         overflow=sim.overflow_ever.cpu().numpy() & LOST_PHYSICS,
-        pool_contacts=used or 0,
-        pool_pairs=pairs,
-        pool_ccd_pairs=convex,
+        pool_contacts=pool[0],
+        pool_pairs=pool[1],
+        pool_ccd_pairs=pool[2],
     )
 
 
@@ -153,44 +151,26 @@ def measure_peaks(cfg: Config, run: Callable[[BatchSizes], Peaks]) -> tuple[Peak
             njmax=sizes.njmax * (2 if bits & ROWS else 1),
             nconmax=sizes.nconmax * (2 if bits & ~ROWS else 1),
         )
-        log.info(
-            "%s overflowed while sizes were measured: again with %s",
-            Overflow(bits),
-            sizes.as_overrides(),
-        )
+        log.info("%s overflow while measuring: again with %s", Overflow(bits), sizes.as_overrides())
         peaks = run(sizes)
     return peaks, sizes
 
 
-def describe_loss(overflow: np.ndarray, sizes: BatchSizes | None) -> tuple[str, str]:
-    """What was lost although there was room to spare, and what to do; both empty if nothing was.
+def describe_lost(peaks: Peaks, sizes: BatchSizes | None) -> tuple[str, str]:
+    """What a run lost although there was room to spare, and what to do; both empty if nothing.
 
     Args:
-        overflow: Bits of `Overflow` raised in each world, shape ``(nworld,)``.
+        peaks: What it used and lost.
         sizes: The room there was, or None on native MuJoCo.
     """
-    bits = int(np.bitwise_or.reduce(overflow))
-    worlds = np.flatnonzero(overflow).tolist()
-    if not bits:
-        return "", ""
-    # In the room to measure in convex pairs have as much as contacts: the same key gives more of
-    # both.
-    keys = [
-        f"batch.{key}"
-        for key, flags in (("njmax", ROWS), ("nconmax", SIZED & ~ROWS))
-        if bits & flags
-    ]
-    fix = (
-        f"Set {' and '.join(keys)} higher still"
-        if keys
-        else "Simplify the model, or run sim=native"
-    )
-    room = "" if sizes is None else f" even with {sizes.as_overrides()}"
-    return f"{describe_overflow(bits)} overflow in {name_worlds(worlds, len(overflow))}{room}", fix
+    loss, keys = describe_loss(peaks.overflow, sizes)
+    fix = f"Set {' and '.join(f'batch.{key}' for key in keys)} higher still" if keys else NO_KEY
+    room = f" even with {sizes.as_overrides()}" if loss and sizes is not None else ""
+    return f"{loss}{room}", fix
 
 
 def require_physics(what: str, peaks: Peaks, sizes: BatchSizes | None) -> None:
-    """Refuses to size anything from motion that lost physics.
+    """Refuses to size anything from motion that lost physics; arguments as of `describe_lost`.
 
     Args:
         what: What was run, such as ``the scripted task``.
@@ -200,7 +180,7 @@ def require_physics(what: str, peaks: Peaks, sizes: BatchSizes | None) -> None:
     Raises:
         FaultError: A world lost physics; names the worlds and what to do.
     """
-    loss, fix = describe_loss(peaks.overflow, sizes)
+    loss, fix = describe_lost(peaks, sizes)
     if loss:
         raise FaultError(f"batch=auto: what {what} needs cannot be measured: {loss}", fix)
 
@@ -251,9 +231,8 @@ def probe_env_sizes(
         sim = make_simulation(
             model, cfg, worlds, backend=backend, device=device, fields=fields, sizes=sizes
         )
-        env = Env(
-            sim, SceneIndex(model, cfg.robot, cfg.scene), cfg, check_faults=False
-        )  # a lack of room is what it looks for
+        # A lack of room is what it looks for.
+        env = Env(sim, SceneIndex(model, cfg.robot, cfg.scene), cfg, check_faults=False)
         try:
             env.reset(seed=cfg.seed)
             play_random_actions(env, c.probe_steps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import reprlib
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -47,22 +48,12 @@ def make_env(
         MjstackError: An override or a term cannot be used; the message says which and what to do.
     """
     several = isinstance(overrides, Sequence) and not isinstance(overrides, str)
-    if not several or not all(isinstance(override, str) for override in overrides):
-        found = (
-            repr(overrides)
-            if isinstance(overrides, str | Sequence)
-            else f"a {type(overrides).__name__}"
-        )
-        raise ArgumentError(
-            "overrides", found, "a list of strings, such as ['task=reach', 'robot=rebot']"
-        )
+    if not several or not all(isinstance(each, str) for each in overrides):
+        expected = "a list of strings, such as ['task=reach', 'robot=rebot']"
+        raise ArgumentError("overrides", reprlib.repr(overrides), expected)
     given = {"nworld": nworld, "seed": seed, "sim.device": device}
-    return build_env(
-        load_config(
-            [*overrides, *(f"{k}={v}" for k, v in given.items() if v is not None)],
-            config_dir=config_dir,
-        )
-    )
+    more = [f"{key}={value}" for key, value in given.items() if value is not None]
+    return build_env(load_config([*overrides, *more], config_dir=config_dir))
 
 
 @torch.inference_mode(False)  # buffers made in inference mode could not be written outside it
@@ -94,20 +85,12 @@ def build_env(
         backend, device = resolve_backend(cfg)
     elif device is None:
         device = resolve_device(cfg.sim.device)
-    if sizes is None:
-        sizes = (
-            probe_env_sizes(cfg, model, nworld, backend, device)
-            if cfg.batch.auto
-            else resolve_env_sizes(cfg)
-        )
+    if sizes is None and cfg.batch.auto:
+        sizes = probe_env_sizes(cfg, model, nworld, backend, device)
+    sizes = sizes or resolve_env_sizes(cfg)
+    fields = required_fields(cfg.reset)
     sim = make_simulation(
-        model,
-        cfg,
-        nworld,
-        backend=backend,
-        device=device,
-        fields=required_fields(cfg.reset),
-        sizes=sizes,
+        model, cfg, nworld, backend=backend, device=device, fields=fields, sizes=sizes
     )
     return Env(sim, SceneIndex(model, cfg.robot, cfg.scene), cfg)
 
@@ -131,8 +114,8 @@ def driven_config(cfg: Config, **changes: object) -> Config:
 
 
 def demonstration_config(cfg: Config) -> Config:
-    """Likewise for episodes that are kept: observations, rewards and success are computed as
-    configured.
+    """The configuration of an environment whose driven episodes are kept: observations, rewards and
+    success are computed as configured.
     """
     return replace(
         driven_config(cfg), observation=cfg.observation, reward=cfg.reward, task=cfg.task

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import Config
 from mjstack.envs.arguments import check_mask, check_seed
-from mjstack.envs.faults import FaultLatch, count_start
-from mjstack.envs.halves import StepHalves
+from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.errors import ArgumentError
@@ -95,7 +95,7 @@ class Env:
         self.world = torch.arange(sim.nworld, device=sim.device)
         self.episode = torch.full_like(self.world, -1)
         self.episode_step = torch.zeros_like(self.world)
-        self.given_places: dict[str, torch.Tensor] = {}
+        self.given_places: dict[str, Tensor] = {}
         self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
         self._all_worlds = torch.ones_like(self.success)
         self._steps = self._version = 0
@@ -143,12 +143,12 @@ class Env:
         self.key.fill_(value)
 
     @property
-    def action(self) -> torch.Tensor:
+    def action(self) -> Tensor:
         """The policy's last action, shape ``(nworld, action_dim)``."""
         return self.action_manager.action
 
     @property
-    def previous_action(self) -> torch.Tensor:
+    def previous_action(self) -> Tensor:
         """The one before."""
         return self.action_manager.previous_action
 
@@ -165,8 +165,8 @@ class Env:
         return min(limits, default=self.cfg.task.episode_steps)
 
     def reset(
-        self, *, seed: int | None = None, mask: torch.Tensor | None = None
-    ) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        self, *, seed: int | None = None, mask: Tensor | None = None
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Starts new episodes.
 
         Args:
@@ -179,7 +179,6 @@ class Env:
 
         Raises:
             ArgumentError: The seed or the mask cannot be used.
-            FaultError: The start does not fit the batch sizes.
         """
         if self._closed:
             found = "reset() after close()"
@@ -195,8 +194,6 @@ class Env:
         self.episode_step.masked_fill_(mask, 0)
         self._start_worlds(mask)
         if everywhere:
-            if count_start(self.sim):
-                self._start_worlds(self._all_worlds)  # as if nobody had looked
             self._faults.clear()
             self._started = True
         self._reset_managers(mask)
@@ -204,8 +201,8 @@ class Env:
         return {name: group.clone() for name, group in observed.items()}, {}
 
     def step(
-        self, action: torch.Tensor
-    ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        self, action: Tensor
+    ) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor, dict[str, Any]]:
         """Advances every world by one control interval; see the class for the order.
 
         Args:
@@ -270,15 +267,17 @@ class Env:
         """
         self._version += 1
 
-    def halves(self) -> StepHalves:
-        """A step taken apart, for measurements."""
+    def halves(self) -> tuple[Repeated, Repeated]:
+        """The physics of a step, and everything else of it: two graphs, for measurements. They act
+        on the action that was processed last.
+        """
 
         def managers() -> None:
             self._apply_action()
             self._evaluate()
 
         physics = self.captured(self._step_physics, "the physics")
-        return StepHalves(physics, self.captured(managers, "the managers"))
+        return physics, self.captured(managers, "the managers")
 
     def read_statistics(self) -> dict[str, float]:
         """Means over the episodes that ended since the last call; see `EpisodeStatistics.read`.
@@ -348,7 +347,7 @@ class Env:
             self._faults.raise_first()
         self._reset_ended(broken)
 
-    def _reset_ended(self, broken: torch.Tensor) -> None:
+    def _reset_ended(self, broken: Tensor) -> None:
         """The terminal observation, the statistics, the reset of the worlds that ended, and the
         observation to go on with.
         """
@@ -384,12 +383,12 @@ class Env:
         elif on_cuda or bool(broken.any()):
             self._outputs.restore_observations()
 
-    def _start_worlds(self, mask: torch.Tensor) -> None:
+    def _start_worlds(self, mask: Tensor) -> None:
         """Start states of the masked worlds; a function of seed, world and episode alone."""
         self.reset_manager.reset(mask)
         self.sim.kinematics(mask)
 
-    def _reset_managers(self, mask: torch.Tensor) -> None:
+    def _reset_managers(self, mask: Tensor) -> None:
         """Clear what managers keep from step to step."""
         self.action_manager.reset(mask)
         self.termination_manager.reset(mask)

@@ -1,13 +1,12 @@
-"""What goes wrong in a world while it is stepped: latched on the device, and told to
-whoever looks.
-"""
+"""Faults of a world while it is stepped: latched on the device until the host reads them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import Enum
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import TerminationTermCfg
 from mjstack.errors import FaultError, name_worlds
@@ -16,27 +15,18 @@ from mjstack.managers.observation import ObservationManager
 from mjstack.managers.reward import RewardManager
 from mjstack.managers.term import resolve_func
 from mjstack.math import not_finite
-from mjstack.sim import LOST_PHYSICS, Overflow, Simulation, describe_overflow
+from mjstack.sim import LOST_PHYSICS, BatchSizes, Overflow, Simulation, describe_overflow
 
-_POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
-
-
-class Fault(Enum):
-    """What went wrong in a world, latched until the host looks; in the order in which
-    `FaultLatch.record` stacks them.
-    """
-
-    ACTION = "actions were not finite"
-    STATE = "the state is not finite"
-    REWARD = "the reward is not finite"
-    OBSERVATION = "an observation is not finite"
+POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
+NO_KEY = "Simplify the model, or run sim=native"
 
 
+# Each fault and what to do, in the order in which `FaultLatch.record` stacks them.
 _FIXES = {
-    Fault.ACTION: "Check what the policy returns",
-    Fault.STATE: "Lower the gains or the timestep, or add the termination non_finite",
-    Fault.REWARD: "Correct the term",
-    Fault.OBSERVATION: "Correct the term",
+    "actions were not finite": "Check what the policy returns",
+    "the state is not finite": "Lower the gains or the timestep, or add the termination non_finite",
+    "the reward is not finite": "Correct the term",
+    "an observation is not finite": "Correct the term",
 }
 
 
@@ -56,16 +46,16 @@ class FaultLatch:
         self._actions = actions
         self._rewards = rewards
         self._observations = observations
-        self._faults = torch.zeros((sim.nworld, len(Fault)), dtype=torch.bool, device=sim.device)
+        self._faults = torch.zeros((sim.nworld, len(_FIXES)), dtype=torch.bool, device=sim.device)
         self._overflow = torch.zeros(sim.nworld, dtype=torch.int32, device=sim.device)
         self._none = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
         funcs = [resolve_func(f"termination.{n}", cfg.func) for n, cfg in termination.items()]
         ends_on = {getattr(func, "ends_on", None) for func in funcs}
         # A world's own overflow may end its episode; that of the shared pool voids the whole batch.
-        self._lost = _POOL if "overflow" in ends_on else LOST_PHYSICS
+        self._lost = POOL if "overflow" in ends_on else LOST_PHYSICS
         self._state_ends = "non_finite" in ends_on
 
-    def record(self, broken: torch.Tensor) -> None:
+    def record(self, broken: Tensor) -> None:
         """Add the faults of a step, before a reset can erase them.
 
         Args:
@@ -94,81 +84,61 @@ class FaultLatch:
         if not bool(self._faults.any() | (self._overflow != 0).any()):
             return
         nworld = self._sim.nworld
-        overflow = self._overflow.tolist()
-        lost = [w for w, bits in enumerate(overflow) if bits]
-        if lost:
-            bits = 0
-            for w in lost:
-                bits |= overflow[w]
-            what = f"{describe_overflow(bits)} overflow in {name_worlds(lost, nworld)}"
-            raise FaultError(what, _capacity_hint(self._sim, bits))
-        for column, fault in enumerate(Fault):
+        if bool(self._overflow.any()):
+            overflow = self._overflow.cpu().numpy()
+            what, keys = describe_loss(overflow, self._sim.sizes)
+            raise FaultError(what, _capacity_hint(self._sim, keys))
+        for column, (what, fix) in enumerate(_FIXES.items()):
             worlds = self._faults[:, column].nonzero()[:, 0].tolist()
             if worlds:
-                where = f"{name_worlds(worlds, nworld)}{self._culprits(fault, worlds[0])}"
-                raise FaultError(f"{fault.value} in {where}", _FIXES[fault])
+                terms = self._terms(what, worlds[0])
+                culprits = f", from {', '.join(terms)}" if terms else ""
+                raise FaultError(f"{what} in {name_worlds(worlds, nworld)}{culprits}", fix)
 
-    def _culprits(self, fault: Fault, world: int) -> str:
-        """Names the terms behind a number that is not finite, as far as their last values tell."""
+    def _terms(self, what: str, world: int) -> list[str]:
+        """Names of the terms behind a number that is not finite, as far as their last values
+        tell.
+        """
         rewards = self._rewards
-        if fault is Fault.REWARD:
-            bad = ~torch.isfinite(rewards.values[world])
-            names = [n for n, is_bad in zip(rewards.names, bad.tolist(), strict=True) if is_bad]
-            return f", from reward.{', reward.'.join(names)}" if names else ""
-        if fault is Fault.OBSERVATION:
-            terms = self._observations.not_finite_terms(world)
-            return f", from {', '.join(terms)}" if terms else ""
-        return ""
+        if "reward" in what:
+            bad = (~torch.isfinite(rewards.values[world])).tolist()
+            return [
+                f"reward.{name}" for name, is_bad in zip(rewards.names, bad, strict=True) if is_bad
+            ]
+        return self._observations.not_finite_terms(world) if "observation" in what else []
 
 
-def count_start(sim: Simulation) -> bool:
-    """Counts the contacts of a full start, which MJWarp's pool must hold before the first step.
-    Waits for the device.
+def describe_loss(overflow: np.ndarray, sizes: BatchSizes | None) -> tuple[str, list[str]]:
+    """Which buffers overflowed in which worlds, and the keys to raise; empty if none did.
 
-    Returns:
-        Whether the state was computed with for it: native MuJoCo has no such pool.
-
-    Raises:
-        FaultError: The start does not fit.
+    Args:
+        overflow: Bits of `Overflow` raised in each world, shape ``(nworld,)``.
+        sizes: The room there was, or None on native MuJoCo.
     """
-    sizes = sim.sizes
-    pool = sim.peak_pool
-    if sizes is None or pool is None:
-        return False
-    pool.zero_()  # it has the peak of everything before
-    sim.forward()
-    used = max(pool.tolist())
-    room = sizes.contact_pool(sim.nworld)
-    if used > room:
-        key, value = (
-            ("naconmax", sizes.naconmax)
-            if sizes.naconmax is not None
-            else ("nconmax", sizes.nconmax)
-        )
-        per_world = -(-used // sim.nworld)
-        need = used if sizes.naconmax is not None else per_world
-        raise FaultError(
-            f"batch.{key}={value}: the start of {sim.nworld} worlds needs at least {used} contacts"
-            f" and collision pairs ({per_world} per world), and there is room for {room}",
-            f"Raise it to more than batch.{key}={need}, or choose a reset with fewer contacts",
-        )
-    return True
+    bits = int(np.bitwise_or.reduce(overflow))
+    if not bits:
+        return "", []
+    # The sizes of whole pools take precedence where they are set. By default convex pairs have as
+    # much room as contacts.
+    contacts = "nconmax" if sizes is None or sizes.naconmax is None else "naconmax"
+    convex = contacts
+    for key in ("nccdmax", "naccdmax"):
+        convex = key if getattr(sizes, key, None) is not None else convex
+    by_key = {"njmax": Overflow.NEFC | Overflow.NJMAX_NNZ, contacts: POOL}
+    by_key[convex] = by_key.get(convex, 0) | Overflow.CCD
+    worlds = np.flatnonzero(overflow).tolist()
+    what = f"{describe_overflow(bits)} overflow in {name_worlds(worlds, len(overflow))}"
+    return what, [key for key, flags in by_key.items() if bits & flags]
 
 
-def _capacity_hint(sim: Simulation, bits: int) -> str:
-    """What to raise for some overflow bits."""
-    sizes = sim.sizes
-    pool = sim.peak_pool
-    # The pools' own sizes take precedence where they are set.
-    contacts = "nconmax" if getattr(sizes, "naconmax", None) is None else "naconmax"
-    convex = "nccdmax" if getattr(sizes, "naccdmax", None) is None else "naccdmax"
-    by_key = {"njmax": Overflow.NEFC | Overflow.NJMAX_NNZ, contacts: _POOL, convex: Overflow.CCD}
-    keys = [key for key, flags in by_key.items() if bits & flags]
+def _capacity_hint(sim: Simulation, keys: list[str]) -> str:
+    """How much to raise the sizes of overflowed buffers."""
     if not keys:
-        return "Simplify the model, or use sim=native"
-    held = ", ".join(f"{key}={getattr(sizes, key, None)}" for key in keys)
+        return NO_KEY
+    held = ", ".join(f"{key}={getattr(sim.sizes, key)}" for key in keys)
     peak = f"; up to {int(sim.peak_constraints.max())} rows were needed" if "njmax" in keys else ""
-    if contacts in keys and pool is not None:
+    pool = sim.peak_pool
+    if {"nconmax", "naconmax"} & set(keys) and pool is not None:
         most = max(pool.tolist())
         peak += f"; all worlds together needed {most}, {-(-most // sim.nworld)} per world"
     return f"Raise {' and '.join(f'batch.{key}' for key in keys)} ({held}{peak})"

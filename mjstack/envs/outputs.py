@@ -1,4 +1,4 @@
-"""What a step returns, laid side by side in memory: one copy makes all of it the caller's own.
+"""Results of a step, laid side by side in memory: one copy makes all of it the caller's own.
 
 The copies share memory, so that keeping one of them keeps all of a step. To autograd each is a
 tensor of its own.
@@ -10,6 +10,7 @@ import math
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from mjstack.managers.observation import ObservationManager
 from mjstack.managers.reward import RewardManager
@@ -19,7 +20,7 @@ _ALIGNMENT = 16  # bytes
 
 
 class Outputs:
-    """What `Env.step` returns, in one block of memory. Rewards, ends and observations are computed
+    """Results of `Env.step` in one block of memory. Rewards, ends and observations are computed
     right into it.
     """
 
@@ -28,7 +29,7 @@ class Outputs:
         rewards: RewardManager,
         ends: TerminationManager,
         observations: ObservationManager,
-        success: torch.Tensor,
+        success: Tensor,
     ) -> None:
         """Allocate the block, and move the managers' results into it."""
         self._groups = list(observations.groups)
@@ -52,7 +53,7 @@ class Outputs:
         for name in self._groups:
             observations.groups[name] = self.tensors[f"obs/{name}"]
 
-    def write_final(self, success: torch.Tensor, broken: torch.Tensor) -> None:
+    def write_final(self, success: Tensor, broken: Tensor) -> None:
         """Keep success and the observations of this step, before a reset changes them.
 
         Args:
@@ -73,19 +74,15 @@ class Outputs:
 
     def returned(
         self,
-    ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+    ) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor, dict[str, Any]]:
         """Copies, as `Env.step` returns them."""
-        out = self.copy()
+        out = self._views(self._memory.clone())
         obs = {name: out[f"obs/{name}"] for name in self._groups}
         final = {name: out[f"final/{name}"] for name in self._groups}
         extras = {"final_obs": final, "success": out["success"]}
         return obs, out["reward"], out["terminated"], out["truncated"], extras
 
-    def copy(self) -> dict[str, torch.Tensor]:
-        """Copies of all tensors."""
-        return self._views(self._memory.clone())
-
-    def _views(self, memory: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _views(self, memory: Tensor) -> dict[str, Tensor]:
         storage = memory.untyped_storage()
         views = {}
         for name, (start, dtype, shape) in self._layout.items():

@@ -5,6 +5,7 @@ then.
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 
 class EpisodeStatistics:
@@ -23,11 +24,11 @@ class EpisodeStatistics:
 
     def update(
         self,
-        done: torch.Tensor,
-        steps: torch.Tensor,
-        success: torch.Tensor,
-        rewards: torch.Tensor,
-        terminations: torch.Tensor,
+        done: Tensor,
+        steps: Tensor,
+        success: Tensor,
+        rewards: Tensor,
+        terminations: Tensor,
     ) -> None:
         """Adds the episodes that end in this step.
 

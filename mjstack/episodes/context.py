@@ -30,6 +30,7 @@ from mjstack.episodes.rollout import (
     Advance,
     Observer,
     Reset,
+    RolloutTiming,
     State,
     make_driver,
     rollout,
@@ -58,45 +59,28 @@ Say = Callable[[str], None]
 AnyGate = TypeVar("AnyGate", bound=Callable)
 
 
-def _silent(_: str) -> None:
-    pass
-
-
 @dataclass(kw_only=True, slots=True)
 class TimedEpisode:
-    """How long an episode took, and where it failed.
+    """How long an episode took, and where it failed; kept once its simulation is gone.
 
     Attributes:
         description: Backend and hardware.
         nworld: Number of worlds.
-        seconds: Wall time of the steps [s].
-        warm_up_seconds: The eager first call of what is captured [s].
-        capture_seconds: The capture alone [s].
-        captured: Whether whole steps were replayed.
+        timing: The rollout's.
         failed: Worlds that failed.
     """
 
     description: str
     nworld: int
-    seconds: float
-    warm_up_seconds: float
-    capture_seconds: float
-    captured: bool
+    timing: RolloutTiming
     failed: list[int]
 
     @classmethod
     def of(cls, episode: Episode, sim: Simulation) -> TimedEpisode:
-        """What is kept of an episode once its simulation is gone."""
+        """The time of an episode."""
         failed = np.flatnonzero(episode.result.failed.cpu().numpy()).tolist()
-        timing = episode.timing
         return cls(
-            description=sim.description,
-            nworld=sim.nworld,
-            seconds=timing.seconds,
-            warm_up_seconds=timing.warm_up_seconds,
-            capture_seconds=timing.capture_seconds,
-            captured=timing.captured,
-            failed=failed,
+            description=sim.description, nworld=sim.nworld, timing=episode.timing, failed=failed
         )
 
 
@@ -194,7 +178,7 @@ class RunContext:
     cfg: Config
     stage: Stage = None  # type: ignore[assignment]
     folder: Path | None = None
-    say: Say = _silent
+    say: Say = lambda line: None
     advance: Advance | None = None
     on_step: StepHook | None = None
     artifacts: Artifacts = field(default_factory=Artifacts)
@@ -301,12 +285,34 @@ class RunContext:
         """Worlds on the backend of the batch."""
         return self.simulation(nworld, *self.backend)
 
-    def simulation(self, nworld: int, backend: Backend, device: str) -> Simulation:
-        """Worlds that can start as the configuration says."""
-        fields = required_fields(self.cfg.reset)
-        sizes = self.sizes if backend is Backend.mjwarp else None
+    def simulation(
+        self,
+        nworld: int,
+        backend: Backend,
+        device: str,
+        *,
+        reset: Reset | None = None,
+        sizes: BatchSizes | None = None,
+    ) -> Simulation:
+        """Worlds that can start as the configuration says.
+
+        Args:
+            nworld: How many.
+            backend: Native or MJWarp.
+            device: ``cpu`` or ``cuda:N``.
+            reset: How they start, if not as configured.
+            sizes: Buffer sizes, if not those of the batch.
+        """
+        if sizes is None and backend is Backend.mjwarp:
+            sizes = self.sizes
         return make_simulation(
-            self.model, self.cfg, nworld, backend=backend, device=device, fields=fields, sizes=sizes
+            self.model,
+            self.cfg,
+            nworld,
+            backend=backend,
+            device=device,
+            fields=required_fields(self.cfg.reset if reset is None else reset),
+            sizes=sizes,
         )
 
     @property
@@ -334,13 +340,8 @@ class RunContext:
 
     def parity_simulation(self) -> Simulation:
         """One MJWarp world."""
-        return make_simulation(
-            self.model,
-            self.cfg,
-            1,
-            backend=Backend.mjwarp,
-            device=resolve_device(self.cfg.sim.device),
-        )
+        device = resolve_device(self.cfg.sim.device)
+        return make_simulation(self.model, self.cfg, 1, backend=Backend.mjwarp, device=device)
 
     def phase_end(self, name: str) -> int:
         """Last step of a phase."""

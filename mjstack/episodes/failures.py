@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from enum import IntEnum
 
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import Config
 from mjstack.drivers.driver import Driver
@@ -16,11 +17,11 @@ from mjstack.scene.phases import build_phases
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.tasks.check import make_check
 
-GONE_FRAMES = 3  # in a row without load on both jaws: less may be a touch in passing
+GONE_STEPS = 3  # in a row without load on both jaws: less may be a touch in passing
 
 
 class Sign(IntEnum):
-    """What the first sign of failure was. Of several in one step, the lowest number counts."""
+    """The first sign of failure. Of several in one step, the lowest number counts."""
 
     NONE = 0
     PHYSICS = 1
@@ -28,11 +29,6 @@ class Sign(IntEnum):
     DROPPED = 3
     MISSED = 4
     LEFT = 5
-
-    @property
-    def text(self) -> str:
-        """The sign in words."""
-        return _TEXT[self]
 
 
 _TEXT = {
@@ -47,13 +43,14 @@ _TEXT = {
 
 def describe_sign(sign: int, phase: str) -> str:
     """A sign in words, with the phase's name if there is one."""
-    return f"{phase}: {Sign(sign).text}" if phase else Sign(sign).text
+    text = _TEXT[Sign(sign)]
+    return f"{phase}: {text}" if phase else text
 
 
 class FailureMonitor(Observer):
-    """Notes the first sign of failure in every world, and the phase and step in which it was seen.
+    """Records the first sign of failure in every world, with its phase and step.
 
-    What counts as a sign:
+    These are signs:
 
     - PHYSICS: the state is not finite, or a buffer overflowed.
     - EMPTY: a phase that grasps is over, both jaws did not press on its cube in its last step, and
@@ -71,20 +68,20 @@ class FailureMonitor(Observer):
     Attributes:
         sign: Number of the `Sign`, shape ``(nworld,)``, int64.
         phase: Number of the phase in which it was seen, -1 without one, shape ``(nworld,)``, int64.
-        step: The step in whose end it was seen, likewise; where a phase ended with it, the first
-            one after that phase.
+        step: The step in whose end it was seen, -1 without one, shape ``(nworld,)``, int64; where a
+            phase ended with it, the first one after that phase.
     """
 
-    sign: torch.Tensor
-    phase: torch.Tensor
-    step: torch.Tensor
+    sign: Tensor
+    phase: Tensor
+    step: Tensor
 
     def __init__(self, cfg: Config) -> None:
         """Reads the phases, and what belongs where."""
         self._check = make_check(cfg)
         objects = self._check.objects
-        numbers = {name: number for number, name in enumerate(cfg.scene.objects)}
-        column = {numbers[name]: place for place, name in enumerate(objects)}
+        names = list(cfg.scene.objects)
+        column = {names.index(name): place for place, name in enumerate(objects)}
         # Without phases there is one, in which nothing is grasped or carried.
         phases = build_phases(cfg)
         self._tables = tuple(
@@ -95,32 +92,26 @@ class FailureMonitor(Observer):
 
     def start(self, env: Env, driver: Driver) -> None:
         """Allocate for the environment's worlds."""
-        self._env = env
-        self._driver = driver
+        super().start(env, driver)
         self._view = self._check.view(env)
-        n = env.nworld
         device = env.device
-
-        def full(value: int, dtype: torch.dtype = torch.int64, size: int = n) -> torch.Tensor:
-            return torch.full((size,), value, dtype=dtype, device=device)
-
         self._grasped, self._carried = (
             torch.tensor(table, device=device) for table in self._tables
         )
-        self.sign = full(0)
-        self.phase = full(-1)
-        self.step = full(-1)
-        self._now = full(0, size=1)
-        self._at = full(0)
         self._release = torch.tensor(self._releases, device=device)
-        self._loaded = torch.zeros((n, len(self._releases)), dtype=torch.bool, device=device)
+        self.sign = torch.zeros(env.nworld, dtype=torch.int64, device=device)
+        self.phase = torch.full_like(self.sign, -1)
+        self.step = torch.full_like(self.sign, -1)
+        self._now = torch.zeros_like(self.sign[:1])
+        self._at = torch.zeros_like(self.sign)
+        self._gone = torch.zeros_like(self.sign)
+        self._loaded = self.sign.new_zeros((env.nworld, len(self._releases)), dtype=torch.bool)
         self._placed = torch.zeros_like(self._loaded)
-        self._gone = full(0, torch.int32)
 
     def update(self) -> None:
         """Process the end of a step. Fixed shapes, no host read."""
-        sim = self._env.sim
-        phase = self._driver.phase
+        sim = self.env.sim
+        phase = self.driver.phase
         step = self._view.step()
         loaded = step.in_hand
         placed = self._check.placed(step)
@@ -131,7 +122,7 @@ class FailureMonitor(Observer):
         empty = entered & (grasped >= 0) & ~_of(self._loaded, grasped)
         carried = self._carried.index_select(0, phase)
         self._gone.add_(1).mul_((carried >= 0) & ~_of(loaded, carried))
-        dropped = self._gone >= GONE_FRAMES
+        dropped = self._gone >= GONE_STEPS
         missed = entered & ((self._at[:, None] == self._release) & ~self._placed).any(1)
         left = ((phase[:, None] > self._release) & self._placed & ~placed).any(1)
 
@@ -156,7 +147,7 @@ class FailureMonitor(Observer):
         self._now += 1
 
 
-def _of(table: torch.Tensor, cube: torch.Tensor) -> torch.Tensor:
+def _of(table: Tensor, cube: Tensor) -> Tensor:
     """Each world's column, shape ``(nworld,)``; the first one where there is none (-1)."""
     return table.gather(1, cube.clamp(min=0)[:, None])[:, 0]
 

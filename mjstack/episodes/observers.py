@@ -76,13 +76,13 @@ class Judge(Observer):
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
-        self._driver = driver
+        super().start(env, driver)
         self._check = make_check(env.cfg)
         self._check.start(env, driver.steps, driver.phases)
 
     def update(self) -> None:
         """See `Observer`."""
-        self._check.update(self._driver.phase)
+        self._check.update(self.driver.phase)
 
     def finish(self) -> None:
         """See `Observer`."""
@@ -102,15 +102,14 @@ class WorldRecorder(Observer):
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
-        self._sim = env.sim
-        self._driver = driver
+        super().start(env, driver)
         self.qpos = np.full((driver.steps, env.sim.qpos.shape[1]), np.nan)
         self.phase = np.full(driver.steps, -1)
 
     def after_step(self, step: int) -> None:
         """See `Observer`."""
-        self.qpos[step] = self._sim.qpos[0].cpu().numpy()
-        self.phase[step] = int(self._driver.phase[0])
+        self.qpos[step] = self.env.sim.qpos[0].cpu().numpy()
+        self.phase[step] = int(self.driver.phase[0])
 
 
 class Snapshots(Observer):
@@ -125,14 +124,10 @@ class Snapshots(Observer):
         self._steps = frozenset(steps)
         self.states: dict[int, State] = {}
 
-    def start(self, env: Env, driver: Driver) -> None:
-        """See `Observer`."""
-        self._sim = env.sim
-
     def after_step(self, step: int) -> None:
         """See `Observer`."""
         if step in self._steps:
-            self.states[step] = snapshot(self._sim)
+            self.states[step] = snapshot(self.env.sim)
 
 
 class CommandRecorder(Observer):
@@ -146,13 +141,12 @@ class CommandRecorder(Observer):
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
-        self._env = env
-        self._driver = driver
+        super().start(env, driver)
         self.recorded = Recorded(driver, env.action_manager.action_dim)
 
     def update(self) -> None:
         """See `Observer`."""
-        self.recorded.append(self._env.action_manager.action, self._driver.phase)
+        self.recorded.append(self.env.action_manager.action, self.driver.phase)
 
 
 class Hook(Observer):
@@ -162,10 +156,6 @@ class Hook(Observer):
         """``function`` gets the step's number and the simulation."""
         self._function = function
 
-    def start(self, env: Env, driver: Driver) -> None:
-        """See `Observer`."""
-        self._sim = env.sim
-
     def after_step(self, step: int) -> None:
         """See `Observer`."""
-        self._function(step, self._sim)
+        self._function(step, self.env.sim)

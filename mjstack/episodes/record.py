@@ -4,24 +4,19 @@ people.
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from mjstack.drivers.driver import Driver
-from mjstack.envs import Env
+from mjstack.config.schema import Config
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.observers import Episode
-from mjstack.episodes.rollout import Observer
 from mjstack.errors import RunError
-from mjstack.files import write_atomic
-from mjstack.mdp.geometry import pose_w
+from mjstack.files import write_npz
+from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
 from mjstack.tasks.check import CheckResult, Rules
 
@@ -33,104 +28,75 @@ REGIONS = "success_regions.csv"
 PICTURE = "success.png"
 
 
-class StartRecorder(Observer):
-    """Keeps where objects start.
-
-    Attributes:
-        names: Names of the objects.
-        poses: x and y [m] and rotation about z [rad] of each, shape ``(nworld, objects, 3)``.
-    """
-
-    names: tuple[str, ...]
-    poses: np.ndarray
-
-    def start(self, env: Env, driver: Driver) -> None:
-        """See `Observer`."""
-        self.names = tuple(env.index.objects)
-        poses = [pose_w(env, name).double().cpu().numpy() for name in self.names]
-        # Objects stand flat at a start, so that all of a rotation is about z.
-        self.poses = np.stack(
-            [np.column_stack((p[:, :2], 2.0 * np.arctan2(p[:, 6], p[:, 3]))) for p in poses], axis=1
-        )
-
-
 @dataclass(eq=False, kw_only=True, slots=True)
 class Circumstances:
-    """Where episodes started and where they went wrong.
+    """Where episodes started and where they went wrong; named as in the file.
 
     Attributes:
         objects: Names of the objects.
-        phases: Names of the phases.
-        starts: Of the objects; see `StartRecorder`.
+        phase_names: Names of the phases.
+        start_places: x and y [m] and rotation about z [rad] of each object at the start, shape
+            ``(nworld, objects, 3)``.
         retries: Grasps that were tried again, shape ``(nworld,)``.
         unreachable: Whether a target was out of reach, shape ``(nworld,)``, bool.
         sign: Number of the first `Sign` of failure, shape ``(nworld,)``.
-        phase: Number of the phase in which it was seen, -1 without one, shape ``(nworld,)``.
-        step: The step, -1 without one, shape ``(nworld,)``.
+        sign_phase: Number of the phase in which it was seen, -1 without one, shape ``(nworld,)``.
+        sign_step: The step, -1 without one, shape ``(nworld,)``.
     """
 
-    objects: tuple[str, ...]
-    phases: list[str]
-    starts: np.ndarray
+    objects: list[str]
+    phase_names: list[str]
+    start_places: np.ndarray
     retries: np.ndarray
     unreachable: np.ndarray
     sign: np.ndarray
-    phase: np.ndarray
-    step: np.ndarray
+    sign_phase: np.ndarray
+    sign_step: np.ndarray
 
     @classmethod
     def of(
-        cls,
-        episode: Episode,
-        starts: StartRecorder,
-        monitor: FailureMonitor,
-        phases: Sequence[str],
-        tolerance: float,
+        cls, episode: Episode, monitor: FailureMonitor, cfg: Config, index: SceneIndex
     ) -> Circumstances:
-        """Copy the arrays to the host. A target is reached within ``tolerance`` [m]."""
-        sign, phase, step = torch.stack((monitor.sign, monitor.phase, monitor.step)).cpu().numpy()
+        """Copy the arrays to the host."""
+        # Objects stand flat at a start, so that all of a rotation is about z.
+        poses = [episode.start[:, at : at + 7].astype(float) for at in index.object_qpos]
+        yaws = [2.0 * np.arctan2(pose[:, 6], pose[:, 3]) for pose in poses]
+        places = [np.column_stack((p[:, :2], yaw)) for p, yaw in zip(poses, yaws, strict=True)]
+        signs = torch.stack((monitor.sign, monitor.phase, monitor.step)).cpu().numpy()
+        sign, phase, step = signs
         return cls(
-            objects=starts.names,
-            phases=list(phases),
-            starts=starts.poses,
+            objects=list(index.objects),
+            phase_names=list(cfg.controller.phases),
+            start_places=np.stack(places, axis=1),
             retries=episode.retries,
-            unreachable=~(episode.waypoint_error <= tolerance),  # NaN is not reached
+            # NaN is not reached.
+            unreachable=~(episode.waypoint_error <= cfg.controller.ik_tolerance),
             sign=sign,
-            phase=phase,
-            step=step,
+            sign_phase=phase,
+            sign_step=step,
         )
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, Any]:
         """The arrays by their names in the file."""
-        return {
-            "start_places": self.starts,
-            "retries": self.retries,
-            "unreachable": self.unreachable,
-            "sign": self.sign,
-            "sign_phase": self.phase,
-            "sign_step": self.step,
-            "sign_names": np.array([sign.name for sign in Sign]),
-            "phase_names": np.array(self.phases),
+        names = [item.name for item in fields(self) if item.name != "objects"]
+        held = {name: getattr(self, name) for name in names}
+        return held | {"sign_names": [sign.name for sign in Sign]}
+
+    def cells(self, world: int) -> dict[str, object]:
+        """A world's cells of the table of failing episodes, by column."""
+        phase = self.sign_phase[world]
+        step = self.sign_step[world]
+        cells = {
+            "sign": Sign(self.sign[world]).name,
+            "phase": self.phase_names[phase] if phase >= 0 else "",
+            "step": step if step >= 0 else "",
+            "retries": self.retries[world],
+            "unreachable": int(self.unreachable[world]),
         }
-
-    def header(self) -> list[str]:
-        """Names of the columns that `cells` fills."""
-        parts = ("x_m", "y_m", "yaw_rad")
-        starts = [f"{name}_{part}" for name in self.objects for part in parts]
-        return ["sign", "phase", "step", "retries", "unreachable", *starts]
-
-    def cells(self, world: int) -> list[object]:
-        """A world's cells of the table of failing episodes."""
-        phase = self.phase[world]
-        step = self.step[world]
-        return [
-            Sign(self.sign[world]).name,
-            self.phases[phase] if phase >= 0 else "",
-            step if step >= 0 else "",
-            self.retries[world],
-            int(self.unreachable[world]),
-            *(f"{number:.6g}" for number in self.starts[world].ravel()),
-        ]
+        for name, place in zip(self.objects, self.start_places[world], strict=True):
+            for part, number in zip(("x_m", "y_m", "yaw_rad"), place, strict=True):
+                cells[f"{name}_{part}"] = f"{number:.6g}"
+        return cells
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -200,9 +166,7 @@ class EpisodeRecord:
             with np.load(path) as held:
                 values = [name for name in held.files if name.startswith("value.")]
                 return cls(
-                    seed=int(held["seed"]),
-                    backend=str(held["backend"]),
-                    device=str(held["device"]),
+                    **{name: held[name].item() for name in ("seed", "backend", "device")},
                     failed=held["failed"],
                     values={name.removeprefix("value."): held[name] for name in values},
                     qpos=held["qpos"],
@@ -231,25 +195,18 @@ class EpisodeRecord:
             **{f"value.{name}": values for name, values in self.values.items()},
             **({} if self.circumstances is None else self.circumstances.arrays()),
         }
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **arrays)
-        write_atomic(folder / _file_name(gate, self.seed), buffer.getvalue())
+        write_npz(folder / _file_name(gate, self.seed), arrays)
 
-    def header(self) -> list[str]:
-        """Names of the columns of `failing_rows`."""
-        more = [] if self.circumstances is None else self.circumstances.header()
-        return ["seed", "world", "rules", *more, *self.values]
-
-    def failing_rows(self, rules: Rules) -> list[list[object]]:
-        """Cells of every failing episode: rules, circumstances, and all measurements."""
+    def failing_rows(self, rules: Rules) -> list[dict[str, object]]:
+        """Cells of every failing episode by column: rules, circumstances, and all measurements."""
         return [
-            [
-                self.seed,
-                world,
-                " ".join(rules.broken(int(self.failed[world]))),
-                *([] if self.circumstances is None else self.circumstances.cells(world)),
-                *(f"{values[world]:.6g}" for values in self.values.values()),
-            ]
+            {
+                "seed": self.seed,
+                "world": world,
+                "rules": " ".join(rules.broken(int(self.failed[world]))),
+                **({} if self.circumstances is None else self.circumstances.cells(world)),
+                **{name: f"{values[world]:.6g}" for name, values in self.values.items()},
+            }
             for world in np.flatnonzero(self.failed).tolist()
         ]
 
@@ -257,13 +214,6 @@ class EpisodeRecord:
 def measured_values(result: CheckResult) -> dict[str, np.ndarray]:
     """Measurements of the check, by name with unit, on the host; each of shape ``(nworld,)``."""
     return {name: value.double().cpu().numpy() for name, value in result.values.items()}
-
-
-def write_failing(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """Replace a table of failing episodes in one step."""
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows([header, *rows])
-    write_atomic(path, out.getvalue())
 
 
 def starts_name(seed: int | str) -> str:

@@ -1,22 +1,34 @@
-"""Where an episode started against how it ended: success rates over cells of the objects'
-starts.
+"""Where an episode started against how it ended: success rates over cells of the objects' starts,
+as a table, a file and a picture.
 """
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
+from mjstack.config.schema import Config
+from mjstack.episodes.context import RunContext
+from mjstack.episodes.record import PICTURE, REGIONS
+from mjstack.episodes.tally import EpisodeTally, rate_cells
+from mjstack.files import to_csv, write_atomic
 from mjstack.math import wilson_interval
+from mjstack.report.success import save_places
+from mjstack.report.table import Table
+from mjstack.report.write import safely_draw
+
+log = logging.getLogger(__name__)
 
 _EDGE = 1e-9  # cells: a place this close below a cell's edge is on it
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Region:
-    """Episodes whose object started in one cell. What a cell does not restrict is None.
+    """Episodes whose object started in one cell. A bound that a cell does not have is None.
 
     Attributes:
         object: Its name.
@@ -29,12 +41,12 @@ class Region:
     """
 
     object: str
-    x_min_m: float | None
-    x_max_m: float | None
-    y_min_m: float | None
-    y_max_m: float | None
-    yaw_min_deg: float | None
-    yaw_max_deg: float | None
+    x_min_m: float | None = None
+    x_max_m: float | None = None
+    y_min_m: float | None = None
+    y_max_m: float | None = None
+    yaw_min_deg: float | None = None
+    yaw_max_deg: float | None = None
     episodes: int
     succeeded: int
     rate: float
@@ -87,50 +99,90 @@ def find_regions(
         episodes: Least number of episodes.
         objects: Names of the objects.
     """
-
-    def edge(number: int) -> float:
-        return round(number * cell, 9)
-
     out = []
     for number, name in enumerate(objects):
         mine = places[:, number]
-        at = np.floor(mine[:, :2] / cell + _EDGE).astype(np.int64)
-        turn = np.floor(radial_yaw_deg(mine) / yaw_cell_deg + _EDGE).astype(np.int64)[:, None]
-        turn[turn * yaw_cell_deg >= 90.0] = 0  # on the edge of 90, which is 0
-        unbound = np.full_like(turn, -1)
-        for keys, placed in (
-            (np.hstack((at, unbound)), True),
-            (np.hstack((np.zeros_like(at), turn)), False),
-            (np.hstack((at, turn)), True),
-        ):
+        x, y = np.floor(mine[:, :2] / cell + _EDGE).T
+        yaw = np.floor(radial_yaw_deg(mine) / yaw_cell_deg + _EDGE)
+        yaw[yaw * yaw_cell_deg >= 90.0] = 0.0  # on the edge of 90, which is 0
+        # Each axis: the cell of every episode, the width and the unit of a cell, and the last edge.
+        axes = {
+            "x": (x, cell, "m", math.inf),
+            "y": (y, cell, "m", math.inf),
+            "yaw": (yaw, yaw_cell_deg, "deg", 90.0),
+        }
+        for chosen in (("x", "y"), ("yaw",), ("x", "y", "yaw")):
+            keys = np.stack([axes[axis][0] for axis in chosen], axis=1)
             cells, which = np.unique(keys, axis=0, return_inverse=True)
-            counts = np.bincount(which.ravel(), minlength=len(cells))
-            good = np.bincount(which.ravel(), weights=succeeded, minlength=len(cells)).astype(
-                np.int64
-            )
-            for (i, j, k), n, k_good in zip(
-                cells.tolist(), counts.tolist(), good.tolist(), strict=True
-            ):
+            counts = np.bincount(which.ravel())
+            good = np.bincount(which.ravel(), weights=succeeded).astype(int)
+            for key, n, k in zip(cells.tolist(), counts.tolist(), good.tolist(), strict=True):
                 if n < episodes:
                     continue
-                low, high = wilson_interval(k_good, n)
-                yaw = (
-                    (None, None) if k < 0 else (k * yaw_cell_deg, min((k + 1) * yaw_cell_deg, 90.0))
-                )
+                bounds = {}
+                for axis, at in zip(chosen, key, strict=True):
+                    _, width, unit, last = axes[axis]
+                    bounds[f"{axis}_min_{unit}"] = round(at * width, 9)
+                    bounds[f"{axis}_max_{unit}"] = min(round((at + 1.0) * width, 9), last)
+                low, high = wilson_interval(k, n)
                 out.append(
                     Region(
                         object=name,
-                        x_min_m=edge(i) if placed else None,
-                        x_max_m=edge(i + 1) if placed else None,
-                        y_min_m=edge(j) if placed else None,
-                        y_max_m=edge(j + 1) if placed else None,
-                        yaw_min_deg=yaw[0],
-                        yaw_max_deg=yaw[1],
+                        **bounds,
                         episodes=n,
-                        succeeded=k_good,
-                        rate=k_good / n,
+                        succeeded=k,
+                        rate=k / n,
                         rate_low95=low,
                         rate_high95=high,
                     )
                 )
     return sorted(out, key=lambda region: (region.rate, region.rate_high95))
+
+
+def regions_table(cfg: Config, regions: list[Region]) -> list[Table]:
+    """The regions with the lowest rates; no table where none has a failure."""
+    t = cfg.gate.success
+    failing = [r for r in regions if r.succeeded < r.episodes]
+    if not failing:
+        return []
+    shown = failing[: t.worst_regions]
+    rows = [
+        [r.where, str(r.episodes), str(r.succeeded), *rate_cells(r.succeeded, r.episodes)]
+        for r in shown
+    ]
+    title = (
+        f"Worst regions of at least {t.cell_episodes} episodes ({len(shown)} of {len(failing)} with"
+        " a failure)"
+    )
+    header = ["where the object started", "episodes", "succeeded", "rate", "95 % interval"]
+    return [Table(title=title, header=header, rows=rows)]
+
+
+def save_regions(
+    context: RunContext, regions: list[Region], starts: np.ndarray, tally: EpisodeTally
+) -> list[str]:
+    """Write the table of regions and the picture of all starts. A failure takes no result back.
+
+    Returns:
+        The files that could not be written, a line each.
+    """
+    folder = context.folder
+    if folder is None:
+        return []
+    lost = []
+    try:
+        rows = to_csv([asdict(region) for region in regions], [f.name for f in fields(Region)])
+        write_atomic(folder / REGIONS, rows)
+    except OSError as error:
+        log.exception("%s was not written", REGIONS)
+        lost.append(f"{REGIONS} could not be written ({error.strerror})")
+    scene = context.cfg.scene
+    table = (scene.table_center[:2], scene.table_half[:2])
+    title = f"{context.cfg.robot.title}: {tally.summary}"
+    colors = {name: thing.color for name, thing in scene.free.items()}
+    succeeded = np.concatenate(tally.succeeded)
+    problem = safely_draw(folder / PICTURE, save_places, starts, succeeded, table, title, colors)
+    if problem:
+        return [*lost, problem]
+    context.artifacts.pictures.append(PICTURE)
+    return lost

@@ -1,4 +1,4 @@
-"""The rollout: the only loop over an episode. Whoever needs to know what happens in it observes."""
+"""The rollout: the only loop over an episode. Everything else observes it."""
 
 from __future__ import annotations
 
@@ -30,13 +30,19 @@ class Observer:
     """Base class of everything that looks on at a rollout. Every method may be left out.
 
     Attributes:
+        env: The environment, from `start` on.
+        driver: The driver, from `start` on.
         aside: Time spent in `after_step` that is not part of the episode's [s].
     """
 
+    env: Env
+    driver: Driver
     aside: float = 0.0
 
     def start(self, env: Env, driver: Driver) -> None:
         """Prepare for an episode. Called once, when every world is at its start."""
+        self.env = env
+        self.driver = driver
 
     def update(self) -> None:
         """Process the end of a step, inside the captured graph: fixed shapes, no host read."""
@@ -110,7 +116,12 @@ def rollout(
     graph: Repeated | None = play
     if sim.device.type != "cuda" and physics is None:
         graph = sim.graph_of(env.cfg.timing.decimation, kinematics=True)
-    before = _graph_seconds(graph)
+
+    def graph_seconds() -> tuple[float, float]:
+        """Warm-up and capture so far [s]."""
+        return (0.0, 0.0) if graph is None else (graph.warm_up_seconds, graph.capture_seconds)
+
+    before = graph_seconds()
 
     sim.synchronize()
     began = time.perf_counter()
@@ -127,9 +138,8 @@ def rollout(
     for observer in reversed(observers):  # an energy meter, say, before the check computes
         observer.finish()
 
-    after = _graph_seconds(graph)
     warm_up, capture = (
-        now if now != then else 0.0 for now, then in zip(after, before, strict=True)
+        now if now != then else 0.0 for now, then in zip(graph_seconds(), before, strict=True)
     )
     captured = play.captured
     play.drop()  # its memory, which only the collector would find otherwise
@@ -199,11 +209,6 @@ def make_driver(env: Env, planner: OpenLoopPlanner, advance: Advance | None = No
     sources = source_xy(env).double().cpu().numpy()
     tape = planner.plan(sources, progress).to(sim.device, sim.ctrl.dtype)
     return OpenLoopDriver(tape, planner.phases, sim.nworld, sim.device)
-
-
-def _graph_seconds(graph: Repeated | None) -> tuple[float, float]:
-    """Warm-up and capture so far [s]."""
-    return (0.0, 0.0) if graph is None else (graph.warm_up_seconds, graph.capture_seconds)
 
 
 @dataclass(slots=True)

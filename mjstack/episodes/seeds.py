@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor
-from mjstack.episodes.record import Circumstances, EpisodeRecord, StartRecorder, write_failing
+from mjstack.episodes.record import FAILING, SUCCESS_FAILING, Circumstances, EpisodeRecord
 from mjstack.episodes.rollout import Observer
-from mjstack.episodes.tally import EpisodeTally, failing_name
-from mjstack.sim import Simulation
+from mjstack.episodes.tally import EpisodeTally
+from mjstack.files import to_csv, write_atomic
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +37,15 @@ def play_seeds(
         observers: More observers, by seed.
     """
     cfg = context.cfg
-    tally = EpisodeTally(gate=gate, noun=noun, several=count > 1, rules=context.check.rules)
+    folder = context.folder
+    name = SUCCESS_FAILING if gate != "batch" and "batch" in cfg.gates else FAILING
+    tally = EpisodeTally(
+        gate=gate,
+        noun=noun,
+        several=count > 1,
+        check=context.check,
+        path=None if folder is None else folder / name,
+    )
     sim = context.batch_simulation(cfg.nworld)
     sizes = sim.sizes
     tally.notes = {
@@ -52,7 +60,16 @@ def play_seeds(
     try:
         for seed in range(cfg.seed, last + 1):
             try:
-                record = _play(context, sim, seed, tally, circumstances, observers(seed))
+                monitor = FailureMonitor(cfg)
+                looking = [*([monitor] if circumstances else []), *observers(seed)]
+                episode = context.play(sim, cfg.reset, looking, seed=seed)
+                found = (
+                    Circumstances.of(episode, monitor, cfg, context.index)
+                    if circumstances
+                    else None
+                )
+                record = EpisodeRecord.of(seed, sim, episode, found)
+                tally.add(record, episode, sim)
             except Exception as error:
                 if seed == cfg.seed:
                     raise
@@ -61,7 +78,7 @@ def play_seeds(
                 left = f"seed {seed}" if seed == last else f"seeds {seed} to {last}"
                 tally.problems.append(f"{left} not played: {why} (run.log has the traceback)")
                 break
-            _write(context, record, tally)
+            _write(record, tally)
             if count > 1:
                 context.say(
                     f"{gate}, seed {seed}: {int(record.succeeded.sum())} of {cfg.nworld} worlds"
@@ -72,40 +89,16 @@ def play_seeds(
     return tally
 
 
-def _play(
-    context: RunContext,
-    sim: Simulation,
-    seed: int,
-    tally: EpisodeTally,
-    circumstances: bool,
-    observers: Sequence[Observer],
-) -> EpisodeRecord:
-    """One seed's episode in every world."""
-    cfg = context.cfg
-    starts = StartRecorder()
-    monitor = FailureMonitor(cfg)
-    looking = [starts, monitor] if circumstances else []
-    episode = context.play(sim, cfg.reset, [*looking, *observers], seed=seed)
-    found = None
-    if circumstances:
-        phases = [phase.name for phase in context.planner.phases]
-        found = Circumstances.of(episode, starts, monitor, phases, cfg.controller.ik_tolerance)
-    record = EpisodeRecord.of(seed, sim, episode, found)
-    tally.add(record, episode, sim)
-    return record
-
-
-def _write(context: RunContext, record: EpisodeRecord, tally: EpisodeTally) -> None:
+def _write(record: EpisodeRecord, tally: EpisodeTally) -> None:
     """Write the seed's record, before the next one can break or be stopped. A full disk takes no
     result back.
     """
-    folder = context.folder
-    if folder is None:
+    if tally.path is None:
         return
     try:
-        record.write(folder, tally.gate)
+        record.write(tally.path.parent, tally.gate)
         if tally.rows:
-            write_failing(folder / failing_name(context, tally.gate), record.header(), tally.rows)
+            write_atomic(tally.path, to_csv(tally.rows))
     except OSError as error:
         log.exception("the record of seed %d was not written", record.seed)
         tally.details.append(

@@ -5,24 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
-from mjstack.episodes.context import RunContext, TimedEpisode
+from mjstack.episodes.context import TimedEpisode
 from mjstack.episodes.failures import describe_sign
 from mjstack.episodes.observers import Episode
-from mjstack.episodes.record import (
-    FAILING,
-    SUCCESS_FAILING,
-    Circumstances,
-    EpisodeRecord,
-)
+from mjstack.episodes.record import FAILING, Circumstances, EpisodeRecord
 from mjstack.errors import name_worlds
 from mjstack.math import wilson_interval
 from mjstack.report.markdown import format_percent
 from mjstack.report.table import Table
 from mjstack.sim import Simulation
-from mjstack.tasks.check import Rules
+from mjstack.tasks.check import EpisodeCheck
 
 _NAMED = 100  # episodes a line in report.md; the table of failing ones has all
 
@@ -35,7 +31,8 @@ class EpisodeTally:
         gate: Whose episodes.
         noun: What is counted, such as ``worlds``.
         several: Whether there are several seeds; then an episode's name has its seed.
-        rules: The task's.
+        check: The task's.
+        path: The file of failing episodes; None where nothing is written.
         seeds: Those that were played.
         succeeded: For each seed, which worlds succeeded, shape ``(nworld,)``, bool.
         circumstances: For each seed, if they were recorded.
@@ -45,7 +42,7 @@ class EpisodeTally:
         low: Smallest of everything measured, by name.
         high: Largest of everything measured, by name.
         ends: Hashes of the final states.
-        rows: Cells of the table of failing episodes.
+        rows: Cells of the table of failing episodes, by column.
         seconds: Wall time of the steps [s].
         steps: Physics steps of all worlds.
         first: Time of the first seed's episode.
@@ -57,7 +54,8 @@ class EpisodeTally:
     gate: str
     noun: str
     several: bool
-    rules: Rules
+    check: EpisodeCheck
+    path: Path | None
     seeds: list[int] = field(default_factory=list)
     succeeded: list[np.ndarray] = field(default_factory=list)
     circumstances: list[Circumstances] = field(default_factory=list)
@@ -67,7 +65,7 @@ class EpisodeTally:
     low: dict[str, float] = field(default_factory=dict)
     high: dict[str, float] = field(default_factory=dict)
     ends: set[int] = field(default_factory=set)
-    rows: list[list[object]] = field(default_factory=list)
+    rows: list[dict[str, object]] = field(default_factory=list)
     seconds: float = 0.0
     steps: int = 0
     first: TimedEpisode | None = None
@@ -86,12 +84,9 @@ class EpisodeTally:
         return self.episodes - len(self.failed)
 
     @property
-    def per_seed(self) -> dict[int, int]:
-        """Number of episodes that succeeded, by seed."""
-        return {
-            seed: int(succeeded.sum())
-            for seed, succeeded in zip(self.seeds, self.succeeded, strict=True)
-        }
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the success rate."""
+        return wilson_interval(self.good, self.episodes)
 
     def add(self, record: EpisodeRecord, episode: Episode, sim: Simulation) -> None:
         """Count one seed."""
@@ -102,9 +97,9 @@ class EpisodeTally:
         if self.first is None:
             self.first = TimedEpisode.of(episode, sim)
         self.failed += self.names(record.seed, np.flatnonzero(record.failed).tolist())
-        for rule, worlds in self.rules.failing(record.failed).items():
+        for rule, worlds in self.check.rules.failing(record.failed).items():
             self.broken.setdefault(rule, []).extend(self.names(record.seed, worlds))
-        self.rows += record.failing_rows(self.rules)
+        self.rows += record.failing_rows(self.check.rules)
         if record.circumstances is not None:
             self.circumstances.append(record.circumstances)
             out = np.flatnonzero(record.circumstances.unreachable).tolist()
@@ -125,37 +120,32 @@ class EpisodeTally:
         """Names of a seed's episodes, as ``world=`` of job=replay takes them."""
         return [f"{seed}:{world}" if self.several else str(world) for world in worlds]
 
-    def metrics(self, context: RunContext) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Counts, the success rate with its interval, and the extremes of what was measured."""
-        low, high = wilson_interval(self.good, self.episodes)
-        extremes = {"min": self.low, "max": self.high}
-        return {
-            "worlds": context.cfg.nworld,
+        low, high = self.interval
+        metrics: dict[str, float] = {
+            "worlds": len(self.succeeded[0]),
             "seeds": len(self.seeds),
             "episodes": self.episodes,
             "succeeded": self.good,
             "success_rate": self.good / self.episodes,
             "success_rate_low95": low,
             "success_rate_high95": high,
-            **{
-                metric: extremes[side][value]
-                for metric, (value, side) in context.check.summaries.items()
-            },
-            "waypoint_error_max_m": self.high["waypoint_error_m"],
-            "peak_contacts_per_world": int(self.high["peak_contacts"]),
-            "peak_constraint_rows_per_world": int(self.high["peak_constraint_rows"]),
-            **(
-                {f"seed{seed}.succeeded": count for seed, count in self.per_seed.items()}
-                if self.several
-                else {}
-            ),
-            **{f"failed.{rule}": len(names) for rule, names in self.broken.items()},
         }
+        for metric, (value, side) in self.check.summaries.items():
+            metrics[metric] = (self.low if side == "min" else self.high)[value]
+        metrics["waypoint_error_max_m"] = self.high["waypoint_error_m"]
+        for name in ("contacts", "constraint_rows"):
+            metrics[f"peak_{name}_per_world"] = int(self.high[f"peak_{name}"])
+        if self.several:
+            for seed, succeeded in zip(self.seeds, self.succeeded, strict=True):
+                metrics[f"seed{seed}.succeeded"] = int(succeeded.sum())
+        return metrics | {f"failed.{rule}": len(names) for rule, names in self.broken.items()}
 
     @property
     def summary(self) -> str:
         """The success rate in words."""
-        low, high = wilson_interval(self.good, self.episodes)
+        low, high = self.interval
         rate = format_percent(self.good / self.episodes)
         return (
             f"{self.good} of {self.episodes} {self.noun} succeeded ({rate}, 95 % interval"
@@ -168,30 +158,29 @@ class EpisodeTally:
         if not self.failed:
             return ""
         counts = "; ".join(
-            f"{self.rules.texts[rule]} in {len(names)}" for rule, names in self.broken.items()
+            f"{self.check.rules.texts[rule]} in {len(names)}" for rule, names in self.broken.items()
         )
         return f"{name_worlds(self.failed, self.episodes, what=self.noun)} failed: {counts}"
 
-    def all_details(self, context: RunContext) -> list[str]:
+    def all_details(self) -> list[str]:
         """Lines of the report: the failing episodes by rule, and remarks."""
-        named = [(self.rules.texts[rule], names) for rule, names in self.broken.items()]
-        if self.unreachable:
-            named.insert(0, ("target out of reach", self.unreachable))
+        named = [("target out of reach", self.unreachable)] if self.unreachable else []
+        named += [(self.check.rules.texts[rule], names) for rule, names in self.broken.items()]
         lines = [
             f"{text}: {name_worlds(names, self.episodes, _NAMED, self.noun)}"
             for text, names in named
         ] + self.details
-        if self.failed and context.folder is not None:
-            table = failing_name(context, self.gate)
-            lines.append(f"{table} has every failing episode with what was measured")
+        if self.failed and self.path is not None:
+            lines.append(f"{self.path.name} has every failing episode with what was measured")
         return lines
 
-    def way_to_look(self, context: RunContext) -> str:
+    @property
+    def way_to_look(self) -> str:
         """The command that replays a failing episode; empty if there is none."""
-        if not self.failed or context.folder is None:
+        if not self.failed or self.path is None:
             return ""
-        named = "" if failing_name(context, self.gate) == FAILING else f"{self.gate}:"
-        return f". To look at one: job=replay run={context.folder} world={named}{self.failed[0]}"
+        gate = "" if self.path.name == FAILING else f"{self.gate}:"
+        return f". To look at one: job=replay run={self.path.parent} world={gate}{self.failed[0]}"
 
     def tables(self) -> list[Table]:
         """Tables of the report: seeds, and first signs of failure."""
@@ -204,18 +193,15 @@ class EpisodeTally:
             ]
             tables.append(Table(title="Seeds", header=header, rows=rows))
         signs: dict[tuple[int, int], list[str]] = {}
-        phases: list[str] = []
-        for seed, kept, good in zip(
-            self.seeds, self.circumstances, self.succeeded, strict=bool(self.circumstances)
-        ):
-            phases = kept.phases
+        for seed, kept, good in zip(self.seeds, self.circumstances, self.succeeded, strict=False):
             for world in np.flatnonzero(~good).tolist():
-                key = int(kept.phase[world]), int(kept.sign[world])
+                key = int(kept.sign_phase[world]), int(kept.sign[world])
                 signs.setdefault(key, []).extend(self.names(seed, [world]))
         if signs:
+            phases = [*self.circumstances[0].phase_names, ""]  # the last one for no sign, -1
             rows = [
                 [
-                    describe_sign(sign, phases[phase] if phase >= 0 else ""),
+                    describe_sign(sign, phases[phase]),
                     str(len(names)),
                     ", ".join(names[:8]) + (", ..." if len(names) > 8 else ""),
                 ]
@@ -230,8 +216,3 @@ def rate_cells(k: int, n: int) -> list[str]:
     """A rate and its interval as two cells."""
     low, high = wilson_interval(k, n)
     return [f"{100.0 * k / n:.1f} %", f"{100.0 * low:.1f} to {100.0 * high:.1f} %"]
-
-
-def failing_name(context: RunContext, gate: str) -> str:
-    """Name of a gate's table of failing episodes."""
-    return SUCCESS_FAILING if gate != "batch" and "batch" in context.cfg.gates else FAILING

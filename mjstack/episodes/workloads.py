@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -21,8 +20,7 @@ from mjstack.envs.buffers import (
     require_physics,
 )
 from mjstack.episodes.rollout import Reset
-from mjstack.managers.reset import required_fields
-from mjstack.sim import BatchSizes, Simulation, device_memory, make_simulation
+from mjstack.sim import BatchSizes, Simulation, device_memory
 
 if TYPE_CHECKING:
     from mjstack.episodes.context import RunContext
@@ -38,9 +36,8 @@ class Workload:
         final: State at the end, shape ``(nworld, nq)``.
         failed: Bits of the rules that each world broke, shape ``(nworld,)``; zero for random
             actions, which nothing judges.
-        seconds: Wall time, with the building of the worlds.
-        data_bytes: What MJWarp's arrays take, or None.
-        device_bytes: What the CUDA device gave out for these worlds, model included, or None.
+        memory: Bytes of MJWarp's arrays (``data``), and of the CUDA device for these worlds, model
+            included (``device``); None where there are none.
         description: Backend and hardware.
     """
 
@@ -48,9 +45,7 @@ class Workload:
     sizes: BatchSizes | None
     final: np.ndarray
     failed: np.ndarray
-    seconds: float
-    data_bytes: int | None
-    device_bytes: int | None
+    memory: dict[str, int | None]
     description: str
 
     @property
@@ -61,52 +56,38 @@ class Workload:
 
 def measuring_worlds(context: RunContext) -> int:
     """How many worlds size the buffers."""
+    nworld = context.cfg.nworld
     on_cuda = context.backend[1].startswith("cuda")
-    return (
-        context.cfg.nworld
-        if on_cuda
-        else min(context.cfg.nworld, context.cfg.gate.capacity.cpu_nworld)
-    )
+    return nworld if on_cuda else min(nworld, context.cfg.gate.capacity.cpu_nworld)
 
 
-def measure_task(context: RunContext, reset: Reset) -> Workload:
-    """The scripted task from some start, with room to spare."""
-    return _measure(context, lambda sizes: play_task(context, reset, sizes))
-
-
-def measure_random(context: RunContext) -> Workload:
-    """Random actions, with room to spare."""
-    return _measure(context, lambda sizes: play_random(context, sizes))
-
-
-def play_task(context: RunContext, reset: Reset, sizes: BatchSizes | None) -> Workload:
-    """Plays the scripted task once in worlds of exactly these sizes."""
+def play_task(context: RunContext, reset: Reset, sizes: BatchSizes | None = None) -> Workload:
+    """Play the driven task once, in worlds of exactly these sizes; without, with room to spare."""
 
     def play(sim: Simulation) -> np.ndarray:
         return context.play(sim, reset).result.failed.cpu().numpy()
 
-    return _play(context, reset, sizes, play)
+    return _run(context, reset, sizes, play)
 
 
-def play_random(context: RunContext, sizes: BatchSizes | None) -> Workload:
-    """Steps the task's own environment with random actions; worlds end and start anew as its
-    managers say.
+def play_random(context: RunContext, sizes: BatchSizes | None = None) -> Workload:
+    """Step the task's environment with random actions; worlds end and start anew as its managers
+    say. Sizes as in `play_task`.
     """
     cfg = context.cfg
     advance = context.advance
     steps = cfg.gate.capacity.random_steps or cfg.task.episode_steps
 
     def play(sim: Simulation) -> np.ndarray:
-        env = Env(
-            sim, context.index, cfg, check_faults=False
-        )  # a lack of room is what this looks for
+        # A lack of room is what this looks for.
+        env = Env(sim, context.index, cfg, check_faults=False)
         env.reset(seed=cfg.seed)
         play_random_actions(
             env, steps, advance and (lambda done: advance("random actions", done, steps))
         )
         return np.zeros(sim.nworld, dtype=np.int64)
 
-    return _play(context, cfg.reset, sizes, play)
+    return _run(context, cfg.reset, sizes, play)
 
 
 def size_batch(context: RunContext) -> BatchSizes:
@@ -117,20 +98,26 @@ def size_batch(context: RunContext) -> BatchSizes:
     """
     worlds = measuring_worlds(context)
     margin = context.cfg.gate.capacity.margin
-    task = measure_task(context, context.cfg.reset)
+    task = play_task(context, context.cfg.reset)
     require_physics("the scripted task", task.peaks, task.sizes)
     return recommend_sizes(
         task.peaks, margin, f"batch=auto: the scripted task in {worlds} worlds, times {margin:g}"
     )
 
 
-def _measure(context: RunContext, play: Callable[[BatchSizes | None], Workload]) -> Workload:
-    if context.backend[0] is Backend.native:
-        return play(None)
+def _run(
+    context: RunContext,
+    reset: Reset,
+    sizes: BatchSizes | None,
+    play: Callable[[Simulation], np.ndarray],
+) -> Workload:
+    """Play in worlds of these sizes; without, on MJWarp, with room to spare."""
+    if sizes is not None or context.backend[0] is Backend.native:
+        return _play(context, reset, sizes, play)
     runs: list[Workload] = []
 
     def run(sizes: BatchSizes) -> Peaks:
-        runs.append(play(sizes))
+        runs.append(_play(context, reset, sizes, play))
         return runs[-1].peaks
 
     measure_peaks(context.cfg, run)
@@ -143,39 +130,29 @@ def _play(
     sizes: BatchSizes | None,
     play: Callable[[Simulation], np.ndarray],
 ) -> Workload:
-    """Builds worlds, plays in them, and reads what there is to know before they go."""
+    """Build worlds, play in them, and read what there is to know before they go."""
     backend, device = context.backend
-    nworld = measuring_worlds(context)
-    began = time.perf_counter()
-    warp = backend is not Backend.native
-    before = _used(device) if warp else None
-    fields = required_fields(reset)
-    sim = make_simulation(
-        context.model,
-        context.cfg,
-        nworld,
-        backend=backend,
-        device=device,
-        fields=fields,
-        sizes=sizes,
-    )
+    before = _used_bytes(device)
+    sim = context.simulation(measuring_worlds(context), backend, device, reset=reset, sizes=sizes)
     failed = play(sim)
-    after = _used(device) if warp else None
+    after = _used_bytes(device)
     workload = Workload(
         peaks=read_peaks(sim),
         sizes=sizes,
         final=sim.qpos.cpu().numpy().copy(),
         failed=failed,
-        seconds=time.perf_counter() - began,
-        data_bytes=sim.memory_bytes(),
-        device_bytes=None if before is None or after is None else after - before,
+        memory={
+            "data": sim.memory_bytes(),
+            "device": None if before is None or after is None else after - before,
+        },
         description=sim.description,
     )
     sim.close()
     return workload
 
 
-def _used(device: str) -> int | None:
+def _used_bytes(device: str) -> int | None:
+    """Memory of a CUDA device that is in use; None elsewhere."""
     gc.collect()  # the worlds of the run before
     memory = device_memory(device)
     return None if memory is None else memory[0]

@@ -26,7 +26,7 @@ def run_batch(context: RunContext) -> list[GateResult]:
     context.artifacts.carry_start = snapshots.states.get(carry)
     context.artifacts.timed_episode = tally.first
 
-    metrics = tally.metrics(context) | {"distinct_final_states": len(tally.ends)}
+    metrics = tally.metrics() | {"distinct_final_states": len(tally.ends)}
     if not tally.failed:  # worlds that fail have no speed
         speed = tally.steps / tally.seconds
         metrics |= {"episode_s": tally.seconds, "world_steps_per_s": speed}
@@ -47,11 +47,11 @@ def run_batch(context: RunContext) -> list[GateResult]:
         GateResult(
             name="batch",
             status=Status.failed if problems else Status.passed,
-            reason="; ".join([summary, *problems]) + tally.way_to_look(context),
+            reason="; ".join([summary, *problems]) + tally.way_to_look,
             thresholds=context.check.thresholds() | thresholds,
             metrics=metrics,
             notes=tally.notes,
-            details=tally.all_details(context),
+            details=tally.all_details(),
             tables=tally.tables(),
         )
     ]

@@ -10,12 +10,10 @@ from functools import reduce
 import numpy as np
 
 from mjstack.config.schema import Config
-from mjstack.envs.buffers import Peaks, describe_loss, join_peaks, recommend_sizes
+from mjstack.envs.buffers import Peaks, describe_lost, join_peaks, recommend_sizes
 from mjstack.episodes.context import RunContext, needs_episode
 from mjstack.episodes.workloads import (
     Workload,
-    measure_random,
-    measure_task,
     measuring_worlds,
     play_random,
     play_task,
@@ -69,9 +67,9 @@ def run_capacity(context: RunContext) -> list[GateResult]:
 
     # Environments. Each start is planned once, for both of its runs, and the task's last: its plan
     # is kept for the gates that follow.
-    runs = {"random_actions": measure_random(context)}
+    runs = {"random_actions": play_random(context)}
     try:
-        runs["randomized"] = measure_task(context, t.reset)
+        runs["randomized"] = play_task(context, t.reset)
     except Unreachable as error:  # starts of the user's own; the other workloads stand
         result.details.append(f"randomised starts: not measured: {error}")
     title = "environments (random actions, randomised starts)"
@@ -79,7 +77,7 @@ def run_capacity(context: RunContext) -> list[GateResult]:
     broken = _try(context, env, result)
 
     # The driven task
-    task_run = measure_task(context, cfg.reset)
+    task_run = play_task(context, cfg.reset)
     task = _group(cfg, "scripted task", "recommended", {"task": task_run}, resolve_sizes(cfg), how)
     broken += _try(context, task, result)
 
@@ -132,7 +130,7 @@ def _group(
     """Join the peaks of some workloads, and recommend sizes for them."""
     peaks = reduce(join_peaks, (run.peaks for run in runs.values()))
     wanted = recommend_sizes(peaks, cfg.gate.capacity.margin, source)
-    losses = [describe_loss(run.peaks.overflow, run.sizes) for run in runs.values() if run.sizes]
+    losses = [describe_lost(run.peaks, run.sizes) for run in runs.values() if run.sizes]
     return _Group(
         title=title,
         prefix=prefix,
@@ -201,8 +199,8 @@ def _compare(
     result.metrics |= {f"rerun.{name}.{key}": value for key, value in metrics.items()}
     result.notes[f"rerun.{name}.sizes"] = sizes
     for part, run in (("measuring", first), ("rerun", again)):
-        for what in ("data", "device"):
-            if (size := getattr(run, f"{what}_bytes")) is not None:
+        for what, size in run.memory.items():
+            if size is not None:
                 result.metrics[f"memory.{name}.{part}.{what}_mb"] = size / 1e6
 
     # Problems

@@ -16,8 +16,7 @@ from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext, needs_episode
 from mjstack.episodes.record import starts_name
-from mjstack.episodes.region_report import regions_table, save_regions
-from mjstack.episodes.regions import find_regions
+from mjstack.episodes.regions import find_regions, regions_table, save_regions
 from mjstack.episodes.rollout import CLOSED_LOOP, Observer
 from mjstack.episodes.seeds import play_seeds
 from mjstack.errors import MjstackError
@@ -58,7 +57,7 @@ def run_success(context: RunContext) -> list[GateResult]:
     )
     tally.details = unwritten + tally.details
     kept = tally.circumstances
-    starts = np.concatenate([seed.starts for seed in kept])
+    starts = np.concatenate([seed.start_places for seed in kept])
     retries = np.concatenate([seed.retries for seed in kept])
     succeeded = np.concatenate(tally.succeeded)
     retried = retries > 0
@@ -70,7 +69,7 @@ def run_success(context: RunContext) -> list[GateResult]:
         episodes=t.cell_episodes,
         objects=kept[0].objects,
     )
-    metrics = tally.metrics(own) | {
+    metrics = tally.metrics() | {
         "distinct_starts": len(np.unique(np.round(starts, 6).reshape(len(starts), -1), axis=0)),
         "retried": int(retried.sum()),
         "retries": int(retries.sum()),
@@ -92,19 +91,18 @@ def run_success(context: RunContext) -> list[GateResult]:
         )
     elif all(region.succeeded == region.episodes for region in regions):
         tally.details.append(f"no region of at least {t.cell_episodes} episodes had a failure")
-    if own.folder is not None:
-        tally.details += save_regions(own, regions, starts, tally)
+    tally.details += save_regions(own, regions, starts, tally)
     context.artifacts.pictures += own.artifacts.pictures
     good = metrics["success_rate"] >= t.rate and not tally.problems
     return [
         GateResult(
             name="success",
             status=Status.passed if good else Status.failed,
-            reason="; ".join([*parts, *tally.problems]) + tally.way_to_look(own),
+            reason="; ".join([*parts, *tally.problems]) + tally.way_to_look,
             thresholds=own.check.thresholds() | {"success_rate_min": t.rate},
             metrics=metrics,
             notes=tally.notes,
-            details=tally.all_details(own),
+            details=tally.all_details(),
             tables=[*tally.tables(), *regions_table(cfg, regions)],
         )
     ]

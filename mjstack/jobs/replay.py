@@ -19,7 +19,7 @@ from mjstack.episodes.failures import FailureMonitor, describe_sign
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.replay import ReplayedWorld, replay_world, start_of_world
 from mjstack.errors import ConfigError, DeviceError, RunError
-from mjstack.files import write_atomic
+from mjstack.files import write_atomic, write_npz
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
 from mjstack.jobs.earlier_run import EarlierRun, archived_starts, copy_names
@@ -219,13 +219,13 @@ def _replay(
         context.artifacts.shown = done.recorder
         shown = f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
         context.artifacts.shown_by = shown
-    told = [str(finding) for finding in done.findings]
+    told = list(done.findings)
     told += [_first_sign(monitor, done, context) for monitor in monitors]
     for line in told:
         context.say(escape(f"  {line}"))
     name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
     assert context.folder is not None
-    done.write(context.folder / name, seed=plan.seed, world=plan.world)
+    write_npz(context.folder / name, done.arrays)
     recorded = rules.describe(int(plan.record.failed[plan.world])) or "succeeded"
     return [
         GateResult(

@@ -204,14 +204,15 @@ def step_cache() -> Iterator[None]:
         current_term.values = outer
 
 
-def require_positive(name: str, value: float) -> None:
-    """Refuses a parameter that is not a positive number.
+def require_positive(name: str, value: float, *, zero: bool = False) -> None:
+    """Refuses a parameter that is not a positive number, or zero where that will do.
 
     Raises:
         ParameterError: It is not.
     """
-    if not 0.0 < value < math.inf:
-        raise ParameterError(name, value, "a positive number")
+    if not 0.0 <= value < math.inf or (value == 0.0 and not zero):
+        expected = "a number that is not negative" if zero else "a positive number"
+        raise ParameterError(name, value, expected)
 
 
 def shared(key: Any, compute: Callable[[], torch.Tensor]) -> torch.Tensor:

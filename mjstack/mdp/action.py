@@ -2,27 +2,39 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
+from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView
-from mjstack.mdp.geometry import named_pose, robot
+from mjstack.mdp.geometry import named_pose, robot, robot_joints
 from mjstack.scene.index import Columns
 
 MODES = ("relative", "absolute", "delta")
-PARTS = ("arm", "gripper", "all")
 
 
-class JointPosition(ActionTerm):
+class _Commands(ActionTerm):
+    """Commands of some of the robot's actuators, from actions of -1 to 1."""
+
+    def _set_up(self, env: EnvView, chosen: Sequence[int], dim: int) -> None:
+        self._ctrl = env.sim.ctrl
+        self._columns = Columns(env.index.ctrl[chosen], env.device)
+        self.actuators = self._columns.indices
+        self.dim = dim
+        self.high = torch.ones(dim, dtype=self._ctrl.dtype, device=env.device)
+        self.low = -self.high
+
+
+class JointPosition(_Commands):
     """Position commands of some joints, kept within the actuators' ranges.
 
     ``relative``: a pose of the robot's, home by default, plus ``scale`` times the action.
-        ``absolute``: the action itself
-    [rad, m]. ``delta``: the last command plus ``scale`` times the action. Actions of the first and
-    the last kind count from -1 to 1.
+    ``absolute``: the action itself [rad, m]. ``delta``: the last command plus ``scale`` times the
+    action. Actions of the first and the last kind count from -1 to 1.
     """
 
     def __init__(
@@ -48,42 +60,31 @@ class JointPosition(ActionTerm):
         """
         if mode not in MODES:
             raise UnknownName("action mode", mode, MODES)
-        _check_scale(scale)
-        names = [*env.cfg.robot.arm_joints, *env.cfg.robot.gripper_joints]
-        n = len(names)
+        require_positive("scale", scale)
+        names = robot_joints(env)
         n_arm = env.index.n_arm
+        parts = {"arm": names[:n_arm], "gripper": names[n_arm:], "all": names}
         if isinstance(joints, str):
-            if joints not in PARTS:
-                raise UnknownName("action joints", joints, PARTS)
-            chosen = (
-                list(range(n))
-                if joints == "all"
-                else list(range(n_arm))
-                if joints == "arm"
-                else list(range(n_arm, n))
-            )
-        else:
-            for name in joints:
-                if name not in names:
-                    raise UnknownName("action joint", name, names)
-            chosen = [names.index(name) for name in joints]
-            if not chosen or len(set(chosen)) < len(chosen):
-                raise ParameterError("joints", joints, "at least one joint, each once")
-        tensors = robot(env)
-        self._ctrl = env.sim.ctrl
+            if joints not in parts:
+                raise UnknownName("action joints", joints, parts)
+            joints = parts[joints]
+        for name in joints:
+            if name not in names:
+                raise UnknownName("action joint", name, names)
+        chosen = [names.index(name) for name in joints]
+        if not chosen or len(set(chosen)) < len(chosen):
+            raise ParameterError("joints", joints, "at least one joint, each once")
+        self._set_up(env, chosen, len(chosen))
         self._mode = mode
         self._scale = scale
-        self._columns = Columns(env.index.ctrl[chosen], env.device)
         self._pose = named_pose(env, pose)[chosen]
-        self._low, self._high = tensors.ctrl_range[chosen].unbind(1)
-        self.dim = len(chosen)
-        self.actuators = tuple(env.index.ctrl[chosen].tolist())
-        self.low, self.high = (
-            (self._low, self._high) if mode == "absolute" else _unit_bounds(self.dim, self._pose)
-        )
-        self.unit = "rad, m" if mode == "absolute" else "-1 to 1"
+        self._low, self._high = robot(env).ctrl_range[chosen].unbind(1)
+        self.unit = "-1 to 1"
+        if mode == "absolute":
+            self.unit = "rad, m"
+            self.low, self.high = self._low, self._high
 
-    def write_commands(self, action: torch.Tensor) -> None:
+    def write_commands(self, action: Tensor) -> None:
         """Writes the commands of its joints."""
         if self._mode == "absolute":
             command = action
@@ -94,28 +95,23 @@ class JointPosition(ActionTerm):
         self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))
 
 
-class Gripper(ActionTerm):
+class Gripper(_Commands):
     """One number for all fingers: -1 is closed, 1 is open, as the robot's profile has them."""
 
     def __init__(self, env: EnvView) -> None:
         """Reads the profile."""
-        tensors = robot(env)
-        self._ctrl = env.sim.ctrl
-        self._columns = Columns(env.index.ctrl[env.index.n_arm :], env.device)
-        self._closed = tensors.gripper_closed
-        self._opening = tensors.gripper_open - tensors.gripper_closed
-        self.dim = 1
-        self.actuators = tuple(env.index.ctrl[env.index.n_arm :].tolist())
-        self.low, self.high = _unit_bounds(1, tensors.home)
+        self._set_up(env, range(env.index.n_arm, len(env.index.ctrl)), dim=1)
+        self._closed = robot(env).gripper_closed
+        self._opening = robot(env).gripper_open - self._closed
 
-    def write_commands(self, action: torch.Tensor) -> None:
+    def write_commands(self, action: Tensor) -> None:
         """Writes the fingers' commands."""
         self._columns.write(
             self._ctrl, self._closed + 0.5 * (action.clamp(-1.0, 1.0) + 1.0) * self._opening
         )
 
 
-class EndEffectorDelta(ActionTerm):
+class EndEffectorDelta(_Commands):
     """Moves the commanded grasp point by ``scale`` times the action in x, y and z, by batched
     inverse kinematics.
 
@@ -136,43 +132,24 @@ class EndEffectorDelta(ActionTerm):
         Raises:
             MjstackError: A parameter is out of range.
         """
-        from mjstack.kinematics.batched_ik import (
-            BatchedIk,
-        )  # loads Warp, which other actions do not need
+        # Loads Warp, which other actions do not need.
+        from mjstack.kinematics.batched_ik import BatchedIk
 
-        _check_scale(scale)
-        if iterations < 1:
-            raise ParameterError("iterations", iterations, "an integer of at least 1")
-        tensors = robot(env)
-        self._ctrl = env.sim.ctrl
-        self._columns = tensors.ctrl
+        require_positive("scale", scale)
+        require_positive("iterations", iterations)
         self._n_arm = env.index.n_arm
-        self._arm = Columns(env.index.ctrl[: env.index.n_arm], env.device)
-        self._low, self._high = tensors.ctrl_range.unbind(1)
+        self._set_up(env, range(self._n_arm), dim=3)
+        self._all = robot(env).ctrl
+        self._low, self._high = robot(env).ctrl_range[: self._n_arm].unbind(1)
         self._scale = scale
         self._ik = BatchedIk(
             env.sim.model, env.cfg.robot, env.nworld, env.device, iterations=iterations
         )
-        self.dim = 3
-        self.actuators = tuple(env.index.ctrl[: env.index.n_arm].tolist())
-        self.low, self.high = _unit_bounds(3, tensors.home)
 
-    def write_commands(self, action: torch.Tensor) -> None:
+    def write_commands(self, action: Tensor) -> None:
         """Writes the arm's commands."""
-        last = self._columns.read(self._ctrl)
+        last = self._all.read(self._ctrl)
         target = self._ik.forward(last)[0] + self._scale * action.clamp(-1.0, 1.0).float()
         command, _ = self._ik.solve(last, target)
         command = command[:, : self._n_arm].to(self._ctrl.dtype)
-        self._arm.write(
-            self._ctrl, torch.clamp(command, self._low[: self._n_arm], self._high[: self._n_arm])
-        )
-
-
-def _unit_bounds(dim: int, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    ones = torch.ones(dim, dtype=like.dtype, device=like.device)
-    return -ones, ones
-
-
-def _check_scale(scale: float) -> None:
-    if not (math.isfinite(scale) and scale > 0.0):
-        raise ParameterError("scale", scale, "a positive number")
+        self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))

@@ -5,9 +5,10 @@ share.
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from mjstack.errors import ParameterError, UnknownName
-from mjstack.managers.term import shared
+from mjstack.managers.term import require_positive, shared
 from mjstack.managers.view import EnvView, episode_draw
 from mjstack.math import lowest_point
 from mjstack.scene import table_top
@@ -20,11 +21,22 @@ def robot(env: EnvView) -> RobotTensors:
     return env.index.on(env.device, env.sim.qpos.dtype)
 
 
+def robot_joints(env: EnvView) -> list[str]:
+    """Names of the robot's joints: the arm's, then the gripper's."""
+    return [*env.cfg.robot.arm_joints, *env.cfg.robot.gripper_joints]
+
+
+def joint_limits(env: EnvView) -> tuple[Tensor, Tensor]:
+    """Lowest and highest position of each joint that is also a command, each ``(n,)``."""
+    both = torch.stack((robot(env).range, robot(env).ctrl_range))
+    return both[..., 0].amax(0), both[..., 1].amin(0)
+
+
 POSES = ("home", "start")
 LOADED = 1e-5  # N: a jaw that presses with more touches the object
 
 
-def named_pose(env: EnvView, pose: str) -> torch.Tensor:
+def named_pose(env: EnvView, pose: str) -> Tensor:
     """One of the robot's own commands, `POSES`, shape ``(n,)``.
 
     Raises:
@@ -35,25 +47,25 @@ def named_pose(env: EnvView, pose: str) -> torch.Tensor:
     return getattr(robot(env), pose)
 
 
-def joint_positions(env: EnvView) -> torch.Tensor:
+def joint_positions(env: EnvView) -> Tensor:
     """Arm joints [rad], then gripper joints [rad or m], shape ``(nworld, n)``. Not to be written
     into.
     """
     return robot(env).qpos.read(env.sim.qpos)
 
 
-def joint_velocities(env: EnvView) -> torch.Tensor:
-    """Likewise [rad/s, m/s]."""
+def joint_velocities(env: EnvView) -> Tensor:
+    """Joint velocities [rad/s, m/s], shape ``(nworld, n)``. Not to be written into."""
     return robot(env).qvel.read(env.sim.qvel)
 
 
-def grasp_point(env: EnvView) -> torch.Tensor:
+def grasp_point(env: EnvView) -> Tensor:
     """Midpoint between the jaws [m], world frame, shape ``(nworld, 3)``."""
     first, second = env.index.grasp_sites
     return 0.5 * (env.sim.site_xpos[:, first] + env.sim.site_xpos[:, second])
 
 
-def gripper_opening(env: EnvView) -> torch.Tensor:
+def gripper_opening(env: EnvView) -> Tensor:
     """How far each gripper joint is open as measured, 0 closed to 1 open, shape ``(nworld,
     n_gripper)``.
     """
@@ -62,7 +74,7 @@ def gripper_opening(env: EnvView) -> torch.Tensor:
     return (q - tensors.gripper_closed) / (tensors.gripper_open - tensors.gripper_closed)
 
 
-def pose_w(env: EnvView, name: str) -> torch.Tensor:
+def pose_w(env: EnvView, name: str) -> Tensor:
     """Position [m] and quaternion (wxyz) of an object, from qpos, which is never stale, shape
     ``(nworld, 7)``.
     """
@@ -72,12 +84,29 @@ def pose_w(env: EnvView, name: str) -> torch.Tensor:
     return env.sim.qpos[:, address : address + 7]
 
 
-def above_table(env: EnvView, name: str) -> torch.Tensor:
+def grasp_point_to_object(env: EnvView, name: str, height: float = 0.0) -> Tensor:
+    """From the grasp point to a point above an object's centre [m], shape ``(nworld, 3)``."""
+    offset = pose_w(env, name)[:, :3] - grasp_point(env)
+    offset[:, 2] += height
+    return offset
+
+
+def nearness(offset: Tensor, scale: float) -> Tensor:
+    """``1 - tanh(distance / scale)`` of offsets [m], shape ``(nworld, d)``; shape ``(nworld,)``.
+
+    Raises:
+        ParameterError: The scale is not positive.
+    """
+    require_positive("scale", scale)
+    return 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
+
+
+def above_table(env: EnvView, name: str) -> Tensor:
     """Height of an object's lowest point above the table [m], shape ``(nworld,)``. Not to be
     written into.
     """
 
-    def compute() -> torch.Tensor:
+    def compute() -> Tensor:
         pose = pose_w(env, name)
         thing = env.cfg.scene.objects[name]
         low = lowest_point(pose[:, :3], pose[:, 3:], thing.shape, thing.size)
@@ -86,7 +115,7 @@ def above_table(env: EnvView, name: str) -> torch.Tensor:
     return shared((id(env), above_table, name), compute)
 
 
-def place_xy(env: EnvView, name: str) -> torch.Tensor:
+def place_xy(env: EnvView, name: str) -> Tensor:
     """Position of a place [m], drawn anew in each episode if it has ``random_xy``, shape ``(nworld,
     2)``. Not to be written into.
 
@@ -102,7 +131,7 @@ def place_xy(env: EnvView, name: str) -> torch.Tensor:
     if not any(place.random_xy):
         return env.index.constant(place.xy, env.sim.qpos).expand(env.nworld, -1)
 
-    def compute() -> torch.Tensor:
+    def compute() -> Tensor:
         dx, dy = episode_draw(env, name, 2).unbind(1)
         wide, deep = place.random_xy
         return torch.stack((place.xy[0] + wide * dx, place.xy[1] + deep * dy), dim=1)
@@ -110,7 +139,7 @@ def place_xy(env: EnvView, name: str) -> torch.Tensor:
     return shared((id(env), place_xy, name), compute)
 
 
-def source_xy(env: EnvView) -> torch.Tensor:
+def source_xy(env: EnvView) -> Tensor:
     """Position of every object, then of every place, in the scene's order [m], shape ``(nworld,
     sources, 2)``.
     """
@@ -119,14 +148,14 @@ def source_xy(env: EnvView) -> torch.Tensor:
     return torch.stack([*objects, *places], dim=1)
 
 
-def jaw_forces(env: EnvView, name: str) -> torch.Tensor:
+def jaw_forces(env: EnvView, name: str) -> Tensor:
     """Size of the contact force [N] of each jaw on an object, at the last physics step, shape
     ``(nworld, 2)``.
     """
     return _jaw_forces(env.index, env.sim, name)
 
 
-def objects_in_hand(index: SceneIndex, sim: Simulation) -> torch.Tensor:
+def objects_in_hand(index: SceneIndex, sim: Simulation) -> Tensor:
     """Whether all jaws press on each object of the scene, at the last physics step, shape
     ``(nworld, objects)``, bool.
     """
@@ -134,7 +163,7 @@ def objects_in_hand(index: SceneIndex, sim: Simulation) -> torch.Tensor:
     return torch.stack(held, dim=1)
 
 
-def _jaw_forces(index: SceneIndex, sim: Simulation, name: str) -> torch.Tensor:
+def _jaw_forces(index: SceneIndex, sim: Simulation, name: str) -> Tensor:
     if name not in index.jaw_force:
         raise UnknownName("object", name, index.jaw_force)
     parts = [sim.sensordata[:, a : a + 3] for a in index.jaw_force[name]]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from mjstack.managers.view import EnvView, offers
+from mjstack.mdp import geometry
 from mjstack.mdp.geometry import (
     grasp_point,
     jaw_forces,
@@ -18,31 +20,31 @@ from mjstack.scene import table_top
 
 
 @offers(unit="joint")
-def joint_pos(env: EnvView) -> torch.Tensor:
+def joint_pos(env: EnvView) -> Tensor:
     """Joint positions [rad, m], arm then gripper, shape ``(nworld, n)``."""
     return joint_positions(env)
 
 
 @offers(unit="joint")
-def joint_pos_relative(env: EnvView) -> torch.Tensor:
+def joint_pos_relative(env: EnvView) -> Tensor:
     """Joint positions less home [rad, m], shape ``(nworld, n)``."""
     return joint_positions(env) - robot(env).home
 
 
 @offers(unit="joint/s")
-def joint_vel(env: EnvView) -> torch.Tensor:
+def joint_vel(env: EnvView) -> Tensor:
     """Joint velocities [rad/s, m/s], shape ``(nworld, n)``."""
     return joint_velocities(env)
 
 
 @offers(unit="m")
-def grasp_point_pos(env: EnvView) -> torch.Tensor:
+def grasp_point_pos(env: EnvView) -> Tensor:
     """Grasp point [m], world frame, shape ``(nworld, 3)``."""
     return grasp_point(env)
 
 
 @offers(unit="m")
-def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> torch.Tensor:
+def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> Tensor:
     """From the grasp point to a point above an object's centre [m], shape ``(nworld, 3)``.
 
     Args:
@@ -50,19 +52,17 @@ def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> 
         object: Scene object.
         height: How far above [m].
     """
-    offset = pose_w(env, object)[:, :3] - grasp_point(env)
-    offset[:, 2] += height
-    return offset
+    return geometry.grasp_point_to_object(env, object, height)
 
 
 @offers(unit="m")
-def object_to_object(env: EnvView, *, a: str, b: str) -> torch.Tensor:
+def object_to_object(env: EnvView, *, a: str, b: str) -> Tensor:
     """From one object's centre to another's [m], shape ``(nworld, 3)``."""
     return pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
 
 
 @offers(unit="m")
-def object_to_place(env: EnvView, *, object: str, place: str) -> torch.Tensor:
+def object_to_place(env: EnvView, *, object: str, place: str) -> Tensor:
     """From an object's centre to where it is when it stands at a place on the table [m], shape
     ``(nworld, 3)``.
     """
@@ -72,20 +72,20 @@ def object_to_place(env: EnvView, *, object: str, place: str) -> torch.Tensor:
 
 
 @offers(unit=("m",) * 3 + ("1",) * 4)
-def object_pose(env: EnvView, *, object: str) -> torch.Tensor:
+def object_pose(env: EnvView, *, object: str) -> Tensor:
     """Position [m] and quaternion (wxyz), world frame, shape ``(nworld, 7)``."""
     return pose_w(env, object)
 
 
 @offers(unit=("m/s",) * 3 + ("rad/s",) * 3)
-def object_velocity(env: EnvView, *, object: str) -> torch.Tensor:
+def object_velocity(env: EnvView, *, object: str) -> Tensor:
     """Linear [m/s, world frame] and angular [rad/s, body frame] velocity, shape ``(nworld, 6)``."""
     _, address = env.index.object_address(object)
     return env.sim.qvel[:, address : address + 6]
 
 
 @offers(unit="N")
-def jaw_force(env: EnvView, *, object: str) -> torch.Tensor:
+def jaw_force(env: EnvView, *, object: str) -> Tensor:
     """Size of each jaw's contact force on an object [N], at the last physics step, shape ``(nworld,
     2)``.
     """
@@ -93,6 +93,6 @@ def jaw_force(env: EnvView, *, object: str) -> torch.Tensor:
 
 
 @offers(unit="joint")
-def last_action(env: EnvView) -> torch.Tensor:
+def last_action(env: EnvView) -> Tensor:
     """The policy's last action, shape ``(nworld, action_dim)``."""
     return env.action

@@ -8,18 +8,17 @@ import math
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from mjstack.errors import ParameterError
-from mjstack.managers.term import resolve_func
+from mjstack.managers.term import require_positive, resolve_func
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
-from mjstack.mdp.geometry import named_pose, pose_w, robot
+from mjstack.mdp.geometry import joint_limits, named_pose, pose_w, robot
 from mjstack.mdp.starts.placement import Placement
 from mjstack.mdp.starts.randomization import (
-    FRICTION_FIELDS,
-    GAIN_FIELDS,
-    MASS_FIELDS,
     ObjectMasses,
+    Quantity,
     ServoGains,
     SlidingFriction,
     bounds,
@@ -27,7 +26,7 @@ from mjstack.mdp.starts.randomization import (
 from mjstack.mdp.starts.reach import require_reach
 
 
-def home(env: EnvView, mask: torch.Tensor, *, pose: str = "home") -> None:
+def home(env: EnvView, mask: Tensor, *, pose: str = "home") -> None:
     """Puts the robot at its home command, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
     _write_robot(env, mask, named_pose(env, pose).expand(env.nworld, -1))
     env.sim.qvel.masked_fill_(mask[:, None], 0.0)
@@ -49,17 +48,13 @@ class JointNoise:
             arm: Of the arm's joints [rad].
             gripper: Of the gripper's [rad or m].
         """
-        _not_negative("arm", arm)
-        _not_negative("gripper", gripper)
-        tensors = robot(env)
-        n_arm = env.index.n_arm
-        self._width = torch.full_like(tensors.home, gripper)
-        self._width[:n_arm] = arm
-        both = torch.stack((tensors.range, tensors.ctrl_range))
-        self._low = both[..., 0].amax(0)
-        self._high = both[..., 1].amin(0)
+        require_positive("arm", arm, zero=True)
+        require_positive("gripper", gripper, zero=True)
+        self._width = torch.full_like(robot(env).home, gripper)
+        self._width[: env.index.n_arm] = arm
+        self._low, self._high = joint_limits(env)
 
-    def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
+    def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Writes qpos and ctrl."""
         noise = random_uniform(env, self.label, self._width.shape[0])
         command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
@@ -79,16 +74,16 @@ class JitterObjects:
             xy: Of x and y [m].
             yaw: Of the rotation about z [rad].
         """
-        _not_negative("xy", xy)
-        _not_negative("yaw", yaw)
+        require_positive("xy", xy, zero=True)
+        require_positive("yaw", yaw, zero=True)
         placement = Placement(
             env.cfg, env.sim.model, env.index, region=(xy, xy), gap=0.0, pose=env.cfg.robot.home
         )
-        placement.require_all_free("xy", xy)
+        placement.require_room("xy", xy, candidates=1)
         self._xy = xy
         self._yaw = yaw
 
-    def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
+    def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Writes qpos."""
         draw = random_uniform(env, self.label, 3 * len(env.index.objects))
         for number, name in enumerate(env.index.objects):
@@ -135,10 +130,9 @@ class RandomizeObjects:
         """
         if len(xy) != 2:
             raise ParameterError("xy", list(xy), "two numbers [m]")
-        for name, value in (("xy", xy[0]), ("xy", xy[1]), ("yaw", yaw), ("gap", gap)):
-            _not_negative(name, value)
-        if candidates < 1:
-            raise ParameterError("candidates", candidates, "an integer of at least 1")
+        for name, value in (("xy", min(xy)), ("yaw", yaw), ("gap", gap)):
+            require_positive(name, value, zero=True)
+        require_positive("candidates", candidates)
         self._yaw = yaw
         self._candidates = candidates
         noise = [
@@ -159,13 +153,13 @@ class RandomizeObjects:
         require_reach(env, "xy", (xy[0], xy[1]))
         self._placement.to(env.device, env.sim.qpos.dtype)
 
-    def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
+    def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Writes qpos."""
         count = len(env.index.objects)
         draws = random_uniform(env, self.label, count * (2 * self._candidates + 1)).view(
             env.nworld, count, -1
         )
-        offsets = self._placement.choose(
+        offsets, _ = self._placement.choose(
             draws[..., 1:].reshape(env.nworld, count, self._candidates, 2)
         )
         for number, name in enumerate(env.index.objects):
@@ -173,68 +167,53 @@ class RandomizeObjects:
             _write_object(env, mask, name, dx, dy, self._yaw * draws[:, number, 0])
 
 
-@uses_fields(*MASS_FIELDS)
-class ObjectMass:
-    """Scales each object's mass and inertia."""
+class _Randomized:
+    """A quantity of the model, drawn anew for each episode."""
 
-    label = "reset.mass"
+    label = "reset.model"
+
+    def __init__(self, env: EnvView, quantity: Quantity, ends: tuple[float, float]) -> None:
+        self._quantity = quantity
+        self._nominal = quantity.nominal.to(env.sim.qpos.dtype)
+        self._ends = ends
+
+    def __call__(self, env: EnvView, mask: Tensor) -> None:
+        """Writes the model fields."""
+        factors = random_uniform(env, self.label, len(self._nominal), *self._ends)
+        self._quantity.write(mask, self._nominal * factors)
+
+
+@uses_fields(*ObjectMasses.fields)
+class ObjectMass(_Randomized):
+    """Scales each object's mass and inertia."""
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Takes the smallest and largest factor."""
-        self._low, self._high = bounds("scale", scale)
-        self._masses = ObjectMasses(env)
-        self._nominal = self._masses.nominal.to(env.sim.qpos.dtype)
-
-    def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
-        """Writes the mass fields."""
-        factors = random_uniform(env, self.label, len(env.index.objects), self._low, self._high)
-        self._masses.write(mask, self._nominal * factors)
+        super().__init__(env, ObjectMasses(env), bounds("scale", scale))
 
 
-@uses_fields(*FRICTION_FIELDS)
-class ObjectFriction:
+@uses_fields(*SlidingFriction.fields)
+class ObjectFriction(_Randomized):
     """Draws the sliding friction of each object, and of the grip; see `SlidingFriction`."""
-
-    label = "reset.friction"
 
     def __init__(self, env: EnvView, *, sliding: Sequence[float]) -> None:
         """Takes the smallest and largest coefficient."""
-        self._low, self._high = bounds("sliding", sliding)
-        self._friction = SlidingFriction(env, self._low)
-
-    def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
-        """Writes geom_friction."""
-        self._friction.write(
-            mask, random_uniform(env, self.label, len(self._friction.names), self._low, self._high)
-        )
+        ends = bounds("sliding", sliding)
+        super().__init__(env, SlidingFriction(env, ends[0]), ends)
 
 
-@uses_fields(*GAIN_FIELDS)
-class ActuatorGains:
+@uses_fields(*ServoGains.fields)
+class ActuatorGains(_Randomized):
     """Scales the stiffness and damping of each of the robot's position servos by one factor per
     servo.
     """
 
-    label = "reset.gains"
-
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Takes the smallest and largest factor."""
-        self._low, self._high = bounds("scale", scale)
-        self._gains = ServoGains(env)
-
-    def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
-        """Writes gains and biases."""
-        self._gains.write(
-            mask, random_uniform(env, self.label, len(env.index.ctrl), self._low, self._high)
-        )
+        super().__init__(env, ServoGains(env), bounds("scale", scale))
 
 
-def _write(view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor) -> None:
-    """Writes the masked rows of a ``(nworld, d)`` view."""
-    torch.where(mask[:, None], value.to(view.dtype), view, out=view)
-
-
-def _write_robot(env: EnvView, mask: torch.Tensor, command: torch.Tensor) -> None:
+def _write_robot(env: EnvView, mask: Tensor, command: Tensor) -> None:
     tensors = robot(env)
     tensors.qpos.write_masked(env.sim.qpos, mask, command)
     tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
@@ -242,20 +221,16 @@ def _write_robot(env: EnvView, mask: torch.Tensor, command: torch.Tensor) -> Non
 
 def _write_object(
     env: EnvView,
-    mask: torch.Tensor,
+    mask: Tensor,
     name: str,
-    dx: torch.Tensor,
-    dy: torch.Tensor,
-    yaw: torch.Tensor,
+    dx: Tensor,
+    dy: Tensor,
+    yaw: Tensor,
 ) -> None:
     """Moves the masked worlds' object off the position where the simulation's reset has put it."""
     view = pose_w(env, name)
     place = view[:, :3] + torch.stack((dx, dy, torch.zeros_like(dx)), dim=1)
     # Float64, because a float32 cosine need not be that of any angle, and a file of starts has the
     # angle.
-    _write(view, mask, torch.cat((place, quat_from_yaw(yaw.double()).to(place.dtype)), dim=1))
-
-
-def _not_negative(name: str, value: float) -> None:
-    if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0.0):
-        raise ParameterError(name, value, "a number that is not negative")
+    pose = torch.cat((place, quat_from_yaw(yaw.double()).to(place.dtype)), dim=1)
+    torch.where(mask[:, None], pose, view, out=view)

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import (
     above_table,
-    grasp_point,
+    grasp_point_to_object,
     jaw_forces,
     joint_velocities,
+    nearness,
     place_xy,
     pose_w,
 )
 
 
-def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> torch.Tensor:
+def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> Tensor:
     """Nearness of the grasp point to a point above an object: ``1 - tanh(distance / scale)``.
 
     Args:
@@ -25,18 +27,15 @@ def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> to
         scale: Distance over which the reward falls [m].
         height: How far above the object's centre the point is [m].
     """
-    require_positive("scale", scale)
-    offset = pose_w(env, object)[:, :3] - grasp_point(env)
-    offset[:, 2] += height
-    return 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
+    return nearness(grasp_point_to_object(env, object, height), scale)
 
 
-def grasp(env: EnvView, *, object: str, force: float = 0.05) -> torch.Tensor:
+def grasp(env: EnvView, *, object: str, force: float = 0.05) -> Tensor:
     """1 while both jaws press on an object with more than ``force`` [N], else 0."""
     return (jaw_forces(env, object) > force).all(1).to(torch.float32)
 
 
-def lift(env: EnvView, *, object: str, height: float) -> torch.Tensor:
+def lift(env: EnvView, *, object: str, height: float) -> Tensor:
     """Height of an object's lowest point above the table as a fraction of ``height`` [m], from 0 to
     1.
     """
@@ -44,35 +43,31 @@ def lift(env: EnvView, *, object: str, height: float) -> torch.Tensor:
     return (above_table(env, object) / height).clamp(0.0, 1.0)
 
 
-def place(env: EnvView, *, a: str, b: str, scale: float) -> torch.Tensor:
+def place(env: EnvView, *, a: str, b: str, scale: float) -> Tensor:
     """Nearness of object ``a`` to its position on object ``b``, while it is off the table: ``1 -
     tanh(distance / scale)``.
     """
-    require_positive("scale", scale)
     offset = pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
     objects = env.cfg.scene.objects
     offset[:, 2] += objects[a].half_height + objects[b].half_height
-    near = 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
-    return near * (above_table(env, a) > 0.005)
+    return nearness(offset, scale) * (above_table(env, a) > 0.005)
 
 
-def near_place(env: EnvView, *, object: str, place: str, scale: float) -> torch.Tensor:
+def near_place(env: EnvView, *, object: str, place: str, scale: float) -> Tensor:
     """Horizontal nearness of an object to a place: ``1 - tanh(distance / scale)``."""
-    require_positive("scale", scale)
-    away = place_xy(env, place) - pose_w(env, object)[:, :2]
-    return 1.0 - torch.tanh(torch.linalg.vector_norm(away, dim=1) / scale)
+    return nearness(place_xy(env, place) - pose_w(env, object)[:, :2], scale)
 
 
-def success(env: EnvView) -> torch.Tensor:
+def success(env: EnvView) -> Tensor:
     """1 in a step in which the task is achieved."""
     return env.success.to(torch.float32)
 
 
-def action_rate(env: EnvView) -> torch.Tensor:
+def action_rate(env: EnvView) -> Tensor:
     """Squared change of the action since the last step, summed."""
     return (env.action - env.previous_action).square().sum(1)
 
 
-def joint_vel(env: EnvView) -> torch.Tensor:
+def joint_vel(env: EnvView) -> Tensor:
     """Squared joint velocities [rad^2/s^2], summed."""
     return joint_velocities(env).square().sum(1)

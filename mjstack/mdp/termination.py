@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
+from torch import Tensor
 
-from mjstack.errors import ParameterError
+from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import joint_positions, pose_w, robot
@@ -14,14 +13,13 @@ from mjstack.scene import table_top
 from mjstack.sim import LOST_PHYSICS
 
 
-def time_out(env: EnvView, *, steps: int) -> torch.Tensor:
+def time_out(env: EnvView, *, steps: int) -> Tensor:
     """After this many steps."""
-    if steps < 1:
-        raise ParameterError("steps", steps, "an integer of at least 1")
+    require_positive("steps", steps)
     return env.episode_step >= steps
 
 
-def success(env: EnvView) -> torch.Tensor:
+def success(env: EnvView) -> Tensor:
     """Once the task is achieved."""
     return env.success
 
@@ -37,7 +35,7 @@ class ObjectOffTable:
         self._half = torch.tensor(scene.table_half[:2], dtype=dtype, device=env.device)
         self._top = table_top(scene)
 
-    def __call__(self, env: EnvView) -> torch.Tensor:
+    def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with an object off the table, shape ``(nworld,)``."""
         off = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
         for name in env.index.objects:
@@ -61,26 +59,25 @@ class JointLimit:
         Raises:
             ParameterError: The margin is negative or not finite.
         """
-        if not (math.isfinite(margin) and margin >= 0.0):
-            raise ParameterError("margin", margin, "a number that is not negative")
+        require_positive("margin", margin, zero=True)
         limits = robot(env).range
         room = margin * (limits[:, 1] - limits[:, 0])
         self._low = limits[:, 0] - room
         self._high = limits[:, 1] + room
 
-    def __call__(self, env: EnvView) -> torch.Tensor:
+    def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with a joint outside, shape ``(nworld,)``."""
         q = joint_positions(env)
         return ((q < self._low) | (q > self._high)).any(1)
 
 
 @offers(ends_on="non_finite")
-def non_finite(env: EnvView) -> torch.Tensor:
+def non_finite(env: EnvView) -> Tensor:
     """When a position or velocity is NaN or infinite: such a world cannot go on."""
     return not_finite(env.sim.qpos, env.sim.qvel)
 
 
 @offers(ends_on="overflow")
-def overflow(env: EnvView) -> torch.Tensor:
+def overflow(env: EnvView) -> Tensor:
     """When a buffer of the world was too small, so that physics was lost."""
     return (env.sim.overflow & LOST_PHYSICS) != 0

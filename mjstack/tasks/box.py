@@ -7,100 +7,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from mjstack.config.fields import spec
-from mjstack.config.schema import BoxCfg, Config
-from mjstack.errors import ConfigError, ParameterError, UnknownName
+from mjstack.errors import ConfigError, UnknownName
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import gripper_opening
-from mjstack.scene import LowestPoint, table_top
-from mjstack.tasks.check import EpisodeCheck, Rule
-from mjstack.tasks.parts import Carried, InWindow, Streak, away, in_hand, millimetres
-from mjstack.tasks.view import Step, TaskView
-
-ROLES = (
-    "approach",
-    "descend",
-    "close",
-    "lift",
-    "carry",
-    "hold",
-    "open",
-    "retreat",
-    "settle",
+from mjstack.scene import LowestPoint
+from mjstack.tasks.box_geometry import Inside, corner_speed, scene_box
+from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
+from mjstack.tasks.parts import (
+    AtLeast,
+    Carried,
+    HeldSuccess,
+    InWindow,
+    Streak,
+    away,
+    in_hand,
 )
-"""Phases of each object, such as ``lift_red``."""
-
-
-def scene_box(cfg: Config) -> BoxCfg:
-    """The scene's box.
-
-    Raises:
-        ConfigError: It has none.
-    """
-    if cfg.scene.box is None:
-        raise ConfigError("scene", cfg.scene.name, "a scene with a box", "Set scene=box")
-    return cfg.scene.box
-
-
-class Inside:
-    """The inside of the scene's box, and how objects lie to it."""
-
-    def __init__(self, cfg: Config, tolerance: float) -> None:
-        """Reads the box.
-
-        Args:
-            cfg: The configuration.
-            tolerance: How far a corner may be beyond the inside [m].
-
-        Raises:
-            ConfigError: The scene has no box.
-        """
-        box = scene_box(cfg)
-        top = table_top(cfg.scene)
-        self.rim = top + box.height
-        self._low = [*(box.center[i] - box.half[i] for i in (0, 1)), top + box.floor]
-        self._high = [*(box.center[i] + box.half[i] for i in (0, 1)), self.rim]
-        self._tolerance = tolerance
-
-    def beyond(self, step: Step) -> torch.Tensor:
-        """How far the outermost corner is outside [m], negative inside, shape ``(nworld,
-        objects)``.
-        """
-
-        def compute() -> torch.Tensor:
-            low, high = step.bounds
-            outside = step.view.constant(*self._low) - low, high - step.view.constant(*self._high)
-            return torch.maximum(*outside).amax(-1)
-
-        return step.once("beyond", compute)
-
-    def holds(self, step: Step) -> torch.Tensor:
-        """Whether all corners are in the box, shape ``(nworld, objects)``, bool."""
-        return self.beyond(step) <= self._tolerance
-
-    def over(self, step: Step) -> torch.Tensor:
-        """Whether all corners are over the inside or in it, shape ``(nworld, objects)``, bool."""
-        low, high = step.bounds
-        inside = (low >= step.view.constant(*self._low)) & (high <= step.view.constant(*self._high))
-        return inside[..., :2].all(-1)
-
-
-def corner_speed(step: Step) -> torch.Tensor:
-    """Speed of the fastest corner [m/s], shape ``(nworld, objects)``."""
-
-    def compute() -> torch.Tensor:
-        signs = step.view.constant(*itertools.chain(*itertools.product((-1.0, 1.0), repeat=3)))
-        arms = step.view.half[:, None] * signs.view(8, 3)
-        # A free joint's linear velocity is the world's, its angular velocity the body's: all of it
-        # in the body's frame.
-        linear = (step.turn * step.velocity[..., :3, None]).sum(-2)
-        spin = step.velocity[..., None, 3:].expand(-1, -1, 8, -1)
-        return torch.linalg.vector_norm(
-            linear[..., None, :] + torch.linalg.cross(spin, arms.expand_as(spin)), dim=-1
-        ).amax(-1)
-
-    return step.once("corner_speed", compute)
+from mjstack.tasks.view import Step, TaskView, once_per_step
 
 
 class BoxCheck(EpisodeCheck):
@@ -110,9 +35,9 @@ class BoxCheck(EpisodeCheck):
     An object is loaded while all jaws press on it, and airborne while it is loaded, up from the
     table and touches no support.
 
-    With phases (`ROLES`), worlds may be in different ones. An object's first phase, its approach,
-    forgets what was found before: a world that goes back to it to grasp anew is judged from its
-    last attempt.
+    With phases, such as ``lift_red``, worlds may be in different ones. An object's approach clears
+    what was found before: a world that goes back to it to grasp anew is judged from its last
+    attempt.
 
     Without phases, an object is grasped, lifted and carried in that order at any time before the
     settled window. A load that is lost after the lift while the object is not over the box is a
@@ -164,22 +89,25 @@ class BoxCheck(EpisodeCheck):
             raise ConfigError("task.check.places", t.places, "a place for each object")
         self.slots = dict(zip(t.objects, t.places, strict=True))
         self._check_places()
-        phases = self.cfg.controller.phases
-        for name in itertools.chain(*self.during(*ROLES)) if phases else ():
-            if name not in phases:
-                raise UnknownName("task.check: phase", name, phases)
         self.summaries = {
             **{f"slot_err_{each}_max_m": (f"slot_err_{each}_m", "max") for each in self.objects},
             "beyond_max_m": ("beyond_m", "max"),
             "corner_speed_max_m_per_s": ("corner_speed_m_per_s", "max"),
             "jaw_clearance_min_m": ("jaw_clearance_m", "min"),
-            **{f"grasp_steps_{each}_min": (f"grasp_steps_{each}", "min") for each in self.objects},
-            **{
-                f"settled_steps_{each}_min": (f"settled_steps_{each}", "min")
-                for each in self.objects
-            },
         }
-        grasp = _Grasp(self)
+        for value in ("grasp_steps", "settled_steps"):
+            for each in self.objects:
+                self.summaries[f"{value}_{each}_min"] = (f"{value}_{each}", "min")
+
+        grasp = Streak(
+            "GRASP",
+            "{object} not grasped",
+            self.objects,
+            in_hand(*self.objects),
+            t.grasp_steps,
+            phases=self.during("close"),
+            anew=self.during("approach"),
+        )
         lift = Streak(
             "LIFT",
             "{object} not lifted",
@@ -187,34 +115,22 @@ class BoxCheck(EpisodeCheck):
             self.airborne,
             t.lift_steps,
             phases=self.during("lift", "carry"),
-            doing="loaded in the air",
             after=grasp,
         )
         carry = _CarriedOver(self, lift)
         release = _Release(self, carry)
-        return [
-            grasp,
-            lift,
-            carry,
-            _Drop(self, grasp, lift, carry),
-            release,
-            _Settled(self, release),
-            _Order(self, release),
-            InWindow(
-                "INSIDE",
-                "an object not at rest in the box at the end",
-                self.resting,
-                t.window,
-                measure=self.trace,
-                found=lambda values: (
-                    f"outermost corner {millimetres(values['beyond_m'])} outside, fastest"
-                    f" {values['corner_speed_m_per_s']:.2g} m/s"
-                ),
-                wanted=f"out of the jaws, at most {millimetres(t.inside)} outside, corners below"
-                f" {t.rest_speed:g} m/s",
-            ),
-            _JawClear(self),
-        ]
+        inside = InWindow(
+            "INSIDE",
+            "an object not at rest in the box at the end",
+            self.resting,
+            t.window,
+            measure=self.trace,
+            shown=["beyond_m", "corner_speed_m_per_s"],
+        )
+        drop = _Drop(self, grasp, lift, carry)
+        settled = _Settled(self, release)
+        order = _Order(self, release)
+        return [grasp, lift, carry, drop, release, settled, order, inside, _JawClear(self)]
 
     def _check_places(self) -> None:
         """Raises unless every object fits into the box at its place."""
@@ -234,31 +150,25 @@ class BoxCheck(EpisodeCheck):
         """Names of each object's phases of some roles."""
         return [[f"{role}_{each}" for role in roles] for each in self.t.objects]
 
-    def airborne(self, step: Step) -> torch.Tensor:
+    @once_per_step
+    def airborne(self, step: Step) -> Tensor:
         """Whether each object is held in the air, shape ``(nworld, objects)``, bool."""
+        up = step.bounds[0][..., 2] - step.view.top >= self.t.lift_height
+        return step.in_hand & up & ~step.supported
 
-        def compute() -> torch.Tensor:
-            up = step.bounds[0][..., 2] - step.view.top >= self.t.lift_height
-            return step.in_hand & up & ~step.supported
-
-        return step.once("airborne", compute)
-
-    def resting(self, step: Step) -> torch.Tensor:
+    @once_per_step
+    def resting(self, step: Step) -> Tensor:
         """Whether each object is out of the jaws, inside and slow, shape ``(nworld, objects)``,
         bool.
         """
+        slow = corner_speed(step) < self.t.rest_speed
+        return step.untouched & self.inside.holds(step) & slow
 
-        def compute() -> torch.Tensor:
-            slow = corner_speed(step) < self.t.rest_speed
-            return step.untouched & self.inside.holds(step) & slow
-
-        return step.once("resting", compute)
-
-    def placed(self, step: Step) -> torch.Tensor:
+    def placed(self, step: Step) -> Tensor:
         """Whether each object is in the box."""
         return self.inside.holds(step)
 
-    def trace(self, step: Step) -> dict[str, torch.Tensor]:
+    def trace(self, step: Step) -> dict[str, Tensor]:
         """See `EpisodeCheck`."""
         return {
             **{f"slot_err_{each}_m": away(step, each, self.slots[each]) for each in self.objects},
@@ -273,55 +183,23 @@ class BoxCheck(EpisodeCheck):
         return f"{', '.join(off)} off their places, jaws {clearance:.0f} mm above the rim"
 
 
-class _PerObject(Rule):
-    """A rule of the box task for each object."""
-
-    def __init__(self, name: str, text: str, check: BoxCheck) -> None:
-        super().__init__(name, text, check.objects)
-        self.check = check
-        self.t = check.t
-
-
-class _Grasp(Streak):
-    """GRASP: both jaws press; it begins with forgetting what was found before the approach."""
-
-    def __init__(self, check: BoxCheck) -> None:
-        super().__init__(
-            "GRASP",
-            "{object} not grasped",
-            check.objects,
-            in_hand(*check.objects),
-            check.t.grasp_steps,
-            phases=check.during("close"),
-            doing="between both jaws",
-        )
-        self._approaches = check.during("approach")
-
-    def start(self, view: TaskView) -> None:
-        super().start(view)
-        self._approach = view.during(self._approaches)
-
-    def update(self, step: Step) -> None:
-        if step.view.phased:
-            step.view.forget(step.judged(self._approach))
-        super().update(step)
-
-
 class _CarriedOver(Carried):
     """CARRY: carried, and over the box when it is let go of."""
 
     def __init__(self, check: BoxCheck, lift: Streak) -> None:
+        t = check.t
         super().__init__(
             "CARRY",
             "{object} not carried over the box",
             check.objects,
             check.airborne,
-            check.t.carry_steps,
-            distance=check.t.carry_distance,
+            t.carry_steps,
+            distance=t.carry_distance,
             phases=check.during("carry"),
-            doing="loaded in the air",
             after=lift,
         )
+        for shown, suffix in zip(self.shown, self.suffixes, strict=True):
+            shown.append(f"over_box{suffix}")
         self._check = check
 
     def start(self, view: TaskView) -> None:
@@ -334,151 +212,109 @@ class _CarriedOver(Carried):
         hold = step.judged(self._hold) if step.view.phased else step.in_hand
         self.over.copy_(torch.where(hold, self._check.inside.over(step), self.over))
 
-    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def judge(self, end: Step) -> Judgement:
         held, values = super().judge(end)
         return held & (self.over > 0.0), values | self.by_object("over_box{}", self.over)
 
-    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
-        ending = ", not over the box when it was let go of"
-        return [
-            (
-                found if values[f"over_box{suffix}"] else found + ending,
-                f"{wanted}, then over the box",
-            )
-            for suffix, (found, wanted) in zip(self.suffixes, super().report(values), strict=True)
-        ]
 
-
-class _Drop(_PerObject):
+class _Drop(AtLeast):
     """DROP: no step without load between the last grasp and the release."""
 
     def __init__(self, check: BoxCheck, grasp: Streak, lift: Streak, carry: _CarriedOver) -> None:
-        super().__init__("DROP", "{object} dropped", check)
+        super().__init__(
+            "DROP",
+            "{object} dropped",
+            check.objects,
+            "unloaded_steps{}",
+            0,
+            phases=check.during("close", "lift", "carry", "hold"),
+        )
+        self.wanted = ["0"] * len(self.wanted)
         self._grasp = grasp
         self._lift = lift
         self._carry = carry
 
-    def start(self, view: TaskView) -> None:
-        self._close = view.during(self.check.during("close"))
-        self._held = view.during(self.check.during("close", "lift", "carry", "hold"))
-        self._unloaded = view.counter(len(self.objects))
-
     def update(self, step: Step) -> None:
         if step.view.phased:
             # A grasp that slips while the jaws still close is made anew; the last one counts.
-            grasped = self._grasp.length == self.t.grasp_steps
-            self._unloaded.masked_fill_(step.judged(self._close) & grasped, 0.0)
-            lost = self._grasp.held() & step.judged(self._held)
+            grasped = self._grasp.length == self._grasp.least
+            self.best.masked_fill_(step.judged(self._grasp.key) & grasped, 0.0)
+            lost = self._grasp.held() & step.judged(self.key)
         else:
             lost = self._lift.held() & (self._carry.over == 0.0)
-        self._unloaded.add_(lost & ~step.in_hand)
+        self.best.add_(lost & ~step.in_hand)
 
-    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        return self._unloaded == 0.0, self.by_object("unloaded_steps{}", self._unloaded)
-
-    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
-        return [
-            (
-                f"{values[f'unloaded_steps{suffix}']:.0f} steps without both jaws between grasp and"
-                " release",
-                "none",
-            )
-            for suffix in self.suffixes
-        ]
+    def held(self) -> Tensor:
+        return self.best == 0.0
 
 
-class _Release(_PerObject):
+class _Release(AtLeast):
     """RELEASE: out of the jaws, the gripper open."""
 
     def __init__(self, check: BoxCheck, carry: Carried) -> None:
-        super().__init__("RELEASE", "{object} not released", check)
+        super().__init__(
+            "RELEASE",
+            "{object} not released",
+            check.objects,
+            "opening{}",  # widest without contact
+            check.t.open_fraction,
+            phases=check.during("open", "retreat", "settle"),
+        )
         self._carry = carry
 
-    def start(self, view: TaskView) -> None:
-        self._opens = view.during(self.check.during("open", "retreat", "settle"))
-        self.opening = view.counter(len(self.objects))  # widest without contact
-
     def update(self, step: Step) -> None:
-        opens = step.judged(self._opens) if step.view.phased else self._carry.held()
+        opens = step.judged(self.key) if step.view.phased else self._carry.held()
         opening = gripper_opening(step.view.env).amin(1).float()[:, None]
         wide = torch.where(opens & step.untouched, opening, 0.0)
-        torch.maximum(self.opening, wide, out=self.opening)
-
-    def held(self) -> torch.Tensor:
-        """Whether each object has been released, shape ``(nworld, objects)``, bool."""
-        return self.opening >= self.t.open_fraction
-
-    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        return self.held(), self.by_object("opening{}", self.opening)
-
-    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
-        return [
-            (
-                f"opened {100.0 * values[f'opening{suffix}']:.0f} % without contact to a jaw",
-                f"at least {100.0 * self.t.open_fraction:g} %",
-            )
-            for suffix in self.suffixes
-        ]
+        torch.maximum(self.best, wide, out=self.best)
 
 
-class _Settled(_PerObject):
+class _Settled(AtLeast):
     """SETTLED: at rest in the box after the release."""
 
     def __init__(self, check: BoxCheck, release: _Release) -> None:
-        super().__init__("SETTLED", "{object} not at rest in the box after its release", check)
+        super().__init__(
+            "SETTLED",
+            "{object} not at rest in the box after its release",
+            check.objects,
+            "settled_steps{}",  # as of the settling's last step, or the most
+            check.t.window,
+            phases=check.during("settle"),
+        )
+        self._check = check
         self._release = release
 
     def start(self, view: TaskView) -> None:
-        size = len(self.objects)
-        self._settle = view.during(self.check.during("settle"))
-        self._rest = view.zeros(size)  # steps at rest in a row
-        self._settled = view.counter(size)  # as of the settling's last step, or the most
+        super().start(view)
+        self._rest = view.zeros(len(self.objects))  # steps at rest in a row
 
     def update(self, step: Step) -> None:
-        self._rest.add_(1.0).mul_(self.check.resting(step))
+        self._rest.add_(1.0).mul_(self._check.resting(step))
         if step.view.phased:
-            settled = torch.where(step.judged(self._settle), self._rest, self._settled)
+            settled = torch.where(step.judged(self.key), self._rest, self.best)
         else:
-            settled = torch.maximum(self._settled, self._rest * self._release.held())
-        self._settled.copy_(settled)
-
-    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        held = self._settled >= self.t.window
-        return held, self.by_object("settled_steps{}", self._settled)
-
-    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
-        return [
-            (
-                f"{values[f'settled_steps{suffix}']:.0f} steps at rest in the box after release",
-                f"at least {self.t.window}",
-            )
-            for suffix in self.suffixes
-        ]
+            settled = torch.maximum(self.best, self._rest * self._release.held())
+        self.best.copy_(settled)
 
 
 class _Order(Rule):
     """ORDER: no object is grasped before the one before it is released."""
 
     def __init__(self, check: BoxCheck, release: _Release) -> None:
-        first, *others = check.objects
-        pairs = zip(check.objects, others, strict=False)
+        pairs = itertools.pairwise(check.objects)
         text = " or ".join(f"{later} grasped before {each} was released" for each, later in pairs)
-        super().__init__("ORDER", text or f"{first} grasped too early")
+        super().__init__("ORDER", text or "never broken", shown=["too_early"], wanted="0")
         self._release = release
 
     def start(self, view: TaskView) -> None:
-        self._early = torch.zeros(view.env.nworld, dtype=torch.bool, device=view.env.device)
+        self._early = view.zeros()
 
     def update(self, step: Step) -> None:
         early = step.in_hand[:, 1:] & ~self._release.held()[:, :-1]
-        self._early |= early.any(1)
+        self._early.masked_fill_(early.any(1), 1.0)
 
-    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        return ~self._early, {"too_early": self._early.float()}
-
-    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
-        (text,) = self.texts.values()
-        return [(text if values["too_early"] else "in order", "each released before the next")]
+    def judge(self, end: Step) -> Judgement:
+        return self._early == 0.0, {"too_early": self._early}
 
 
 class _JawClear(Rule):
@@ -487,10 +323,12 @@ class _JawClear(Rule):
     at_end = True
 
     def __init__(self, check: BoxCheck) -> None:
-        super().__init__("JAW_CLEAR", "gripper too low at the end")
+        least = f"at least {check.t.jaw_clearance:g}"
+        text = "gripper too low at the end"
+        super().__init__("JAW_CLEAR", text, shown=["jaw_clearance_m"], wanted=least)
         self._check = check
 
-    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def judge(self, end: Step) -> Judgement:
         sim = end.view.env.sim
         sim.kinematics()
         jaws = LowestPoint(sim.model, self._check.cfg.robot.jaw_bodies, sim.device)
@@ -498,44 +336,17 @@ class _JawClear(Rule):
         clearance = jaws.height(sim.xpos, sim.xquat) - self._check.inside.rim
         return clearance >= self._check.t.jaw_clearance, {"jaw_clearance_m": clearance}
 
-    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
-        return [
-            (
-                f"lowest jaw geometry {millimetres(values['jaw_clearance_m'])} above the rim",
-                f"at least {millimetres(self._check.t.jaw_clearance)}",
-            )
-        ]
 
-
-class BoxSuccess:
+class BoxSuccess(HeldSuccess):
     """Achieved while all objects have been at rest in the box, out of the jaws, for the whole
     window, and the gripper is open. It shares the thresholds of the task's check.
     """
 
     def __init__(self, env: EnvView, *, open_fraction: float) -> None:
-        """Allocates the counter.
-
-        Args:
-            env: The environment, its task's check a `BoxCheck`.
-            open_fraction: How far the gripper must be open, from 0 (closed) to 1 (open), as
-                measured.
+        """Allocates the streak; see `HeldSuccess`.
 
         Raises:
             MjstackError: The fraction is out of range, or the task has another check.
         """
-        if not 0.0 <= open_fraction <= 1.0:
-            raise ParameterError("open_fraction", open_fraction, "a number from 0 to 1")
-        self._open = open_fraction
         check = BoxCheck(env.cfg)
-        self._view = check.view(env)
-        self._rest = InWindow("REST", "", check.resting, check.t.window)
-        self._rest.start(self._view)
-
-    def __call__(self, env: EnvView) -> torch.Tensor:
-        """Processes a step; shape ``(nworld,)``, bool."""
-        self._rest.update(self._view.step())
-        return self._rest.held() & (gripper_opening(env) >= self._open).all(1)
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Forgets the masked worlds."""
-        self._rest.length.masked_fill_(mask, 0.0)
+        super().__init__(env, check, check.resting, open_fraction)

@@ -4,16 +4,16 @@ task's check.
 
 from __future__ import annotations
 
-import math
-
 import torch
+from torch import Tensor
 
-from mjstack.errors import ParameterError, UnknownName
+from mjstack.errors import UnknownName
 from mjstack.managers.term import require_positive, shared
 from mjstack.managers.view import EnvView, offers
-from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, place_xy, pose_w
+from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, nearness, place_xy, pose_w
 from mjstack.scene import table_top
-from mjstack.tasks.box import BoxCheck, scene_box
+from mjstack.tasks.box import BoxCheck
+from mjstack.tasks.box_geometry import scene_box
 
 
 @offers(unit="m")
@@ -42,15 +42,14 @@ class ToSlot:
         scene = env.cfg.scene
         self._height = table_top(scene) + box.floor + scene.objects[object].half_height
 
-    def __call__(self, env: EnvView) -> torch.Tensor:
+    def __call__(self, env: EnvView) -> Tensor:
         """The offset."""
         xy, z = pose_w(env, self._object)[:, :3].split((2, 1), dim=1)
         return torch.cat((place_xy(env, self._place) - xy, self._height - z), dim=1)
 
 
 class Place:
-    """Nearness of a cube to its place in the box, while it is off the table: ``1 - tanh(distance /
-    scale)``.
+    """Nearness of a cube to its place in the box, while it is off the table; see `nearness`.
 
     Off the table is a cube whose lowest corner is higher than half the thickness of the box's
     floor, ``scene.box.floor``: also one that rests in the box, however thin that floor is.
@@ -73,9 +72,9 @@ class Place:
         self._scale = scale
         self._off_table = 0.5 * scene_box(env.cfg).floor
 
-    def __call__(self, env: EnvView) -> torch.Tensor:
+    def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
-        near = 1.0 - torch.tanh(torch.linalg.vector_norm(self._to_slot(env), dim=1) / self._scale)
+        near = nearness(self._to_slot(env), self._scale)
         return near * (above_table(env, self._object) > self._off_table)
 
 
@@ -86,13 +85,13 @@ class _ByObject:
         self._check = BoxCheck(env.cfg)
         self._view = self._check.view(env)
 
-    def _inside(self, env: EnvView) -> torch.Tensor:
+    def _inside(self, env: EnvView) -> Tensor:
         """Whether each object is in the box, shape ``(nworld, objects)``, bool. Not to be written
         into.
         """
         return shared((id(env), _ByObject), lambda: self._check.placed(self._view.step()))
 
-    def _next(self, env: EnvView, values: list[torch.Tensor]) -> torch.Tensor:
+    def _next(self, env: EnvView, values: list[Tensor]) -> Tensor:
         """The value, ``(nworld, n)`` each, of the first object that is not in the box, or of the
         last one.
         """
@@ -106,11 +105,7 @@ class _ByObject:
 class InBox(_ByObject):
     """Share of the objects that is in the box, 0 to 1."""
 
-    def __init__(self, env: EnvView) -> None:
-        """Reads the box's place."""
-        super().__init__(env)
-
-    def __call__(self, env: EnvView) -> torch.Tensor:
+    def __call__(self, env: EnvView) -> Tensor:
         """The share, shape ``(nworld,)``."""
         return self._inside(env).float().mean(1)
 
@@ -134,11 +129,10 @@ class ReachNext(_ByObject):
         super().__init__(env)
         self._scale = scale
 
-    def __call__(self, env: EnvView) -> torch.Tensor:
+    def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
         aim = self._next(env, [pose_w(env, name)[:, :3] for name in self._check.objects])
-        distance = torch.linalg.vector_norm(aim - grasp_point(env), dim=1)
-        near = 1.0 - torch.tanh(distance / self._scale)
+        near = nearness(aim - grasp_point(env), self._scale)
         return torch.where(self._inside(env).all(1), 1.0, near)
 
 
@@ -157,12 +151,11 @@ class GraspNext(_ByObject):
         Raises:
             MjstackError: There is no box, or the force is out of range.
         """
-        if not 0.0 <= force < math.inf:
-            raise ParameterError("force", force, "a number that is not negative")
+        require_positive("force", force, zero=True)
         super().__init__(env)
         self._force = force
 
-    def __call__(self, env: EnvView) -> torch.Tensor:
+    def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
         held = [jaw_forces(env, name) > self._force for name in self._check.objects]
         grasped = self._next(env, held).all(1)

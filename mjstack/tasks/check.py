@@ -21,12 +21,13 @@ Example:
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mjstack.config.complete import typed
 from mjstack.config.fields import check_fields, field_range
@@ -38,7 +39,7 @@ from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED
 from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS
-from mjstack.tasks.view import Step, TaskView
+from mjstack.tasks.view import PhaseNames, Step, TaskView
 
 _EVERY_TASK = {
     "FINITE": "state not finite",
@@ -48,7 +49,12 @@ _EVERY_TASK = {
 _SUFFIXES = {"m/s": "m_per_s", "rad/s": "rad_per_s", "N": "n"}
 
 
-class Rules(Mapping[str, int]):
+Judgement = tuple[Tensor, dict[str, Tensor]]
+"""Whether a rule was shown to hold, bool, shape ``(nworld,)`` or ``(nworld, rules)``, and measured
+values by name with unit, each ``(nworld,)``."""
+
+
+class Rules(dict[str, int]):
     """A task's rules: the bit of each by its name, in order. A world passes with none set.
 
     FINITE, STEPS and OVERFLOW come first, whatever the task.
@@ -61,16 +67,7 @@ class Rules(Mapping[str, int]):
             texts: What went wrong if a rule of the task is broken, by the rule's name.
         """
         self.texts = {**_EVERY_TASK, **texts}
-        self._bits = {name: 1 << number for number, name in enumerate(self.texts)}
-
-    def __getitem__(self, name: str) -> int:
-        return self._bits[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._bits)
-
-    def __len__(self) -> int:
-        return len(self._bits)
+        super().__init__((name, 1 << number) for number, name in enumerate(self.texts))
 
     def broken(self, bits: int) -> list[str]:
         """Names of the rules in a bit set."""
@@ -99,8 +96,8 @@ class CheckResult:
         values: Measured values, by name with unit, each ``(nworld,)``.
     """
 
-    failed: torch.Tensor
-    values: dict[str, torch.Tensor]
+    failed: Tensor
+    values: dict[str, Tensor]
 
 
 class Rule(ABC):
@@ -110,18 +107,33 @@ class Rule(ABC):
 
     Attributes:
         texts: What went wrong if it is broken, by name; one entry, or one for each object.
+        shown: Names of the measured values that tell about each of them.
+        wanted: What the rule wants of those, in words.
+        phases: For each object, the phases in which it counts.
         at_end: Whether it can only hold at the end of a whole episode.
     """
 
+    phases: PhaseNames = ()
     at_end = False
 
-    def __init__(self, name: str, text: str, objects: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        name: str,
+        text: str,
+        objects: Sequence[str] = (),
+        *,
+        shown: Sequence[str] = (),
+        wanted: str = "see the thresholds",
+    ) -> None:
         """Names the rule.
 
         Args:
             name: In capital letters. The rule of one of several objects is ``NAME_OBJECT``.
             text: What went wrong if it is broken; ``{object}`` is the object's name.
             objects: The objects that it judges one by one.
+            shown: Names of the measured values that tell about it, such as ``grasp_steps{}``, where
+                ``{}`` is the suffix of the object.
+            wanted: What the rule wants of those, in words.
         """
         self.objects = list(objects)
         self.suffixes = [f"_{each}" for each in objects] if len(objects) > 1 else [""]
@@ -130,6 +142,8 @@ class Rule(ABC):
             f"{name}{suffix.upper()}": text.format(object=each)
             for suffix, each in zip(self.suffixes, names, strict=True)
         }
+        self.shown = [[value.format(suffix) for value in shown] for suffix in self.suffixes]
+        self.wanted = [wanted] * len(self.suffixes)
 
     def start(self, view: TaskView) -> None:  # noqa: B027
         """Allocates for the worlds of a view."""
@@ -138,26 +152,24 @@ class Rule(ABC):
         """Processes the state at the end of a step. Fixed shapes, no host read."""
 
     @abstractmethod
-    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def judge(self, end: Step) -> Judgement:
         """Judges the episode.
 
         Args:
             end: The state at its end.
-
-        Returns:
-            Whether the rule was shown to hold, bool, shape ``(nworld,)`` or ``(nworld, rules)``,
-            and measured values by name with unit, each ``(nworld,)``.
         """
 
-    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
-        """What was found in one world, and what the rule wants: in words, for each of its names.
+    def report(self, values: Mapping[str, float]) -> dict[str, tuple[str, str]]:
+        """Report the values of one world, and what the rule wants, by each of its names.
 
         Args:
             values: Measured values of that world.
         """
-        return [("see the values", "see the thresholds")] * len(self.texts)
+        found = [", ".join(f"{name} {values[name]:.4g}" for name in names) for names in self.shown]
+        told = ((text or "see the values") for text in found)
+        return dict(zip(self.texts, zip(told, self.wanted, strict=True), strict=True))
 
-    def by_object(self, name: str, value: torch.Tensor) -> dict[str, torch.Tensor]:
+    def by_object(self, name: str, value: Tensor) -> dict[str, Tensor]:
         """Columns by name: ``{}`` in it is the object, if there are several.
 
         Args:
@@ -198,19 +210,16 @@ class EpisodeCheck(ABC):
         Raises:
             MjstackError: A threshold is missing, unknown, of the wrong type or out of range.
         """
+        node = dict(cfg.task.check or {})
+        name = node.pop("func", None)
         if not issubclass(check_class(cfg) or object, type(self)):
-            found = (cfg.task.check or {}).get("func")
-            raise ConfigError(
-                "task.check.func",
-                found,
-                f"{type(self).__module__}.{type(self).__name__}, which a term shares",
-            )
+            expected = f"{type(self).__module__}.{type(self).__name__}, which a term shares"
+            raise ConfigError("task.check.func", name, expected)
         self.cfg = cfg
-        node = {key: value for key, value in (cfg.task.check or {}).items() if key != "func"}
         self.t: Any = typed("task.check", node, self.Thresholds)
         check_fields("task.check", self.t)
-        phases = cfg.controller.phases.values()
-        steps = sum(round(phase.seconds / cfg.timing.step_dt) for phase in phases)
+        phases = cfg.controller.phases
+        steps = sum(round(phase.seconds / cfg.timing.step_dt) for phase in phases.values())
         steps = steps or cfg.task.episode_steps
         if self.settle_steps > steps:
             expected = f"at most {steps} steps (the episode)"
@@ -220,6 +229,9 @@ class EpisodeCheck(ABC):
         for name in self.objects:
             if name not in cfg.scene.objects:
                 raise UnknownName("task.check: object", name, cfg.scene.objects)
+        for name in [n for rule in self._rules for names in rule.phases for n in names]:
+            if phases and name not in phases:
+                raise UnknownName("task.check: phase", name, phases)
         self.rules = Rules(
             {name: text for rule in self._rules for name, text in rule.texts.items()}
         )
@@ -235,14 +247,9 @@ class EpisodeCheck(ABC):
 
     def view(self, env: EnvView, steps: int = 0, phases: Sequence[Phase] = ()) -> TaskView:
         """The task's objects in the worlds of an environment; arguments as of `start`."""
-        return TaskView(
-            env,
-            self.objects,
-            phases,
-            steps=steps,
-            window=self.settle_steps,
-            force=getattr(self.t, "force", LOADED),
-        )
+        force = getattr(self.t, "force", LOADED)
+        window = self.settle_steps
+        return TaskView(env, self.objects, phases, steps=steps, window=window, force=force)
 
     def start(self, env: EnvView, steps: int, phases: Sequence[Phase] = ()) -> None:
         """Allocates for an episode.
@@ -258,7 +265,7 @@ class EpisodeCheck(ABC):
             rule.start(self._view)
         self._finite = torch.ones(env.nworld, dtype=torch.bool, device=env.device)
 
-    def update(self, phase: torch.Tensor | None = None) -> None:
+    def update(self, phase: Tensor | None = None) -> None:
         """Processes the state at the end of a step. Fixed shapes, no host read.
 
         Args:
@@ -282,7 +289,7 @@ class EpisodeCheck(ABC):
             "STEPS": (sim.step_count == wanted) & complete,
             "OVERFLOW": (sim.overflow & LOST_PHYSICS) == 0,
         }
-        values: dict[str, torch.Tensor] = {}
+        values: dict[str, Tensor] = {}
         end = self._view.step()
         for rule in self._rules:
             ok, measured = rule.judge(end)
@@ -296,12 +303,12 @@ class EpisodeCheck(ABC):
         return CheckResult(failed, values)
 
     @abstractmethod
-    def placed(self, step: Step) -> torch.Tensor:
+    def placed(self, step: Step) -> Tensor:
         """Whether each object is where it belongs, in the order of ``objects``, shape ``(nworld,
         objects)``, bool. No host read.
         """
 
-    def trace(self, step: Step) -> dict[str, torch.Tensor]:
+    def trace(self, step: Step) -> dict[str, Tensor]:
         """Values that a replay keeps at every step end, by name with unit, each ``(nworld,)``."""
         return {}
 
@@ -318,16 +325,13 @@ class EpisodeCheck(ABC):
         return numbers
 
     def report(self, values: Mapping[str, float]) -> dict[str, tuple[str, str]]:
-        """What was found in one world, and what is wanted, by the name of each of the task's rules.
+        """Report the values of one world, and what is wanted, by the name of each of the task's
+        rules.
 
         Args:
             values: Measured values of that world.
         """
-        return {
-            name: told
-            for rule in self._rules
-            for name, told in zip(rule.texts, rule.report(values), strict=True)
-        }
+        return {name: told for rule in self._rules for name, told in rule.report(values).items()}
 
     def headline(self, values: Mapping[str, float]) -> str:
         """A world's values in a few words."""

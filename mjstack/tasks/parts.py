@@ -7,16 +7,20 @@ A condition is a function of a `Step` that returns a bool tensor, shape ``(nworl
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
+from torch import Tensor
 
+from mjstack.errors import ParameterError
+from mjstack.managers.view import EnvView
 from mjstack.math import quat_angle
-from mjstack.mdp.geometry import place_xy
-from mjstack.tasks.check import Rule
-from mjstack.tasks.view import Step, TaskView
+from mjstack.mdp.geometry import gripper_opening, place_xy
+from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
+from mjstack.tasks.view import PhaseNames, Step, TaskView
 
-Condition = Callable[[Step], torch.Tensor]
+Condition = Callable[[Step], Tensor]
 
 
 # Conditions
@@ -27,17 +31,17 @@ def airborne(*objects: str, height: float) -> Condition:
     have to press on them too, so that a throw or a push is none.
     """
 
-    def condition(step: Step) -> torch.Tensor:
+    def condition(step: Step) -> Tensor:
         columns = step.view.columns(objects)
-        up = step.height[:, columns] > height
-        return up if step.view.phased else up & step.in_hand[:, columns]
+        up = columns.read(step.height) > height
+        return up if step.view.phased else up & columns.read(step.in_hand)
 
     return condition
 
 
 def in_hand(*objects: str) -> Condition:
     """Objects on which all jaws press."""
-    return lambda step: step.in_hand[:, step.view.columns(objects)]
+    return lambda step: step.view.columns(objects).read(step.in_hand)
 
 
 def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: float) -> Condition:
@@ -45,14 +49,14 @@ def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: floa
     heights [m].
     """
 
-    def condition(step: Step) -> torch.Tensor:
+    def condition(step: Step) -> Tensor:
         apart, dz = offset(step, object, onto)
         return (apart <= xy_err) & (dz >= dz_min) & (dz <= dz_max)
 
     return condition
 
 
-def offset(step: Step, object: str, onto: str) -> tuple[torch.Tensor, torch.Tensor]:
+def offset(step: Step, object: str, onto: str) -> tuple[Tensor, Tensor]:
     """Horizontal distance of the centres [m], and height of the first above the second [m], each
     ``(nworld,)``.
     """
@@ -62,14 +66,10 @@ def offset(step: Step, object: str, onto: str) -> tuple[torch.Tensor, torch.Tens
 
 def at_place(object: str, place: str, *, distance: float) -> Condition:
     """An object whose centre is within a horizontal distance of a place [m]."""
-
-    def condition(step: Step) -> torch.Tensor:
-        return away(step, object, place) <= distance
-
-    return condition
+    return lambda step: away(step, object, place) <= distance
 
 
-def away(step: Step, object: str, place: str) -> torch.Tensor:
+def away(step: Step, object: str, place: str) -> Tensor:
     """Horizontal distance of an object's centre from a place [m], shape ``(nworld,)``."""
     xy = step.pos[:, step.view.column(object), :2]
     return torch.linalg.vector_norm(xy - place_xy(step.view.env, place).float(), dim=1)
@@ -80,7 +80,7 @@ def on_table(object: str, *, gap: float) -> Condition:
     centre at least half its size from the edges.
     """
 
-    def condition(step: Step) -> torch.Tensor:
+    def condition(step: Step) -> Tensor:
         view = step.view
         scene = view.env.cfg.scene
         column = view.column(object)
@@ -95,11 +95,60 @@ def on_table(object: str, *, gap: float) -> Condition:
 # Rules
 
 
-class Streak(Rule):
-    """A condition holds for some steps in a row, for every object.
+class AtLeast(Rule):
+    """A number of each object gets to some threshold.
 
     It counts in some phases of the driver, or without phases at any time before the settled window.
+    A subclass updates ``best``.
+
+    Attributes:
+        least: The threshold.
+        key: Of the phases in which it counts, for `Step.judged`.
+        best: The number so far, shape ``(nworld, objects)``, float32.
     """
+
+    def __init__(
+        self,
+        name: str,
+        text: str,
+        objects: Sequence[str],
+        value: str,
+        least: float,
+        *,
+        phases: PhaseNames,
+    ) -> None:
+        """Describes the rule; see `Rule`.
+
+        Args:
+            name: Of the rule.
+            text: What went wrong.
+            objects: The objects.
+            value: Name of the number, with ``{}`` for the suffix of the object.
+            least: The threshold.
+            phases: For each object, the phases in which it counts.
+        """
+        super().__init__(name, text, objects, shown=[value])
+        self.wanted = [f"at least {least:g}{_in(each)}" for each in phases]
+        self.least = least
+        self._value = value
+        self.phases = phases
+
+    def start(self, view: TaskView) -> None:
+        """Allocates the numbers."""
+        self.key = view.during(self.phases)
+        self.best = view.counter(len(self.objects))
+
+    def held(self) -> Tensor:
+        """Whether it has held so far, shape ``(nworld, objects)``, bool."""
+        return self.best >= self.least
+
+    def judge(self, end: Step) -> Judgement:
+        """See `Rule`."""
+        return self.held(), self.by_object(self._value, self.best)
+
+
+class Streak(AtLeast):
+    """A condition holds for some steps in a row, for every object."""
 
     def __init__(
         self,
@@ -109,9 +158,9 @@ class Streak(Rule):
         condition: Condition,
         steps: int,
         *,
-        phases: Sequence[Sequence[str]],
-        doing: str,
-        after: Streak | None = None,
+        phases: PhaseNames,
+        after: AtLeast | None = None,
+        anew: PhaseNames = (),
     ) -> None:
         """Describes the rule; see `Rule`.
 
@@ -122,52 +171,33 @@ class Streak(Rule):
             condition: With a column for each.
             steps: How many in a row.
             phases: For each object, the phases in which it counts.
-            doing: The condition in words, such as ``in the air``.
             after: Without phases it counts once this one holds.
+            anew: For each object, phases that clear every counter of the check.
         """
-        super().__init__(name, text, objects)
+        value = f"{name.lower()}_steps{{}}"
+        super().__init__(name, text, objects, value, steps, phases=phases)
         self._condition = condition
-        self._steps = steps
-        self._phases = phases
-        self._doing = doing
         self._after = after
-        self._value = f"{name.lower()}_steps{{}}"
+        self._anew = anew
 
     def start(self, view: TaskView) -> None:
         """Allocates the streaks."""
-        size = len(self.objects)
-        self._key = view.during(self._phases)
-        self.length = view.counter(size)  # of the current streak
-        self.best = view.counter(size)
+        super().start(view)
+        self.length = view.counter(len(self.objects))  # of the current streak
+        self._clears = view.during(self._anew)
 
     def update(self, step: Step) -> None:
         """Extends or ends the streaks."""
+        if self._anew and step.view.phased:
+            step.view.forget(step.judged(self._clears))
         self.length.add_(1.0).mul_(self._counts(step))
         torch.maximum(self.best, self.length, out=self.best)
 
-    def _counts(self, step: Step) -> torch.Tensor:
-        counts = self._condition(step) & step.judged(self._key)
+    def _counts(self, step: Step) -> Tensor:
+        counts = self._condition(step) & step.judged(self.key)
         if self._after is not None and not step.view.phased:
             counts &= self._after.held()
         return counts
-
-    def held(self) -> torch.Tensor:
-        """Whether it has held so far, shape ``(nworld, objects)``, bool."""
-        return self.best >= self._steps
-
-    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """See `Rule`."""
-        return self.held(), self.by_object(self._value, self.best)
-
-    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
-        """See `Rule`."""
-        return [
-            (
-                f"{values[self._value.format(suffix)]:.0f} steps {self._doing} in a row",
-                f"at least {self._steps}{_in(phases)}",
-            )
-            for suffix, phases in zip(self.suffixes, self._phases, strict=True)
-        ]
 
 
 class Carried(Streak):
@@ -175,24 +205,26 @@ class Carried(Streak):
     distance away from where the streak began.
     """
 
-    def __init__(self, *args: object, distance: float, **kwargs: object) -> None:
+    def __init__(self, *args: Any, distance: float, **kwargs: Any) -> None:
         """Takes the arguments of `Streak` and the distance [m]."""
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
-        self._distance = distance
+        super().__init__(*args, **kwargs)
+        self._steps = self.least
+        self.least = distance
         self._value = self._value.replace("_steps{}", "{}_m")
+        self.shown = [[self._value.format(suffix)] for suffix in self.suffixes]
+        self.wanted = [f"at least {distance:g}{_in(each)}" for each in self.phases]
 
     def start(self, view: TaskView) -> None:
         """Allocates the streaks."""
         super().start(view)
         size = len(self.objects)
-        self._columns = view.columns(self.objects)
         self._from = view.zeros(size, 2)  # where the streak began
         self._far = view.counter(size)  # farthest from there
 
     def update(self, step: Step) -> None:
         """Extends or ends the streaks."""
         counts = self._counts(step)
-        xy = step.pos[:, self._columns, :2]
+        xy = step.view.columns(self.objects).read(step.pos)[..., :2]
         begins = counts & (self.length == 0.0)
         self._from.copy_(torch.where(begins[..., None], xy, self._from))
         self.length.add_(1.0).mul_(counts)
@@ -200,20 +232,6 @@ class Carried(Streak):
         self._far.copy_(torch.where(counts, torch.maximum(self._far, away), 0.0))
         far = torch.where(self.length >= self._steps, self._far, 0.0)
         torch.maximum(self.best, far, out=self.best)
-
-    def held(self) -> torch.Tensor:
-        """Whether it has held so far, shape ``(nworld, objects)``, bool."""
-        return self.best >= self._distance
-
-    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
-        """See `Rule`."""
-        return [
-            (
-                f"{values[self._value.format(suffix)]:.3f} m {self._doing}",
-                f"at least {self._distance:g} m in {self._steps} steps or more{_in(phases)}",
-            )
-            for suffix, phases in zip(self.suffixes, self._phases, strict=True)
-        ]
 
 
 class InWindow(Rule):
@@ -228,9 +246,8 @@ class InWindow(Rule):
         condition: Condition,
         window: int,
         *,
-        measure: Callable[[Step], dict[str, torch.Tensor]] = lambda end: {},
-        found: Callable[[Mapping[str, float]], str] = lambda values: "",
-        wanted: str = "",
+        measure: Callable[[Step], dict[str, Tensor]] = lambda end: {},
+        shown: Sequence[str] = (),
     ) -> None:
         """Describes the rule; see `Rule`.
 
@@ -240,16 +257,13 @@ class InWindow(Rule):
             condition: If it has several columns, all have to hold.
             window: How many steps.
             measure: Values at the end of the episode, by name with unit.
-            found: Those of one world in words.
-            wanted: The condition in words.
+            shown: Those that tell about the rule.
         """
-        super().__init__(name, text)
+        self._value = f"{name.lower()}_steps"
+        super().__init__(name, text, shown=[self._value, *shown], wanted=f"at least {window}")
         self._condition = condition
         self._window = window
         self._measure = measure
-        self._found = found
-        self._wanted = wanted
-        self._value = f"{name.lower()}_steps"
 
     def start(self, view: TaskView) -> None:
         """Allocates the streak that lasts to the end."""
@@ -260,23 +274,13 @@ class InWindow(Rule):
         holds = self._condition(step)
         self.length.add_(1.0).mul_(holds if holds.dim() == 1 else holds.all(1))
 
-    def held(self) -> torch.Tensor:
+    def held(self) -> Tensor:
         """Whether it has held in the last steps, shape ``(nworld,)``, bool."""
         return self.length >= self._window
 
-    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def judge(self, end: Step) -> Judgement:
         """See `Rule`."""
         return self.held(), {**self._measure(end), self._value: self.length}
-
-    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
-        """See `Rule`."""
-        found = self._found(values)
-        return [
-            (
-                f"in the last {values[self._value]:.0f} steps{found and '; at the end '}{found}",
-                f"in the last {self._window}{self._wanted and ': '}{self._wanted}",
-            )
-        ]
 
 
 class AtRest(Rule):
@@ -295,12 +299,18 @@ class AtRest(Rule):
             position: [m].
             rotation_deg: [deg].
         """
-        super().__init__("REST_SPEED", "{object}")
+        super().__init__("REST", "")
         self.texts = {
             "REST_SPEED": "object moving",
             "REST_POSITION": "object drifting",
             "REST_ROTATION": "object turning",
         }
+        self.shown = [
+            ["rest_speed_m_per_s", "peak_speed_m_per_s"],
+            ["rest_position_m"],
+            ["rest_rotation_deg"],
+        ]
+        self.wanted = [f"at most {limit:g}" for limit in (speed, position, rotation_deg)]
         self._window = window
         self._speed = speed
         self._position = position
@@ -319,7 +329,7 @@ class AtRest(Rule):
         self._poses.index_copy_(1, slot, step.pose[:, None])
         self._speeds.index_copy_(1, slot, step.speed[:, None])
 
-    def judge(self, end: Step) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def judge(self, end: Step) -> Judgement:
         """See `Rule`."""
         rms = self._speeds.square().mean(1).sqrt().amax(1)
         distance = torch.zeros_like(rms)
@@ -340,79 +350,46 @@ class AtRest(Rule):
             "rest_rotation_deg": angle.double().rad2deg(),
         }
 
-    def report(self, values: Mapping[str, float]) -> list[tuple[str, str]]:
-        """See `Rule`."""
-        speed, peak, position, rotation = (
-            values[f"{name}"]
-            for name in (
-                "rest_speed_m_per_s",
-                "peak_speed_m_per_s",
-                "rest_position_m",
-                "rest_rotation_deg",
-            )
-        )
-        return [
-            (f"{speed:.3g} m/s RMS, peak {peak:.3g}", f"at most {self._speed:g} m/s RMS"),
-            (millimetres(position), f"at most {millimetres(self._position)}"),
-            (f"{rotation:.3g} deg", f"at most {math.degrees(self._rotation):g} deg"),
-        ]
+
+# Success of a step
 
 
-class RestWindow:
-    """Whether objects have been at rest for the last steps, asked in every step; see `AtRest`.
-
-    For the largest distance between any two steps of the window, each step keeps its largest
-    distance to the later ones: a new step updates all of them at once, and the one that leaves
-    takes its own along. Distances stay squared, and angles stay cosines, until they are judged.
-    """
+class HeldSuccess:
+    """Achieved while a condition has held for the window of a check, and the gripper is open."""
 
     def __init__(
-        self, view: TaskView, window: int, *, speed: float, position: float, rotation_deg: float
+        self, env: EnvView, check: EpisodeCheck, condition: Condition, open_fraction: float
     ) -> None:
-        """Allocates the ring; arguments as of `AtRest`."""
-        size = len(view.objects)
-        self._window = window
-        self._limits = (
-            speed**2,
-            position**2,
-            1.0 - math.cos(0.5 * math.radians(rotation_deg)),
-        )
-        # Where the oldest step is, in every world.
-        self._slot = torch.zeros(1, dtype=torch.int64, device=view.env.device)
-        self._pos = view.zeros(window, size, 3)
-        self._quat = view.zeros(window, size, 4)
-        self._apart = torch.zeros_like(self._pos)
-        self._product = torch.zeros_like(self._quat)
-        self._energy = view.zeros(window, size)  # squared speed
-        self._far = view.zeros(window, size)  # squared distance to later steps
-        self._turned = view.zeros(window, size)  # 1 - |cosine of half the angle| to them
+        """Allocates the streak.
 
-    def append(self, step: Step) -> None:
-        """Takes a step in place of the oldest one."""
-        pos, quat = step.pose[:, None].split((3, 4), dim=-1)
-        self._slot.add_(1).remainder_(self._window)
-        self._pos.index_copy_(1, self._slot, pos)
-        self._quat.index_copy_(1, self._slot, quat)
-        self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
-        for ring in (self._far, self._turned):
-            ring.index_fill_(1, self._slot, 0.0)
+        Args:
+            env: The environment.
+            check: The task's check.
+            condition: A condition of a step.
+            open_fraction: How far the gripper must be open, from 0 (closed) to 1 (open), as
+                measured.
 
-    def compare(self, step: Step) -> torch.Tensor:
-        """Holds the step appended last against the others; shape ``(nworld,)``, bool."""
-        pos, quat = step.pose[:, None].split((3, 4), dim=-1)
-        torch.sub(self._pos, pos, out=self._apart).square_()
-        torch.maximum(self._far, self._apart.sum(-1), out=self._far)
-        torch.mul(self._quat, quat, out=self._product)
-        torch.maximum(self._turned, 1.0 - self._product.sum(-1).abs(), out=self._turned)
-        speed, position, rotation = self._limits
-        rest = (self._energy.mean(1) <= speed).all(1)
-        rest &= self._far.amax((1, 2)) <= position
-        return rest & (self._turned.amax((1, 2)) <= rotation)
+        Raises:
+            ParameterError: The fraction is out of range.
+        """
+        if not 0.0 <= open_fraction <= 1.0:
+            raise ParameterError("open_fraction", open_fraction, "a number from 0 to 1")
+        self._open = open_fraction
+        self._view = check.view(env)
+        self._streak = InWindow("STREAK", "", condition, check.settle_steps)
+        self._streak.start(self._view)
 
+    def __call__(self, env: EnvView) -> Tensor:
+        """Processes a step; shape ``(nworld,)``, bool."""
+        self._streak.update(self._view.step())
+        return self._achieved(env)
 
-def millimetres(metres: float) -> str:
-    """A length in words."""
-    return f"{1e3 * metres:.3g} mm"
+    def _achieved(self, env: EnvView) -> Tensor:
+        return self._streak.held() & (gripper_opening(env) >= self._open).all(1)
+
+    def reset(self, mask: Tensor) -> None:
+        """Forgets the masked worlds."""
+        self._streak.length.masked_fill_(mask, 0.0)
 
 
 def _in(phases: Sequence[str]) -> str:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
+from torch import Tensor
 
-from mjstack.errors import ParameterError
+from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView
-from mjstack.mdp.geometry import grasp_point, pose_w
+from mjstack.mdp.geometry import grasp_point_to_object
 
 
 class ReachSuccess:
@@ -30,24 +29,21 @@ class ReachSuccess:
             MjstackError: There is no such object, or a number is out of range.
         """
         env.index.object_address(object)
-        if not (math.isfinite(distance) and distance > 0.0):
-            raise ParameterError("distance", distance, "a positive number [m]")
-        if steps < 1:
-            raise ParameterError("steps", steps, "an integer of at least 1")
+        require_positive("distance", distance)
+        require_positive("steps", steps)
         self._object = object
         self._height = height
         self._distance = distance
         self._steps = steps
         self._run = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
 
-    def __call__(self, env: EnvView) -> torch.Tensor:
-        """Takes in a step; shape ``(nworld,)``, bool."""
-        offset = pose_w(env, self._object)[:, :3] - grasp_point(env)
-        offset[:, 2] += self._height
+    def __call__(self, env: EnvView) -> Tensor:
+        """Processes a step; shape ``(nworld,)``, bool."""
+        offset = grasp_point_to_object(env, self._object, self._height)
         near = torch.linalg.vector_norm(offset, dim=1) <= self._distance
         self._run.add_(1).mul_(near)
         return self._run >= self._steps
 
-    def reset(self, mask: torch.Tensor) -> None:
+    def reset(self, mask: Tensor) -> None:
         """Forgets the masked worlds."""
         self._run.masked_fill_(mask, 0)

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from mjstack.config.fields import spec
-from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.view import EnvView
-from mjstack.mdp.geometry import gripper_opening
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import (
     AtRest,
     Carried,
+    HeldSuccess,
     InWindow,
-    RestWindow,
     Streak,
     airborne,
-    millimetres,
     offset,
     on_table,
     on_top,
 )
-from mjstack.tasks.view import Step
+from mjstack.tasks.view import Step, TaskView
 
 
 class StackCheck(EpisodeCheck):
@@ -83,12 +82,12 @@ class StackCheck(EpisodeCheck):
     def build(self) -> list[Rule]:
         """See `EpisodeCheck`."""
         t = self.t
-        phases = self.cfg.controller.phases
-        for key in ("lift_phases", "carry_phase"):
-            for name in [getattr(t, key)] if key == "carry_phase" else t.lift_phases:
-                if phases and name not in phases:
-                    raise UnknownName(f"task.check.{key}: phase", name, phases)
         self.objects = [t.object, t.onto]
+        self.rest = {
+            "speed": t.rest_speed,
+            "position": t.rest_position,
+            "rotation_deg": t.rest_rotation_deg,
+        }
         moved = [t.object]
         up = airborne(t.object, height=t.airborne_height)
         self.stacked = on_top(t.object, t.onto, xy_err=t.xy_err, dz_min=t.dz_min, dz_max=t.dz_max)
@@ -100,7 +99,6 @@ class StackCheck(EpisodeCheck):
             up,
             t.lift_steps,
             phases=[t.lift_phases],
-            doing="in the air",
         )
         carry = Carried(
             "CARRY",
@@ -110,7 +108,6 @@ class StackCheck(EpisodeCheck):
             t.carry_steps,
             distance=t.carry_distance,
             phases=[[t.carry_phase]],
-            doing="in the air",
             after=lift,
         )
         return [
@@ -122,30 +119,17 @@ class StackCheck(EpisodeCheck):
                 self.stacked,
                 t.window,
                 measure=self.trace,
-                found=self.headline,
-                wanted=f"xy_err at most {millimetres(t.xy_err)}, dz {1e3 * t.dz_min:g} to"
-                f" {millimetres(t.dz_max)}",
+                shown=["xy_err_m", "dz_m"],
             ),
-            InWindow(
-                "SUPPORTED",
-                f"{t.onto} not on the table",
-                self.supported,
-                t.window,
-                wanted=f"within {millimetres(t.support_gap)} of the top, centre on the table",
-            ),
-            AtRest(
-                t.window,
-                speed=t.rest_speed,
-                position=t.rest_position,
-                rotation_deg=t.rest_rotation_deg,
-            ),
+            InWindow("SUPPORTED", f"{t.onto} not on the table", self.supported, t.window),
+            AtRest(t.window, **self.rest),
         ]
 
-    def placed(self, step: Step) -> torch.Tensor:
+    def placed(self, step: Step) -> Tensor:
         """Whether the object is on the other one, and that one on the table."""
         return torch.stack((self.stacked(step), self.supported(step)), dim=1)
 
-    def trace(self, step: Step) -> dict[str, torch.Tensor]:
+    def trace(self, step: Step) -> dict[str, Tensor]:
         """See `EpisodeCheck`."""
         xy_err, dz = offset(step, *self.objects)
         return {"xy_err_m": xy_err, "dz_m": dz}
@@ -155,54 +139,86 @@ class StackCheck(EpisodeCheck):
         return f"xy_err {1e3 * values['xy_err_m']:.1f} mm, dz {1e3 * values['dz_m']:.1f} mm"
 
 
-class StackSuccess:
+class RestWindow:
+    """Whether objects have been at rest for the last steps, asked in every step; see `AtRest`.
+
+    For the largest distance between any two steps of the window, each step keeps its largest
+    distance to the later ones: a new step updates all of them at once, and the one that leaves
+    takes its own along. Distances stay squared, and angles stay cosines, until they are judged.
+    """
+
+    def __init__(
+        self, view: TaskView, window: int, *, speed: float, position: float, rotation_deg: float
+    ) -> None:
+        """Allocates the ring; arguments as of `AtRest`."""
+        size = len(view.objects)
+        self._window = window
+        self._limits = (
+            speed**2,
+            position**2,
+            1.0 - math.cos(0.5 * math.radians(rotation_deg)),
+        )
+        # Where the oldest step is, in every world.
+        self._slot = torch.zeros(1, dtype=torch.int64, device=view.env.device)
+        self._pos = view.zeros(window, size, 3)
+        self._quat = view.zeros(window, size, 4)
+        self._apart = torch.zeros_like(self._pos)
+        self._product = torch.zeros_like(self._quat)
+        self._energy = view.zeros(window, size)  # squared speed
+        self._far = view.zeros(window, size)  # squared distance to later steps
+        self._turned = view.zeros(window, size)  # 1 - |cosine of half the angle| to them
+
+    def append(self, step: Step) -> None:
+        """Takes a step in place of the oldest one."""
+        pos, quat = step.pose[:, None].split((3, 4), dim=-1)
+        self._slot.add_(1).remainder_(self._window)
+        self._pos.index_copy_(1, self._slot, pos)
+        self._quat.index_copy_(1, self._slot, quat)
+        self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
+        for ring in (self._far, self._turned):
+            ring.index_fill_(1, self._slot, 0.0)
+
+    def compare(self, step: Step) -> Tensor:
+        """Holds the step appended last against the others; shape ``(nworld,)``, bool."""
+        pos, quat = step.pose[:, None].split((3, 4), dim=-1)
+        torch.sub(self._pos, pos, out=self._apart).square_()
+        torch.maximum(self._far, self._apart.sum(-1), out=self._far)
+        torch.mul(self._quat, quat, out=self._product)
+        torch.maximum(self._turned, 1.0 - self._product.sum(-1).abs(), out=self._turned)
+        speed, position, rotation = self._limits
+        rest = (self._energy.mean(1) <= speed).all(1)
+        rest &= self._far.amax((1, 2)) <= position
+        return rest & (self._turned.amax((1, 2)) <= rotation)
+
+
+class StackSuccess(HeldSuccess):
     """Achieved while an object has stood at rest on another one through the whole window, and the
     gripper is open: rules 4 and 5 of the check, whose thresholds it shares.
     """
 
     def __init__(self, env: EnvView, *, open_fraction: float) -> None:
-        """Allocates the ring.
-
-        Args:
-            env: The environment, its task's check a `StackCheck`.
-            open_fraction: How far the gripper must be open, from 0 (closed) to 1 (open), as
-                measured.
+        """Allocates the ring; see `HeldSuccess`.
 
         Raises:
             MjstackError: The fraction is out of range, or the task has another check.
         """
-        if not 0.0 <= open_fraction <= 1.0:
-            raise ParameterError("open_fraction", open_fraction, "a number from 0 to 1")
-        self._open = open_fraction
-        self._check = StackCheck(env.cfg)
-        t = self._check.t
-        self._view = self._check.view(env)
-        self._rest = RestWindow(
-            self._view,
-            t.window,
-            speed=t.rest_speed,
-            position=t.rest_position,
-            rotation_deg=t.rest_rotation_deg,
+        check = StackCheck(env.cfg)
+        super().__init__(
+            env, check, lambda step: check.stacked(step) & check.supported(step), open_fraction
         )
-        # Steps in a row that were stacked and supported.
-        self._held = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
+        self._rest = RestWindow(self._view, check.t.window, **check.rest)
 
-    def __call__(self, env: EnvView) -> torch.Tensor:
-        """Processes a step; shape ``(nworld,)``, bool."""
-        step = self._view.step()
-        stacked = self._check.stacked(step) & self._check.supported(step)
-        self._held.add_(1).mul_(stacked)
-        self._rest.append(step)
-        if not stacked.is_cuda and not bool(stacked.any()):
-            # No window that holds this step can pass, in any world.
-            return torch.zeros_like(stacked)
-        rest = self._rest.compare(step)
-        opened = (gripper_opening(env) >= self._open).all(1)
-        return (self._held >= self._check.t.window) & rest & opened
+    def __call__(self, env: EnvView) -> Tensor:
+        """Processes a step; shape ``(nworld,)``, bool.
 
-    def reset(self, mask: torch.Tensor) -> None:
-        """Forgets the masked worlds.
-
-        The ring may keep them: every slot is written anew before `_held` can reach the window.
+        `reset` may leave the ring alone: every slot is written anew before the streak can reach the
+        window.
         """
-        self._held.masked_fill_(mask, 0)
+        step = self._view.step()
+        self._streak.update(step)
+        self._rest.append(step)
+        length = self._streak.length
+        if not length.is_cuda and not bool(length.any()):
+            # No window that holds this step can pass, in any world.
+            return torch.zeros_like(length, dtype=torch.bool)
+        return self._achieved(env) & self._rest.compare(step)

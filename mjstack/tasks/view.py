@@ -5,9 +5,11 @@ alone, which are never stale.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, wraps
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from mjstack.errors import UnknownName
 from mjstack.managers.view import EnvView
@@ -17,7 +19,25 @@ from mjstack.scene import table_top
 from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
 
+PhaseNames = Sequence[Sequence[str]]
+"""For each object, names of phases."""
 _ROWS = 16  # of a block of counters
+
+
+def once_per_step(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Make a function whose last argument is a step compute a value once per step, for all
+    conditions that share it. It is not to be written into.
+    """
+
+    @wraps(compute)
+    def shared(*args: Any) -> Tensor:
+        known = args[-1].known
+        key = (compute, *args[:-1])
+        if key not in known:
+            known[key] = compute(*args)
+        return known[key]
+
+    return shared
 
 
 class TaskView:
@@ -61,9 +81,8 @@ class TaskView:
         self._phases = [phase.name for phase in phases]
         self._stop = steps if phases else steps - window
         self._table = torch.zeros((len(phases), 0), dtype=torch.bool, device=env.device)
-        self._blocks: list[tuple[torch.Tensor, int]] = []
-        self._constants: dict[tuple[float, ...], torch.Tensor] = {}
-        self._columns: dict[tuple[str, ...], slice | torch.Tensor] = {}
+        self._blocks: list[tuple[Tensor, int]] = []
+        self._columns: dict[tuple[str, ...], Columns] = {}
 
         index = env.index
         scene = env.cfg.scene
@@ -83,7 +102,7 @@ class TaskView:
     def _forces(self, addresses: Sequence[Sequence[int]]) -> Columns:
         return Columns([a + i for row in addresses for a in row for i in range(3)], self.env.device)
 
-    def step(self, phase: torch.Tensor | None = None) -> Step:
+    def step(self, phase: Tensor | None = None) -> Step:
         """The state now, computed where it is asked for, once."""
         return Step(self, phase)
 
@@ -91,17 +110,14 @@ class TaskView:
         """Number of an object."""
         return self.objects.index(name)
 
-    def columns(self, names: Sequence[str]) -> slice | torch.Tensor:
-        """Numbers of some objects, as an index that needs no copy from the host."""
+    def columns(self, names: Sequence[str]) -> Columns:
+        """Columns of some objects, made once: a captured step may not copy from the host."""
         key = tuple(names)
         if key not in self._columns:
-            found = [self.column(name) for name in names]
-            span = slice(found[0], found[-1] + 1)
-            together = found == list(range(span.start, span.stop))
-            self._columns[key] = span if together else torch.tensor(found, device=self.env.device)
+            self._columns[key] = Columns([self.column(name) for name in names], self.env.device)
         return self._columns[key]
 
-    def during(self, phases: Sequence[Sequence[str]]) -> slice:
+    def during(self, phases: PhaseNames) -> slice:
         """A key for `Step.judged`: for each column of a rule, the phases in which it counts."""
         if not self.phased:
             return slice(0, 0)
@@ -111,7 +127,7 @@ class TaskView:
         self._table = torch.cat((self._table, new), dim=1)
         return slice(first, first + len(phases))
 
-    def judged(self, phase: torch.Tensor | None) -> torch.Tensor:
+    def judged(self, phase: Tensor | None) -> Tensor:
         """Every column of every key, shape ``(nworld, n)``; without phases whether the step
         counts, shape ``(1, 1)``.
         """
@@ -120,20 +136,16 @@ class TaskView:
             return going
         return self._table.index_select(0, phase) & going
 
-    def constant(self, *values: float) -> torch.Tensor:
+    def constant(self, *values: float) -> Tensor:
         """Numbers on the device, copied there once, shape ``(n,)``, float32."""
-        if values not in self._constants:
-            self._constants[values] = torch.tensor(
-                values, dtype=torch.float32, device=self.env.device
-            )
-        return self._constants[values]
+        return self.env.index.constant(values, self.half)
 
-    def zeros(self, *shape: int, fill: float = 0.0) -> torch.Tensor:
+    def zeros(self, *shape: int, fill: float = 0.0) -> Tensor:
         """A buffer, shape ``(nworld, *shape)``, float32."""
         size = (self.env.nworld, *shape)
         return torch.full(size, fill, dtype=torch.float32, device=self.env.device)
 
-    def counter(self, size: int) -> torch.Tensor:
+    def counter(self, size: int) -> Tensor:
         """A buffer that `forget` clears, shape ``(nworld, size)``, float32."""
         for place, (block, used) in enumerate(self._blocks):
             if block.shape[2] == size and used < _ROWS:
@@ -143,7 +155,7 @@ class TaskView:
         self._blocks.append((torch.zeros(shape, dtype=torch.float32, device=self.env.device), 0))
         return self.counter(size)
 
-    def forget(self, mask: torch.Tensor) -> None:
+    def forget(self, mask: Tensor) -> None:
         """Clears all counters of the masked columns, shape ``(nworld, size)``."""
         for block, _ in self._blocks:
             if block.shape[2] == mask.shape[1]:
@@ -161,31 +173,25 @@ class Step:
     smaller than a grasp's force: it tells contact from none.
     """
 
-    def __init__(self, view: TaskView, phase: torch.Tensor | None) -> None:
+    def __init__(self, view: TaskView, phase: Tensor | None) -> None:
         """Takes the view, and the phase of every world."""
         self.view = view
+        self.known: dict[tuple, Tensor] = {}  # see `once_per_step`
         self._phase = phase
-        self._known: dict[str, torch.Tensor] = {}
-
-    def once(self, key: str, compute: Callable[[], torch.Tensor]) -> torch.Tensor:
-        """A value that several conditions need, computed once. Not to be written into."""
-        if key not in self._known:
-            self._known[key] = compute()
-        return self._known[key]
 
     @cached_property
-    def pose(self) -> torch.Tensor:
+    def pose(self) -> Tensor:
         """Position [m] and quaternion (wxyz), shape ``(nworld, objects, 7)``."""
         env = self.view.env
         return torch.stack([pose_w(env, name) for name in self.view.objects], dim=1).float()
 
     @property
-    def pos(self) -> torch.Tensor:
+    def pos(self) -> Tensor:
         """Position [m], shape ``(nworld, objects, 3)``."""
         return self.pose[..., :3]
 
     @cached_property
-    def velocity(self) -> torch.Tensor:
+    def velocity(self) -> Tensor:
         """Velocity as MuJoCo has it: linear [m/s] in the world, angular [rad/s] in the object's
         frame, shape ``(nworld, objects, 6)``.
         """
@@ -197,25 +203,25 @@ class Step:
         return torch.stack(parts, dim=1)
 
     @cached_property
-    def turn(self) -> torch.Tensor:
+    def turn(self) -> Tensor:
         """Rotation matrices, shape ``(nworld, objects, 3, 3)``."""
         return quat_to_matrix(self.pose[..., 3:])
 
     @cached_property
-    def height(self) -> torch.Tensor:
+    def height(self) -> Tensor:
         """Height of the lowest point above the table [m], shape ``(nworld, objects)``."""
         pos, quat = self.pose.split((3, 4), dim=-1)
         first, *others = self.view.things
         if all((each.shape, each.size) == (first.shape, first.size) for each in others):
             return lowest_point(pos, quat, first.shape, first.size) - self.view.top
-        heights = [
+        lowest = [
             lowest_point(pos[:, column], quat[:, column], each.shape, each.size)
             for column, each in enumerate(self.view.things)
         ]
-        return torch.stack(heights, dim=1) - self.view.top
+        return torch.stack(lowest, dim=1) - self.view.top
 
     @cached_property
-    def bounds(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def bounds(self) -> tuple[Tensor, Tensor]:
         """Least and largest coordinates [m] of the corners, or of those of the box around another
         shape, each ``(nworld, objects, 3)``.
         """
@@ -223,43 +229,43 @@ class Step:
         return self.pos - reach, self.pos + reach
 
     @cached_property
-    def speed(self) -> torch.Tensor:
+    def speed(self) -> Tensor:
         """Fastest that any point can be [m/s], shape ``(nworld, objects)``."""
         parts = torch.linalg.vector_norm(self.velocity.unflatten(-1, (2, 3)), dim=-1)
         linear, angular = parts.unbind(-1)
         return linear + self.view.radius * angular
 
     @cached_property
-    def pressed(self) -> torch.Tensor:
+    def pressed(self) -> Tensor:
         """Whether each jaw presses on each object, shape ``(nworld, objects, jaws)``, bool."""
         return self._sensed(self.view.jaws)
 
     @cached_property
-    def in_hand(self) -> torch.Tensor:
+    def in_hand(self) -> Tensor:
         """Whether all jaws press on each object, shape ``(nworld, objects)``, bool."""
         return self.pressed.all(-1)
 
     @cached_property
-    def untouched(self) -> torch.Tensor:
+    def untouched(self) -> Tensor:
         """Whether no jaw presses on each object, shape ``(nworld, objects)``, bool."""
         return ~self.pressed.any(-1)
 
     @cached_property
-    def supported(self) -> torch.Tensor:
+    def supported(self) -> Tensor:
         """Whether anything but a jaw presses on each object, shape ``(nworld, objects)``, bool;
         needs ``scene.support_sensors``.
         """
         return self._sensed(self.view.supports).any(-1)
 
-    def judged(self, key: slice) -> torch.Tensor:
+    def judged(self, key: slice) -> Tensor:
         """Whether the step counts for a rule, shape ``(nworld, columns)`` or ``(1, 1)``, bool."""
         return self._judged[:, key] if self.view.phased else self._judged
 
     @cached_property
-    def _judged(self) -> torch.Tensor:
+    def _judged(self) -> Tensor:
         return self.view.judged(self._phase)
 
-    def _sensed(self, columns: Columns) -> torch.Tensor:
+    def _sensed(self, columns: Columns) -> Tensor:
         forces = columns.read(self.view.env.sim.sensordata)
         parts = forces.unflatten(1, (len(self.view.objects), -1, 3))
         return torch.linalg.vector_norm(parts, dim=-1) > self.view.force

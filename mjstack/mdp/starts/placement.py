@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import Config, ObjectCfg
 from mjstack.errors import ParameterError
@@ -86,18 +87,6 @@ class Placement:
         """Moves the constants to where worlds are placed."""
         self._tensors = [t.to(device, dtype) for t in self._tensors]
 
-    def choose(self, draws: torch.Tensor) -> torch.Tensor:
-        """The first candidates that fit.
-
-        Args:
-            draws: Numbers in [-1, 1), shape ``(n, objects, candidates, 2)``: x and y.
-
-        Returns:
-            Offsets from the nominal positions [m], shape ``(n, objects, 2)``; 0 for all objects
-            where nothing fits.
-        """
-        return self._choose(draws)[0]
-
     def require_room(self, name: str, value: object, candidates: int) -> None:
         """Tries the region on many imaginary worlds.
 
@@ -112,9 +101,9 @@ class Placement:
         ).double()
         draws = draws.view(_TRIALS, count, candidates, 2)
         hard = draws[
-            ~self._choose(draws[:, :, :_FIRST])[1]
+            ~self.choose(draws[:, :, :_FIRST])[1]
         ]  # the first few do for most worlds, which saves time
-        lacking = sum(int((~self._choose(share)[1]).sum()) for share in hard.split(_SHARE))
+        lacking = sum(int((~self.choose(share)[1]).sum()) for share in hard.split(_SHARE))
         if lacking:
             raise ParameterError(
                 name,
@@ -125,30 +114,18 @@ class Placement:
                 " (scene.objects.NAME.xy)",
             )
 
-    def require_all_free(self, name: str, value: object) -> None:
-        """Checks the corners of the region, which is small: every draw must fit.
-
-        Raises:
-            ParameterError: An object could leave the table or touch another one.
-        """
-        corners = torch.tensor([[x, y] for x in (-1.0, 1.0) for y in (-1.0, 1.0)]).double()
-        numbers = range(len(self._apart))
-        for i, j in itertools.combinations_with_replacement(numbers, 2):
-            draws = torch.zeros((16, len(self._apart), 1, 2), dtype=torch.float64)
-            draws[:, i, 0] = corners.repeat_interleave(4, dim=0)
-            draws[:, j, 0] = corners.repeat(4, 1)
-            if not bool(self._choose(draws)[1].all()):
-                raise ParameterError(
-                    name,
-                    value,
-                    "objects that stay on the table, apart from each other and clear of the arm",
-                )
-
-    def _choose(self, draws: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Offsets, and whether all objects fit, ``(n,)``.
+    def choose(self, draws: Tensor) -> tuple[Tensor, Tensor]:
+        """The first candidates that fit.
 
         One object after the other takes its first candidate that is free, clear of those before,
         and leaves each of those after it one that is clear too.
+
+        Args:
+            draws: Numbers in [-1, 1), shape ``(n, objects, candidates, 2)``: x and y.
+
+        Returns:
+            Offsets from the nominal positions [m], shape ``(n, objects, 2)``, 0 for all objects
+            where nothing fits; and whether all objects fit, ``(n,)``.
         """
         nominal, region, center, room, *rectangles = self._tensors
         offsets = draws * region
@@ -209,7 +186,7 @@ def _arm_boxes(
     geoms = np.flatnonzero(collides & ~fixed & ~np.isin(body, list(index.bodies.values())))
     joints = [model.joint(name).id for name in cfg.robot.arm_joints]
     dofs = model.jnt_dofadr[joints]
-    centers, halves = _boxes(data, geoms)
+    centers, halves = world_boxes(data, geoms)
     jac = np.empty((3, model.nv))
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     for k, g in enumerate(geoms):
@@ -228,27 +205,21 @@ def _arm_boxes(
 def _fixed_boxes(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
     """The same of what collides and is fixed to the world, floor and table left out."""
     model = data.model
-    geoms = []
-    for g in range(model.ngeom):
-        geom = model.geom(g)
-        collides = bool(geom.contype[0] or geom.conaffinity[0])
-        if (
-            geom.name in ("floor", "table")
-            or not collides
-            or model.body_weldid[model.geom_bodyid[g]] != 0
-        ):
-            continue
-        if (
-            geom.type[0] != mujoco.mjtGeom.mjGEOM_PLANE
-        ):  # without end; the floor is the only one in a scene
-            geoms.append(g)
-    return _boxes(data, np.array(geoms, dtype=int))
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    # A plane has no end; the floor is the only one in a scene.
+    solid = model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
+    geoms = np.flatnonzero(collides & fixed & solid)
+    return world_boxes(data, geoms[geoms != model.geom("table").id])
 
 
-def _boxes(data: mujoco.MjData, geoms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def world_boxes(
+    data: mujoco.MjData, geoms: Sequence[int] | np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Centres and half sizes of the boxes along the world's axes that hold some geoms, shape ``(n,
     3)`` each.
     """
+    geoms = np.asarray(geoms, dtype=int)
     model = data.model
     rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)
     centers = data.geom_xpos[geoms] + np.einsum("nij,nj->ni", rotation, model.geom_aabb[geoms, :3])
