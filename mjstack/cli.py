@@ -6,8 +6,6 @@ makes the run folder before calling it. So every job is composed, checked and bu
 Hydra runs what was composed.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -50,8 +48,8 @@ if TYPE_CHECKING:
 _OTHER_CONFIG = {"--config-name", "-cn", "--config-path", "-cp"}
 _WIDE = 3  # gates; with more of them a sweep's table has only their status
 
-_checked: dict[tuple[str, ...], CheckedJob] = {}  # by their overrides, until Hydra runs them
-_results: list[JobResult] = []  # of the jobs that ran in this process
+_checked: dict[tuple[str, ...], "CheckedJob"] = {}  # by their overrides, until Hydra runs them
+_results: list["JobResult"] = []  # of the jobs that ran in this process
 
 
 def run(args: list[str]) -> int:
@@ -159,7 +157,7 @@ def _print_help(hydra: Hydra, args: list[str]) -> None:
         )  # Python writes there once more at its end
 
 
-def run_job(cfg: DictConfig) -> JobResult:
+def run_job(cfg: DictConfig) -> "JobResult":
     """Runs a job in the folder that Hydra made. A launcher may call it in another process, where
     nothing has been checked yet.
     """
@@ -175,7 +173,7 @@ def run_job(cfg: DictConfig) -> JobResult:
     return result
 
 
-def _check(cfg: DictConfig, overrides: list[str]) -> CheckedJob:
+def _check(cfg: DictConfig, overrides: list[str]) -> "CheckedJob":
     """Types and checks a composed job, and keeps what that built for its run."""
     from mjstack.jobs import (
         check_job,
@@ -263,7 +261,7 @@ def _check_writable(cfg: DictConfig, kind: str) -> None:
         ) from error
 
 
-def _print_sweep(outcomes: list[JobResult]) -> None:
+def _print_sweep(outcomes: list["JobResult"]) -> None:
     """One row per job, also written beside the jobs as summary.md."""
     names = list(dict.fromkeys(gate.name for outcome in outcomes for gate in outcome.gates))
     rows = []

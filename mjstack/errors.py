@@ -4,8 +4,6 @@ Every error that a user can cause derives from `MjstackError` and carries the ex
 command line returns for it.
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Iterable, Sequence
@@ -51,7 +49,7 @@ class ConfigError(InputError):
         self.key = key
         self._facts = (value, expected, fix)
 
-    def at(self, key: str) -> ConfigError:
+    def at(self, key: str) -> "ConfigError":
         """The same error under the key that the user has set."""
         return ConfigError(key, *self._facts)
 

@@ -1,7 +1,5 @@
 """Files that appear complete or not at all, and rows as CSV."""
 
-from __future__ import annotations
-
 import csv
 import io
 import os

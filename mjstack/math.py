@@ -3,8 +3,6 @@
 Quaternions are (w, x, y, z), the last dimension is the vector's own.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

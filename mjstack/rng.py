@@ -5,8 +5,6 @@ int64 tensors. World 5 of 16 draws what world 5 of 2048 draws, and no draw depen
 worlds reset.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import torch

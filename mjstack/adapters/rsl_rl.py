@@ -1,7 +1,5 @@
 """RSL-RL's `VecEnv` over an environment, without leaving the device."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Command lines of the benchmark scripts: one harness, and the measurements of each."""
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import statistics

@@ -15,8 +15,6 @@ parts are subtracted from the whole: where it is far from 0, the repetitions dif
 the managers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

@@ -1,7 +1,5 @@
 """The whole episode with its check; on MJWarp beside bare steps of the same commands."""
 
-from __future__ import annotations
-
 import math
 import statistics
 import time
@@ -112,7 +110,7 @@ def measure_episode(
 
 
 def play_bare(
-    context: RunContext, sim: MjwarpSimulation, recorded: Recorded | None = None
+    context: RunContext, sim: "MjwarpSimulation", recorded: Recorded | None = None
 ) -> tuple[float, str]:
     """Play the same commands from the same start with bare steps.
 

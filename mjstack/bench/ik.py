@@ -4,8 +4,6 @@ The worlds start at home and their targets are random places that the arm can re
 every case. The time is that of `BatchedIk.solve`, its two copies of the input included.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial
@@ -96,7 +94,7 @@ def measure_solve(
     return out
 
 
-def _problem(cfg: Config, ik: BatchedIk) -> tuple[torch.Tensor, torch.Tensor]:
+def _problem(cfg: Config, ik: "BatchedIk") -> tuple[torch.Tensor, torch.Tensor]:
     """Home in every world, and grasp points within 0.5 rad of it.
 
     Shapes ``(nworld, n)`` and ``(nworld, 3)``.

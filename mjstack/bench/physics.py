@@ -1,7 +1,5 @@
 """Physics steps: under a held joint target with the object in hand, and in each arrangement."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

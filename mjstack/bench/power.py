@@ -1,7 +1,5 @@
 """Energy of a GPU over some work, from NVML's counter; or one line that says why there is none."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

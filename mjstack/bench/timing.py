@@ -1,7 +1,5 @@
 """Wall time of work on a simulation, and the repetitions of a measurement."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Checks values that types and ranges cannot: how they fit together."""
 
-from __future__ import annotations
-
 import importlib
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Complete a composed configuration: terms as dataclasses, and what follows from other values."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, fields
 from functools import cache
 from pathlib import Path

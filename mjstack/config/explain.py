@@ -4,8 +4,6 @@ Some overrides are checked before Hydra sees them, which answers with a tracebac
 about its own parser; its chained, multi-line errors about the others are turned into one line.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import fields, is_dataclass

@@ -9,8 +9,6 @@ Example:
     ...     '''Duration of one physics step.'''
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import math

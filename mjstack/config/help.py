@@ -3,8 +3,6 @@
 Groups and choices are those of the search path; units, ranges and words are those of the fields.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import textwrap

@@ -1,7 +1,5 @@
 """Composes `conf/` into the dataclasses of `schema`."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

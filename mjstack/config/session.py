@@ -5,8 +5,6 @@ under the entry point group ``mjstack.configs``, and in folders that the caller 
 beside an added one is importable, so that its YAML can name functions by module.
 """
 
-from __future__ import annotations
-
 import copy
 import os
 import sys

@@ -1,7 +1,5 @@
 """Demonstrations on disk in the layout of LeRobotDataset v3, with pyarrow alone."""
 
-from __future__ import annotations
-
 from mjstack.datasets.lerobot import require_pyarrow
 from mjstack.datasets.reader import StoredDataset, read_dataset
 from mjstack.datasets.spec import DatasetSpec, EpisodeData, Feature

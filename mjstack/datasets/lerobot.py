@@ -11,8 +11,6 @@ A shard is a data file and the episodes file of the same number. Shards are neve
 count.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Opening a dataset: to read it, or to go on with it."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json

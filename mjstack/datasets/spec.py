@@ -2,8 +2,6 @@
 anything is written.
 """
 
-from __future__ import annotations
-
 import numbers
 from collections.abc import Mapping
 from dataclasses import dataclass, field

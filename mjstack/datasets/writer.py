@@ -2,8 +2,6 @@
 has committed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -87,7 +85,7 @@ class DatasetWriter:
         except OSError as error:
             raise UnwrittenError(str(folder), error, len(self.committed)) from error
 
-    def __enter__(self) -> DatasetWriter:
+    def __enter__(self) -> "DatasetWriter":
         return self
 
     def __exit__(self, *error: object) -> None:

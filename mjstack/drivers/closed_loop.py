@@ -2,8 +2,6 @@
 needs no host.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Drivers give the joint targets of every world, step by step, and the phase of each world."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import torch
@@ -69,7 +67,7 @@ class Recorded:
         self._phases.index_copy_(0, self._next, phase[None].to(torch.int16))
         self._next.add_(1)
 
-    def rewind(self) -> Recorded:
+    def rewind(self) -> "Recorded":
         """Repeat from the first step on; returns itself."""
         self._next.zero_()
         return self

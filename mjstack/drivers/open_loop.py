@@ -1,7 +1,5 @@
 """Planning before the episode: targets of the grasp point and joint trajectories of every world."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
@@ -33,7 +31,7 @@ _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # World, commands at the knots (n, nu), largest distance [m] from a target.
 Plan = tuple[int, np.ndarray, float]
 
-_planner: OpenLoopPlanner  # of a process that plans for another one
+_planner: "OpenLoopPlanner"  # of a process that plans for another one
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class JointTrajectory:
         """Length of the episode."""
         return len(self.weights)
 
-    def to(self, device: torch.device, dtype: torch.dtype) -> JointTrajectory:
+    def to(self, device: torch.device, dtype: torch.dtype) -> "JointTrajectory":
         """The same trajectory on a device."""
         return replace(
             self,

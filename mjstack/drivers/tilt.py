@@ -1,7 +1,5 @@
 """Approach tilt of a grasp, so that an object arrives upright."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Checks of the arguments of an environment's reset."""
 
-from __future__ import annotations
-
 import operator
 
 import torch

@@ -2,8 +2,6 @@
 actions to find them.
 """
 
-from __future__ import annotations
-
 import gc
 import logging
 import math

@@ -1,7 +1,5 @@
 """Builds environments from a configuration."""
 
-from __future__ import annotations
-
 import os
 import reprlib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The environment: one step order over any simulation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Faults of a world while it is stepped: latched on the device until the host reads them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -4,8 +4,6 @@ The copies share memory, so that keeping one of them keeps all of a step. To aut
 tensor of its own.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

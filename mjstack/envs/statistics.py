@@ -2,8 +2,6 @@
 then.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

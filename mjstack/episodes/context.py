@@ -1,7 +1,5 @@
 """The context of a run: configuration, scene, plan, and the products of its gates."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -76,7 +74,7 @@ class TimedEpisode:
     failed: list[int]
 
     @classmethod
-    def of(cls, episode: Episode, sim: Simulation) -> TimedEpisode:
+    def of(cls, episode: Episode, sim: Simulation) -> "TimedEpisode":
         """The time of an episode."""
         failed = np.flatnonzero(episode.result.failed.cpu().numpy()).tolist()
         return cls(
@@ -187,7 +185,7 @@ class RunContext:
         if self.stage is None:
             self.stage = Stage(self.cfg)
 
-    def with_config(self, cfg: Config) -> RunContext:
+    def with_config(self, cfg: Config) -> "RunContext":
         """A context for another configuration of the same scene and plan, which it shares. Its
         artifacts are its own: other starts, say, have other peaks.
         """

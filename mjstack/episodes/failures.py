@@ -1,7 +1,5 @@
 """Where an episode goes wrong: the first sign of failure of every world, kept on the device."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from enum import IntEnum
 

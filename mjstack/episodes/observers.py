@@ -1,7 +1,5 @@
 """Observers of a rollout, and the judged episode that most of them look on at."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 

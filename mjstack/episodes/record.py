@@ -2,8 +2,6 @@
 people.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -56,7 +54,7 @@ class Circumstances:
     @classmethod
     def of(
         cls, episode: Episode, monitor: FailureMonitor, cfg: Config, index: SceneIndex
-    ) -> Circumstances:
+    ) -> "Circumstances":
         """Copy the arrays to the host."""
         # Objects stand flat at a start, so that all of a rotation is about z.
         poses = [episode.start[:, at : at + 7].astype(float) for at in index.object_qpos]
@@ -131,7 +129,7 @@ class EpisodeRecord:
         sim: Simulation,
         episode: Episode,
         circumstances: Circumstances | None = None,
-    ) -> EpisodeRecord:
+    ) -> "EpisodeRecord":
         """Copy the results to the host."""
         return cls(
             seed=seed,
@@ -145,7 +143,7 @@ class EpisodeRecord:
         )
 
     @classmethod
-    def read(cls, folder: Path, seed: int, gate: str = "batch") -> EpisodeRecord | None:
+    def read(cls, folder: Path, seed: int, gate: str = "batch") -> "EpisodeRecord | None":
         """Read the record of a gate's seed, without circumstances.
 
         Args:

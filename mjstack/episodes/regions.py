@@ -2,8 +2,6 @@
 as a table, a file and a picture.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Sequence

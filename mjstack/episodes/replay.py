@@ -1,7 +1,5 @@
 """One world of a batch played again, alone: its trajectory, and a report on every rule."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

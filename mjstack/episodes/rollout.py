@@ -1,7 +1,5 @@
 """The rollout: the only loop over an episode. Everything else observes it."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Plays a gate's episodes, seed after seed, and records each."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 

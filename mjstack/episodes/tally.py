@@ -1,7 +1,5 @@
 """Episodes of a gate, counted seed after seed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The runs that size MJWarp's buffers: the scripted task, and random actions."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -54,14 +52,14 @@ class Workload:
         return int((self.failed == 0).sum())
 
 
-def measuring_worlds(context: RunContext) -> int:
+def measuring_worlds(context: "RunContext") -> int:
     """How many worlds size the buffers."""
     nworld = context.cfg.nworld
     on_cuda = context.backend[1].startswith("cuda")
     return nworld if on_cuda else min(nworld, context.cfg.gate.capacity.cpu_nworld)
 
 
-def play_task(context: RunContext, reset: Reset, sizes: BatchSizes | None = None) -> Workload:
+def play_task(context: "RunContext", reset: Reset, sizes: BatchSizes | None = None) -> Workload:
     """Play the driven task once, in worlds of exactly these sizes; without, with room to spare."""
 
     def play(sim: Simulation) -> np.ndarray:
@@ -70,7 +68,7 @@ def play_task(context: RunContext, reset: Reset, sizes: BatchSizes | None = None
     return _run(context, reset, sizes, play)
 
 
-def play_random(context: RunContext, sizes: BatchSizes | None = None) -> Workload:
+def play_random(context: "RunContext", sizes: BatchSizes | None = None) -> Workload:
     """Step the task's environment with random actions; worlds end and start anew as its managers
     say. Sizes as in `play_task`.
     """
@@ -90,7 +88,7 @@ def play_random(context: RunContext, sizes: BatchSizes | None = None) -> Workloa
     return _run(context, cfg.reset, sizes, play)
 
 
-def size_batch(context: RunContext) -> BatchSizes:
+def size_batch(context: "RunContext") -> BatchSizes:
     """Sizes for ``batch=auto`` where the capacity gate does not run before.
 
     Raises:
@@ -106,7 +104,7 @@ def size_batch(context: RunContext) -> BatchSizes:
 
 
 def _run(
-    context: RunContext,
+    context: "RunContext",
     reset: Reset,
     sizes: BatchSizes | None,
     play: Callable[[Simulation], np.ndarray],
@@ -125,7 +123,7 @@ def _run(
 
 
 def _play(
-    context: RunContext,
+    context: "RunContext",
     reset: Reset,
     sizes: BatchSizes | None,
     play: Callable[[Simulation], np.ndarray],

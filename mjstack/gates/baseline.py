@@ -1,7 +1,5 @@
 """Gate *baseline*: one native world stacks the cubes."""
 
-from __future__ import annotations
-
 from mjstack.episodes.context import RunContext, judge_one, needs_episode
 from mjstack.report.record import GateResult
 

@@ -1,7 +1,5 @@
 """Gate *batch*: every world does the task, or is named with the rule it broke."""
 
-from __future__ import annotations
-
 from mjstack.episodes.context import RunContext, needs_episode
 from mjstack.episodes.observers import Snapshots
 from mjstack.episodes.seeds import play_seeds

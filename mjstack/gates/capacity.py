@@ -2,8 +2,6 @@
 they be?
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import reduce
 

@@ -1,7 +1,5 @@
 """Gate *parity*: MJWarp against native MuJoCo, one world."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Runs the chosen gates in their order and keeps the report current."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

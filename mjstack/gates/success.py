@@ -2,8 +2,6 @@
 fails.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from pathlib import Path

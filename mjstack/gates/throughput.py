@@ -1,7 +1,5 @@
 """Gate *throughput*: the speed of physics, of the validated episode and of ``env.step``."""
 
-from __future__ import annotations
-
 import gc
 import os
 import sys

@@ -2,8 +2,6 @@
 as asked for are there.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from contextlib import suppress

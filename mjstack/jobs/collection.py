@@ -2,8 +2,6 @@
 until enough are there.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time
@@ -54,7 +52,7 @@ class CollectPlan:
     most: int
 
     @classmethod
-    def of(cls, context: RunContext, home: Path, env: Env) -> CollectPlan:
+    def of(cls, context: RunContext, home: Path, env: Env) -> "CollectPlan":
         """Plan from an environment of the demonstrations, with any number of worlds.
 
         Raises:

@@ -1,7 +1,5 @@
 """The folder of an earlier run: its configuration, report, records, and copies of starts files."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -33,7 +31,7 @@ class EarlierRun:
     provenance: dict[str, Any]
 
     @classmethod
-    def read(cls, name: str) -> EarlierRun:
+    def read(cls, name: str) -> "EarlierRun":
         """Read a run's folder.
 
         Raises:

@@ -1,7 +1,5 @@
 """Job *gates*: a configuration and a folder in, gates run, a report left behind."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

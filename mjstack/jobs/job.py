@@ -1,7 +1,5 @@
 """A job: its check, its run, and its result."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

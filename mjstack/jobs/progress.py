@@ -1,7 +1,5 @@
 """Shows how far a job is: a bar on a terminal, a line now and then elsewhere."""
 
-from __future__ import annotations
-
 import time
 
 from rich.console import Console
@@ -45,7 +43,7 @@ class ProgressBar:
         self._task: TaskID | None = None
         self._began = self._spoke = time.monotonic()
 
-    def __enter__(self) -> ProgressBar:
+    def __enter__(self) -> "ProgressBar":
         self._progress.start()
         return self
 

@@ -2,8 +2,6 @@
 positions the objects may stand.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from pathlib import Path

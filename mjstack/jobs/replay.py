@@ -2,8 +2,6 @@
 every rule explained.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The runner of jobs that leave a report, which is written after each result."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

@@ -1,7 +1,5 @@
 """Job *scaling*: throughput from one world to many, each number of worlds in a process."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """One run of the scaling job: the gates, for one backend and number of worlds, in a process."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

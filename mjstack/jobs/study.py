@@ -3,8 +3,6 @@
 It informs, and gates nothing.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 from dataclasses import asdict, replace

@@ -1,7 +1,5 @@
 """Inverse kinematics of many worlds at once, on the worlds' device."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

@@ -1,7 +1,5 @@
 """The moving links from the world to a gripper's grasp sites, read from a compiled model."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import warp as wp

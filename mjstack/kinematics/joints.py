@@ -1,7 +1,5 @@
 """Facts of a robot's joints that every solver of inverse kinematics needs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import mujoco

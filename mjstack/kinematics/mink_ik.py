@@ -1,7 +1,5 @@
 """Inverse kinematics with mink on a model of the robot alone: the reference, which plans grasps."""
 
-from __future__ import annotations
-
 import math
 
 import mink

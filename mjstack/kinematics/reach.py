@@ -4,8 +4,6 @@
 Warp is not loaded, and the gripper's tilt matters too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The reset manager: terms that write the start of an episode into the masked worlds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

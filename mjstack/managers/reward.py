@@ -1,7 +1,5 @@
 """The reward manager: a weighted sum of terms, per second of simulated time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

@@ -1,7 +1,5 @@
 """Terms: how they are found, built, checked, called and shown."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import io

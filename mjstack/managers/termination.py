@@ -2,8 +2,6 @@
 happened.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

@@ -1,7 +1,5 @@
 """The environment as terms see it, and what a term may ask of it or say of itself."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable
 from typing import Any, Protocol

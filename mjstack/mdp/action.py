@@ -1,7 +1,5 @@
 """Action terms: classes that turn a slice of the action into actuator commands."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

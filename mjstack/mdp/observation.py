@@ -1,7 +1,5 @@
 """Observation terms: functions of the environment that return ``(nworld,)`` or ``(nworld, d)``."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -2,8 +2,6 @@
 values each time.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

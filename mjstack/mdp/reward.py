@@ -1,7 +1,5 @@
 """Reward terms: functions of the environment that return ``(nworld,)``, mostly between 0 and 1."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Termination terms: functions or classes that return ``(nworld,)`` bool."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

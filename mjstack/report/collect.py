@@ -1,7 +1,5 @@
 """A dataset of demonstrations as tables: its content, the expert's success, and how to load it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from mjstack.report.markdown import format_value

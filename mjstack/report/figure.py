@@ -1,7 +1,5 @@
 """Figures that are saved as pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

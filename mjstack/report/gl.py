@@ -1,7 +1,5 @@
 """Chooses how MuJoCo draws offscreen. Import before mujoco, which decides at its own import."""
 
-from __future__ import annotations
-
 import ctypes.util
 import os
 import sys

@@ -1,7 +1,5 @@
 """Pictures of a run: the final scene, the objects' way there, and a video."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

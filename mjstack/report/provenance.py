@@ -1,7 +1,5 @@
 """Where a result comes from: versions, hardware, commit, and hashes of configuration and model."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import platform

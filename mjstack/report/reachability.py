@@ -1,7 +1,5 @@
 """The reach of the arm as a table, as text and as a picture."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Results of a run as data: gates and provenance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import Enum
 

@@ -1,7 +1,5 @@
 """The scaling table and its curves: a row per backend and number of worlds."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The solver study as a table and as a picture."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

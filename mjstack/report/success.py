@@ -1,7 +1,5 @@
 """Where episodes started, and which failed, as a picture of the table from above."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tables of text cells, as Markdown and on a terminal."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -33,7 +31,7 @@ class Table:
     @classmethod
     def of(
         cls, title: str, columns: Mapping[str, Callable[[Row], str]], rows: Iterable[Row]
-    ) -> Table:
+    ) -> "Table":
         """Make a table from records.
 
         Args:

@@ -1,7 +1,5 @@
 """Write report.json and report.md, and draw pictures that may fail."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math

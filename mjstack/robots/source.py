@@ -1,7 +1,5 @@
 """Robot descriptions as MjSpec: any MJCF file, mjstack's own mesh-free ones, or Menagerie's."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How low bodies reach, from their poses and the shapes of their geoms."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import mujoco

@@ -1,7 +1,5 @@
 """Names to addresses, resolved once."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations

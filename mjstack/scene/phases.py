@@ -1,7 +1,5 @@
 """The phases of the scripted motion: when they are, and where the grasp point goes in each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Chooses a backend and a device: the only branch on the backend."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

@@ -2,8 +2,6 @@
 its CPU device.
 """
 
-from __future__ import annotations
-
 import gc
 import logging
 import time

@@ -1,7 +1,5 @@
 """MuJoCo Warp: thousands of worlds on CUDA, or on Warp's CPU device for checks."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Model fields that may differ from world to world, and what native MuJoCo derives from them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 
 import mujoco

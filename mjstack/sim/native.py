@@ -2,8 +2,6 @@
 cores.
 """
 
-from __future__ import annotations
-
 import copy
 import os
 import platform

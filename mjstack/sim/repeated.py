@@ -1,7 +1,5 @@
 """Work that is repeated step by step, captured or not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

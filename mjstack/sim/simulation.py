@@ -1,7 +1,5 @@
 """The base of every physics backend: torch views of batched state, and how to step it."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from enum import IntFlag
 

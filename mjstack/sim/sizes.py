@@ -1,7 +1,5 @@
 """Buffer sizes of MJWarp, from the configuration and the defaults of a robot in a scene."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Warp and MuJoCo Warp, imported in one place, and ordered with torch's work."""
 
-from __future__ import annotations
-
 import torch
 import warp as wp
 

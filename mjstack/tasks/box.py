@@ -1,7 +1,5 @@
 """Task *box*: objects into a box, one after the other, each to its place."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass

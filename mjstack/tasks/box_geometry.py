@@ -1,7 +1,5 @@
 """The scene's box, and how objects lie to it."""
 
-from __future__ import annotations
-
 import itertools
 
 import torch

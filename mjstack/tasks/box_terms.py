@@ -2,8 +2,6 @@
 task's check.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -18,8 +18,6 @@ Example:
     ...         return [InWindow("UP", f"{t.object} not in the air", up, t.window)]
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields

@@ -4,8 +4,6 @@ A condition is a function of a `Step` that returns a bool tensor, shape ``(nworl
 ``(nworld,)``. A rule that judges objects one by one has conditions with a column for each.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Success of any task that has a check: every object is where it belongs."""
 
-from __future__ import annotations
-
 import torch
 
 from mjstack.errors import ParameterError

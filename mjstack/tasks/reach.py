@@ -1,7 +1,5 @@
 """Task *reach*: the grasp point to a point above a cube."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

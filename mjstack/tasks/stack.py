@@ -1,7 +1,5 @@
 """Task *stack*: one object onto another one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -2,8 +2,6 @@
 alone, which are never stale.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cached_property, wraps
 from typing import Any
@@ -102,7 +100,7 @@ class TaskView:
     def _forces(self, addresses: Sequence[Sequence[int]]) -> Columns:
         return Columns([a + i for row in addresses for a in row for i in range(3)], self.env.device)
 
-    def step(self, phase: Tensor | None = None) -> Step:
+    def step(self, phase: Tensor | None = None) -> "Step":
         """The state now, computed where it is asked for, once."""
         return Step(self, phase)
 

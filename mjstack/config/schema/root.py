@@ -1,7 +1,5 @@
 """The whole configuration."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

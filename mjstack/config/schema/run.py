@@ -1,7 +1,5 @@
 """A run: physics, the gates and their parameters, and the jobs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any

@@ -1,7 +1,5 @@
 """The robot and the scene: table, objects, places and perhaps a box."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from enum import Enum

@@ -1,7 +1,5 @@
 """The managers' terms, and the task with the scripted motion that does it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

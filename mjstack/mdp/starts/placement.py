@@ -2,8 +2,6 @@
 fixed.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 

@@ -6,8 +6,6 @@ computed in float64 from the value as the field holds it, so that writing what w
 nothing.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import ClassVar, Protocol

@@ -1,7 +1,5 @@
 """Whether the arm reaches what its phases ask of an object, wherever the object may stand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Worlds that start from the rows of a file, and a file of how worlds have started."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

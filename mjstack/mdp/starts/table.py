@@ -1,7 +1,5 @@
 """A file of starts: a CSV with a header and one row per world, read and checked cell by cell."""
 
-from __future__ import annotations
-
 import csv
 import math
 import reprlib
