@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
+import mujoco
 import torch
 from comparison import assert_same_run
 from compositions import load_config
@@ -39,6 +40,16 @@ _model = cache(lambda robot: build_model(configure(robot=robot)))
 def configure(*overrides: str, robot: str = "so101") -> Config:
     """A configuration of the caller's own."""
     return load_config((f"robot={robot}", *overrides))
+
+
+@cache
+def has_gl() -> bool:
+    """Whether MuJoCo draws offscreen on this machine; where it does not, there is no scene.png."""
+    try:
+        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception:  # OpenGL loaders fail in their own ways
+        return False
+    return True
 
 
 @cache

@@ -430,13 +430,10 @@ def test_runs_get_the_command_line() -> None:
 
 
 BAD = [
-    ["job.nworlds=[]"],
     ["job.nworlds=[0]"],
-    ["job.nworlds=[2,2]"],
     ["job.nworlds=many"],
     ["job.nworld=[2]"],
     ["job.backends=[cuda]"],
-    ["job.backends=[]"],
     ["job.repetitions=0"],
     ["job.run_minutes=0"],
     ["job.max_minutes=-1"],

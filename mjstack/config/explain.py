@@ -135,7 +135,7 @@ def _unknown_key(key: str, known: Sequence[str], overrides: Sequence[str]) -> Co
         )
 
     nearest = max(keys, key=likeness)
-    near = likeness(nearest)[0] > 0.6
+    near = likeness(nearest)[0] >= 0.6
     hint = f" Did you mean '{nearest}'?" if near else ""
     if key.partition(".")[0] in TERM_GROUPS:
         return CompositionError(

@@ -11,8 +11,8 @@ def choose_gl() -> None:
     """Set ``MUJOCO_GL`` on Linux: the user's choice if its library is there, else what this
     machine has.
 
-    A choice whose library is missing would break the import of mujoco itself; then pictures are
-    plotted instead.
+    A choice whose library is missing would break the import of mujoco itself; then the scene is not
+    drawn.
     """
     if not sys.platform.startswith("linux"):
         return

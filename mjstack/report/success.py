@@ -45,7 +45,7 @@ def save_places(
             axes.scatter(good[:, 1], good[:, 0], size, color, alpha=alpha, lw=0, label=label)
             label = f"{name}, failed: {len(bad):,}"
             axes.scatter(bad[:, 1], bad[:, 0], 45.0, "k", "x", lw=2.6)
-            axes.scatter(bad[:, 1], bad[:, 0], 40.0, color, "x", lw=1.2, label=label)
+            axes.scatter(bad[:, 1], bad[:, 0], 40.0, color=color, marker="x", lw=1.2, label=label)
         axes.set(xlabel="y [m]", ylabel="x [m]", aspect="equal")
         axes.invert_xaxis()
         axes.grid(alpha=0.3)
