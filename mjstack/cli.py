@@ -31,7 +31,7 @@ import mjstack
 from mjstack.config import Config
 from mjstack.config.explain import check_overrides, parse
 from mjstack.config.help import help_text, key_help
-from mjstack.config.load import compose, compose_job, split_search_path, to_config
+from mjstack.config.load import compose, split_search_path, to_config
 from mjstack.config.session import (
     CONFIG_NAME,
     PROVIDER,
@@ -45,8 +45,12 @@ from mjstack.report.table import Table
 if TYPE_CHECKING:
     from mjstack.jobs import CheckedJob, JobResult
 
-_OTHER_CONFIG = {"--config-name", "-cn", "--config-path", "-cp"}
-_WIDE = 3  # gates; with more of them a sweep's table has only their status
+_OTHER_CONFIG = {  # mjstack runs its own configuration
+    "--config-name",
+    "-cn",
+    "--config-path",
+    "-cp",
+}
 
 _checked: dict[tuple[str, ...], "CheckedJob"] = {}  # by their overrides, until Hydra runs them
 _results: list["JobResult"] = []  # of the jobs that ran in this process
@@ -131,7 +135,7 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
     master = compose(hydra, overrides, RunMode.MULTIRUN)
     for job in jobs:
-        _check(compose_job(hydra, master, job), job)
+        _check(compose(hydra, job, sweep=master), job)
     _check_writable(master, "sweep")
     returned = run_and_report(lambda: hydra.multirun(CONFIG_NAME, run_job, overrides))
     batches = returned if isinstance(returned, list) else []  # a launcher's own processes return
@@ -189,15 +193,9 @@ def _parse(args: list[str]) -> Namespace:
     """Hydra's reading of the flags, or a `CompositionError`."""
     parser = get_args_parser()
     parser.exit_on_error = False
-    known = set(parser._option_string_actions)
+    known = set(parser._option_string_actions) - _OTHER_CONFIG
     for arg in args:
-        name = arg.partition("=")[0]
-        if name in _OTHER_CONFIG:
-            raise CompositionError(
-                f"argument '{arg}': mjstack runs its own configuration. Change it with key=value"
-                " overrides, or add choices with --config-dir DIR."
-            )
-        if arg.startswith("-") and name not in known:
+        if arg.startswith("-") and arg.partition("=")[0] not in known:
             raise _unknown_flag(arg, known)
     try:
         flags = parser.parse_intermixed_args(args)
@@ -271,14 +269,8 @@ def _print_sweep(outcomes: list["JobResult"]) -> None:
         rows.append([str(number), " ".join(outcome.overrides), *cells, outcome.status.value])
     title = f"sweep of {len(outcomes)} jobs"
     table = Table(title=title, header=["job", "overrides", *names, "status"], rows=rows)
-    lines = table.to_markdown()
-    if len(names) > _WIDE:
-        table.rows = [
-            [number, job, *(cell.partition(":")[0] for cell in cells), status]
-            for number, job, *cells, status in rows
-        ]
     Console().print(table.to_console())
     sweep_folder = os.path.commonpath([str(outcome.folder) for outcome in outcomes])
     if len(outcomes) > 1:
-        (Path(sweep_folder) / "summary.md").write_text("\n".join(lines) + "\n")
+        (Path(sweep_folder) / "summary.md").write_text("\n".join(table.to_markdown()) + "\n")
         Console(soft_wrap=True).print(f"summary: {sweep_folder}/summary.md")

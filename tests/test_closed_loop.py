@@ -15,7 +15,7 @@ from mjstack.drivers.tilt import _keeps, _places
 from mjstack.envs import Env, driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError
-from mjstack.managers.reset import required_fields
+from mjstack.managers.episode import required_fields
 from mjstack.scene.phases import build_phases
 from mjstack.sim import make_simulation
 

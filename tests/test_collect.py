@@ -38,7 +38,7 @@ from mjstack.jobs.collect import collect_folder, plan_collection, run_collect_jo
 from mjstack.jobs.collection import FILE, CollectPlan
 from mjstack.jobs.demonstration import Played, StepRecorder
 from mjstack.jobs.demonstration_spec import differences, episode_config, make_spec
-from mjstack.managers.reset import required_fields
+from mjstack.managers.episode import required_fields
 from mjstack.report.collect import LOADING
 from mjstack.sim import make_simulation
 

@@ -168,28 +168,6 @@ def test_other_joint_types_are_refused() -> None:
         BatchedIk(model, odd_arm().robot, 2, "cpu")
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"iterations": 0},
-        {"nworld": 0},
-        {"damping": 0.0},
-        {"damping": float("nan")},
-        {"max_step": -1.0},
-        {"tolerance": 0.0},
-        {"block_dim": 0},
-        {"posture_gain": -0.1},
-        {"approach_gain": float("nan")},
-        {"posture_gain": 1.5},
-        {"iterations": 3, "approach_gain": 0.1},
-    ],
-)
-def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
-    arm = odd_arm()
-    with pytest.raises(ArgumentError, match=next(iter(settings))):
-        BatchedIk(arm.model, arm.robot, **{"nworld": 2, "device": "cpu", **settings})
-
-
 def test_shapes_are_not_broadcast() -> None:
     ik = odd_arm().solver(3)
     with pytest.raises(ArgumentError, match=r"q: found shape \(1, 5\), expected shape \(3, 5\)"):
@@ -198,10 +176,6 @@ def test_shapes_are_not_broadcast() -> None:
         ik.solve(torch.zeros(3, 5), torch.zeros(3))
     with pytest.raises(ArgumentError, match="q: found shape"):
         ik.forward(torch.zeros(3, 4))
-    with pytest.raises(
-        ArgumentError, match="posture: found one, expected None, because posture_gain is 0"
-    ):
-        ik.solve(torch.zeros(3, 5), torch.zeros(3, 3), torch.zeros(5))
     drawn = odd_arm().solver(3, posture_gain=0.1)
     for shape in ((4,), (1, 5), (3, 4), (1, 3, 5)):
         with pytest.raises(ArgumentError, match="posture: found shape"):

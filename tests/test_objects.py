@@ -296,7 +296,6 @@ def test_what_is_stacked_is_higher_from_then_on() -> None:
         (("mass: 0.1", "mass: 0.0"), "scene.objects.puck.mass=0"),
         (("xy: [0.33, -0.10]", "xy: [0.9, -0.10]"), "on the table"),
         (("goal:", "puck:"), "a name that no object has"),
-        (("puck:", "table:"), "scene.objects.table"),
         (("random_xy: [0.03, 0.02]", "random_xy: [0.03, 0.5]"), "scene.places.goal.xy"),
     ],
 )

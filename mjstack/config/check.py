@@ -13,7 +13,6 @@ from mjstack.errors import ConfigError, UnknownName
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
 _WORLD = re.compile(r"((batch|success):)?(\d+:)?\d+")
-_TAKEN = ("world", "floor", "table")
 
 
 def validate(cfg: Config) -> None:
@@ -109,8 +108,6 @@ def _scene(scene: SceneCfg) -> None:
     """Objects, places and the box are on the table and clear of each other."""
     for name, thing in scene.objects.items():
         key = f"scene.objects.{name}"
-        if name in _TAKEN:
-            raise ConfigError(key, name, f"a name other than {', '.join(_TAKEN)}")
         if len(thing.size) != SHAPES[thing.shape]:
             raise ConfigError(f"{key}.size", thing.size, f"{SHAPES[thing.shape]} numbers")
         edge = min(thing.size[:2]) if thing.shape == "box" else thing.footprint

@@ -89,14 +89,13 @@ def list_groups() -> list[Group]:
     """The groups of the whole search path, mjstack's in the order of composition first."""
     choices = list_choices()
     lines = (CONFIG_FOLDER / "config.yaml").read_text(encoding="utf-8").splitlines()
-    found = [match for line in lines if (match := _GROUP.fullmatch(line))]
+    found = filter(None, map(_GROUP.fullmatch, lines))
     known = {match["name"]: (match["default"], match["words"]) for match in found}
     groups = []
     for name in [*known, *(name for name in choices if name not in known)]:
         default, words = known.get(name, ("", "added by the search path"))
-        first = [choice for choice in choices[name] if choice == default]
-        rest = [choice for choice in choices[name] if choice != default]
-        groups.append(Group(name, first + rest, words))
+        ordered = sorted(choices[name], key=default.__ne__)
+        groups.append(Group(name, ordered, words))
     return groups
 
 
@@ -142,10 +141,10 @@ def key_help(cfg: Config, prefix: str, width: int) -> str:
         depth = prefix.count(".") + 1
         beside = [key.name for key in keys if f".{key.name}".startswith(f".{parent}")]
         raise UnknownName("key", prefix, {".".join(name.split(".")[:depth]) for name in beside})
-    rows = [(f"{k.name}={k.value}", f"{k.words} Accepts {k.accepts}.".strip()) for k in found]
     lines = []
-    for name, words in rows:
-        lines += [name, *textwrap.wrap(words, width, initial_indent="  ", subsequent_indent="  ")]
+    for key in found:
+        words = textwrap.wrap(f"{key.words} Accepts {key.accepts}.".strip(), width - 2)
+        lines += [f"{key.name}={key.value}", *(f"  {line}" for line in words)]
     return "\n".join(lines)
 
 

@@ -1,8 +1,7 @@
 """Composes `conf/` into the dataclasses of `schema`."""
 
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
@@ -19,11 +18,11 @@ from mjstack.config.complete import complete
 from mjstack.config.explain import check_overrides, explain, parse
 from mjstack.config.schema import JOB_SCHEMAS, Config
 from mjstack.config.session import (
+    ADD_FOLDER,
     CONFIG_NAME,
     check_trusted,
     hydra_session,
     search_path,
-    used_folder,
     without_hydra,
 )
 from mjstack.errors import CompositionError, ConfigError
@@ -76,19 +75,25 @@ def split_search_path(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
     return entries, others
 
 
-def compose(hydra: Hydra, overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictConfig:
-    """Compose without validating values; Hydra's part is in it, and errors are one line each."""
-    with _explained(overrides):
-        cfg = hydra.compose_config(CONFIG_NAME, list(overrides), run_mode, from_shell=False)
+def compose(
+    hydra: Hydra,
+    overrides: Sequence[str],
+    run_mode: RunMode = RunMode.RUN,
+    sweep: DictConfig | None = None,
+) -> DictConfig:
+    """Compose without validating values, as a job of a sweep if there is one; Hydra's part is in
+    it, and errors are one line each.
+    """
+    try:
+        if sweep is None:
+            cfg = hydra.compose_config(CONFIG_NAME, list(overrides), run_mode, from_shell=False)
+        else:
+            cfg = hydra.config_loader.load_sweep_config(sweep, list(overrides))
         _drop_inherited(hydra, cfg, overrides)
-    return cfg
-
-
-def compose_job(hydra: Hydra, sweep: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    """Compose a job of a sweep, as `compose`."""
-    with _explained(overrides):
-        cfg = hydra.config_loader.load_sweep_config(sweep, list(overrides))
-        _drop_inherited(hydra, cfg, overrides)
+    except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
+        raise explain(error, overrides) from error
+    except YAMLError as error:
+        raise CompositionError(f"{' '.join(str(error).split())}.") from error
     return cfg
 
 
@@ -121,17 +126,6 @@ def _drop_inherited(hydra: Hydra, cfg: DictConfig, overrides: Sequence[str]) -> 
                 del node[name]
 
 
-@contextmanager
-def _explained(overrides: Sequence[str]) -> Iterator[None]:
-    """Turn Hydra's errors about overrides into one line each."""
-    try:
-        yield
-    except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
-        raise explain(error, overrides) from error
-    except YAMLError as error:
-        raise CompositionError(f"{' '.join(str(error).split())}.") from error
-
-
 def load_saved(path: Path) -> Config:
     """The configuration that a run left in ``.hydra/config.yaml``, typed and checked as a new one
     is.
@@ -151,13 +145,13 @@ def load_saved(path: Path) -> Config:
         ) from error
     if missing:
         raise CompositionError(f"{missing[0]} is missing, expected every key of this version.")
-    check_trusted(cast(DictConfig, merged), path.parent)
+    check_trusted(cast(DictConfig, merged))
     try:
         return to_config(cast(DictConfig, merged))
     except ConfigError as error:
         if error.key != "robot.file":
             raise
-        raise CompositionError(f"{error} {used_folder(path.parent)}") from error
+        raise CompositionError(f"{error} {ADD_FOLDER}") from error
 
 
 def to_config(cfg: DictConfig) -> Config:

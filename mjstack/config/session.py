@@ -9,7 +9,7 @@ import copy
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -38,6 +38,10 @@ CONFIG_FOLDER = next(
 CONFIG_NAME = "config"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
+ADD_FOLDER = (
+    "If you trust the folder that the run had used (its .hydra/hydra.yaml names it), add"
+    " --config-dir DIR."
+)
 _FILE = "file://"
 _PACKAGE = "pkg://"
 
@@ -108,32 +112,21 @@ def is_trusted(dotted: str) -> bool:
     return any(Path(place).resolve().parent in parents for place in places if place)
 
 
-def check_trusted(cfg: DictConfig, saved: Path) -> None:
+def check_trusted(cfg: DictConfig) -> None:
     """Check that every function that a saved configuration names is in the current search path.
 
     Args:
         cfg: The configuration of an earlier run.
-        saved: The folder that Hydra left in that run's.
 
     Raises:
-        CompositionError: A function is elsewhere; names it, and the folder that the run had used.
+        CompositionError: A function is elsewhere; names it.
     """
     for key, name in _functions("", OmegaConf.to_container(cfg, resolve=False)):
         if not is_trusted(name):
             raise CompositionError(
                 f"{key}={name}: expected a name of mjstack, of a package registered under"
-                f" mjstack.configs, or beside a folder of the search path. {used_folder(saved)}"
+                f" mjstack.configs, or beside a folder of the search path. {ADD_FOLDER}"
             )
-
-
-def used_folder(saved: Path) -> str:
-    """What to do about a name or a file that only the search path of an earlier run has."""
-    had = "had no --config-dir"
-    with suppress(Exception):  # the file may be anything, and this is for the message alone
-        runtime = OmegaConf.select(OmegaConf.load(saved / "hydra.yaml"), "hydra.runtime")
-        used = [str(s.path) for s in runtime.config_sources if s.provider == PROVIDER]
-        had = f"used --config-dir {used[0]}" if used else had
-    return f"The run {had}: if you trust it, add --config-dir DIR."
 
 
 def _functions(prefix: str, node: object) -> Iterator[tuple[str, str]]:

@@ -17,7 +17,7 @@ from mjstack.config.schema import Backend, Config
 from mjstack.envs.env import Env
 from mjstack.envs.faults import NO_KEY, POOL, describe_loss
 from mjstack.errors import FaultError
-from mjstack.managers.reset import required_fields
+from mjstack.managers.episode import required_fields
 from mjstack.managers.view import random_uniform
 from mjstack.scene import SceneIndex
 from mjstack.sim import (

@@ -13,7 +13,7 @@ from mjstack.config.schema import Backend, Config
 from mjstack.envs.buffers import probe_env_sizes
 from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError
-from mjstack.managers.reset import required_fields
+from mjstack.managers.episode import required_fields
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import BatchSizes, make_simulation, resolve_backend, resolve_device
 from mjstack.sim.sizes import resolve_env_sizes

@@ -13,11 +13,9 @@ from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
+from mjstack.managers.episode import ResetManager, RewardManager, TerminationManager
 from mjstack.managers.observation import ObservationManager
-from mjstack.managers.reset import ResetManager
-from mjstack.managers.reward import RewardManager
 from mjstack.managers.term import Term, current_term, first_value, step_cache
-from mjstack.managers.termination import TerminationManager
 from mjstack.math import not_finite
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation

@@ -9,8 +9,8 @@ from torch import Tensor
 from mjstack.config.schema import TerminationTermCfg
 from mjstack.errors import FaultError, name_worlds
 from mjstack.managers.action import ActionManager
+from mjstack.managers.episode import RewardManager
 from mjstack.managers.observation import ObservationManager
-from mjstack.managers.reward import RewardManager
 from mjstack.managers.term import resolve_func
 from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Overflow, Simulation, describe_overflow

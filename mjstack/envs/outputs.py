@@ -10,9 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mjstack.managers.episode import RewardManager, TerminationManager
 from mjstack.managers.observation import ObservationManager
-from mjstack.managers.reward import RewardManager
-from mjstack.managers.termination import TerminationManager
 
 _ALIGNMENT = 16  # bytes
 

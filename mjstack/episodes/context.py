@@ -37,7 +37,7 @@ from mjstack.episodes.rollout import (
 )
 from mjstack.episodes.workloads import size_batch
 from mjstack.errors import ConfigError
-from mjstack.managers.reset import required_fields
+from mjstack.managers.episode import required_fields
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import (

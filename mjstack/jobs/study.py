@@ -23,7 +23,7 @@ from mjstack.jobs.gates import check_machine
 from mjstack.jobs.job import Job, JobResult
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.runner import Record, run_reported
-from mjstack.managers.reset import required_fields
+from mjstack.managers.episode import required_fields
 from mjstack.report.record import GateResult, Status
 from mjstack.report.study import Row, save_study, study_table
 from mjstack.report.write import write_tables

@@ -3,10 +3,13 @@ at once.
 """
 
 from mjstack.managers.action import ActionManager, ActionTerm
+from mjstack.managers.episode import (
+    ResetManager,
+    RewardManager,
+    TerminationManager,
+    required_fields,
+)
 from mjstack.managers.observation import ObservationManager
-from mjstack.managers.reset import ResetManager, required_fields
-from mjstack.managers.reward import RewardManager
-from mjstack.managers.termination import TerminationManager
 from mjstack.managers.view import EnvView, episode_draw, offers, random_uniform, uses_fields
 
 __all__ = [

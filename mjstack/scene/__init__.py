@@ -1,7 +1,6 @@
 """Scenes: a robot, a table and objects as one MjModel, and where each name lies in it."""
 
 from mjstack.scene.build import build_model, build_scene, table_top
-from mjstack.scene.extent import LowestPoint
-from mjstack.scene.index import SceneIndex
+from mjstack.scene.index import LowestPoint, SceneIndex
 
 __all__ = ["LowestPoint", "SceneIndex", "build_model", "build_scene", "table_top"]

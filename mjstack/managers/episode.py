@@ -1,0 +1,203 @@
+"""The managers of an episode's start, rewards and end: reset terms write the start into the masked
+worlds, reward terms are summed, termination terms say which worlds end.
+"""
+
+from collections.abc import Mapping
+
+import torch
+
+from mjstack.config.schema import RewardTermCfg, TermCfg, TerminationTermCfg
+from mjstack.errors import MjstackError, TermError
+from mjstack.managers.term import (
+    Term,
+    first_value,
+    raised,
+    render_table,
+    resolve_func,
+    show_params,
+)
+from mjstack.managers.view import EnvView
+
+
+class ResetManager:
+    """Puts the masked worlds back and runs every term over them, in their order."""
+
+    def __init__(self, env: EnvView, cfg: Mapping[str, TermCfg]) -> None:
+        """Builds the terms.
+
+        Raises:
+            TermError: A term cannot be found, or a parameter is wrong.
+        """
+        self._env = env
+        for name, term in cfg.items():
+            wanted = required_fields({name: term})
+            lacking = [field for field in wanted if field not in env.sim.fields]
+            if lacking:
+                raise TermError(
+                    f"reset.{name}",
+                    f"writes {', '.join(lacking)}: build the simulation with fields={list(wanted)}",
+                )
+        self._terms = {
+            name: Term(f"reset.{name}", term, env, masked=True) for name, term in cfg.items()
+        }
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Resets the worlds of a ``(nworld,)`` bool mask: qpos0 first, then every term."""
+        self._env.sim.reset(mask)
+        for term in self._terms.values():
+            try:
+                term(self._env, mask)
+            except MjstackError:
+                raise
+            except Exception as error:
+                raise raised(term.label, error) from error
+
+    def __str__(self) -> str:
+        rows = [
+            (name, show_params(term.params), ", ".join(term.model_fields))
+            for name, term in self._terms.items()
+        ]
+        return render_table(
+            f"reset: {len(rows)} terms", ("term", "parameters", "model fields"), rows
+        )
+
+
+def required_fields(cfg: Mapping[str, TermCfg]) -> tuple[str, ...]:
+    """Per-world model fields that some reset terms write, for the simulation's constructor."""
+    names: dict[str, None] = {}
+    for name, term in cfg.items():
+        names |= dict.fromkeys(
+            getattr(resolve_func(f"reset.{name}", term.func), "model_fields", ())
+        )
+    return tuple(names)
+
+
+class RewardManager:
+    """Adds up ``weight x value x step_dt`` over the terms.
+
+    Attributes:
+        names: The terms.
+        weights: ``weight x step_dt`` of every term, shape ``(nterm,)``, float32. Write into it to
+            change a weight later.
+        reward: The sum at the last step, shape ``(nworld,)``, float32.
+        values: Its summands, shape ``(nworld, nterm)``, float32.
+        episode_sums: The summands since each world's last reset, shape ``(nworld, nterm)``,
+            float32.
+    """
+
+    def __init__(self, env: EnvView, cfg: Mapping[str, RewardTermCfg]) -> None:
+        """Builds the terms and calls each once.
+
+        Raises:
+            TermError: A term cannot be found, does not return ``(nworld,)`` numbers, or has a
+                weight that is not finite.
+        """
+        self._env = env
+        self._cfg = dict(cfg)
+        self._terms = {name: Term(f"reward.{name}", term, env) for name, term in cfg.items()}
+        for term in self._terms.values():
+            first_value(term, env, dims=(1,))
+        self.names = list(self._terms)
+        weights = [cfg[name].weight * env.cfg.timing.step_dt for name in self.names]
+        self.weights = torch.tensor(weights, dtype=torch.float32, device=env.device)
+        self.reward = torch.zeros(env.nworld, dtype=torch.float32, device=env.device)
+        self.values = torch.zeros(
+            (env.nworld, len(self.names)), dtype=torch.float32, device=env.device
+        )
+        self.episode_sums = torch.zeros_like(self.values)
+
+    def compute(self, void: torch.Tensor | None = None) -> torch.Tensor:
+        """Writes `values` and `reward`, and returns `reward`.
+
+        Args:
+            void: Worlds whose state is not finite, shape ``(nworld,)``, bool: they get no reward
+                for this step.
+        """
+        if self._terms:
+            torch.mul(
+                torch.stack([term(self._env).float() for term in self._terms.values()], 1),
+                self.weights,
+                out=self.values,
+            )
+        if void is not None:
+            self.values.masked_fill_(void[:, None], 0.0)
+        self.episode_sums += self.values
+        return torch.sum(self.values, dim=1, out=self.reward)
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Starts the sums of the masked worlds anew."""
+        self.episode_sums.masked_fill_(mask[:, None], 0.0)
+        for term in self._terms.values():
+            term.reset(mask)
+
+    def __str__(self) -> str:
+        rows = [
+            (name, self._cfg[name].weight, show_params(term.params))
+            for name, term in self._terms.items()
+        ]
+        return render_table(
+            f"reward: {len(rows)} terms", ("term", "weight per s", "parameters"), rows
+        )
+
+
+class TerminationManager:
+    """Asks every term about every world.
+
+    Attributes:
+        names: The terms.
+        terminated: Ended by a term that is no time-out, shape ``(nworld,)``, bool.
+        truncated: Ended by a time-out alone, shape ``(nworld,)``, bool.
+        values: What each term said last, shape ``(nworld, nterm)``, bool.
+    """
+
+    def __init__(self, env: EnvView, cfg: Mapping[str, TerminationTermCfg]) -> None:
+        """Builds the terms and calls each once.
+
+        Raises:
+            TermError: A term cannot be found, or does not return ``(nworld,)`` bool.
+        """
+        self._env = env
+        self._cfg = dict(cfg)
+        self._terms = {name: Term(f"termination.{name}", term, env) for name, term in cfg.items()}
+        for term in self._terms.values():
+            first_value(term, env, dims=(1,), boolean=True)
+        self.names = list(self._terms)
+
+        def flags(*shape: int) -> torch.Tensor:
+            return torch.zeros((env.nworld, *shape), dtype=torch.bool, device=env.device)
+
+        self.terminated = flags()
+        self.truncated = flags()
+        self.values = flags(len(self.names))
+        self._ends = torch.tensor(
+            [not cfg[name].time_out for name in self.names], dtype=torch.bool, device=env.device
+        )
+
+    def compute(self) -> None:
+        """Writes `terminated`, `truncated` and `values`."""
+        if not self._terms:
+            return
+        torch.stack([term(self._env) for term in self._terms.values()], dim=1, out=self.values)
+        torch.any(self.values & self._ends, dim=1, out=self.terminated)
+        # Where both hold, the state itself ended the episode: there is nothing left to bootstrap
+        # from.
+        torch.any(self.values, dim=1, out=self.truncated)
+        self.truncated ^= self.terminated
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Lets terms with a memory forget the masked worlds."""
+        for term in self._terms.values():
+            term.reset(mask)
+
+    def __str__(self) -> str:
+        rows = [
+            (
+                name,
+                "truncated" if self._cfg[name].time_out else "terminated",
+                show_params(term.params),
+            )
+            for name, term in self._terms.items()
+        ]
+        return render_table(
+            f"termination: {len(rows)} terms", ("term", "episode counts as", "parameters"), rows
+        )
