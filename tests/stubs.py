@@ -60,7 +60,6 @@ def fake_demonstrations(
             steps=cast(StepRecorder, SimpleNamespace(values=values, layout=LAYOUT)),
             failed=failed,
             retries=np.array([world % 3 for world in range(worlds)], dtype=np.int32),
-            seconds=0.5,
         )
 
     return play

@@ -28,7 +28,7 @@ from mjstack.datasets import DatasetWriter, lerobot
 from mjstack.envs import build_env, demonstration_config
 from mjstack.episodes.context import RunContext, Stage
 from mjstack.errors import UnwrittenError
-from mjstack.jobs import collection, demonstration_spec
+from mjstack.jobs import collection, demonstration
 from mjstack.jobs.collection import FILE, Collection, CollectPlan
 from mjstack.jobs.demonstration import play_demonstrations
 from mjstack.jobs.runner import run_provenance
@@ -63,7 +63,7 @@ def patch_all(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     monkeypatch.setattr(collection, "run_provenance", lambda cfg, context: dict(_provenance()))
     monkeypatch.setattr(
-        demonstration_spec,
+        demonstration,
         "config_content",
         lambda cfg: copy.deepcopy(_content(cfg.job.keep_failures)),
     )
@@ -106,21 +106,16 @@ def left_in(home: Path, result: GateResult) -> dict[str, Any]:
     ]
     steps: pa.Table = pq.read_table(home / "dataset" / "data").combine_chunks()
     notes = json.loads((home / FILE).read_text())
-    timed = [name for name in result.metrics if name.endswith("_s")]
     return {
         "rows": rows,
         "steps": {name: steps[name].combine_chunks() for name in steps.column_names},
         "statistics": json.loads((home / "dataset" / lerobot.STATS).read_text()),
-        "notes": [
-            {name: value for name, value in note.items() if not name.endswith("_s")}
-            for note in notes
-        ],
+        "notes": notes,
         "metrics": {
             name: value
             for name, value in result.metrics.items()
             if name
             not in (
-                *timed,
                 "dataset",
                 "megabytes",
                 "episodes_of_this_call",
@@ -384,7 +379,8 @@ def test_what_is_not_finite_is_left_out(
         collection, "play_demonstrations", fake_demonstrations(some_fail, diverge, noise=True)
     )
     expected = left_in(tmp_path / "whole", collect(tmp_path / "whole", keep_failures=True))
-    assert [note["not_finite"] for note in expected["notes"]] == [1, 0]
+    lost = [note["broken"].get("a number that is not finite", 0) for note in expected["notes"]]
+    assert lost == [1, 0]
     play_interrupted(tmp_path / "parts", 2, keep_failures=True)
     assert_same(
         left_in(tmp_path / "parts", collect(tmp_path / "parts", keep_failures=True)), expected
@@ -450,7 +446,7 @@ def test_ctrl_c_on_cuda() -> None:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(collection, "play_demonstrations", play_demonstrations)
-        monkeypatch.setattr(demonstration_spec, "config_content", config_content)
+        monkeypatch.setattr(demonstration, "config_content", config_content)
         try:
             with pytest.MonkeyPatch.context() as inner:
                 interrupt_at(3, inner)

@@ -249,6 +249,8 @@ def test_memory_that_runs_out_is_said(error: Exception, so101_cfg: Config) -> No
     def gate(context: RunContext) -> list[GateResult]:
         raise error
 
-    (result,) = run_guarded(RunContext(cfg=so101_cfg), "batch", gate)
+    results: list[GateResult] = []
+    run_guarded(RunContext(cfg=so101_cfg), "batch", gate, results.append)
+    (result,) = results
     assert result.status is Status.failed
     assert result.reason.startswith(f"out of memory ({error}). Run fewer worlds")

@@ -41,7 +41,7 @@ HOMES = {
     "omegaconf": ("config/", "cli.py", "jobs/"),
     "matplotlib": ("report/",),
     "imageio_ffmpeg": ("report/picture.py",),
-    "pynvml": ("bench/power.py",),
+    "pynvml": ("bench/timing.py",),
     "gymnasium": ("adapters/",),
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),

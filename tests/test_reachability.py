@@ -478,7 +478,8 @@ def test_the_job_leaves_a_map(
     share = np.mean([row["grasp_reached"] == "1" for row in rows])
     assert gates["grasp"]["metrics"]["reached_fraction"] == pytest.approx(share)
     text = (tmp_path / "reachability.md").read_text()
-    assert "| red | (" in text
+    assert "| red | " in text
+    assert "the largest square is " in text
     assert "![reachability.png](reachability.png)" in text
     assert (tmp_path / "reachability.png").stat().st_size > 10_000
     assert "largest square" in capsys.readouterr().out

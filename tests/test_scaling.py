@@ -525,10 +525,10 @@ def test_table_shows_gaps() -> None:
         "mjwarp",
         status=PASS,
         **{"physics.ms_per_batched_step.median": 1.376, "episode.bare_ratio.median": 1.02},
-        **{"physics.gpu_memory_whole_gpu_mib": 5.0, "episode.gpu_memory_whole_gpu_mib": 7.0},
+        **{"env_step.gpu_memory_whole_gpu_mib": 7.0},
     )
     bad = new_row(4096, "mjwarp", status="out of memory", reason="a | b")
     lines = scaling_table([good, bad]).to_markdown()
-    assert lines[2].startswith("| 2,048 | mjwarp | - | 1.376 |")
-    assert "| 1.020 | 7 |" in lines[2]
-    assert lines[3].endswith("| out of memory: a \\| b |")
+    assert lines[2].startswith("| 2048 | mjwarp | - | 1.376 |")
+    assert "| 1.02 | 7 |" in lines[2]
+    assert lines[3].endswith("| out of memory | a \\| b |")

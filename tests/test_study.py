@@ -78,7 +78,7 @@ def test_native_study(tmp_path: Path) -> None:
     assert {gate["name"]: gate["status"] for gate in found["gates"]}["iterations_100"] == "skip"
     text = (tmp_path / "study.md").read_text()
     assert "| iterations_5 | iterations=5 |" in text
-    assert "0 of 2" in text
+    assert "| 2 | 0 |" in text
     assert "does not tell which worlds stopped" in text
     assert (tmp_path / "study.png").stat().st_size > 10_000
     assert "![study.png](study.png)" in text

@@ -15,10 +15,9 @@ import torch
 from compositions import load_config
 from environments import at_double_speed
 
-from mjstack.bench import cli, env_step, episode, physics, power
+from mjstack.bench import cli, env_step, episode, physics, timing
 from mjstack.bench.env_step import measure_env_step
-from mjstack.bench.power import EnergyMeter
-from mjstack.bench.timing import Measurement, steps_that_fit, timed
+from mjstack.bench.timing import EnergyMeter, Measurement, steps_that_fit, timed
 from mjstack.config.schema import Config, GraphMode
 from mjstack.envs import Env, build_env
 from mjstack.episodes.context import RunContext
@@ -53,8 +52,7 @@ def speeds(result: GateResult, measurement: str = "") -> list[str]:
 
 def test_rates_are_arithmetic() -> None:
     measured = Measurement(name="m")
-    measured.add_rates([2.0, 0.5, 1.0], 4, 5, decimation=10)
-    measured.add_env_rates([2.0, 0.5, 1.0], 4, 5)
+    measured.add_rates([2.0, 0.5, 1.0], 4, 5, 10, whole=True)
     metrics = measured.metrics()
     expected = {
         "ms_per_batched_step": (20.0, 10.0, 40.0),
@@ -450,14 +448,14 @@ class FakeNvml:
 
 def meter(monkeypatch: pytest.MonkeyPatch, nvml: FakeNvml | None) -> EnergyMeter:
     monkeypatch.setitem(sys.modules, "pynvml", nvml)  # None: an import error
-    monkeypatch.setattr(power, "cuda_uuid", lambda _: "GPU-1")
+    monkeypatch.setattr(timing, "cuda_uuid", lambda _: "GPU-1")
     return EnergyMeter("cuda:0")
 
 
 def test_energy_is_that_of_the_stretches_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """What passes between them, 500 J and a minute, does not count."""
     clock = iter([10.0, 14.0, 74.0, 80.0])
-    monkeypatch.setattr(power.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: next(clock))
     nvml = FakeNvml()
     energy = meter(monkeypatch, nvml)
     for _ in range(2):
@@ -492,7 +490,7 @@ def test_the_meter_sees_an_episodes_replayed_steps(new_context: Callable[..., Ru
         start=lambda: seen.append(int(sim.step_count[0])),
         stop=lambda: seen.append(int(sim.step_count[0])),
     )
-    context.play(sim, context.cfg.reset, [power.EnergyObserver(energy)])
+    context.play(sim, context.cfg.reset, [timing.EnergyObserver(energy)])
     assert seen == [20, 6000]  # not the two steps that warm up and are captured
 
 

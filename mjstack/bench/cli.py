@@ -9,7 +9,6 @@ import numpy as np
 from rich.console import Console
 
 from mjstack.bench import env_step, ik, physics
-from mjstack.bench.timing import Measurement
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import build_env
@@ -134,17 +133,25 @@ def _ik(args: argparse.Namespace, cfg: Config, progress: Progress) -> Table:
                 repetitions=args.repetitions,
             )
         )
-    columns: dict[str, Callable[[Measurement], str]] = {
-        "worlds": lambda r: f"{r.facts['nworld']:,}",
-        "iterations": lambda r: str(r.facts["iterations"]),
-        "block": lambda r: str(r.facts["block_dim"]),
-        "eager, ms": lambda r: _spread(r.samples["eager_ms"]),
-        "in a graph, ms": lambda r: _spread(r.samples.get("graph_ms")),
-        "within 0.5 mm": lambda r: f"{100.0 * r.facts['reached']:.2f} %",
-        "gains": lambda r: f"{ik.GAIN if r.facts['gained'] else 0.0}",
+    rows = [
+        {
+            **result.facts,
+            "eager": _spread(result.samples["eager_ms"]),
+            "graph": _spread(result.samples.get("graph_ms")),
+            "gain": ik.GAIN if result.facts["gained"] else 0.0,
+        }
+        for result in results
+    ]
+    columns = {
+        "worlds": "nworld",
+        "iterations": "iterations",
+        "block": "block_dim",
+        "eager, ms": "eager",
+        "in a graph, ms": "graph",
+        "share within 0.5 mm": "reached",
+        "gains": "gain",
     }
-    title = f"BatchedIk.solve: {cfg.robot.title}, {device}"
-    return Table.of(title, columns, results)
+    return Table.of(f"BatchedIk.solve: {cfg.robot.title}, {device}", columns, rows)
 
 
 def _spread(values: list[float] | None) -> str:

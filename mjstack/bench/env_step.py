@@ -20,9 +20,9 @@ from functools import partial
 
 import torch
 
-from mjstack.bench.power import EnergyMeter
 from mjstack.bench.timing import (
     WARM_UP,
+    EnergyMeter,
     Measurement,
     describe_lost,
     lost_worlds,
@@ -86,8 +86,7 @@ def measure_env_step(
     # The result
     out = Measurement(name="env_step")
     whole = [env_seconds for env_seconds, _, _ in times]
-    out.add_env_rates(whole, env.nworld, steps)
-    out.add_rates(whole, env.nworld, steps, decimation=decimation)
+    out.add_rates(whole, env.nworld, steps, decimation, whole=True)
     ms = 1e3 / steps
     out.samples |= {
         "physics_ms_per_step": [ms * p for _, p, _ in times],
@@ -170,7 +169,7 @@ class _Parts:
         # The whole step
         restore(sim, start)
         env.read_statistics()
-        whole = timed(sim, lambda: self._whole(actions, targets), meter)
+        whole = timed(sim, partial(self._whole, actions, targets), meter)
         counted = env.read_statistics()
         self._find_losses(counted)
         end = snapshot(sim)

@@ -5,9 +5,10 @@ import statistics
 import time
 from typing import TYPE_CHECKING, cast
 
-from mjstack.bench.power import EnergyMeter, EnergyObserver
 from mjstack.bench.timing import (
     WARM_UP,
+    EnergyMeter,
+    EnergyObserver,
     Measurement,
     lost_worlds,
 )
@@ -85,8 +86,7 @@ def measure_episode(
     timings = [p.timing for p in played]
     times = [timing.seconds for timing in timings]
     out.samples = {"seconds": times, **out.samples}
-    out.add_rates(times, sim.nworld, steps, decimation=cfg.timing.decimation)
-    out.add_env_rates(times, sim.nworld, steps)
+    out.add_rates(times, sim.nworld, steps, cfg.timing.decimation, whole=True)
     out.facts = {
         "repetitions": len(played),
         "of_the_batch_gate": sum(p is before for p in played),
@@ -101,8 +101,6 @@ def measure_episode(
         out.headline += f" ({out.median('bare_ratio'):.3f} x bare steps)"
     elif mjwarp:
         out.notes["bare_ratio"] = "not measured: no time for an episode and as many bare steps"
-    if "controller_over_step" in out.samples:
-        out.headline += f", controller {100.0 * out.median('controller_over_step'):+.1f} %"
     if failed:
         out.rejected = True
         out.problem = f"{name_worlds(failed, sim.nworld)} failed the check"
@@ -150,29 +148,20 @@ def play_bare(
 def _play(
     context: RunContext, sim: Simulation, meter: EnergyMeter, out: Measurement
 ) -> TimedEpisode:
-    """Play one repetition: the episode, on MJWarp the bare steps, and the commands again.
+    """Play one repetition: the episode and, on MJWarp, the bare steps.
 
-    Joint trajectories can be evaluated again; the commands of a driver with feedback are recorded,
-    and repeated without it. Both episodes record, so that they differ by the driver alone.
+    Joint trajectories can be evaluated again; the commands of a driver with feedback are recorded.
     """
     cfg = context.cfg
-    keep = sim.backend == "mjwarp" and cfg.controller.name == CLOSED_LOOP
+    mjwarp = sim.backend == "mjwarp"
     commands = CommandRecorder()
+    keep = mjwarp and cfg.controller.name == CLOSED_LOOP
     recorders: list[Observer] = [commands] if keep else []
     episode = context.play(sim, cfg.reset, [*recorders, EnergyObserver(meter)])
-    seconds = episode.timing.seconds
-    timed = TimedEpisode.of(episode, sim)
-    samples: dict[str, float] = {}
-    if sim.backend == "mjwarp":
+    if mjwarp:
         recorded = commands.recorded if keep else None
         bare, problem = play_bare(context, cast("MjwarpSimulation", sim), recorded)
         out.problem = out.problem or problem
-        samples |= {"bare_seconds": bare, "bare_ratio": seconds / bare}
-    if keep:
-        again = context.play(sim, cfg.reset, [CommandRecorder()], repeat=commands.recorded)
-        if lost := int((again.result.failed != 0).sum()):
-            out.problem = out.problem or f"{lost} worlds failed when their commands were repeated"
-        samples["controller_over_step"] = seconds / again.timing.seconds - 1.0
-    for name, value in samples.items():
-        out.samples.setdefault(name, []).append(value)
-    return timed
+        out.samples.setdefault("bare_seconds", []).append(bare)
+        out.samples.setdefault("bare_ratio", []).append(episode.timing.seconds / bare)
+    return TimedEpisode.of(episode, sim)

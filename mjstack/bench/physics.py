@@ -6,9 +6,9 @@ from functools import partial
 import numpy as np
 import torch
 
-from mjstack.bench.power import EnergyMeter
 from mjstack.bench.timing import (
     WARM_UP,
+    EnergyMeter,
     Measurement,
     describe_lost,
     lost_worlds,
@@ -106,7 +106,7 @@ def measure_physics(
 
     # The result
     graph = sim.graph_of(held.decimation)
-    out.add_rates(times, sim.nworld, steps, decimation=held.decimation)
+    out.add_rates(times, sim.nworld, steps, held.decimation)
     out.facts |= {
         "steps_per_repetition": steps,
         "repetitions": repetitions,

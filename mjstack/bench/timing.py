@@ -1,19 +1,117 @@
-"""Wall time of work on a simulation, and the repetitions of a measurement."""
+"""Wall time and energy of work on a simulation, and the repetitions of a measurement."""
 
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 import torch
 
-from mjstack.bench.power import EnergyMeter
 from mjstack.config.schema import Config, GraphMode
+from mjstack.drivers.driver import Driver
+from mjstack.envs import Env
+from mjstack.episodes.rollout import Observer
 from mjstack.math import not_finite
-from mjstack.sim import LOST_PHYSICS, Simulation, device_memory
+from mjstack.sim import LOST_PHYSICS, Simulation, cuda_uuid, device_memory
 
 WARM_UP = 3  # calls: eager, captured, replayed
+_EAGER = 2  # steps: the warm-up, and the one that is captured
+SHORTEST = 0.5  # s, of a stretch of work on average: the counter moves some ten times a second
+
+
+class EnergyMeter:
+    """Adds up what the GPU's energy counter moves from `start` to `stop`. It counts the whole GPU,
+    for every process on it.
+
+    Attributes:
+        reason: Why there is no figure; empty where there is one.
+    """
+
+    def __init__(self, device: str) -> None:
+        """Open the counter.
+
+        Args:
+            device: ``cpu`` or ``cuda:N``.
+        """
+        self._counter: Callable[[], float] = lambda: 0.0  # [mJ]
+        self._began = self._first = 0.0
+        self.clear()
+        self.reason = ""
+        self._cpu = device == "cpu"
+        if self._cpu:
+            return
+        try:
+            import pynvml
+
+            pynvml.nvmlInit()
+            handle = pynvml.nvmlDeviceGetHandleByUUID(cuda_uuid(device))
+            pynvml.nvmlDeviceGetTotalEnergyConsumption(handle)
+        except ImportError:
+            self.reason = "nvidia-ml-py is not installed: pip install 'mjstack[gpu]'"
+        except pynvml.NVMLError as error:  # a part of a GPU, or an old one, has no counter
+            self.reason = f"NVML: {error}"
+        else:
+            self._counter = partial(pynvml.nvmlDeviceGetTotalEnergyConsumption, handle)
+
+    def clear(self) -> None:
+        """Clear what was added up."""
+        self._joules = self._seconds = 0.0
+        self._stretches = 0
+
+    def start(self) -> None:
+        """Begin a stretch of work, the device idle."""
+        self._first = self._counter()
+        self._began = time.perf_counter()
+
+    def stop(self) -> None:
+        """End it, the device idle again, and add it."""
+        self._seconds += time.perf_counter() - self._began
+        self._joules += 1e-3 * (self._counter() - self._first)
+        self._stretches += 1
+
+    @property
+    def missing(self) -> str:
+        """Why there is no figure; empty where there is one, and on a CPU."""
+        each = self._seconds / max(self._stretches, 1)
+        if self._cpu or self.reason or each >= SHORTEST:
+            return self.reason
+        return f"stretches of {each:.2g} s are too short for NVML's counter"
+
+    def metrics(self) -> dict[str, float]:
+        """Energy and mean power of the stretches; nothing where they are missing."""
+        if self._cpu or self.missing:
+            return {}
+        return {"gpu_power_mean_w": self._joules / self._seconds, "gpu_energy_j": self._joules}
+
+    def notes(self) -> dict[str, str]:
+        """Why they are missing."""
+        return {"gpu_power_mean_w": f"not measured: {self.missing}"} if self.missing else {}
+
+
+class EnergyObserver(Observer):
+    """Measures the energy of a rollout's steps from the third on, when all are replayed."""
+
+    def __init__(self, meter: EnergyMeter) -> None:
+        """``meter`` adds it up."""
+        self._meter = meter
+
+    def start(self, env: Env, driver: Driver) -> None:
+        """See `Observer`."""
+        self._sim = env.sim
+
+    def after_step(self, step: int) -> None:
+        """See `Observer`."""
+        if step == _EAGER - 1:
+            self._sim.synchronize()
+            reading = time.perf_counter()
+            self._meter.start()
+            self.aside = time.perf_counter() - reading
+
+    def finish(self) -> None:
+        """See `Observer`."""
+        self._meter.stop()
 
 
 class Captured(Protocol):
@@ -58,27 +156,24 @@ class Measurement:
         """Median of a figure's repetitions."""
         return statistics.median(self.samples[sample])
 
-    def add_rates(self, seconds: list[float], nworld: int, steps: int, *, decimation: int) -> None:
-        """Add time and rate per physics step.
+    def add_rates(
+        self, seconds: list[float], nworld: int, steps: int, decimation: int, *, whole: bool = False
+    ) -> None:
+        """Add time and rate per physics step and, where whole steps were timed, per control step.
 
         Args:
             seconds: Wall time of each repetition [s].
             nworld: Number of worlds.
             steps: Control steps in a repetition.
             decimation: Physics steps in one of them.
+            whole: Whether the control steps were whole ones.
         """
-        count = steps * decimation
-        self.samples |= {
-            "ms_per_batched_step": [1e3 * s / count for s in seconds],
-            "world_steps_per_s": [nworld * count / s for s in seconds],
-        }
-
-    def add_env_rates(self, seconds: list[float], nworld: int, steps: int) -> None:
-        """Add time and rate per control step; the arguments are those of `add_rates`."""
-        self.samples |= {
-            "ms_per_env_step": [1e3 * s / steps for s in seconds],
-            "env_steps_per_s": [nworld * steps / s for s in seconds],
-        }
+        counts = {("ms_per_batched_step", "world_steps_per_s"): steps * decimation}
+        if whole:
+            counts["ms_per_env_step", "env_steps_per_s"] = steps
+        for (ms, rate), count in counts.items():
+            self.samples[ms] = [1e3 * s / count for s in seconds]
+            self.samples[rate] = [nworld * count / s for s in seconds]
 
     def add_resources(self, sim: Simulation, meter: EnergyMeter | None) -> None:
         """Add the energy of the repetitions, and the memory that is taken on the GPU."""

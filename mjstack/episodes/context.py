@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import Backend, Config
-from mjstack.drivers.driver import Driver, Recorded
+from mjstack.drivers.driver import Driver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env
 from mjstack.episodes.observers import (
@@ -263,7 +263,6 @@ class RunContext:
         *,
         seed: int | None = None,
         worlds: Sequence[int] | None = None,
-        repeat: Recorded | None = None,
     ) -> Episode:
         """Roll out one judged episode.
 
@@ -273,11 +272,9 @@ class RunContext:
             observers: Look on.
             seed: Seed, if not the configured one.
             worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start_worlds`.
-            repeat: Commands to repeat, instead of the configured driver's.
         """
         env = self.start(sim, reset, seed=seed, worlds=worlds)
-        driver = self.driver(env) if repeat is None else repeat.rewind()
-        return play_episode(env, driver, observers, advance=self.advance)
+        return play_episode(env, self.driver(env), observers, advance=self.advance)
 
     def batch_simulation(self, nworld: int) -> Simulation:
         """Worlds on the backend of the batch."""

@@ -15,7 +15,7 @@ from mjstack.episodes.record import PICTURE, REGIONS
 from mjstack.episodes.tally import EpisodeTally, rate_cells
 from mjstack.files import to_csv, write_atomic
 from mjstack.math import wilson_interval
-from mjstack.report.success import save_places
+from mjstack.report.picture import save_places
 from mjstack.report.table import Table
 from mjstack.report.write import safely_draw
 

@@ -18,7 +18,7 @@ from mjstack.envs.buffers import (
     require_physics,
 )
 from mjstack.episodes.rollout import Reset
-from mjstack.sim import BatchSizes, Simulation, device_memory
+from mjstack.sim import BatchSizes, Simulation
 
 if TYPE_CHECKING:
     from mjstack.episodes.context import RunContext
@@ -34,8 +34,6 @@ class Workload:
         final: State at the end, shape ``(nworld, nq)``.
         failed: Bits of the rules that each world broke, shape ``(nworld,)``; zero for random
             actions, which nothing judges.
-        memory: Bytes of MJWarp's arrays (``data``), and of the CUDA device for these worlds, model
-            included (``device``); None where there are none.
         description: Backend and hardware.
     """
 
@@ -43,7 +41,6 @@ class Workload:
     sizes: BatchSizes | None
     final: np.ndarray
     failed: np.ndarray
-    memory: dict[str, int | None]
     description: str
 
     @property
@@ -130,27 +127,15 @@ def _play(
 ) -> Workload:
     """Build worlds, play in them, and read what there is to know before they go."""
     backend, device = context.backend
-    before = _used_bytes(device)
+    gc.collect()  # the worlds of the run before, for whose memory these may have no room
     sim = context.simulation(measuring_worlds(context), backend, device, reset=reset, sizes=sizes)
     failed = play(sim)
-    after = _used_bytes(device)
     workload = Workload(
         peaks=read_peaks(sim),
         sizes=sizes,
         final=sim.qpos.cpu().numpy().copy(),
         failed=failed,
-        memory={
-            "data": sim.memory_bytes(),
-            "device": None if before is None or after is None else after - before,
-        },
         description=sim.description,
     )
     sim.close()
     return workload
-
-
-def _used_bytes(device: str) -> int | None:
-    """Memory of a CUDA device that is in use; None elsewhere."""
-    gc.collect()  # the worlds of the run before
-    memory = device_memory(device)
-    return None if memory is None else memory[0]

@@ -142,20 +142,20 @@ def _group(
 
 def _try(context: RunContext, group: _Group, result: GateResult) -> list[str]:
     """Play the workloads again at exactly the recommended sizes, on MJWarp; return the problems."""
-    cfg = context.cfg
     exact = not context.backend[1].startswith("cuda")
-    starts = {"task": cfg.reset, "randomized": cfg.gate.capacity.reset}
+    starts = {"task": context.cfg.reset, "randomized": context.cfg.gate.capacity.reset}
     problems = []
     for name, first in reversed(group.runs.items()):
         if first.sizes is None or group.lost:
             continue
-        if name in starts:
-            again = play_task(context, starts[name], group.wanted)
-        else:
-            again = play_random(context, group.wanted)
-        problem = _compare(name, first, again, result, judged=name in starts, exact=exact)
-        problems += [problem] if problem else []
-    return problems
+        judged = name in starts
+        again = (
+            play_task(context, starts[name], group.wanted)
+            if judged
+            else play_random(context, group.wanted)
+        )
+        problems.append(_compare(name, first, again, result, judged=judged, exact=exact))
+    return list(filter(None, problems))
 
 
 def _compare(
@@ -196,10 +196,6 @@ def _compare(
         metrics["same_final_state"] = not moved
     result.metrics |= {f"rerun.{name}.{key}": value for key, value in metrics.items()}
     result.notes[f"rerun.{name}.sizes"] = sizes
-    for part, run in (("measuring", first), ("rerun", again)):
-        for what, size in run.memory.items():
-            if size is not None:
-                result.metrics[f"memory.{name}.{part}.{what}_mb"] = size / 1e6
 
     # Problems
     at = f"{name} at {sizes}"
@@ -277,33 +273,18 @@ def _shortages(cfg: Config, group: _Group) -> list[tuple[tuple[str, ...], str]]:
     if sizes.naccdmax is not None:
         convex = f"naccdmax={wanted.convex_pool(n)}"
     pool = ("nconmax", "naconmax")
+    convex_keys = ("nccdmax", "naccdmax", *pool)
+    # Buffer, keys, room of a world, most needed, worlds that need more, and the remedy
+    crowded = peaks.contacts > room
+    rows = peaks.rows.max()
     pairs = (peaks.pool_ccd_pairs or 0) / peaks.nworld
-    # By buffer: keys, room of a world, most needed, worlds that need more, and the remedy
-    buffers: dict[str, tuple[tuple[str, ...], float, float, np.ndarray, str]] = {
-        "njmax": (
-            ("njmax",),
-            sizes.njmax,
-            peaks.rows.max(),
-            peaks.rows > sizes.njmax,
-            f"njmax={wanted.njmax}",
-        ),
-        "contact pool": (
-            pool,
-            room,
-            peaks.pool / peaks.nworld,
-            peaks.contacts > room,
-            contacts,
-        ),
-        "convex pairs": (
-            ("nccdmax", "naccdmax", *pool),
-            sizes.convex_pool(n) / n,
-            pairs,
-            np.zeros(0),
-            convex,
-        ),
-    }
+    buffers: list[tuple[str, tuple[str, ...], float, float, np.ndarray, str]] = [
+        ("njmax", ("njmax",), sizes.njmax, rows, peaks.rows > sizes.njmax, f"njmax={wanted.njmax}"),
+        ("contact pool", pool, room, peaks.pool / peaks.nworld, crowded, contacts),
+        ("convex pairs", convex_keys, sizes.convex_pool(n) / n, pairs, np.zeros(0), convex),
+    ]
     out = []
-    for name, (keys, there, need, over, fix) in buffers.items():
+    for name, keys, there, need, over, fix in buffers:
         if need > there:
             worlds = np.flatnonzero(over).tolist()
             where = f" in {name_worlds(worlds, peaks.nworld)}" if worlds else ""

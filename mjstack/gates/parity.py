@@ -1,7 +1,6 @@
 """Gate *parity*: MJWarp against native MuJoCo, one world."""
 
 import math
-from dataclasses import dataclass, field
 
 import torch
 
@@ -15,107 +14,98 @@ from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation, describe_overflow
 
 
-@dataclass(slots=True)
-class _Findings:
-    """What the comparisons add to the gate's result."""
-
-    metrics: dict[str, float] = field(default_factory=dict)
-    thresholds: dict[str, float] = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
-    details: list[str] = field(default_factory=list)
-
-
 @needs_episode
 def run_parity(context: RunContext) -> list[GateResult]:
     """Compare steps from equal states, the options of each backend, and the whole task."""
     cfg = context.cfg
-    reference = context.nominal
     mjwarp = context.parity_simulation()
-    found = _Findings(thresholds=context.check.thresholds())
-    _compare_states(context, mjwarp, found)
-    for option, (asked, held, uploaded, equal) in compare_options(
-        cfg, reference.sim, mjwarp
-    ).items():
+    result = GateResult(
+        name="parity",
+        status=Status.passed,
+        thresholds=context.check.thresholds(),
+        notes={"backend": mjwarp.description},
+    )
+    problems = _compare_states(context, mjwarp, result)
+    options = compare_options(cfg, context.nominal.sim, mjwarp)
+    for option, (asked, held, uploaded, equal) in options.items():
         line = f"option {option}: requested {asked}, native {held}, uploaded {uploaded}"
-        found.details.append(line)
-        if not equal:
-            found.problems.append(line)
+        result.details.append(line)
+        problems += [] if equal else [line]
 
     world = WorldRecorder()
     episode = context.play(mjwarp, NOMINAL, [*context.viewers, world])
     status, reason, judged = judge_one(context.check.rules, episode.result)
     if status is Status.failed:
-        found.problems.append(reason)
+        problems.append(reason)
     if int(mjwarp.overflow[0]):
-        found.problems.append(
+        problems.append(
             f"{describe_overflow(int(mjwarp.overflow[0]))} overflow: raise batch.njmax or"
             " batch.nconmax"
         )
     limits = mjwarp.solver_limits
-    found.metrics |= judged | {
+    result.metrics |= judged | {
         "peak_contacts": int(mjwarp.peak_contacts[0]),
         "peak_constraint_rows": int(mjwarp.peak_constraints[0]),
         "solver_limit_hit": bool(limits is not None and int(limits[0])),
         "episode_s": episode.timing.seconds,
     }
-    distance = _compare_ends(context, world, reference.world, found)
+    problems += _compare_ends(context, world, result)
 
     headline = context.check.headline(judged)
     context.say(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
     context.artifacts.shown = world
     context.artifacts.shown_by = "parity world"
     mjwarp.close()
-    return [
-        GateResult(
-            name="parity",
-            status=Status.failed if found.problems else Status.passed,
-            reason="; ".join(found.problems)
-            or f"{headline}; objects end at most {1e3 * distance:.2f} mm from native's",
-            thresholds=found.thresholds,
-            metrics=found.metrics,
-            notes={"backend": mjwarp.description},
-            details=found.details,
-        )
-    ]
+    ends = [f"final.{name}.position_m" for name in context.index.objects]
+    apart = max((result.metrics[end] for end in ends), default=0.0)
+    good = f"{headline}; objects end at most {1e3 * apart:.2f} mm from native's"
+    result.reason = "; ".join(problems) or good
+    result.status = Status.failed if problems else Status.passed
+    return [result]
 
 
-def _compare_states(context: RunContext, mjwarp: Simulation, found: _Findings) -> None:
-    """Steps of both backends from the same states of the reference episode."""
+def _compare_states(context: RunContext, mjwarp: Simulation, result: GateResult) -> list[str]:
+    """Steps of both backends from the same states of the reference episode; returns the
+    problems.
+    """
     limits = context.cfg.gate.parity
-    native = context.nominal.sim
+    problems = []
     for name, phase in limits.states.items():
         state = context.nominal.states[context.phase_end(phase)]
         for steps, largest in ((1, limits.step1), (50, limits.step50)):
-            apart = compare_steps(native, mjwarp, state, steps)
-            for field_name, limit in largest.items():
-                found.metrics[f"{name}.step{steps}.{field_name}"] = apart[field_name]
-                found.thresholds[f"step{steps}.{field_name}"] = limit
-                if not apart[field_name] <= limit:
-                    found.problems.append(
-                        f"{name}, {steps} steps: {field_name} differs by {apart[field_name]:.2g},"
+            apart = compare_steps(context.nominal.sim, mjwarp, state, steps)
+            for field, limit in largest.items():
+                result.metrics[f"{name}.step{steps}.{field}"] = apart[field]
+                result.thresholds[f"step{steps}.{field}"] = limit
+                if not apart[field] <= limit:
+                    problems.append(
+                        f"{name}, {steps} steps: {field} differs by {apart[field]:.2g},"
                         f" limit {limit:.2g}"
                     )
+    return problems
 
 
-def _compare_ends(
-    context: RunContext, ours: WorldRecorder, theirs: WorldRecorder, found: _Findings
-) -> float:
-    """Poses of all objects at the end of the task; returns the largest distance [m]."""
+def _compare_ends(context: RunContext, world: WorldRecorder, result: GateResult) -> list[str]:
+    """Poses of all objects at the end of the task; returns the problems."""
     limits = context.cfg.gate.parity
-    found.thresholds["final.position_m"] = limits.object_position
-    found.thresholds["final.rotation_deg"] = limits.object_rotation_deg
-    distances = [0.0]
+    far = limits.object_position
+    turned = limits.object_rotation_deg
+    result.thresholds |= {"final.position_m": far, "final.rotation_deg": turned}
+    problems = []
     for name, (address, _) in context.index.objects.items():
-        a, b = (torch.from_numpy(world.qpos[-1, address : address + 7]) for world in (ours, theirs))
-        distances.append(float((a[:3] - b[:3]).norm()))
+        a, b = (
+            torch.from_numpy(one.qpos[-1, address : address + 7])
+            for one in (world, context.nominal.world)
+        )
+        distance = float((a[:3] - b[:3]).norm())
         angle = math.degrees(float(quat_angle(a[3:], b[3:])))
-        found.metrics[f"final.{name}.position_m"] = distances[-1]
-        found.metrics[f"final.{name}.rotation_deg"] = angle
-        if not (distances[-1] <= limits.object_position and angle <= limits.object_rotation_deg):
-            found.problems.append(
-                f"{name} ends {1e3 * distances[-1]:.2f} mm and {angle:.2f} deg from native's"
+        result.metrics[f"final.{name}.position_m"] = distance
+        result.metrics[f"final.{name}.rotation_deg"] = angle
+        if not (distance <= far and angle <= turned):
+            problems.append(
+                f"{name} ends {1e3 * distance:.2f} mm and {angle:.2f} deg from native's"
             )
-    return max(distances)
+    return problems
 
 
 def compare_steps(

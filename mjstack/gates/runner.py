@@ -40,35 +40,25 @@ def find_gates(cfg: Config) -> dict[str, Gate]:
 
 
 def run_gates(
-    context: RunContext,
-    on_start: Callable[[str], None] = lambda _: None,
-    on_result: Callable[[GateResult], None] = lambda _: None,
-) -> list[GateResult]:
-    """Runs the gates that the configuration names, each once, in the order of
-    ``cfg.gate``.
+    context: RunContext, on_start: Callable[[str], None], on_result: Callable[[GateResult], None]
+) -> None:
+    """Runs the gates that the configuration names, each once, in the order of ``cfg.gate``.
+
+    One that raises has failed, with the error as its reason; the others still run.
 
     Args:
         context: What they need. Its ``results`` fill up.
         on_start: Told before a gate starts.
         on_result: Told after each result, before the next gate starts.
-
-    Returns:
-        All results. A gate that raises has failed, with the error as its reason; the others still
-        run.
     """
-    out: list[GateResult] = []
     for name, run in find_gates(context.cfg).items():
         on_start(name)
-        out += run_guarded(context, name, run, on_result)
-    return out
+        run_guarded(context, name, run, on_result)
 
 
 def run_guarded(
-    context: RunContext,
-    name: str,
-    run: Gate,
-    on_result: Callable[[GateResult], None] = lambda _: None,
-) -> list[GateResult]:
+    context: RunContext, name: str, run: Gate, on_result: Callable[[GateResult], None]
+) -> None:
     """Runs one gate, or whatever judges like one. If it raises it has failed, with the error as its
     reason.
     """
@@ -85,7 +75,6 @@ def run_guarded(
             result.seconds = seconds
         context.artifacts.results[result.name] = result
         on_result(result)
-    return results
 
 
 def describe_error(error: Exception) -> str:

@@ -2,7 +2,6 @@
 fails.
 """
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,8 +20,6 @@ from mjstack.errors import MjstackError
 from mjstack.mdp.starts.starts_file import write_starts
 from mjstack.report.markdown import format_percent
 from mjstack.report.record import GateResult, Status
-
-log = logging.getLogger(__name__)
 
 
 def success_config(cfg: Config) -> Config:
@@ -44,16 +41,14 @@ def run_success(context: RunContext) -> list[GateResult]:
     own = context.with_config(success_config(context.cfg))
     cfg = own.cfg
     t = cfg.gate.success
-    unwritten: list[str] = []
     tally = play_seeds(
         own,
         "success",
         count=t.seeds,
         noun="episodes",
         circumstances=True,
-        observers=lambda seed: _starts_writers(own, seed, unwritten),
+        observers=lambda seed: _starts_writers(own, seed),
     )
-    tally.details = unwritten + tally.details
     kept = tally.circumstances
     starts = np.concatenate([seed.start_places for seed in kept])
     retries = np.concatenate([seed.retries for seed in kept])
@@ -76,19 +71,17 @@ def run_success(context: RunContext) -> list[GateResult]:
         "episode_s": tally.seconds,
     }
     reads = reads_starts_file(cfg.reset)
-    tally.notes["starts"] = f"starts={cfg.starts}" if reads else _describe_start(cfg)
+    tally.notes["starts"] = (
+        f"starts={cfg.starts}" if reads else f"gate.success.reset ({', '.join(cfg.reset)})"
+    )
 
     parts = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
     if retried.any():
         parts.append(f"{retried.sum()} retried, {(retried & succeeded).sum()} of them succeeded")
     parts += [tally.failures] if tally.failed else []
-    if not regions:
-        tally.details.append(
-            f"no region has {t.cell_episodes} episodes (gate.success.cell_episodes): more seeds"
-            " have more"
-        )
-    elif all(region.succeeded == region.episodes for region in regions):
-        tally.details.append(f"no region of at least {t.cell_episodes} episodes had a failure")
+    if all(region.succeeded == region.episodes for region in regions):
+        there = "had a failure" if regions else "(gate.success.cell_episodes): more seeds have more"
+        tally.details.append(f"no region of at least {t.cell_episodes} episodes {there}")
     tally.details += save_regions(own, regions, starts, tally)
     context.artifacts.pictures += own.artifacts.pictures
     good = metrics["success_rate"] >= t.rate and not tally.problems
@@ -109,39 +102,24 @@ def run_success(context: RunContext) -> list[GateResult]:
 class _StartsWriter(Observer):
     """Writes how worlds start into a file."""
 
-    def __init__(self, path: Path, unwritten: list[str]) -> None:
-        """``unwritten`` gets the problem if the file cannot be written."""
+    def __init__(self, path: Path, context: RunContext) -> None:
+        """``context`` is told if the file cannot be written."""
         self._path = path
-        self._unwritten = unwritten
+        self._context = context
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         try:
             write_starts(env, self._path)
         except MjstackError as error:  # a full disk, say: the episodes are played all the same
-            log.error("no %s: %s", self._path, error)
-            self._unwritten.append(
-                f"seed {env.seed}: {self._path.name} could not be written: {error}"
-            )
+            self._context.say(f"no {self._path.name}: {error}")
 
 
-def _starts_writers(context: RunContext, seed: int, unwritten: list[str]) -> list[Observer]:
+def _starts_writers(context: RunContext, seed: int) -> list[Observer]:
     """The writer of a seed's starts; none if the worlds start from that very file."""
     if context.folder is None:
         return []
     path = context.folder / starts_name(seed)
     starts = context.cfg.starts
-    if starts is not None and path.resolve() == Path(starts).resolve():
-        return []
-    return [_StartsWriter(path, unwritten)]
-
-
-def _describe_start(cfg: Config) -> str:
-    """How worlds start, in a few words."""
-    regions = [
-        term.params["xy"]
-        for term in cfg.reset.values()
-        if places_objects(term) and "xy" in term.params
-    ]
-    where = "".join(f", objects within {x:g} x {y:g} m of their places" for x, y in regions)
-    return f"gate.success.reset ({', '.join(cfg.reset)}{where})"
+    own = starts is not None and path.resolve() == Path(starts).resolve()
+    return [] if own else [_StartsWriter(path, context)]

@@ -2,19 +2,15 @@
 
 import gc
 import os
-import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
 
 import torch
 
 from mjstack.bench.env_step import measure_env_step
 from mjstack.bench.episode import measure_episode
 from mjstack.bench.physics import measure_physics
-from mjstack.bench.power import EnergyMeter
-from mjstack.bench.timing import Measurement
+from mjstack.bench.timing import EnergyMeter, Measurement
 from mjstack.config.schema import Backend
 from mjstack.envs import build_env
 from mjstack.episodes.context import RunContext, lacks_episode
@@ -47,27 +43,6 @@ def run_throughput(context: RunContext) -> list[GateResult]:
     return [native, _measure(context, CUDA, backend, device)]
 
 
-@dataclass(kw_only=True, slots=True)
-class _Bench:
-    """One backend, and the result that its measurements add to.
-
-    Attributes:
-        context: The run.
-        backend: The backend that is measured.
-        device: ``"cpu"`` or ``"cuda:N"``.
-        seconds: Time budget of each measurement [s].
-        meter: Energy of the GPU.
-        result: Gets facts on the machine and the worlds.
-    """
-
-    context: RunContext
-    backend: Backend
-    device: str
-    seconds: float
-    meter: EnergyMeter
-    result: GateResult
-
-
 def _measure(context: RunContext, name: str, backend: Backend, device: str) -> GateResult:
     """Measure one backend. A measurement that breaks leaves the others their figures."""
     cfg = context.cfg
@@ -80,14 +55,7 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
     began = time.perf_counter()
     on_cuda = device.startswith("cuda")
     seconds = t.max_seconds if on_cuda else t.cpu_max_seconds
-    bench = _Bench(
-        context=context,
-        backend=backend,
-        device=device,
-        seconds=seconds,
-        meter=EnergyMeter(device),
-        result=result,
-    )
+    meter = EnergyMeter(device)
     result.metrics = {
         "worlds": cfg.nworld,
         "cpu_count": os.cpu_count() or 1,
@@ -97,11 +65,12 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
     # The measurements
     found: dict[str, Measurement] = {}
     if {"physics", "episode"} & set(t.measurements):
-        found |= _on_driven_worlds(bench)
+        found |= _on_driven_worlds(context, backend, device, result, seconds, meter)
     if "env_step" in t.measurements:
-        found["env_step"] = _guarded("env_step", lambda: _on_environment(bench))
+        found["env_step"] = _guarded(
+            "env_step", _on_environment, context, backend, device, result, seconds, meter
+        )
     if not on_cuda:
-        result.metrics |= _peak_memory()
         result.notes["gpu_power_and_memory"] = "not measured: no GPU"
 
     # Whether they count
@@ -133,9 +102,15 @@ def _describe(one: Measurement, on_cuda: bool) -> str:
     return f"{one.headline} (eager)" if on_cuda and not one.facts["captured"] else one.headline
 
 
-def _on_driven_worlds(bench: _Bench) -> dict[str, Measurement]:
+def _on_driven_worlds(
+    context: RunContext,
+    backend: Backend,
+    device: str,
+    result: GateResult,
+    seconds: float,
+    meter: EnergyMeter,
+) -> dict[str, Measurement]:
     """Measurements *physics* and *episode*, on the same worlds."""
-    context = bench.context
     t = context.cfg.gate.throughput
     wanted = [name for name in ("physics", "episode") if name in t.measurements]
     if lack := lacks_episode(context.cfg):
@@ -143,11 +118,10 @@ def _on_driven_worlds(bench: _Bench) -> dict[str, Measurement]:
     gc.collect()  # environments hold on to their worlds in cycles, and a GPU has not room for all
     began = time.perf_counter()
     try:
-        sim = context.simulation(context.cfg.nworld, bench.backend, bench.device)
+        sim = context.simulation(context.cfg.nworld, backend, device)
     except Exception as error:
         problem = describe_error(error)
         return {name: Measurement(name=name, problem=problem) for name in wanted}
-    result = bench.result
     result.metrics["build_and_compile_s"] = time.perf_counter() - began
     result.notes["backend"] = sim.description
     if (sizes := sim.sizes) is not None:
@@ -157,48 +131,50 @@ def _on_driven_worlds(bench: _Bench) -> dict[str, Measurement]:
             "njmax": sizes.njmax,
         }
         result.notes["sizes_from"] = sizes.source
+    limits = {"seconds": seconds, "repetitions": t.repetitions, "meter": meter}
     found = {}
     step_seconds: float | None = None
-    budget: dict[str, Any] = {
-        "seconds": bench.seconds,
-        "repetitions": t.repetitions,
-        "meter": bench.meter,
-    }
     if "physics" in wanted:
-        found["physics"] = _guarded("physics", lambda: measure_physics(context, sim, **budget))
+        found["physics"] = _guarded("physics", measure_physics, context, sim, **limits)
         if found["physics"].samples:
             step_ms = found["physics"].median("ms_per_batched_step")
             step_seconds = 1e-3 * step_ms * context.cfg.timing.decimation
     if "episode" in wanted:
         found["episode"] = _guarded(
-            "episode", lambda: measure_episode(context, sim, step_seconds=step_seconds, **budget)
+            "episode", measure_episode, context, sim, step_seconds=step_seconds, **limits
         )
     sim.close()
     return found
 
 
-def _on_environment(bench: _Bench) -> Measurement:
+def _on_environment(
+    context: RunContext,
+    backend: Backend,
+    device: str,
+    result: GateResult,
+    seconds: float,
+    meter: EnergyMeter,
+) -> Measurement:
     """Measurement *env_step*, on an environment with room for random actions."""
-    context = bench.context
     t = context.cfg.gate.throughput
     gc.collect()
     began = time.perf_counter()
     env = build_env(
         context.cfg,
         model=context.model,
-        backend=bench.backend,
-        device=bench.device,
+        backend=backend,
+        device=device,
         sizes=context.env_sizes,
     )
     build_seconds = time.perf_counter() - began
-    bench.result.notes.setdefault("backend", env.sim.description)
+    result.notes.setdefault("backend", env.sim.description)
     try:
         found = measure_env_step(
             env,
             steps=t.env_steps,
             repetitions=t.repetitions,
-            max_seconds=bench.seconds,
-            meter=bench.meter,
+            max_seconds=seconds,
+            meter=meter,
             progress=lambda done: context.tell("env.step, repetitions", done, t.repetitions),
         )
         found.facts["build_and_compile_s"] = build_seconds
@@ -209,19 +185,11 @@ def _on_environment(bench: _Bench) -> Measurement:
         env.close()
 
 
-def _guarded(name: str, measure: Callable[[], Measurement]) -> Measurement:
+def _guarded(
+    name: str, measure: Callable[..., Measurement], *args: object, **options: object
+) -> Measurement:
     """A measurement, or the error that broke it as its problem."""
     try:
-        return measure()
+        return measure(*args, **options)
     except Exception as error:
         return Measurement(name=name, problem=describe_error(error).rstrip("."))
-
-
-def _peak_memory() -> dict[str, float]:
-    """The most memory that this process has held so far, where the system tells (not Windows)."""
-    try:
-        import resource
-    except ImportError:
-        return {}
-    unit = 1 if sys.platform == "darwin" else 1024
-    return {"process_peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20}

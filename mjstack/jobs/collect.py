@@ -2,6 +2,7 @@
 as asked for are there.
 """
 
+import json
 import os
 import time
 from contextlib import suppress
@@ -12,18 +13,34 @@ import torch
 
 from mjstack.config.fingerprint import config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
-from mjstack.datasets import DatasetSpec, require_pyarrow
+from mjstack.datasets import DatasetSpec, lerobot, require_pyarrow
 from mjstack.datasets.reader import check_same, lock_folder, read_info
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.context import RunContext, require_episode
 from mjstack.errors import ConfigError, DatasetError, UnwrittenError
+from mjstack.files import write_atomic
 from mjstack.jobs.collection import DATASET, Collection, CollectPlan, read_batches
-from mjstack.jobs.demonstration_spec import differences, episode_config
+from mjstack.jobs.demonstration import ACTION, STATE, differences, episode_config
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.job import Job, JobResult
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.runner import Record, run_reported
-from mjstack.report.record import Status
+from mjstack.report.record import GateResult, Status
+from mjstack.report.table import Table, format_value, to_document
+
+LOADING = """\
+import json
+from pathlib import Path
+
+import pyarrow.parquet as pq
+
+folder = Path("{folder}")
+info = json.loads((folder / "meta/info.json").read_text())
+episode = pq.read_table(folder / "data", filters=[("episode_index", "==", 0)])
+for name in ("observation.state", "action"):
+    values = episode[name].combine_chunks().flatten().to_numpy().reshape(len(episode), -1)
+    print(name, values.shape, info["features"][name]["names"], info["mjstack"]["units"][name])
+"""
 
 
 def collect_folder(cfg: Config) -> Path:
@@ -81,7 +98,7 @@ def run_collect_job(plan: CollectPlan, folder: Path, overrides: list[str]) -> Jo
         def conclude(status: Status, problem: str = "") -> None:
             result = collection.result(status, problem, time.perf_counter() - began)
             if collection.committed:
-                collection.write_table(folder, result)
+                _write_table(plan, folder, result)
                 bar.say(f"dataset: {collection.path}, described in {folder / 'dataset.md'}")
             record(result)
 
@@ -99,6 +116,31 @@ def run_collect_job(plan: CollectPlan, folder: Path, overrides: list[str]) -> Jo
     count = cast(CollectJobCfg, cfg.job).episodes
     title = f"task {cfg.task.name}, {count:,} demonstrations"
     return run_reported(plan.context, folder, overrides, title, work)
+
+
+def _write_table(plan: CollectPlan, folder: Path, result: GateResult) -> None:
+    """Write dataset.md: facts, the range of every joint and its target, and the lines that load the
+    first episode.
+    """
+    cfg = plan.context.cfg
+    dataset = plan.home / DATASET
+    statistics = json.loads((dataset / lerobot.STATS).read_text())
+    ranges = []
+    for name in (STATE, ACTION):
+        feature = plan.spec.features[name]
+        columns = [statistics[name][key] for key in ("min", "mean", "max")]
+        for joint, unit, *values in zip(feature.names, feature.units, *columns, strict=True):
+            ranges.append([f"{name} {joint}", unit, *(f"{value:.4f}" for value in values)])
+    facts = [[key, format_value(value)] for key, value in (result.notes | result.metrics).items()]
+    header = ["number", "unit", "smallest", "mean", "largest"]
+    tables = [
+        Table(title="", header=["fact", "value"], rows=facts),
+        Table(title="", header=header, rows=ranges),
+    ]
+    title = f"{cfg.robot.title}, task {cfg.task.name}: demonstrations"
+    loading = LOADING.format(folder=dataset)
+    text = f"{to_document(title, tables)}\nWith pyarrow alone:\n\n```python\n{loading}```\n"
+    write_atomic(folder / "dataset.md", text)
 
 
 def _check_starts(env: Env) -> None:

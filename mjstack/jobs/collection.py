@@ -4,7 +4,6 @@ until enough are there.
 
 import json
 import math
-import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -20,11 +19,15 @@ from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, DatasetError
 from mjstack.files import write_atomic
-from mjstack.jobs.demonstration import ACTION, STATE, Played, column_widths, play_demonstrations
-from mjstack.jobs.demonstration_spec import make_spec
+from mjstack.jobs.demonstration import (
+    STATE,
+    Played,
+    column_widths,
+    make_spec,
+    play_demonstrations,
+)
 from mjstack.jobs.runner import run_provenance
 from mjstack.math import wilson_interval
-from mjstack.report.collect import to_markdown
 from mjstack.report.record import GateResult, Status
 from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation
@@ -82,9 +85,9 @@ class CollectedBatch:
         keep: Number of episodes that are to be kept.
         succeeded: Number of worlds that the check passed.
         kept: Episodes of it that are in the dataset; fewer than ``keep`` if it is unfinished.
-        not_finite: Episodes that are left out only because a number in them is not finite.
         retries: Grasps that were tried again, in all worlds.
-        broken: How many worlds broke each rule, by its words.
+        broken: How many worlds broke each rule, by its words; among them those that are left out
+            only because a number in them is not finite.
     """
 
     seed: int
@@ -92,7 +95,6 @@ class CollectedBatch:
     keep: int
     succeeded: int
     kept: int = 0
-    not_finite: int = 0
     retries: int = 0
     broken: dict[str, int] = field(default_factory=dict)
 
@@ -156,7 +158,6 @@ class Collection:
         self.committed = 0
         self._steps = 0
         self._before = 0
-        self._seconds = {"simulation": 0.0, "writing": 0.0}  # of this call
         self._sim: Simulation | None = None
 
     def play(self) -> str:
@@ -201,7 +202,6 @@ class Collection:
                 spare = 1.0 if self._job.keep_failures else _SPARE
                 worlds = min(self._plan.most, math.ceil(spare * wanted))
             played = play_demonstrations(self._context, self._worlds(worlds), seed)
-            self._seconds["simulation"] += played.seconds
 
             # The episodes that are kept
             batch, usable = self._judge(played, wanted)
@@ -221,10 +221,9 @@ class Collection:
             )
             empty = 0 if batch.kept else empty + 1
             if empty == _GIVE_UP:
-                counts = batch.broken | {"a number that is not finite": batch.not_finite}
-                why = [f"{text} in {n} of {batch.worlds} worlds" for text, n in counts.items() if n]
+                why = [f"{text} in {n} of {batch.worlds}" for text, n in batch.broken.items()]
                 reason = f"{_GIVE_UP} seeds in a row brought no episode, the last because of: "
-                return reason + "; ".join(why)
+                return f"{reason}{'; '.join(why)} worlds"
         return ""
 
     def _judge(self, played: Played, wanted: int) -> tuple[CollectedBatch, list[int]]:
@@ -233,25 +232,25 @@ class Collection:
         good = np.flatnonzero((played.failed == 0) | self._job.keep_failures).tolist()
         usable = [world for world in good if played.finite(world)]
         failing = rules.failing(played.failed)
+        broken = {rules.texts[name]: len(worlds) for name, worlds in failing.items()}
+        if lost := len(good) - len(usable):
+            broken["a number that is not finite"] = lost
         batch = CollectedBatch(
             seed=played.seed,
             worlds=len(played.failed),
             keep=min(len(usable), wanted),
             succeeded=int((played.failed == 0).sum()),
-            not_finite=len(good) - len(usable),
             retries=int(played.retries.sum()),
-            broken={rules.texts[name]: len(worlds) for name, worlds in failing.items()},
+            broken=broken,
         )
         return batch, usable
 
     def _add(self, writer: DatasetWriter, played: Played, worlds: list[int]) -> None:
         """Commit the episodes of some worlds, and record it."""
-        began = time.perf_counter()
         for count, (world, arrays) in enumerate(played.episodes(worlds), 1):
             writer.add([self._episode(played, world, arrays)])
             self._context.tell(f"episodes of seed {played.seed}", count, len(worlds))
         writer.flush()
-        self._seconds["writing"] += time.perf_counter() - began
         self._record(writer)
 
     def _record(self, writer: DatasetWriter) -> None:
@@ -328,10 +327,6 @@ class Collection:
             reasons.append(f"the expert succeeded in {share}")
             broken = sum((Counter(batch.broken) for batch in self.batches), Counter())
             details += [f"{text}: {count} of {worlds} worlds" for text, count in broken.items()]
-            if lost := sum(batch.not_finite for batch in self.batches):
-                details.append(
-                    f"{lost} episodes with a number that is not finite are not in the dataset"
-                )
             details += [
                 f"seed {batch.seed} is unfinished: {batch.keep - batch.kept} of its episodes are"
                 " still to come"
@@ -344,7 +339,6 @@ class Collection:
 
         # This call
         if new:
-            metrics |= {f"{name}_s": value for name, value in self._seconds.items()}
             metrics["episodes_per_s"] = new / seconds
             reasons.append(f"{new / seconds:.3g} episodes/s in all")
         elif self.committed >= asked:
@@ -359,17 +353,3 @@ class Collection:
             notes=notes,
             details=details,
         )
-
-    def write_table(self, folder: Path, result: GateResult) -> None:
-        """Write dataset.md: facts, and the range of every joint and its target."""
-        cfg = self._context.cfg
-        statistics = json.loads((self.path / lerobot.STATS).read_text())
-        ranges = []
-        for name in (STATE, ACTION):
-            feature = self._plan.spec.features[name]
-            columns = [statistics[name][key] for key in ("min", "mean", "max")]
-            for joint, unit, *values in zip(feature.names, feature.units, *columns, strict=True):
-                ranges.append([f"{name} {joint}", unit, *(f"{value:.4f}" for value in values)])
-        title = f"{cfg.robot.title}, task {cfg.task.name}: demonstrations"
-        facts = {**result.notes, **result.metrics}
-        write_atomic(folder / "dataset.md", to_markdown(title, facts, ranges, str(self.path)))

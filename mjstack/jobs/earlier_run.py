@@ -49,23 +49,22 @@ class EarlierRun:
                 )
         try:
             cfg = load_saved(saved)
+            provenance = dict(json.loads(report.read_text())["provenance"])
         except MjstackError as error:
             raise RunError(
                 f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error} Use"
                 " the one that ran it."
+            ) from error
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise RunError(
+                f"run={name}: report.json cannot be read ({type(error).__name__}), expected"
+                " mjstack's. Name another folder."
             ) from error
         if cfg.job.name != "gates":
             raise RunError(
                 f"run={name}: is a run of job={cfg.job.name}, expected one of job=gates. Name that"
                 " run's folder."
             )
-        try:
-            provenance = dict(json.loads(report.read_text())["provenance"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise RunError(
-                f"run={name}: report.json cannot be read ({type(error).__name__}), expected"
-                " mjstack's. Name another folder."
-            ) from error
         return cls(folder=folder, cfg=cfg, provenance=provenance)
 
     def record(self, seed: int, gate: str) -> EpisodeRecord:

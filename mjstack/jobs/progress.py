@@ -8,7 +8,6 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    TaskID,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
@@ -40,7 +39,7 @@ class ProgressBar:
         )
         self._gate = ""
         self._unit = ""
-        self._task: TaskID | None = None
+        self._task = self._progress.add_task("", visible=False, rate="")
         self._began = self._spoke = time.monotonic()
 
     def __enter__(self) -> "ProgressBar":
@@ -64,10 +63,10 @@ class ProgressBar:
     def advance(self, unit: str, done: int, total: int) -> None:
         """Show how much of something is done."""
         now = time.monotonic()
-        if unit != self._unit or done <= 1 or self._task is None:
+        if unit != self._unit or done <= 1:
             self._unit = unit
             self._began = now
-            self._task = self._show(f"{self._gate}: {unit}", total)
+            self._show(f"{self._gate}: {unit}", total)
         rate = f"{done / (now - self._began):.1f}/s" if now > self._began and done > 1 else ""
         self._progress.update(self._task, completed=done, rate=rate)
         if self._progress.disable and done > 1 and now - self._spoke > 15.0:
@@ -77,20 +76,13 @@ class ProgressBar:
 
     def finish(self, result: GateResult) -> None:
         """Print a gate's result."""
-        self._drop()
+        self._progress.update(self._task, visible=False)
         color = STATUS_COLOR[result.status]
         self.say(
             f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s):"
             f" {escape(result.reason or 'ok')}"
         )
 
-    def _show(self, text: str, total: int, rate: str = "") -> TaskID:
-        """Replace the bar."""
-        self._drop()
-        self._task = self._progress.add_task(text, total=total, rate=rate)
-        return self._task
-
-    def _drop(self) -> None:
-        if self._task is not None:
-            self._progress.remove_task(self._task)
-            self._task = None
+    def _show(self, text: str, total: int, rate: str = "") -> None:
+        """Begin the bar anew."""
+        self._progress.reset(self._task, total=total, description=text, visible=True, rate=rate)

@@ -17,11 +17,11 @@ from mjstack.jobs.job import Job, JobResult
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.runner import Record, run_reported
 from mjstack.kinematics.reach import PointReach
+from mjstack.report.markdown import summarize
 from mjstack.report.reachability import (
     ObjectRegion,
     ReachLevel,
     points_csv,
-    reach_tables,
     save_map,
 )
 from mjstack.report.record import GateResult, Status
@@ -65,17 +65,20 @@ def run_reachability_job(context: RunContext, folder: Path, overrides: list[str]
 
     def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
         levels: list[ReachLevel] = []
+        results: list[GateResult] = []
         for name, (height, gripper) in find_levels(cfg).items():
             bar.start(name)
             began = time.perf_counter()
             levels.append(map_level(context, name, height, gripper))
-            _write(cfg, folder, levels, [])
-            record(_level_result(levels[-1], time.perf_counter() - began))
+            results.append(_level_result(levels[-1], time.perf_counter() - began))
+            _write(cfg, folder, levels, [], results)
+            record(results[-1])
         regions = [find_region(cfg, levels, name) for name in cfg.scene.free]
-        if problem := _write(cfg, folder, levels, regions, draw=True):
+        results += [_region_result(cfg, region) for region in regions]
+        if problem := _write(cfg, folder, levels, regions, results, draw=True):
             bar.say(escape(problem))
-        for region in regions:
-            record(_region_result(cfg, region))
+        for result in results[len(levels) :]:
+            record(result)
 
     title = f"task {cfg.task.name}, what the arm reaches"
     return run_reported(context, folder, overrides, title, work)
@@ -217,10 +220,12 @@ def _region_result(cfg: Config, region: ObjectRegion) -> GateResult:
     margin = cast(ReachabilityJobCfg, cfg.job).margin
     wide, deep = region.configured
     x, y = region.largest
+    at = "({:.3f}, {:.3f})".format(*region.place)
+    there = "reached" if region.reached else "not reached"
     reason = (
-        f"scene.random_xy {wide:g} x {deep:g} m is {'' if region.reached else 'not '}reached with"
-        f" {1e3 * margin:g} mm to spare; the largest square is {region.square:.3f} m, the largest"
-        f" rectangle {x:.3f} x {y:.3f} m"
+        f"at {at} m, scene.random_xy {wide:g} x {deep:g} m is {there} with {1e3 * margin:g} mm to"
+        f" spare; the largest square is {region.square:.3f} m, the largest rectangle {x:.3f} x"
+        f" {y:.3f} m"
     )
     return GateResult(
         name=region.name,
@@ -243,6 +248,7 @@ def _write(
     folder: Path,
     levels: list[ReachLevel],
     regions: list[ObjectRegion],
+    results: list[GateResult],
     draw: bool = False,
 ) -> str:
     """Write table and picture as far as they are known; return why there is no picture."""
@@ -277,7 +283,7 @@ def _write(
         folder,
         "reachability",
         title,
-        reach_tables(levels, regions),
+        [summarize(results)],
         notes,
         points_csv(x, y, levels),
         picture if draw else None,

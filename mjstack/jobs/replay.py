@@ -3,6 +3,7 @@ every rule explained.
 """
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,6 @@ from rich.markup import escape
 
 from mjstack.config.schema import Backend, Config, SimCfg
 from mjstack.episodes.context import RunContext, judge_one, require_episode
-from mjstack.episodes.failures import FailureMonitor, describe_sign
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.replay import ReplayedWorld, replay_world, start_of_world
 from mjstack.errors import ConfigError, DeviceError, RunError
@@ -49,7 +49,6 @@ class ReplayPlan:
         where: Backend and device, each played once; the first is the earlier run's unless ``sim``
             says otherwise.
         record: The result of the gate.
-        notes: What could not be as it was.
         context: The configuration that the gate played under, on the first backend here.
     """
 
@@ -59,7 +58,6 @@ class ReplayPlan:
     world: int
     where: list[tuple[Backend, str]]
     record: EpisodeRecord
-    notes: list[str]
     context: RunContext
 
 
@@ -82,7 +80,7 @@ def run_replay_job(plan: ReplayPlan, folder: Path, overrides: list[str]) -> JobR
         played = OmegaConf.structured(replace(context.cfg, seed=plan.seed))
         write_atomic(folder / "replayed_config.yaml", OmegaConf.to_yaml(played))
         changes = _changes(plan.run.provenance, run_provenance(context.cfg, context))
-        for line in plan.notes + changes:
+        for line in changes:
             bar.say(escape(line))
         for number, (backend, _) in enumerate(plan.where):
             name = f"replay_{backend.value}"
@@ -125,7 +123,7 @@ def _plan(cfg: Config) -> ReplayPlan:
     played = archived_starts(run.cfg, run.folder)
     if gate == "success":
         played = success_config(played)
-    where, notes = _choose(cfg.sim, record)
+    where = _choose(cfg.sim, record)
     backend, device = where[0]
     sim = SimCfg(backend=backend, device=device)
     return ReplayPlan(
@@ -136,24 +134,20 @@ def _plan(cfg: Config) -> ReplayPlan:
         world=world,
         where=where,
         record=record,
-        notes=notes,
     )
 
 
-def _choose(asked: SimCfg, record: EpisodeRecord) -> tuple[list[tuple[Backend, str]], list[str]]:
-    """Backends and devices to play on, and what could not be as it was."""
+def _choose(asked: SimCfg, record: EpisodeRecord) -> list[tuple[Backend, str]]:
+    """Backends and devices to play on."""
     native = (Backend.native, "cpu")
     backend = Backend(record.backend) if asked.backend is Backend.auto else asked.backend
     if backend is Backend.native:
-        return [native], []
+        return [native]
     device = resolve_device(asked.device)
-    notes = []
     if asked.device == "auto" and record.backend == "mjwarp":
-        try:
+        with suppress(DeviceError):  # it is not here
             device = resolve_device(record.device)
-        except DeviceError:
-            notes = [f"that run was on {record.device}, which is not here: replayed on {device}"]
-    return [(backend, device), *([native] if asked.backend is Backend.auto else [])], notes
+    return [(backend, device), *([native] if asked.backend is Backend.auto else [])]
 
 
 def _check_start(plan: ReplayPlan) -> None:
@@ -198,14 +192,13 @@ def _replay(
     """Play the world on one backend, and compare the result with the recorded one."""
     first = number == 0
     backend, device = plan.where[number]
-    monitors = [FailureMonitor(context.cfg)] if plan.gate == "success" else []
     done = replay_world(
         context,
         seed=plan.seed,
         world=plan.world,
         backend=backend,
         device=device,
-        observers=[*(context.viewers if first else []), *monitors],
+        observers=context.viewers if first else [],
     )
     rules = context.check.rules
     status, reason, metrics = judge_one(rules, done.episode.result)
@@ -217,9 +210,7 @@ def _replay(
         context.artifacts.shown = done.recorder
         shown = f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
         context.artifacts.shown_by = shown
-    told = list(done.findings)
-    told += [_first_sign(monitor, done, context) for monitor in monitors]
-    for line in told:
+    for line in done.findings:
         context.say(escape(f"  {line}"))
     name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
     assert context.folder is not None
@@ -233,20 +224,9 @@ def _replay(
             thresholds=context.check.thresholds(),
             metrics={"seed": plan.seed, "world": plan.world, **metrics},
             notes={"backend": done.description, "recorded": recorded, "trajectory": name},
-            details=told + plan.notes + changes,
+            details=[*done.findings, *changes],
         )
     ]
-
-
-def _first_sign(monitor: FailureMonitor, done: ReplayedWorld, context: RunContext) -> str:
-    """The first sign of failure, as the success gate reports it."""
-    sign = int(monitor.sign[0])
-    seen = "none"
-    if sign:
-        phase = context.planner.phases[int(monitor.phase[0])].name
-        seen = f"{describe_sign(sign, phase)}, seen in step {int(monitor.step[0])}"
-    retries = int(done.episode.retries[0])
-    return f"first sign of failure: {seen}; grasps tried again: {retries}"
 
 
 def _compare(

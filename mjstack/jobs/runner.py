@@ -176,9 +176,6 @@ def _viewer(context: RunContext) -> StepHook:
 
 def _print_summary(console: Console, report: Report, folder: Path) -> None:
     colors = {status.value: color for status, color in STATUS_COLOR.items()}
-    console.print(summarize(report).to_console(colors))
+    console.print(summarize(report.gates).to_console(colors))
     console.print(f"report: {escape(str(folder))}/report.md")
-    for gate in report.gates:
-        if gate.status is Status.skipped:
-            console.print(f"skipped: {gate.name}: {escape(gate.reason)}")
     console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status.value}[/]")

@@ -5,11 +5,13 @@ It informs, and gates nothing.
 
 import statistics
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from enum import Enum
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
+import numpy as np
 from rich.markup import escape
 
 from mjstack.bench.physics import HeldPhysics
@@ -24,11 +26,24 @@ from mjstack.jobs.job import Job, JobResult
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.runner import Record, run_reported
 from mjstack.managers.episode import required_fields
+from mjstack.report.picture import figure
 from mjstack.report.record import GateResult, Status
-from mjstack.report.study import Row, save_study, study_table
+from mjstack.report.table import Table
 from mjstack.report.write import write_tables
 from mjstack.sim import Simulation, SolverLimit, make_simulation
 from mjstack.sim.sizes import resolve_measuring_sizes
+
+Row = dict[str, Any]
+"""One variant of the solver; a value that was not measured is missing.
+
+``variant``, ``changes``, ``status`` (pass: it was measured; skip: it changes nothing), ``reason``;
+then, of the whole episode, ``worlds``, ``succeeded``, ``broken_rules``, ``peak_rows`` (most
+constraint rows of a world), the check's summaries, and ``iteration_limit_worlds`` and
+``line_search_limit_worlds`` (worlds whose solver stopped at its limit in some step); then, object
+in hand, ``ms_per_batched_step`` (median of the repetitions, with ``ms_min`` and ``ms_max``),
+``base_ms`` (of the configured solver beside them) and ``ratio`` (of neighbouring repetitions:
+median, ``ratio_min``, ``ratio_max``).
+"""
 
 
 def check_study(cfg: Config) -> RunContext:
@@ -201,17 +216,56 @@ def _write(context: RunContext, folder: Path, rows: list[Row], draw: bool = Fals
         (
             f"{backend.value} on {device}. Times: object in hand, joint target held; medians of"
             f" {cast(StudyJobCfg, cfg.job).repetitions} repetitions, interleaved with those of"
-            " base. A ratio is that of two neighbouring repetitions; in brackets the smallest and"
-            " the largest."
+            " base. A ratio is that of two neighbouring repetitions."
         ),
         "base as a variant is a second copy of it: its ratio shows how far equal runs differ.",
     ]
     if backend.value == "native":
         notes.append("Native MuJoCo does not tell which worlds stopped at a limit of the solver.")
     done = [row for row in rows if row["status"] == "pass"]
-    picture = (lambda path: save_study(path, done, title)) if draw else None
-    tables = [study_table(rows)]
+    picture = (lambda path: _draw(path, done, title)) if draw else None
+    tables = [Table.of("", _SHOWN, rows)]
     return write_tables(folder, "study", title, tables, notes, to_csv(rows), picture)
 
+
+def _draw(path: Path, rows: Sequence[Row], title: str) -> None:
+    """Draw a bar per measured variant: its time over that of the base, and the worlds that
+    succeeded.
+    """
+    nworld = rows[0]["worlds"]
+    places = np.arange(len(rows))
+    succeeded = [row["succeeded"] for row in rows]
+    colors = ["#2457c7" if count == nworld else "#cc2a24" for count in succeeded]
+    middle, low, high = (
+        np.array([row[key] for row in rows]) for key in ("ratio", "ratio_min", "ratio_max")
+    )
+    size = (11, 1.5 + 0.3 * len(rows))
+    with figure(path, title, 2, figsize=size, sharey=True) as (_, (time, worlds)):
+        whiskers = (middle - low, high - middle)
+        time.barh(places, middle, xerr=whiskers, color=colors, ecolor="0.4", capsize=2)
+        time.axvline(1.0, color="0.3", linewidth=1.0)
+        time.set(xlabel="time per step over that of base (whiskers: all repetitions)")
+        time.set_yticks(places, [row["variant"] for row in rows])
+        time.invert_yaxis()
+        worlds.barh(places, succeeded, color=colors)
+        worlds.set(xlabel=f"succeeded of {nworld} worlds (red: not all)", xlim=(0, nworld))
+        for axes in (time, worlds):
+            axes.grid(alpha=0.3, axis="x")
+
+
+_SHOWN = {
+    "variant": "variant",
+    "changes": "changes",
+    "ms per step": "ms_per_batched_step",
+    "ratio to base": "ratio",
+    "smallest": "ratio_min",
+    "largest": "ratio_max",
+    "worlds": "worlds",
+    "succeeded": "succeeded",
+    "iteration limit": "iteration_limit_worlds",
+    "line-search limit": "line_search_limit_worlds",
+    "broken rules": "broken_rules",
+    "notes": "reason",
+}
 
 JOB = Job(check_study, run_study_job)

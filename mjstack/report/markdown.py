@@ -1,10 +1,10 @@
 """The report as text for people."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from mjstack.report.record import GateResult, Report, Status
-from mjstack.report.table import Table
+from mjstack.report.table import Table, format_value
 
 # Units by the end of a metric's name; the first that fits counts.
 _UNITS = {
@@ -25,7 +25,7 @@ _SPREAD = ("median", "min", "max")
 
 def to_markdown(report: Report) -> str:
     """Summary table, pictures, then every gate with its figures, and the provenance."""
-    lines = [f"# mjstack run: {report.status.value}", "", *summarize(report).to_markdown()]
+    lines = [f"# mjstack run: {report.status.value}", "", *summarize(report.gates).to_markdown()]
     for picture in report.pictures:
         lines += ["", f"![{picture}]({picture})"]
     for gate in report.gates:
@@ -43,22 +43,12 @@ def to_markdown(report: Report) -> str:
     return "\n".join(lines) + "\n"
 
 
-def summarize(report: Report) -> Table:
+def summarize(gates: Iterable[GateResult]) -> Table:
     """A row per gate: its status, wall time, and result in a line."""
     rows = [
-        [gate.name, gate.status.value, f"{gate.seconds:.1f}", gate.reason or "ok"]
-        for gate in report.gates
+        [gate.name, gate.status.value, f"{gate.seconds:.1f}", gate.reason or "ok"] for gate in gates
     ]
     return Table(title="", header=["gate", "status", "seconds", "result"], rows=rows)
-
-
-def format_value(value: object) -> str:
-    """A number with as many digits as a reader needs; other values as they are."""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:,.0f}" if 1e4 <= abs(value) < math.inf else f"{value:.4g}"
-    return "" if value is None else str(value)
 
 
 def format_percent(rate: float, unit: str = " %") -> str:

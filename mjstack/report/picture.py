@@ -1,58 +1,84 @@
-"""Pictures of a run: the final scene, the objects' way there, and a video."""
+"""Pictures of a run: the final scene, the objects' way there, where episodes started, and a
+video.
+"""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
+import matplotlib
 import mujoco
 import numpy as np
+from matplotlib.patches import Rectangle
 
 from mjstack.errors import MissingExtra, MjstackError
-from mjstack.report.figure import figure
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
 
 Drawn = tuple[Sequence[float], Sequence[float]]
 
 
-class SceneCamera:
-    """Draws a model offscreen."""
+@contextmanager
+def figure(path: Path, title: str, columns: int = 1, **options: Any) -> Iterator[tuple[Any, Any]]:
+    """Make a figure with panels side by side, and save it when the block ends.
 
-    def __init__(self, model: mujoco.MjModel, width: int = 960, height: int = 720) -> None:
-        """Open a renderer.
+    Args:
+        path: The picture.
+        title: Above the panels.
+        columns: Number of panels.
+        options: Of ``plt.subplots``, such as ``figsize``.
 
-        Raises:
-            MjstackError: This machine cannot draw offscreen.
-        """
-        self._model = model
-        self._data = mujoco.MjData(model)
-        try:
-            self._renderer = mujoco.Renderer(model, height, width)
-        except Exception as error:  # OpenGL loaders fail in their own ways
-            gl = os.environ.get("MUJOCO_GL", "not set")
-            raise MjstackError(
-                f"offscreen rendering fails (MUJOCO_GL={gl}: {type(error).__name__}). Set"
-                " MUJOCO_GL=egl or osmesa."
-            ) from error
-        table = model.geom("table").id
-        x, _, z = model.geom_pos[table].tolist()
-        tall = max(0.0, float(model.stat.center[2]) - z - 0.03)  # m that an arm stands out
-        self._camera = mujoco.MjvCamera()
-        self._camera.lookat = [0.62 * x, 0.0, z + 0.08 + tall]
-        self._camera.distance = 0.55 + x + 1.5 * tall
-        self._camera.azimuth = 140.0
-        self._camera.elevation = -24.0
+    Yields:
+        The figure, and its axes: an array unless there is one panel.
+    """
+    drawn, axes = plt.subplots(1, columns, layout="constrained", **options)
+    try:
+        yield drawn, axes
+        drawn.suptitle(title, wrap=True)
+        drawn.savefig(path, dpi=100)
+    finally:
+        plt.close(drawn)
 
-    def draw(self, qpos: np.ndarray) -> np.ndarray:
-        """An image of one state, shape ``(height, width, 3)``, uint8."""
-        self._data.qpos[:] = qpos
-        mujoco.mj_forward(self._model, self._data)
-        self._renderer.update_scene(self._data, self._camera)
-        return self._renderer.render()
 
-    def close(self) -> None:
-        """Free the renderer."""
-        self._renderer.close()
+def outline(centre: Sequence[float], half: Sequence[float], **style: Any) -> Rectangle:
+    """A rectangle around a point, of which the border is drawn."""
+    corner = (centre[0] - half[0], centre[1] - half[1])
+    return Rectangle(corner, 2.0 * half[0], 2.0 * half[1], **({"fill": False} | style))
+
+
+def _render(
+    model: mujoco.MjModel, states: np.ndarray, width: int, height: int
+) -> Iterator[np.ndarray]:
+    """Draw states offscreen, shape ``(n, nq)``: images of shape ``(height, width, 3)``, uint8.
+
+    Raises:
+        MjstackError: This machine cannot draw offscreen.
+    """
+    data = mujoco.MjData(model)
+    try:
+        renderer = mujoco.Renderer(model, height, width)
+    except Exception as error:  # OpenGL loaders fail in their own ways
+        gl = os.environ.get("MUJOCO_GL", "not set")
+        raise MjstackError(
+            f"offscreen rendering fails (MUJOCO_GL={gl}: {type(error).__name__}). Set"
+            " MUJOCO_GL=egl or osmesa."
+        ) from error
+    x, _, z = model.geom_pos[model.geom("table").id].tolist()
+    tall = max(0.0, float(model.stat.center[2]) - z - 0.03)  # m that an arm stands out
+    camera = mujoco.MjvCamera()
+    camera.lookat = [0.62 * x, 0.0, z + 0.08 + tall]
+    camera.distance = 0.55 + x + 1.5 * tall
+    camera.azimuth = 140.0
+    camera.elevation = -24.0
+    with renderer:
+        for state in states:
+            data.qpos[:] = state
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, camera)
+            yield renderer.render()
 
 
 def save_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
@@ -61,9 +87,8 @@ def save_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
     Raises:
         MjstackError: This machine cannot draw offscreen.
     """
-    camera = SceneCamera(model)
-    plt.imsave(path, camera.draw(qpos))
-    camera.close()
+    (image,) = _render(model, qpos[None], 960, 720)
+    plt.imsave(path, image)
 
 
 def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, step_dt: float) -> None:
@@ -80,13 +105,11 @@ def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, step_dt: flo
     """
     writer_of = require_video()
     skip = max(1, round(1.0 / (25.0 * step_dt)))
-    camera = SceneCamera(model, 640, 480)
     writer = writer_of(str(path), (640, 480), fps=1.0 / (step_dt * skip), macro_block_size=16)
     writer.send(None)
-    for state in qpos[::skip]:
-        writer.send(np.ascontiguousarray(camera.draw(state)))
+    for image in _render(model, qpos[::skip], 640, 480):
+        writer.send(np.ascontiguousarray(image))
     writer.close()
-    camera.close()
 
 
 def require_video() -> Callable[..., Any]:
@@ -118,10 +141,9 @@ def save_trajectories(
             mm = 1e3 * positions[:, number]
             for axes, row in ((side, 2), (above, 0)):
                 axes.plot(mm[:, 1], mm[:, row], color=color, label=name)
-                width, depth = 2e3 * half[1], 2e3 * half[row]
-                for at, style in ((mm[0], {"fill": False}), (mm[-1], {"alpha": 0.5})):
-                    corner = (at[1] - width / 2, at[row] - depth / 2)
-                    axes.add_patch(plt.Rectangle(corner, width, depth, color=color, **style))
+                size = (1e3 * half[1], 1e3 * half[row])
+                for at, style in ((mm[0], {}), (mm[-1], {"fill": True, "alpha": 0.5})):
+                    axes.add_patch(outline((at[1], at[row]), size, color=color, **style))
             height.plot(mm[:, 2], color=color, label=name)
         front = "from the front (outline: start, filled: end)"
         side.set(xlabel="y [mm]", ylabel="z [mm]", title=front, aspect="equal")
@@ -131,3 +153,43 @@ def save_trajectories(
             axes.grid(alpha=0.3)
             axes.margins(0.1)
         height.legend(frameon=False)
+
+
+def save_places(
+    path: Path,
+    places: np.ndarray,
+    succeeded: np.ndarray,
+    table: tuple[Sequence[float], Sequence[float]],
+    title: str,
+    colors: Mapping[str, Sequence[float]],
+) -> None:
+    """Draw every start as a dot per object; a failed one as crosses on its objects, joined by a
+    line.
+
+    Args:
+        path: The picture.
+        places: x and y [m] of each object first, shape ``(n, objects, 2 or more)``.
+        succeeded: Whether each episode was, shape ``(n,)``, bool.
+        table: Centre and half size of the table in x and y [m].
+        title: What is shown.
+        colors: Red, green, blue and alpha of each object, by name.
+    """
+    centre, half = table
+    with figure(path, title, figsize=(7.5, 6.5)) as (_, axes):
+        # As seen by someone who stands behind the arm: y to the left, x away from the base.
+        axes.add_patch(outline(centre[1::-1], half[1::-1], ec="k", lw=1.5))
+        axes.plot(0.0, 0.0, "k^", markersize=9, label="base")
+        for pair in places[~succeeded]:
+            axes.plot(pair[:, 1], pair[:, 0], color="0.3", lw=0.5, alpha=0.6)
+        marks = (("succeeded", succeeded, ".", 0.25), ("failed", ~succeeded, "x", 1.0))
+        for number, (name, color) in enumerate(colors.items()):
+            for word, some, marker, alpha in marks:
+                x, y = places[some, number, :2].T
+                label = f"{name}, {word}: {len(x):,}"
+                axes.scatter(y, x, 30.0, color=color, marker=marker, alpha=alpha, label=label)
+        axes.set(xlabel="y [m]", ylabel="x [m]", aspect="equal")
+        axes.invert_xaxis()
+        axes.grid(alpha=0.3)
+        axes.legend(
+            frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5
+        )

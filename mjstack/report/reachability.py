@@ -1,16 +1,13 @@
 """The reach of the arm as a table, as text and as a picture."""
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.patches import Rectangle
 
-from mjstack.report.figure import figure
-from mjstack.report.table import Table
+from mjstack.report.picture import figure, outline
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -88,33 +85,6 @@ def points_csv(x: np.ndarray, y: np.ndarray, levels: Sequence[ReachLevel]) -> st
     return out.getvalue()
 
 
-def reach_tables(levels: Sequence[ReachLevel], regions: Sequence[ObjectRegion]) -> list[Table]:
-    """A table of the regions and one of the levels."""
-    return [Table.of("", _REGION, regions), Table.of("", _LEVEL, levels)]
-
-
-def _configured(region: ObjectRegion) -> str:
-    x, y = region.configured
-    return f"{x:.3f} x {y:.3f}, {'reached' if region.reached else 'NOT reached'}"
-
-
-_REGION: dict[str, Callable[[ObjectRegion], str]] = {
-    "object": lambda region: region.name,
-    "position": lambda region: f"({region.place[0]:.3f}, {region.place[1]:.3f})",
-    "configured": _configured,
-    "largest square": lambda region: f"{region.square:.3f}",
-    "largest rectangle": lambda region: f"{region.largest[0]:.3f} x {region.largest[1]:.3f}",
-    "tilt at most": lambda region: f"{region.tilt:.0f}°",
-}
-_LEVEL: dict[str, Callable[[ReachLevel], str]] = {
-    "level": lambda level: level.name,
-    "above the table": lambda level: f"{level.height:.3f} m",
-    "gripper": lambda level: level.gripper,
-    "reached": lambda level: f"{100.0 * level.reached.mean():.1f} %",
-    "tilt": lambda level: "{:.0f}° to {:.0f}°".format(*level.tilts),
-}
-
-
 def save_map(
     path: Path,
     title: str,
@@ -151,19 +121,14 @@ def save_map(
         for axes, level in zip(np.atleast_1d(panels), levels, strict=True):
             axes.set_facecolor("0.92")
             box = ((x[0] + x[-1]) / 2, (y[0] + y[-1]) / 2), (wide / 2, deep / 2)
-            axes.add_patch(_box(*box, hatch="////", ec="0.6", lw=0))
+            axes.add_patch(outline(*box, hatch="////", ec="0.6", lw=0))
             image = axes.pcolormesh(x, y, level.tilt, vmin=0.0, vmax=top, shading="nearest")
-            axes.add_patch(_box(*table, ec="k", lw=1.5))
+            axes.add_patch(outline(*table, ec="k", lw=1.5))
             for region in regions:
                 color = colors[region.name]
                 axes.plot(*region.place, "s", color=color, markersize=7, markeredgecolor="w")
-                axes.add_patch(_box(region.place, region.configured, ec=color, lw=1.8))
-                axes.add_patch(_box(region.place, region.largest, ec=color, lw=1.2, ls=":"))
+                axes.add_patch(outline(region.place, region.configured, ec=color, lw=1.8))
+                axes.add_patch(outline(region.place, region.largest, ec=color, lw=1.2, ls=":"))
             label = f"{level.name}: {level.height:.3f} m above, {level.gripper}"
             axes.set(title=label, xlabel="x [m]", ylabel="y [m]", aspect="equal")
         drawn.colorbar(image, ax=panels, label="smallest tilt of the gripper from vertical [deg]")
-
-
-def _box(centre: Sequence[float], half: Sequence[float], **style: Any) -> Rectangle:
-    corner = (centre[0] - half[0], centre[1] - half[1])
-    return Rectangle(corner, 2.0 * half[0], 2.0 * half[1], fill=False, **style)

@@ -1,12 +1,12 @@
 """The scaling table and its curves: a row per backend and number of worlds."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from mjstack.report.figure import figure
+from mjstack.report.picture import figure
 from mjstack.report.table import Table
 
 PASS = "pass"
@@ -109,29 +109,19 @@ def save_scaling_curves(path: Path, rows: Sequence[Row], decimation: int, title:
                 axes.legend(frameon=False, fontsize=8)
 
 
-def _figure(*names: str, form: str = ",.0f") -> Callable[[Row], str]:
-    """How a figure is shown, the largest of several metrics."""
-
-    def show(row: Row) -> str:
-        found = [row[name] for name in names if name in row]
-        return format(max(found), form) if found else "-"
-
-    return show
-
-
-_MEMORY = [f"{name}.gpu_memory_whole_gpu_mib" for name in ("physics", "episode", "env_step")]
-_SHOWN: dict[str, Callable[[Row], str]] = {
-    "worlds": _figure("nworld"),
-    "backend": lambda row: row["backend"],
-    "succeeded": _figure("succeeded"),
-    "ms per step": _figure("physics.ms_per_batched_step.median", form=".4g"),
-    "world-steps/s": _figure(RATE),
-    "env-steps/s": _figure("env_step.env_steps_per_s.median"),
-    "managers": _figure("env_step.managers_over_physics.median", form="+.1%"),
-    "managers alone": _figure("env_step.managers_alone_over_physics.median", form=".1%"),
-    "episode, s": _figure("episode.seconds.median", form=".3g"),
-    "over bare steps": _figure("episode.bare_ratio.median", form=".3f"),
-    "GPU memory, MiB": _figure(*_MEMORY),
-    "capture, s": _figure("episode.capture_s", form=".2f"),
-    "status": lambda row: f"{row['status']}: {row['reason']}" if row["reason"] else row["status"],
+_SHOWN = {
+    "worlds": "nworld",
+    "backend": "backend",
+    "succeeded": "succeeded",
+    "ms per step": "physics.ms_per_batched_step.median",
+    "world-steps/s": RATE,
+    "env-steps/s": "env_step.env_steps_per_s.median",
+    "managers": "env_step.managers_over_physics.median",
+    "managers alone": "env_step.managers_alone_over_physics.median",
+    "episode, s": "episode.seconds.median",
+    "over bare steps": "episode.bare_ratio.median",
+    "GPU memory, MiB": "env_step.gpu_memory_whole_gpu_mib",
+    "capture, s": "episode.capture_s",
+    "status": "status",
+    "reason": "reason",
 }

@@ -1,17 +1,11 @@
 """Tables of text cells, as Markdown and on a terminal."""
 
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import rich.table
 from rich.markup import escape
-
-_NUMBER = re.compile(
-    r"[-+(]?(\d|nan|inf)|-?$"
-)  # begins as a number does, or says that none is known
-Row = TypeVar("Row")
 
 
 @dataclass(kw_only=True, slots=True)
@@ -30,26 +24,21 @@ class Table:
 
     @classmethod
     def of(
-        cls, title: str, columns: Mapping[str, Callable[[Row], str]], rows: Iterable[Row]
+        cls, title: str, columns: Mapping[str, str], rows: Iterable[Mapping[str, object]]
     ) -> "Table":
-        """Make a table from records.
+        """Make a table from records; "-" where a record has no value.
 
         Args:
             title: Its heading.
-            columns: By name of the column, how a record is shown in it.
+            columns: By name of the column, the key of its values.
             rows: The records.
         """
-        cells = [[show(row) for show in columns.values()] for row in rows]
+        cells = [[format_value(row.get(key, "-")) for key in columns.values()] for row in rows]
         return cls(title=title, header=list(columns), rows=cells)
 
-    def numeric(self) -> list[bool]:
-        """Whether all cells of a column are numbers, for each column."""
-        columns = zip(*self.rows, strict=True) if self.rows else [()] * len(self.header)
-        return [all(_NUMBER.match(cell) for cell in column) for column in columns]
-
     def to_markdown(self) -> list[str]:
-        """Lines of a Markdown table without its title; numbers are right-aligned."""
-        rule = ["---:" if numeric else "---" for numeric in self.numeric()]
+        """Lines of a Markdown table without its title."""
+        rule = ["---"] * len(self.header)
         rows = ([_escape(cell) for cell in row] for row in (self.header, rule, *self.rows))
         return [f"| {' | '.join(cells)} |" for cells in rows]
 
@@ -61,13 +50,22 @@ class Table:
         """
         known = colors or {}
         table = rich.table.Table(title=escape(self.title) or None)
-        for name, numeric in zip(self.header, self.numeric(), strict=True):
-            table.add_column(name, justify="right" if numeric else "left", overflow="fold")
+        for name in self.header:
+            table.add_column(name, overflow="fold")
         for row in self.rows:
             table.add_row(
                 *(f"[{known[c]}]{escape(c)}[/]" if c in known else escape(c) for c in row)
             )
         return table
+
+
+def format_value(value: object) -> str:
+    """A number with as many digits as a reader needs; other values as they are."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:,.0f}" if 1e4 <= abs(value) < math.inf else f"{value:.4g}"
+    return "" if value is None else str(value)
 
 
 def to_document(

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -30,7 +29,9 @@ def write_report(report: Report, folder: Path) -> None:
         "gates": gates,
         "pictures": report.pictures,
     }
-    text = json.dumps(_finite(data), indent=2, allow_nan=False) + "\n"
+    # JSON has no NaN: a number that is not finite becomes its name.
+    finite = json.loads(json.dumps(data), parse_constant=lambda name: str(float(name)))
+    text = json.dumps(finite, indent=2) + "\n"
     write_atomic(folder / "report.json", text)
     write_atomic(folder / "report.md", to_markdown(report))
 
@@ -88,14 +89,3 @@ def write_tables(
     shown = picture.name if picture.exists() else ""
     write_atomic(folder / f"{name}.md", to_document(title, tables, notes, shown))
     return problem
-
-
-def _finite(node: object) -> object:
-    """JSON has no NaN: a number that is not finite becomes its name."""
-    if isinstance(node, dict):
-        return {key: _finite(value) for key, value in node.items()}
-    if isinstance(node, list):
-        return [_finite(value) for value in node]
-    if isinstance(node, float) and not math.isfinite(node):
-        return str(node)
-    return node

@@ -19,7 +19,7 @@ from mjstack.sim.substep import (
     place_static_geoms,
     rearranged_step,
 )
-from mjstack.sim.usage import Usage, array_bytes
+from mjstack.sim.usage import Usage
 from mjstack.sim.warp_setup import mjw, torch_stream_scope, wp
 
 
@@ -149,12 +149,6 @@ class MjwarpSimulation(Simulation):
         with torch_stream_scope(self._device):
             mjw.reset_data(self._m, self._d, reset=self._selected)
         self._usage.clear(self._mask)
-
-    def memory_bytes(self) -> int:
-        """Bytes of MJWarp's data: all that grows with nworld, but for per-world fields and what a
-        step borrows.
-        """
-        return array_bytes(self._d)
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as uploaded."""

@@ -211,10 +211,6 @@ class Simulation(ABC):
         """The graph that ``step(n)`` replays; None on a backend that captures nothing."""
         return None
 
-    def memory_bytes(self) -> int | None:
-        """Bytes of the arrays that grow with nworld; None where they are not counted."""
-        return None
-
     @abstractmethod
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as this backend holds them, by MuJoCo's names."""

@@ -110,7 +110,8 @@ def array_bytes(node: object) -> int:
 
 
 def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
-    """Compute `MjwarpSimulation.memory_bytes` for these sizes, without allocating it.
+    """Bytes of MJWarp's data for these sizes, computed without allocating it: all that grows with
+    nworld, but for per-world fields and what a step borrows.
 
     Every array is as long as nworld, as the contact pool, or constant. So two small ones on the CPU
     tell the rest.
