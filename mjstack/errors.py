@@ -93,7 +93,6 @@ class TermError(InputError):
     def __init__(self, label: str, problem: str) -> None:
         """Builds the message from the term's dotted configuration key and what is wrong with it."""
         super().__init__(f"{label}: {problem.rstrip('.')}.")
-        self.label = label
 
 
 class ParameterError(ConfigError):
@@ -171,7 +170,6 @@ class RebindError(MjstackError):
             f"{view} is a view of the simulation's memory and cannot be rebound: write {view}[:] ="
             " ... instead."
         )
-        self.view = view
 
 
 class CaptureError(MjstackError):
@@ -191,7 +189,6 @@ class CaptureError(MjstackError):
             f"{name} cannot be captured{where} ({reason}): expected fixed shapes and no host read"
             " (.item(), .cpu(), nonzero, if tensor). Correct it, or set graph=off."
         )
-        self.culprit = culprit
 
 
 class ArgumentError(InputError):

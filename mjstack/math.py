@@ -124,20 +124,18 @@ def not_finite(*parts: torch.Tensor) -> torch.Tensor:
     return sum(others, first) != 0.0
 
 
-def wilson_interval(
-    successes: int, trials: int, z: float = 1.959963984540054
-) -> tuple[float, float]:
-    """Confidence interval of a success rate (Wilson, "Probable inference", JASA 1927), sound at 0
-    and at all successes too.
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """95 % confidence interval of a success rate (Wilson, "Probable inference", JASA 1927), sound
+    at 0 and at all successes too.
 
     Args:
         successes: How many succeeded.
         trials: Of how many, at least 1.
-        z: Quantile of the normal distribution; the default is for 95 %.
 
     Returns:
         Lower and upper end, from 0 to 1.
     """
+    z = 1.959963984540054  # quantile of the normal distribution
     rate = successes / trials
     share = z * z / trials
     centre = (rate + 0.5 * share) / (1.0 + share)

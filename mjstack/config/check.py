@@ -19,12 +19,15 @@ def validate(cfg: Config) -> None:
     """Raise a `ConfigError` or `UnknownName` for the first value that cannot be used."""
     check_fields("", cfg)
     known = cfg.gate.functions()
-    if not cfg.gates:
-        raise ConfigError("gates", "[]", f"at least one of {', '.join(known)}")
+    _refuse(not cfg.gates, "gates", "[]", f"at least one of {', '.join(known)}")
     for name in (*cfg.gates, *cfg.gate.added):  # a misspelt one has no function
         _require("gate", name, known)
-    if not _DEVICE.fullmatch(cfg.sim.device):
-        raise ConfigError("sim.device", cfg.sim.device, "auto, cpu or cuda:N, such as cuda:0")
+    _refuse(
+        not _DEVICE.fullmatch(cfg.sim.device),
+        "sim.device",
+        cfg.sim.device,
+        "auto, cpu or cuda:N, such as cuda:0",
+    )
     step_dt = 1.0 / cfg.task.control_hz
     if not math.isclose(cfg.timing.step_dt, step_dt, rel_tol=1e-9):
         raise ConfigError(
@@ -69,18 +72,35 @@ def _require(what: str, name: str | None, known: Mapping | Sequence) -> None:
         raise UnknownName(what, name, known)
 
 
+def _refuse(wrong: bool, key: str, value: object, expected: str, fix: str = "") -> None:
+    """Raise a `ConfigError` for a value that is wrong."""
+    if wrong:
+        raise ConfigError(key, value, expected, fix)
+
+
 def _replay(cfg: Config) -> None:
     """Keys that only one job or one group reads."""
-    if cfg.world is not None and not _WORLD.fullmatch(cfg.world):
-        expected = "a world such as 17, or a seed and a world such as 3:17"
-        raise ConfigError("world", cfg.world, expected)
+    _refuse(
+        cfg.world is not None and not _WORLD.fullmatch(cfg.world),
+        "world",
+        cfg.world,
+        "a world such as 17, or a seed and a world such as 3:17",
+    )
     for key in ("run", "world"):
-        if getattr(cfg, key) is not None and cfg.job.name != "replay":
-            expected = "null, because it is for job=replay alone"
-            raise ConfigError(key, getattr(cfg, key), expected, "Add job=replay")
-    if cfg.starts is not None and not reads_starts_file(cfg.reset):
-        expected = "null, because no reset term reads it"
-        raise ConfigError("starts", cfg.starts, expected, "Add reset=starts_file")
+        _refuse(
+            getattr(cfg, key) is not None and cfg.job.name != "replay",
+            key,
+            getattr(cfg, key),
+            "null, because it is for job=replay alone",
+            "Add job=replay",
+        )
+    _refuse(
+        cfg.starts is not None and not reads_starts_file(cfg.reset),
+        "starts",
+        cfg.starts,
+        "null, because no reset term reads it",
+        "Add reset=starts_file",
+    )
 
 
 def _robot(cfg: Config) -> None:
@@ -91,35 +111,46 @@ def _robot(cfg: Config) -> None:
     lengths = {"home": joints, "start": joints, "gripper_open": grip, "gripper_closed": grip}
     for key, size in lengths.items():
         values = getattr(robot, key)
-        if len(values) != size:
-            raise ConfigError(f"robot.{key}", values, f"{size} numbers, one per joint")
-    if abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3:
-        expected = "a vector of length 1, such as [0, 0, -1]"
-        raise ConfigError("robot.approach_axis", robot.approach_axis, expected)
+        _refuse(len(values) != size, f"robot.{key}", values, f"{size} numbers, one per joint")
+    _refuse(
+        abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3,
+        "robot.approach_axis",
+        robot.approach_axis,
+        "a vector of length 1, such as [0, 0, -1]",
+    )
     for name in (*robot.ik_joints, *robot.locked):
         _require("robot.ik_joints, robot.locked: arm joint", name, robot.arm_joints)
     _require("robot.roll_joint: arm joint", robot.roll_joint, robot.arm_joints)
-    if cfg.controller.yaw_alignment > 0.0 and robot.roll_joint is None:
-        expected = "0, because robot.roll_joint is null"
-        raise ConfigError("controller.yaw_alignment", cfg.controller.yaw_alignment, expected)
+    _refuse(
+        cfg.controller.yaw_alignment > 0.0 and robot.roll_joint is None,
+        "controller.yaw_alignment",
+        cfg.controller.yaw_alignment,
+        "0, because robot.roll_joint is null",
+    )
 
 
 def _scene(scene: SceneCfg) -> None:
     """Objects, places and the box are on the table and clear of each other."""
     for name, thing in scene.objects.items():
         key = f"scene.objects.{name}"
-        if len(thing.size) != SHAPES[thing.shape]:
-            raise ConfigError(f"{key}.size", thing.size, f"{SHAPES[thing.shape]} numbers")
+        _refuse(
+            len(thing.size) != SHAPES[thing.shape],
+            f"{key}.size",
+            thing.size,
+            f"{SHAPES[thing.shape]} numbers",
+        )
         edge = min(thing.size[:2]) if thing.shape == "box" else thing.footprint
         _on_table(scene, f"{key}.xy", thing.xy, (edge, edge))
     for name, place in scene.places.items():
-        if name in scene.objects:
-            raise ConfigError(f"scene.places.{name}", name, "a name that no object has")
+        _refuse(name in scene.objects, f"scene.places.{name}", name, "a name that no object has")
         _on_table(scene, f"scene.places.{name}.xy", place.xy, place.random_xy)
     for (one, first), (other, second) in itertools.combinations(scene.objects.items(), 2):
-        if math.dist(first.xy, second.xy) < first.footprint + second.footprint:
-            expected = f"a position clear of {other}, which is at {second.xy}"
-            raise ConfigError(f"scene.objects.{one}.xy", first.xy, expected)
+        _refuse(
+            math.dist(first.xy, second.xy) < first.footprint + second.footprint,
+            f"scene.objects.{one}.xy",
+            first.xy,
+            f"a position clear of {other}, which is at {second.xy}",
+        )
     if scene.box is not None:
         _box(scene, scene.box)
 
@@ -135,26 +166,34 @@ def _on_table(scene: SceneCfg, key: str, xy: list[float], edge: Sequence[float])
 
 
 def _box(scene: SceneCfg, box: BoxCfg) -> None:
-    if box.height <= box.floor:
-        expected = f"more than the floor's thickness, {box.floor:g} m"
-        raise ConfigError("scene.box.height", box.height, expected)
+    _refuse(
+        box.height <= box.floor,
+        "scene.box.height",
+        box.height,
+        f"more than the floor's thickness, {box.floor:g} m",
+    )
     outer = [half + box.wall for half in box.half]
     _on_table(scene, "scene.box.center", box.center, outer)
     for name, thing in scene.objects.items():
         away = (abs(thing.xy[i] - box.center[i]) - outer[i] for i in (0, 1))
-        if max(away) < thing.size[0]:
-            raise ConfigError(f"scene.objects.{name}.xy", thing.xy, "a position beside the box")
+        _refuse(
+            max(away) < thing.size[0],
+            f"scene.objects.{name}.xy",
+            thing.xy,
+            "a position beside the box",
+        )
 
 
 def _phases(cfg: Config) -> None:
     """The scripted phases, and how their targets are followed."""
     controller = cfg.controller
-    if (
-        max(controller.posture_gain, controller.approach_gain) > 0
-        and controller.step_iterations < 4
-    ):
-        expected = "at least 4 with a posture_gain or an approach_gain"
-        raise ConfigError("controller.step_iterations", controller.step_iterations, expected)
+    gain = max(controller.posture_gain, controller.approach_gain)
+    _refuse(
+        gain > 0 and controller.step_iterations < 4,
+        "controller.step_iterations",
+        controller.step_iterations,
+        "at least 4 with a posture_gain or an approach_gain",
+    )
     phases = controller.phases
     names = list(phases)
     closed_loop = controller.name == "closed_loop" or "success" in cfg.gates
@@ -174,21 +213,36 @@ def _phases(cfg: Config) -> None:
                 raise ConfigError(
                     f"{key}.observe", "false", f"{expected} know yet where {source} is"
                 )
-        if phase.level == "on_top" and not grasped:
-            expected = "center or table, as no phase before grasps"
-            raise ConfigError(f"{key}.level", "on_top", expected)
+        _refuse(
+            phase.level == "on_top" and not grasped,
+            f"{key}.level",
+            "on_top",
+            "center or table, as no phase before grasps",
+        )
         grasped = grasped or phase.grasps is not None
-        if phase.retry is not None and phase.grasps is None:
-            expected = f"null, or {key}.grasps=OBJECT, whose empty grasp is tried again"
-            raise ConfigError(f"{key}.retry", phase.retry, expected)
-        if phase.retry is not None and names.index(phase.retry) > number:
-            raise ConfigError(f"{key}.retry", phase.retry, "this phase or one before it")
+        _refuse(
+            phase.retry is not None and phase.grasps is None,
+            f"{key}.retry",
+            phase.retry,
+            f"null, or {key}.grasps=OBJECT, whose empty grasp is tried again",
+        )
+        _refuse(
+            phase.retry is not None and names.index(phase.retry) > number,
+            f"{key}.retry",
+            phase.retry,
+            "this phase or one before it",
+        )
         steps = phase.seconds / cfg.timing.step_dt
-        if abs(steps - round(steps)) > 1e-6:
-            expected = f"a multiple of the step, {cfg.timing.step_dt:g} s"
-            raise ConfigError(f"{key}.seconds", phase.seconds, expected)
-    if phases and phases[names[0]].anchor is None:
-        raise ConfigError("controller.phases", names[0], "a first phase with an anchor")
+        _refuse(
+            abs(steps - round(steps)) > 1e-6,
+            f"{key}.seconds",
+            phase.seconds,
+            f"a multiple of the step, {cfg.timing.step_dt:g} s",
+        )
+    for name in names[:1]:
+        _refuse(
+            phases[name].anchor is None, "controller.phases", name, "a first phase with an anchor"
+        )
 
 
 def _gates(cfg: Config) -> None:
@@ -201,23 +255,32 @@ def _gates(cfg: Config) -> None:
         _require("gate.throughput.from_phase: phase", gate.throughput.from_phase, phases)
     for name in ("step1", "step50"):
         limits = getattr(gate.parity, name)
-        if set(limits) != set(PARITY_FIELDS):
-            expected = f"a number for each of {', '.join(PARITY_FIELDS)}"
-            raise ConfigError(f"gate.parity.{name}", list(limits), expected)
+        _refuse(
+            set(limits) != set(PARITY_FIELDS),
+            f"gate.parity.{name}",
+            list(limits),
+            f"a number for each of {', '.join(PARITY_FIELDS)}",
+        )
 
 
 def _success(cfg: Config) -> None:
     """Seeds and region of the success gate fit its starts."""
     success = cfg.gate.success
     from_file = reads_starts_file(cfg.reset)
-    if from_file and success.seeds > 1:
-        expected = "1, because with reset=starts_file worlds start alike under every seed"
-        raise ConfigError("gate.success.seeds", success.seeds, expected)
+    _refuse(
+        from_file and success.seeds > 1,
+        "gate.success.seeds",
+        success.seeds,
+        "1, because with reset=starts_file worlds start alike under every seed",
+    )
     if success.region is None:
         return
-    if from_file or not any(map(places_objects, success.reset.values())):
-        expected = "null, because no reset term of the success gate has a region"
-        raise ConfigError("gate.success.region", success.region, expected)
+    _refuse(
+        from_file or not any(map(places_objects, success.reset.values())),
+        "gate.success.region",
+        success.region,
+        "null, because no reset term of the success gate has a region",
+    )
     scene = cfg.scene
     for axis, name in enumerate("xy"):
         # An object of any yaw is a disc.

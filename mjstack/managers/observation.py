@@ -17,7 +17,7 @@ class _Part:
     """One term of a group."""
 
     def __init__(self, label: str, cfg: ObservationTermCfg, env: EnvView) -> None:
-        if cfg.clip is not None and not (len(cfg.clip) == 2 and cfg.clip[0] < cfg.clip[1]):
+        if cfg.clip is not None and not cfg.clip[0] < cfg.clip[-1]:
             raise TermError(
                 label, f"clip={list(cfg.clip)}: expected two numbers, the smaller one first"
             )

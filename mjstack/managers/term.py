@@ -19,6 +19,14 @@ from mjstack.config.schema import TermCfg
 from mjstack.errors import ConfigError, MjstackError, ParameterError, TermError, suggest
 from mjstack.managers.view import EnvView
 
+_WORDS = {
+    float: "a number",
+    int: "an integer",
+    bool: "true or false",
+    str: "a name",
+    type(None): "null",
+}
+
 
 def resolve_func(label: str, path: str) -> Callable[..., Any]:
     """Finds a function or class by its dotted name.
@@ -106,30 +114,20 @@ def check_params(
 
 def _mismatch(value: Any, hint: Any) -> str:
     """What an annotation expects where a value from YAML does not fit it; empty where it fits or
-    nobody can tell.
+    cannot be judged.
     """
-    origin = get_origin(hint)
     inner = get_args(hint)
-    if origin in (Union, UnionType):
+    if get_origin(hint) in (Union, UnionType):
         problems = [_mismatch(value, option) for option in inner]
         return "" if "" in problems else " or ".join(problems)
-    if origin in (list, Sequence) and not isinstance(value, str):
-        if not isinstance(value, list | tuple):
-            return f"a list, such as [{value}, {value}]"
-        return next(
-            (f"a list, each of it {p}" for p in (_mismatch(v, inner[0]) for v in value) if p), ""
-        )
-    names = {
-        float: "a number",
-        int: "an integer",
-        bool: "true or false",
-        str: "a name",
-        type(None): "null",
-    }
-    if hint not in names:
-        return f"a list of {names.get(inner[0], 'values')}" if origin in (list, Sequence) else ""
-    fits = isinstance(value, int | float) if hint is float else isinstance(value, hint)
-    return "" if fits and (hint is bool or not isinstance(value, bool)) else names[hint]
+    if get_origin(hint) in (list, Sequence):
+        words = f"a list, each of it {_WORDS.get(inner[0], 'a value')}"
+        listed = isinstance(value, list | tuple)
+        return "" if listed and not any(_mismatch(part, inner[0]) for part in value) else words
+    if hint not in _WORDS:
+        return ""
+    fits = isinstance(value, (int, float) if hint is float else hint)
+    return "" if fits and (hint is bool or not isinstance(value, bool)) else _WORDS[hint]
 
 
 def build_instance(

@@ -21,19 +21,19 @@ from mjstack.config.schema.task import ControllerCfg, TaskCfg
 class Config:
     """Everything a run needs."""
 
-    robot: RobotCfg = field(default_factory=RobotCfg)
+    robot: RobotCfg = spec()
     """The arm."""
-    model: ModelCfg = field(default_factory=ModelCfg)
+    model: ModelCfg = spec()
     """Source of the arm's MJCF file."""
-    scene: SceneCfg = field(default_factory=SceneCfg)
+    scene: SceneCfg = spec()
     """Table and objects."""
-    timing: TimingCfg = field(default_factory=TimingCfg)
+    timing: TimingCfg = spec()
     """Physics step and control step."""
-    solver: SolverCfg = field(default_factory=SolverCfg)
+    solver: SolverCfg = spec()
     """Limits of the constraint solver, and the friction cone."""
-    batch: BatchCfg = field(default_factory=BatchCfg)
+    batch: BatchCfg = spec()
     """MJWarp's buffer sizes."""
-    sim: SimCfg = field(default_factory=SimCfg)
+    sim: SimCfg = spec()
     """Physics engine and device."""
     # Terms by name, which `complete` types.
     action: dict[str, Any] = spec(factory=dict)
@@ -46,13 +46,13 @@ class Config:
     """Ends of an episode."""
     reward: dict[str, Any] = spec(factory=dict)
     """Rewards of a policy."""
-    task: TaskCfg = field(default_factory=TaskCfg)
+    task: TaskCfg = spec()
     """The task; it chooses some of the groups above."""
-    controller: ControllerCfg = field(default_factory=ControllerCfg)
+    controller: ControllerCfg = spec()
     """Joint trajectories planned before the episode, or feedback."""
     gate: GateCfg = field(default_factory=GateCfg)
     """Parameters of the gates, all in use at once; gates=[...] chooses gates."""
-    job: JobCfg = field(default_factory=JobCfg)
+    job: JobCfg = spec()
     """Work of the command."""
     nworld: int = spec(unit="worlds", ge=1, le=MOST_WORLDS)
     """Worlds of the batch, capacity and throughput gates."""
