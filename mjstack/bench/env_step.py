@@ -41,7 +41,7 @@ def measure_env_step(
     *,
     steps: int,
     repetitions: int,
-    max_seconds: float | None = None,
+    seconds: float | None = None,
     meter: EnergyMeter | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Measurement:
@@ -51,7 +51,7 @@ def measure_env_step(
         env: The environment.
         steps: Control steps per repetition.
         repetitions: Measured repetitions; one before them warms up.
-        max_seconds: Shortens the repetitions so that all of them take about this long [s].
+        seconds: Shortens the repetitions so that all of them take about this long [s].
         meter: Measures the energy of the whole steps.
         progress: Gets the number of repetitions done.
 
@@ -66,8 +66,8 @@ def measure_env_step(
     decimation = env.cfg.timing.decimation
     parts = _Parts(env)
     step_seconds = parts.warm_up()
-    if max_seconds is not None:
-        steps = steps_that_fit(steps, max_seconds, _COST * (repetitions + 1) * step_seconds)
+    if seconds is not None:
+        steps = steps_that_fit(steps, seconds, _COST * (repetitions + 1) * step_seconds)
 
     # The repetitions
     times: list[tuple[float, float, float]] = []
@@ -76,10 +76,10 @@ def measure_env_step(
         meter.clear()
     start = snapshot(sim)
     for repetition in range(repetitions + 1):
-        start, seconds, episodes = parts.play(start, steps, meter if repetition else None)
+        start, spent, episodes = parts.play(start, steps, meter if repetition else None)
         if repetition:  # the first one warms up
             ended += episodes
-            times.append(seconds)
+            times.append(spent)
             if progress is not None:
                 progress(repetition)
 

@@ -13,8 +13,8 @@ from mjstack.episodes.observers import Episode
 from mjstack.episodes.record import FAILING, Circumstances, EpisodeRecord
 from mjstack.errors import name_worlds
 from mjstack.math import wilson_interval
-from mjstack.report.markdown import format_percent
 from mjstack.report.table import Table
+from mjstack.report.write import format_percent
 from mjstack.sim import Simulation
 from mjstack.tasks.check import EpisodeCheck
 

@@ -18,8 +18,8 @@ from mjstack.episodes.rollout import CLOSED_LOOP, Observer
 from mjstack.episodes.seeds import play_seeds
 from mjstack.errors import MjstackError
 from mjstack.mdp.starts.starts_file import write_starts
-from mjstack.report.markdown import format_percent
 from mjstack.report.record import GateResult, Status
+from mjstack.report.write import format_percent
 
 
 def success_config(cfg: Config) -> Config:

@@ -4,6 +4,7 @@ import gc
 import os
 import time
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -55,7 +56,7 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
     began = time.perf_counter()
     on_cuda = device.startswith("cuda")
     seconds = t.max_seconds if on_cuda else t.cpu_max_seconds
-    meter = EnergyMeter(device)
+    limits = {"seconds": seconds, "repetitions": t.repetitions, "meter": EnergyMeter(device)}
     result.metrics = {
         "worlds": cfg.nworld,
         "cpu_count": os.cpu_count() or 1,
@@ -65,10 +66,10 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
     # The measurements
     found: dict[str, Measurement] = {}
     if {"physics", "episode"} & set(t.measurements):
-        found |= _on_driven_worlds(context, backend, device, result, seconds, meter)
+        found |= _on_driven_worlds(context, backend, device, result, limits)
     if "env_step" in t.measurements:
         found["env_step"] = _guarded(
-            "env_step", _on_environment, context, backend, device, result, seconds, meter
+            "env_step", _on_environment, context, backend, device, result, limits
         )
     if not on_cuda:
         result.notes["gpu_power_and_memory"] = "not measured: no GPU"
@@ -107,8 +108,7 @@ def _on_driven_worlds(
     backend: Backend,
     device: str,
     result: GateResult,
-    seconds: float,
-    meter: EnergyMeter,
+    limits: dict[str, Any],
 ) -> dict[str, Measurement]:
     """Measurements *physics* and *episode*, on the same worlds."""
     t = context.cfg.gate.throughput
@@ -131,7 +131,6 @@ def _on_driven_worlds(
             "njmax": sizes.njmax,
         }
         result.notes["sizes_from"] = sizes.source
-    limits = {"seconds": seconds, "repetitions": t.repetitions, "meter": meter}
     found = {}
     step_seconds: float | None = None
     if "physics" in wanted:
@@ -152,8 +151,7 @@ def _on_environment(
     backend: Backend,
     device: str,
     result: GateResult,
-    seconds: float,
-    meter: EnergyMeter,
+    limits: dict[str, Any],
 ) -> Measurement:
     """Measurement *env_step*, on an environment with room for random actions."""
     t = context.cfg.gate.throughput
@@ -172,9 +170,7 @@ def _on_environment(
         found = measure_env_step(
             env,
             steps=t.env_steps,
-            repetitions=t.repetitions,
-            max_seconds=seconds,
-            meter=meter,
+            **limits,
             progress=lambda done: context.tell("env.step, repetitions", done, t.repetitions),
         )
         found.facts["build_and_compile_s"] = build_seconds

@@ -244,10 +244,7 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
 def joint_units(env: Env) -> tuple[str, ...]:
     """Units of the robot's joints, arm then gripper: rad for hinges, m for slides."""
     model = env.sim.model
-    kinds = {
-        int(address): int(kind)
-        for address, kind in zip(model.jnt_qposadr, model.jnt_type, strict=True)
-    }
+    kinds = dict(zip(model.jnt_qposadr.tolist(), model.jnt_type.tolist(), strict=True))
     hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
     return tuple("rad" if kinds[int(address)] == hinge else "m" for address in env.index.robot_qpos)
 

@@ -17,7 +17,6 @@ from mjstack.jobs.job import Job, JobResult
 from mjstack.jobs.progress import ProgressBar
 from mjstack.jobs.runner import Record, run_reported
 from mjstack.kinematics.reach import PointReach
-from mjstack.report.markdown import summarize
 from mjstack.report.reachability import (
     ObjectRegion,
     ReachLevel,
@@ -25,7 +24,7 @@ from mjstack.report.reachability import (
     save_map,
 )
 from mjstack.report.record import GateResult, Status
-from mjstack.report.write import write_tables
+from mjstack.report.write import summarize, write_tables
 from mjstack.scene import table_top
 from mjstack.scene.phases import object_targets
 from mjstack.sim import resolve_backend

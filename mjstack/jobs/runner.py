@@ -21,11 +21,10 @@ from mjstack.episodes.observers import StepHook
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.jobs.job import JobResult
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
-from mjstack.report.markdown import summarize
 from mjstack.report.picture import require_video, save_scene, save_trajectories, save_video
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Report, Status
-from mjstack.report.write import safely_draw, write_report
+from mjstack.report.write import safely_draw, summarize, write_report
 from mjstack.sim import Simulation, cuda_driver, cuda_name
 
 log = logging.getLogger(__name__)

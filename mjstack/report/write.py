@@ -1,19 +1,34 @@
-"""Write report.json and report.md, and draw pictures that may fail."""
+"""Write report.json and report.md, tables as files, and draw pictures that may fail."""
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from mjstack.files import write_atomic
-from mjstack.report.markdown import to_markdown
-from mjstack.report.record import Report
-from mjstack.report.table import Table, to_document
+from mjstack.report.record import GateResult, Report, Status
+from mjstack.report.table import Table, format_value, to_document
 
 log = logging.getLogger(__name__)
 
 SCHEMA = 2
+# Units by the end of a metric's name; the first that fits counts.
+_UNITS = {
+    "_m_per_s": "m/s",
+    "_per_s": "/s",
+    "_mib": "MiB",
+    "_deg": "deg",
+    "_mb": "MB",
+    "_rad": "rad",
+    "_m": "m",
+    "_s": "s",
+    "_w": "W",
+    "_j": "J",
+    "_n": "N",
+}
+_SPREAD = ("median", "min", "max")
 
 
 def write_report(report: Report, folder: Path) -> None:
@@ -89,3 +104,124 @@ def write_tables(
     shown = picture.name if picture.exists() else ""
     write_atomic(folder / f"{name}.md", to_document(title, tables, notes, shown))
     return problem
+
+
+def to_markdown(report: Report) -> str:
+    """Summary table, pictures, then every gate with its figures, and the provenance."""
+    lines = [f"# mjstack run: {report.status.value}", "", *summarize(report.gates).to_markdown()]
+    for picture in report.pictures:
+        lines += ["", f"![{picture}]({picture})"]
+    for gate in report.gates:
+        lines += ["", f"## {gate.name}: {gate.status.value}"]
+        lines += ["", gate.reason] if gate.reason else []
+        for table in [*gate.tables, *_tables(gate)]:
+            lines += ["", f"### {table.title}", "", *table.to_markdown()]
+        lines += ["", *(f"- {line}" for line in gate.details)] if gate.details else []
+    rows = [[key, _words(value)] for key, value in report.provenance.items()]
+    table = Table(title="Provenance", header=["fact", "value"], rows=rows)
+    lines += ["", f"## {table.title}", "", *table.to_markdown()]
+    skipped = [gate for gate in report.gates if gate.status is Status.skipped]
+    if skipped:
+        lines += ["", "Skipped:", ""] + [f"- {gate.name}: {gate.reason}" for gate in skipped]
+    return "\n".join(lines) + "\n"
+
+
+def summarize(gates: Iterable[GateResult]) -> Table:
+    """A row per gate: its status, wall time, and result in a line."""
+    rows = [
+        [gate.name, gate.status.value, f"{gate.seconds:.1f}", gate.reason or "ok"] for gate in gates
+    ]
+    return Table(title="", header=["gate", "status", "seconds", "result"], rows=rows)
+
+
+def format_percent(rate: float, unit: str = " %") -> str:
+    """A rate with as many digits as tell it from 0 and 1, at least two."""
+    gap = min(rate, 1.0 - rate)
+    digits = 2 if gap <= 0.0 else max(2, math.ceil(-math.log10(100.0 * gap)))
+    text = f"{100.0 * rate:.{digits}f}"
+    return text.rstrip("0").rstrip(".") + unit
+
+
+def _tables(gate: GateResult) -> list[Table]:
+    """The gate's numbers, every one once.
+
+    Repeated figures have their median and range in a row. A metric ``STATE.GROUP.NAME`` whose
+    threshold is called ``GROUP.NAME`` stands beside that limit, in a row per state. The rest has
+    name and value.
+    """
+    metrics = dict(gate.metrics)
+    thresholds = dict(gate.thresholds)
+    tables = []
+    repeated = [name[:-7] for name in metrics if name.endswith(".median")]
+    if repeated:
+        rows = []
+        for name in repeated:
+            spread = [metrics.pop(f"{name}.{end}") for end in _SPREAD]
+            rows.append([_label(name), *(_with_unit(name, value) for value in spread)])
+        header = ["figure", "median", "smallest", "largest"]
+        tables.append(Table(title="Figures", header=header, rows=rows))
+
+    limited = _with_limits(metrics, thresholds)
+    if limited.rows:
+        tables.append(limited)
+    rest: dict[str, Mapping[str, object]] = {
+        "measured": metrics,
+        "required": thresholds,
+        "notes": gate.notes,
+    }
+    for name, values in rest.items():
+        if values:
+            rows = [[_label(key), _with_unit(key, value)] for key, value in values.items()]
+            tables.append(Table(title=name.capitalize(), header=[name, "value"], rows=rows))
+    return tables
+
+
+def _with_limits(metrics: dict[str, float], thresholds: dict[str, float]) -> Table:
+    """Metrics per state beside their limits, taken out of both mappings."""
+    cells: dict[str, dict[str, str]] = {}
+    used = set()
+    for name in list(metrics):
+        state, _, quantity = name.partition(".")
+        limit = thresholds.get(quantity)
+        if limit is None or "." not in quantity:
+            continue
+        used.add(quantity)
+        group, _, column = quantity.rpartition(".")
+        row = cells.setdefault(", ".join(_label(part) for part in (state, group) if part), {})
+        row[column] = f"{format_value(float(metrics.pop(name)))} / {format_value(float(limit))}"
+    for quantity in used:
+        del thresholds[quantity]
+    columns = list(dict.fromkeys(column for row in cells.values() for column in row))
+    return Table(
+        title="Found / allowed",
+        header=["state", *columns],
+        rows=[[name, *(row.get(c, "") for c in columns)] for name, row in cells.items()],
+    )
+
+
+def _ending(name: str) -> str:
+    """The end of a name that tells its unit; empty where there is none."""
+    return next((end for end in _UNITS if name.endswith(end)), "")
+
+
+def _label(name: str) -> str:
+    """A metric's name in words, without its unit.
+
+    ``final.red.position_m`` is "final, red: position".
+    """
+    *groups, last = name.removesuffix(_ending(name)).replace("_", " ").split(".")
+    return f"{', '.join(groups)}: {last}" if groups else last
+
+
+def _with_unit(name: str, value: object) -> str:
+    """A value with the unit that its name ends on."""
+    end = _ending(name)
+    number = isinstance(value, float | int) and not isinstance(value, bool)
+    return f"{format_value(value)} {_UNITS[end]}" if end and number else format_value(value)
+
+
+def _words(value: object) -> str:
+    """A value of the provenance; versions become a list."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {item}" for name, item in value.items())
+    return format_value(value)
