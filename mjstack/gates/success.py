@@ -41,14 +41,16 @@ def run_success(context: RunContext) -> list[GateResult]:
     own = context.with_config(success_config(context.cfg))
     cfg = own.cfg
     t = cfg.gate.success
+    unwritten: list[str] = []
     tally = play_seeds(
         own,
         "success",
         count=t.seeds,
         noun="episodes",
         circumstances=True,
-        observers=lambda seed: _starts_writers(own, seed),
+        observers=lambda seed: _starts_writers(own, seed, unwritten),
     )
+    tally.details = unwritten + tally.details
     kept = tally.circumstances
     starts = np.concatenate([seed.start_places for seed in kept])
     retries = np.concatenate([seed.retries for seed in kept])
@@ -71,9 +73,7 @@ def run_success(context: RunContext) -> list[GateResult]:
         "episode_s": tally.seconds,
     }
     reads = reads_starts_file(cfg.reset)
-    tally.notes["starts"] = (
-        f"starts={cfg.starts}" if reads else f"gate.success.reset ({', '.join(cfg.reset)})"
-    )
+    tally.notes["starts"] = f"starts={cfg.starts}" if reads else _describe_start(cfg)
 
     parts = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
     if retried.any():
@@ -102,24 +102,35 @@ def run_success(context: RunContext) -> list[GateResult]:
 class _StartsWriter(Observer):
     """Writes how worlds start into a file."""
 
-    def __init__(self, path: Path, context: RunContext) -> None:
-        """``context`` is told if the file cannot be written."""
+    def __init__(self, path: Path, unwritten: list[str]) -> None:
+        """``unwritten`` gets the problem if the file cannot be written."""
         self._path = path
-        self._context = context
+        self._unwritten = unwritten
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         try:
             write_starts(env, self._path)
         except MjstackError as error:  # a full disk, say: the episodes are played all the same
-            self._context.say(f"no {self._path.name}: {error}")
+            self._unwritten.append(f"{self._path.name} could not be written: {error}")
 
 
-def _starts_writers(context: RunContext, seed: int) -> list[Observer]:
+def _starts_writers(context: RunContext, seed: int, unwritten: list[str]) -> list[Observer]:
     """The writer of a seed's starts; none if the worlds start from that very file."""
     if context.folder is None:
         return []
     path = context.folder / starts_name(seed)
     starts = context.cfg.starts
     own = starts is not None and path.resolve() == Path(starts).resolve()
-    return [] if own else [_StartsWriter(path, context)]
+    return [] if own else [_StartsWriter(path, unwritten)]
+
+
+def _describe_start(cfg: Config) -> str:
+    """How worlds start, in a few words."""
+    regions = [
+        term.params["xy"]
+        for term in cfg.reset.values()
+        if places_objects(term) and "xy" in term.params
+    ]
+    where = "".join(f", objects within {x:g} x {y:g} m of their places" for x, y in regions)
+    return f"gate.success.reset ({', '.join(cfg.reset)}{where})"

@@ -14,6 +14,7 @@ from rich.markup import escape
 
 from mjstack.config.schema import Backend, Config, SimCfg
 from mjstack.episodes.context import RunContext, judge_one, require_episode
+from mjstack.episodes.failures import FailureMonitor, describe_sign
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.replay import ReplayedWorld, replay_world, start_of_world
 from mjstack.errors import ConfigError, DeviceError, RunError
@@ -192,13 +193,14 @@ def _replay(
     """Play the world on one backend, and compare the result with the recorded one."""
     first = number == 0
     backend, device = plan.where[number]
+    monitors = [FailureMonitor(context.cfg)] if plan.gate == "success" else []
     done = replay_world(
         context,
         seed=plan.seed,
         world=plan.world,
         backend=backend,
         device=device,
-        observers=context.viewers if first else [],
+        observers=[*(context.viewers if first else []), *monitors],
     )
     rules = context.check.rules
     status, reason, metrics = judge_one(rules, done.episode.result)
@@ -210,7 +212,9 @@ def _replay(
         context.artifacts.shown = done.recorder
         shown = f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
         context.artifacts.shown_by = shown
-    for line in done.findings:
+    told = list(done.findings)
+    told += [_first_sign(monitor, done, context) for monitor in monitors]
+    for line in told:
         context.say(escape(f"  {line}"))
     name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
     assert context.folder is not None
@@ -224,9 +228,20 @@ def _replay(
             thresholds=context.check.thresholds(),
             metrics={"seed": plan.seed, "world": plan.world, **metrics},
             notes={"backend": done.description, "recorded": recorded, "trajectory": name},
-            details=[*done.findings, *changes],
+            details=told + changes,
         )
     ]
+
+
+def _first_sign(monitor: FailureMonitor, done: ReplayedWorld, context: RunContext) -> str:
+    """The first sign of failure, as the success gate reports it."""
+    sign = int(monitor.sign[0])
+    seen = "none"
+    if sign:
+        phase = context.planner.phases[int(monitor.phase[0])].name
+        seen = f"{describe_sign(sign, phase)}, seen in step {int(monitor.step[0])}"
+    retries = int(done.episode.retries[0])
+    return f"first sign of failure: {seen}; grasps tried again: {retries}"
 
 
 def _compare(
