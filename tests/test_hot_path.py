@@ -157,7 +157,6 @@ PATHS: dict[str, list[str] | None] = {
     "sim/usage.py": ["Usage.count", "Usage.clear"],
     "sim/substep.py": ["rearranged_step"],
     "sim/graph.py": ["side_by_side"],
-    "sim/repeated.py": ["in_parallel"],
     "sim/draws.py": ["draw_uniform"],
     "math.py": None,
 }

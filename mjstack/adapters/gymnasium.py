@@ -57,8 +57,16 @@ class GymnasiumVectorEnv(VectorEnv):
         self.group = group
         self.num_envs = env.nworld
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
-        self.single_observation_space = _observation_space(env, group)
-        self.single_action_space = _action_space(env)
+        boxes: dict[str, spaces.Space] = {
+            name: spaces.Box(-np.inf, np.inf, (dim,), np.float32)
+            for name, dim in env.observation_manager.group_dims.items()
+        }
+        if group is not None and group not in boxes:
+            raise UnknownName("observation group", group, boxes)
+        self.single_observation_space = spaces.Dict(boxes) if group is None else boxes[group]
+        manager = env.action_manager
+        low, high = (bound.float().cpu().numpy() for bound in (manager.low, manager.high))
+        self.single_action_space = spaces.Box(low, high, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, env.nworld)
         self.action_space = batch_space(self.single_action_space, env.nworld)
 
@@ -79,14 +87,16 @@ class GymnasiumVectorEnv(VectorEnv):
         Raises:
             MjstackError: The seed or an option cannot be used.
         """
-        _check_options(options, ("reset_mask",))
-        mask = (options or {}).get("reset_mask")
+        options = options or {}
+        for name in options:
+            if name != "reset_mask":
+                raise UnknownName("reset option", name, ("reset_mask",))
+        mask = options.get("reset_mask")
         if mask is not None:
             mask = torch.as_tensor(mask, device=self.inner.device)
         obs, _ = self.inner.reset(seed=seed, mask=mask)
-        super().reset(
-            seed=seed
-        )  # after the environment, whose message about a wrong seed says more
+        # After the environment, whose message about a wrong seed says more.
+        super().reset(seed=seed)
         return _numpy(obs, self.group), {}
 
     def step(
@@ -104,13 +114,10 @@ class GymnasiumVectorEnv(VectorEnv):
         Raises:
             MjstackError: The actions cannot be used, or something went wrong in the worlds.
         """
-        action = _tensor(actions, self.action_space, self.inner.device)
+        action = torch.from_numpy(_array(actions, self.action_space)).to(self.inner.device)
         obs, reward, terminated, truncated, extras = self.inner.step(action)
         success = extras["success"].cpu().numpy()
-        infos: dict[str, Any] = {
-            "success": success,
-            "_success": np.ones(self.num_envs, dtype=np.bool_),
-        }
+        infos = {"success": success, "_success": np.ones(self.num_envs, dtype=np.bool_)}
         done = (terminated | truncated).cpu().numpy()
         if done.any():
             final = _numpy(extras["final_obs"], self.group)
@@ -164,12 +171,13 @@ class GymnasiumEnv(gymnasium.Env):
             )
         self.inner = env
         self.group = group
+        self._worlds = GymnasiumVectorEnv(env, group=group)
         self.metadata = {"render_modes": [], "render_fps": round(1.0 / env.cfg.timing.step_dt)}
-        self.observation_space = _observation_space(env, group)
-        self.action_space = _action_space(env)
+        self.observation_space = self._worlds.single_observation_space
+        self.action_space = self._worlds.single_action_space
         # The inner environment starts the next episode in the step that ends one; this is what it
         # saw first.
-        self._first: dict[str, torch.Tensor] | None = None
+        self._first: Observation | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -187,15 +195,14 @@ class GymnasiumEnv(gymnasium.Env):
         Raises:
             MjstackError: The seed or an option cannot be used.
         """
-        _check_options(options, ())
+        for name in options or ():
+            raise UnknownName("reset option", name, ())
         first = self._first
         if seed is not None or first is None:
-            first, _ = self.inner.reset(seed=seed)
+            first, _ = self._worlds.reset(seed=seed)
         self._first = None
-        super().reset(
-            seed=seed
-        )  # after the environment, whose message about a wrong seed says more
-        return _row(_numpy(first, self.group), 0), {}
+        super().reset(seed=seed)
+        return _row(first, 0), {}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Advances the world by one control interval.
@@ -215,70 +222,37 @@ class GymnasiumEnv(gymnasium.Env):
             raise ArgumentError(
                 "env", "step() after the end of an episode", "reset() first", "Call env.reset()"
             )
-        obs, reward, terminated, truncated, extras = self.inner.step(
-            _tensor(action, self.action_space, self.inner.device).unsqueeze(0)
-        )
+        actions = _array(action, self.action_space)[None]
+        obs, reward, terminated, truncated, infos = self._worlds.step(actions)
+        info = {"success": bool(infos["success"])}
         ended = bool(terminated), bool(truncated)
         if any(ended):
             self._first = obs
-            obs = extras["final_obs"]
-        return (
-            _row(_numpy(obs, self.group), 0),
-            float(reward),
-            *ended,
-            {"success": bool(extras["success"])},
-        )
+            return infos["final_obs"][0], float(reward[0]), *ended, info
+        return _row(obs, 0), float(reward[0]), *ended, info
 
     def close(self) -> None:
         """Gives the simulation's threads and buffers back."""
         self.inner.close()
 
 
-def _observation_space(env: Env, group: str | None) -> spaces.Space:
-    boxes: dict[str, spaces.Space] = {
-        name: spaces.Box(-np.inf, np.inf, (dim,), np.float32)
-        for name, dim in env.observation_manager.group_dims.items()
-    }
-    if group is None:
-        return spaces.Dict(boxes)
-    if group not in boxes:
-        raise UnknownName("observation group", group, boxes)
-    return boxes[group]
-
-
-def _action_space(env: Env) -> spaces.Box:
-    low, high = (
-        bound.float().cpu().numpy() for bound in (env.action_manager.low, env.action_manager.high)
-    )
-    return spaces.Box(low, high, dtype=np.float32)
-
-
 def _numpy(obs: dict[str, torch.Tensor], group: str | None) -> Observation:
-    if group is not None:
-        return obs[group].cpu().numpy()
-    return {name: value.cpu().numpy() for name, value in obs.items()}
+    arrays = {name: value.cpu().numpy() for name, value in obs.items()}
+    return arrays if group is None else arrays[group]
 
 
 def _row(obs: Observation, world: int) -> Observation:
-    return (
-        {name: value[world] for name, value in obs.items()} if isinstance(obs, dict) else obs[world]
-    )
+    if isinstance(obs, dict):
+        return {name: value[world] for name, value in obs.items()}
+    return obs[world]
 
 
-def _tensor(action: Any, space: spaces.Space, device: torch.device) -> torch.Tensor:
+def _array(action: Any, space: spaces.Space) -> np.ndarray:
     expected = f"a float32 array of shape {space.shape}"
     try:
-        array = np.array(
-            action, dtype=np.float32
-        )  # a copy: torch wants memory that it may write to
+        array = np.array(action, dtype=np.float32)  # a copy: torch wants memory it may write to
     except (TypeError, ValueError) as error:
         raise ArgumentError("action", type(action).__name__, expected) from error
     if array.shape != space.shape:
         raise ArgumentError("action", f"shape {array.shape}", expected)
-    return torch.from_numpy(array).to(device)
-
-
-def _check_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
-    for name in options or ():
-        if name not in known:
-            raise UnknownName("reset option", name, known)
+    return array

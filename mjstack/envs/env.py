@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, GraphMode
 from mjstack.envs.arguments import check_mask, check_seed
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import Outputs
@@ -19,7 +19,7 @@ from mjstack.managers.term import Term, current_term, first_value, step_cache
 from mjstack.math import not_finite
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
-from mjstack.sim.repeated import Repeated, as_graph, in_parallel
+from mjstack.sim.graph import StepGraph, side_by_side
 
 FAULT_WINDOW = 200  # steps between two reads of the faults on CUDA; on the CPU each step reads
 
@@ -241,17 +241,17 @@ class Env:
         self._evaluate()
         current_term.label = ""
 
-    def captured(self, work: Callable[[], None], name: str) -> Repeated:
+    def captured(self, work: Callable[[], None], name: str) -> StepGraph:
         """Work of this environment as a graph on CUDA; elsewhere as it is.
 
         Args:
             work: `advance`, and everything that is to be captured along with it.
             name: Its name in messages.
         """
-        return as_graph(
+        return StepGraph(
             work,
             self.device,
-            self.cfg.graph,
+            self.cfg.graph if self.device.type == "cuda" else GraphMode.off,
             name=name,
             version=lambda: self._version,
             culprit=lambda: current_term.label,
@@ -263,7 +263,7 @@ class Env:
         """
         self._version += 1
 
-    def halves(self) -> tuple[Repeated, Repeated]:
+    def halves(self) -> tuple[StepGraph, StepGraph]:
         """The physics of a step, and everything else of it: two graphs, for measurements. They act
         on the action that was processed last.
         """
@@ -336,7 +336,7 @@ class Env:
             with step_cache():
                 self.observation_manager.compute()
 
-        in_parallel(self.device, reward, observe)
+        side_by_side(self.device, reward, observe)
         current_term.label = ""
         if self._check_faults and not broken.is_cuda:
             self._faults.record(broken)
@@ -368,7 +368,7 @@ class Env:
             if on_cuda and self._check_faults:
                 self._faults.record(broken)
 
-        in_parallel(self.device, keep, count, record)
+        side_by_side(self.device, keep, count, record)
         if ending:
             self.episode += done
             self.episode_step.masked_fill_(done, 0)

@@ -8,14 +8,14 @@ from typing import cast
 import numpy as np
 import torch
 
-from mjstack.config.schema import Config, TermCfg
+from mjstack.config.schema import Config, GraphMode, TermCfg
 from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, driven_config
 from mjstack.mdp.geometry import source_xy
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
-from mjstack.sim.repeated import Repeated
+from mjstack.sim.graph import StepGraph
 
 CLOSED_LOOP = "closed_loop"  # the controller with feedback; any other name plays a plan
 Reset = dict[str, TermCfg]
@@ -109,9 +109,12 @@ def rollout(
         sim.ctrl.copy_(driver.command())
         cast(Callable[[], None], physics)()
 
-    play = Repeated(bare) if physics else env.captured(work, "a step of the episode")
+    if physics is None:
+        play = env.captured(work, "a step of the episode")
+    else:
+        play = StepGraph(bare, sim.device, GraphMode.off, name="the physics")
     # On Warp's CPU device physics alone is captured, once for all episodes.
-    graph: Repeated | None = play
+    graph: StepGraph | None = play
     if sim.device.type != "cuda" and physics is None:
         graph = sim.graph_of(env.cfg.timing.decimation, kinematics=True)
 

@@ -1,6 +1,8 @@
 """Captures fixed work once and replays it: Warp's and torch's in one CUDA graph, or Warp's alone on
-its CPU device.
+its CPU device. Warp is loaded where something is captured, because native runs do not need it.
 """
+
+from __future__ import annotations
 
 import gc
 import logging
@@ -8,13 +10,15 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
 
 import torch
 
 from mjstack.config.schema import GraphMode
 from mjstack.errors import CaptureError
-from mjstack.sim.repeated import Repeated
-from mjstack.sim.warp_setup import torch_stream_scope, wp
+
+if TYPE_CHECKING:
+    import warp as wp
 
 _ALIGNMENT = 512  # bytes
 
@@ -44,7 +48,7 @@ def _inside() -> Iterator[None]:
         _nesting -= 1
 
 
-class StepGraph(Repeated):
+class StepGraph:
     """Work that is the same at every call: no host read, fixed shapes, the same memory.
 
     The first call runs it eagerly, which compiles kernels and makes allocations happen. The second
@@ -53,9 +57,12 @@ class StepGraph(Repeated):
 
     Attributes:
         captured: Whether the next call replays.
-        warm_up_seconds: What the eager call took, compilation included.
-        capture_seconds: What the capture took.
+        warm_up_seconds: Time of the eager call, compilation included [s].
+        capture_seconds: Time of the capture [s].
     """
+
+    warm_up_seconds = 0.0
+    capture_seconds = 0.0
 
     def __init__(
         self,
@@ -80,13 +87,13 @@ class StepGraph(Repeated):
             culprit: Names what was current_term, for the message of a failed capture.
             scratch: Whether Warp's temporaries come from a `Scratch`.
         """
-        super().__init__(work)
+        self._work = work
         self._mode = mode
         self._name = name
         self._version = version
         self._culprit = culprit
         self._scratch = scratch
-        self._device = wp.get_device(str(device))
+        self._device = str(device)
         self._replay: Callable[[], None] | None = None
         self._memory: tuple[torch.cuda.MemPool, Scratch | None] | None = None
         self._warm = self._failed = False
@@ -122,12 +129,13 @@ class StepGraph(Repeated):
         self._seen = self._version()
 
     def _warm_up(self) -> None:
+        from mjstack.sim.warp_setup import wp
+
         began = time.perf_counter()
         with _inside():
             self._work()
-            wp.synchronize_device(
-                self._device
-            )  # Warp's temporaries are freed on a stream that torch's do not wait for
+            # Warp's temporaries are freed on a stream that torch's do not wait for
+            wp.synchronize_device(self._device)
         self._warm = True
         self.warm_up_seconds = time.perf_counter() - began
 
@@ -135,19 +143,23 @@ class StepGraph(Repeated):
         """Capture the work; Python's collector waits, so that nothing is freed in the middle of
         it.
         """
+        from mjstack.sim.warp_setup import wp
+
         began = time.perf_counter()
-        wp.synchronize_device(self._device)
+        device = wp.get_device(self._device)
+        wp.synchronize_device(device)
         collecting = gc.isenabled()
         gc.disable()
         try:
             with _inside():
-                self._replay = self._capture_cuda() if self._device.is_cuda else self._capture_cpu()
+                capture = self._capture_cuda if device.is_cuda else self._capture_cpu
+                self._replay = capture(device)
         except Exception as error:
             self._failed = True
             failure = CaptureError(self._name, self._culprit(), error)
-            if self._device.is_cuda:
+            if device.is_cuda:
                 with suppress(RuntimeError):  # it reports the failed capture once more
-                    torch.cuda.synchronize(wp.device_to_torch(self._device))
+                    torch.cuda.synchronize(wp.device_to_torch(device))
             if self._mode is GraphMode.require:
                 self._failed = False
                 raise failure from error
@@ -159,8 +171,10 @@ class StepGraph(Repeated):
         self.capture_seconds = time.perf_counter() - began
         return True
 
-    def _capture_cuda(self) -> Callable[[], None]:
-        torch_device = wp.device_to_torch(self._device)
+    def _capture_cuda(self, device: wp.Device) -> Callable[[], None]:
+        from mjstack.sim.warp_setup import torch_stream_scope, wp
+
+        torch_device = wp.device_to_torch(device)
         # A stream of torch's own making: newer torch refuses to capture on a blocking one. The same
         # for ever, because a second Warp object for it would unregister it when freed.
         if torch_device not in _capture_streams:
@@ -172,7 +186,7 @@ class StepGraph(Repeated):
         # no one else gets. So there is a second such pool.
         memory = torch.cuda.MemPool()
         pool = torch.cuda.graph_pool_handle()
-        scratch = Scratch(self._device) if self._scratch else None
+        scratch = Scratch(device) if self._scratch else None
         _abandoned.append((graph, memory))
         try:
             with (
@@ -180,9 +194,9 @@ class StepGraph(Repeated):
                     graph, pool=pool, stream=stream, capture_error_mode="thread_local"
                 ),
                 torch.cuda.use_mem_pool(memory),
-                wp.ScopedAllocator(self._device, scratch),
-                torch_stream_scope(self._device),
-                wp.ScopedCapture(stream=wp.get_stream(self._device), external=True),
+                wp.ScopedAllocator(device, scratch),
+                torch_stream_scope(device),
+                wp.ScopedCapture(stream=wp.get_stream(device), external=True),
             ):
                 self._work()
         except Exception:
@@ -195,8 +209,10 @@ class StepGraph(Repeated):
         self._memory = memory, scratch
         return graph.replay
 
-    def _capture_cpu(self) -> Callable[[], None]:
-        with wp.ScopedDevice(self._device), wp.ScopedCapture() as capture:
+    def _capture_cpu(self, device: wp.Device) -> Callable[[], None]:
+        from mjstack.sim.warp_setup import wp
+
+        with wp.ScopedDevice(device), wp.ScopedCapture() as capture:
             self._work()
         graph = capture.graph
         return lambda: wp.capture_launch(graph)
@@ -217,7 +233,6 @@ class Scratch:
     def __init__(self, device: wp.Device) -> None:
         """Start empty."""
         self._device = device
-        self._torch_device = torch.device(wp.device_to_torch(device))
         self._free: dict[tuple[int, int], list[int]] = defaultdict(list)
         self._owner: dict[int, int] = {}
         self._blocks: list[torch.Tensor] = []
@@ -229,7 +244,7 @@ class Scratch:
         free = self._free[stream, size]
         if free:
             return free.pop()
-        block = torch.empty(size, dtype=torch.uint8, device=self._torch_device)
+        block = torch.empty(size, dtype=torch.uint8, device=str(self._device))
         self._blocks.append(block)
         self._owner[block.data_ptr()] = stream
         return block.data_ptr()
@@ -256,6 +271,8 @@ def side_by_side(device: torch.device, *works: Callable[[], None], branches: boo
         for work in works:
             work()
         return
+    from mjstack.sim.warp_setup import torch_stream_scope, wp
+
     main = torch.cuda.current_stream(device)
     free = _side_streams.setdefault(str(device), [])
     while len(free) < len(works) - 1:

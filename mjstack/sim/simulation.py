@@ -7,8 +7,8 @@ import mujoco
 import torch
 
 from mjstack.errors import ArgumentError, RebindError
+from mjstack.sim.graph import StepGraph
 from mjstack.sim.model_fields import Fields
-from mjstack.sim.repeated import Repeated
 from mjstack.sim.sizes import BatchSizes
 
 
@@ -207,7 +207,7 @@ class Simulation(ABC):
                 device.
         """
 
-    def graph_of(self, n: int = 1, *, kinematics: bool = False) -> Repeated | None:
+    def graph_of(self, n: int = 1, *, kinematics: bool = False) -> StepGraph | None:
         """The graph that ``step(n)`` replays; None on a backend that captures nothing."""
         return None
 
