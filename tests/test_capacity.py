@@ -7,6 +7,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,15 +20,15 @@ from mjstack.config.schema import Backend
 from mjstack.envs import Env, build_env
 from mjstack.envs.buffers import (
     Peaks,
+    Workload,
     join_peaks,
-    measure_peaks,
     play_random_actions,
+    play_workload,
     read_peaks,
     recommend_sizes,
     require_physics,
 )
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.workloads import Workload, play_task
 from mjstack.errors import FaultError, MjstackError, Unreachable
 from mjstack.gates import capacity as capacity_module
 from mjstack.gates.batch import run_batch
@@ -165,35 +166,42 @@ def test_peaks_join() -> None:
     assert both.overflow.tolist() == [0, 1, 0, 2]
 
 
+def tried(
+    monkeypatch: pytest.MonkeyPatch, lost: Callable[[BatchSizes], int]
+) -> tuple[list[BatchSizes], Workload]:
+    """The sizes that a workload is tried in, and its last run; some of them lose physics."""
+    made: list[BatchSizes] = []
+
+    def make(sizes: BatchSizes) -> SimpleNamespace:
+        made.append(sizes)
+        qpos = torch.zeros(4, 1)
+        return SimpleNamespace(sizes=sizes, qpos=qpos, description="", close=lambda: None)
+
+    def read(sim: SimpleNamespace) -> Peaks:
+        return peaks(rows=7, overflow=np.array([0, lost(sim.sizes), 0, 0]))
+
+    monkeypatch.setattr("mjstack.envs.buffers.read_peaks", read)
+    return made, play_workload(load_config([]), make, lambda sim: np.zeros(4))
+
+
 @pytest.mark.full
-def test_room_to_measure_in_grows_where_it_is_too_little() -> None:
-    cfg = load_config([])
-    tried: list[BatchSizes] = []
-
-    def run(sizes: BatchSizes) -> Peaks:
-        tried.append(sizes)
-        lost = int(Overflow.NEFC) * (sizes.njmax < 2000) | int(Overflow.CCD) * (sizes.nconmax < 200)
-        return peaks(rows=7, overflow=np.array([0, lost, 0, 0]))
-
-    found, room = measure_peaks(cfg, run)
-    assert [(s.njmax, s.nconmax) for s in tried] == [(768, 128), (1536, 256), (3072, 256)]
-    assert not found.overflow.any()
-    assert room == tried[-1]
-    require_physics("it", found, room)
+def test_room_to_measure_in_grows_where_it_is_too_little(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, run = tried(
+        monkeypatch,
+        lambda s: int(Overflow.NEFC) * (s.njmax < 2000) | int(Overflow.CCD) * (s.nconmax < 200),
+    )
+    assert [(s.njmax, s.nconmax) for s in made] == [(768, 128), (1536, 256), (3072, 256)]
+    assert not run.peaks.overflow.any()
+    assert run.sizes == made[-1]
+    require_physics("it", run)
 
 
 @pytest.mark.full
-def test_room_to_measure_in_does_not_grow_for_ever() -> None:
-    tried: list[BatchSizes] = []
-
-    def run(sizes: BatchSizes) -> Peaks:
-        tried.append(sizes)
-        return peaks(overflow=np.full(4, int(Overflow.NEFC)))
-
-    found, room = measure_peaks(load_config([]), run)
-    assert found.overflow.all()
-    assert len(tried) == 4
-    assert room == tried[-1]
+def test_room_to_measure_in_does_not_grow_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, run = tried(monkeypatch, lambda _: int(Overflow.NEFC))
+    assert run.peaks.overflow.any()
+    assert len(made) == 4
+    assert run.sizes == made[-1]
 
 
 @pytest.mark.parametrize(
@@ -211,7 +219,9 @@ def test_room_to_measure_in_does_not_grow_for_ever() -> None:
 def test_nothing_is_sized_from_motion_that_lost_physics(bits: Overflow, fix: str) -> None:
     lost = peaks(overflow=np.array([0, int(bits), 0, int(bits)]))
     with pytest.raises(FaultError) as caught:
-        require_physics("the scripted task", lost, BatchSizes(nconmax=128, njmax=768))
+        require_physics(
+            "the scripted task", workload(peaks=lost, sizes=BatchSizes(nconmax=128, njmax=768))
+        )
     says = str(caught.value)
     assert says.startswith("batch=auto: what the scripted task needs cannot be measured: ")
     assert "overflow in 2 of 4 worlds (1, 3) even with batch.nconmax=128 batch.njmax=768. " in says
@@ -330,12 +340,12 @@ def test_too_small_is_found_and_the_printed_override_cures_it(
         *overrides,
         *at_double_speed(),
     )
-    run = play_task(cured, cured.cfg.reset, resolve_sizes(cured.cfg))
+    run = cured.play_task(cured.cfg.reset, resolve_sizes(cured.cfg))
     assert not run.peaks.overflow.any()
-    assert run.succeeded == 2
-    ill = play_task(context, context.cfg.reset, resolve_sizes(context.cfg))
+    assert not run.failed.any()
+    ill = context.play_task(context.cfg.reset, resolve_sizes(context.cfg))
     assert (ill.peaks.overflow & int(Overflow.NEFC)).all()
-    assert ill.succeeded == 0
+    assert ill.failed.all()
 
 
 @pytest.mark.full
@@ -440,14 +450,14 @@ def test_a_layout_out_of_reach_leaves_the_other_workloads(
     context = new_context(
         "sim=native", "nworld=1", "gate.capacity.random_steps=5", *at_double_speed()
     )
-    play = capacity_module.play_task
+    play = RunContext.play_task
 
     def unreachable(context: RunContext, reset: dict) -> Workload:
         if reset is context.cfg.gate.capacity.reset:
             raise Unreachable(0, "grasp_red", (0.9, 0.0, 0.0), 0.3, 5e-4)
         return play(context, reset)
 
-    monkeypatch.setattr(capacity_module, "play_task", unreachable)
+    monkeypatch.setattr(RunContext, "play_task", unreachable)
     (result,) = run_capacity(context)
     assert result.status is Status.passed
     assert any(
@@ -462,7 +472,6 @@ def workload(**changes: object) -> Workload:
         "sizes": BatchSizes(nconmax=128, njmax=300),
         "final": np.zeros((2, 3)),
         "failed": np.zeros(2, dtype=np.int64),
-        "memory": {"data": 10, "device": None},
         "description": "",
     }
     return Workload(**(facts | changes))
@@ -524,7 +533,7 @@ def test_each_workload_is_played_again_and_a_flip_fails_where_runs_repeat(
         played.append(("random_actions", sizes))
         return workload(sizes=sizes)
 
-    monkeypatch.setattr(capacity_module, "play_task", play_task)
+    monkeypatch.setattr(RunContext, "play_task", play_task)
     monkeypatch.setattr(capacity_module, "play_random", play_random)
     (result,) = run_capacity(context)
     assert {name: sizes.njmax for name, sizes in played} == {
@@ -550,7 +559,7 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
     context.say = said.append
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([0, int(Overflow.NEFC)])))
-    monkeypatch.setattr(capacity_module, "play_task", lambda *_: workload())
+    monkeypatch.setattr(RunContext, "play_task", lambda *_: workload())
 
     def play_random(context: RunContext, *sizes: BatchSizes) -> Workload:
         assert not sizes, "tried sizes that are not known"
@@ -646,7 +655,7 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
     new_context: NewContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([int(Overflow.NEFC), 0])))
-    monkeypatch.setattr("mjstack.episodes.workloads.play_task", lambda *_: lost)
+    monkeypatch.setattr(RunContext, "play_task", lambda *_: lost)
     context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
     with pytest.raises(
         FaultError,
@@ -658,7 +667,7 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
 
 @pytest.mark.full
 def test_native_environment_measures_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mjstack.envs.buffers.measure_peaks", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr("mjstack.envs.buffers.play_workload", lambda *_: pytest.fail("measured"))
     mjstack.make_env(["batch=auto", "sim=native"], nworld=1).reset(seed=0)
 
 

@@ -219,7 +219,7 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
     assert throughput.reason.count("no figure") == 3
     assert not [name for name in throughput.metrics if "per_s" in name or "ms_per" in name]
 
-    context.artifacts.timed_episode.failed.clear()
+    context.artifacts.timed_episode.result.failed.zero_()
     throughput, cuda = run_throughput(context)
     assert throughput.status is Status.passed
     assert throughput.metrics["physics.world_steps_per_s.median"] > 0

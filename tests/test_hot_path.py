@@ -96,12 +96,13 @@ PATHS: dict[str, list[str] | None] = {
     "tasks/parts.py": [
         *("airborne", "in_hand", "on_top", "offset", "on_table"),
         *(f"{n}.update" for n in ("Streak", "Carried", "InWindow", "AtRest")),
-        *("AtLeast.held", "InWindow.held"),
+        "AtLeast.held",
         "Streak._counts",
-        *(f"HeldSuccess.{n}" for n in ("__call__", "_achieved", "reset")),
+        *("HeldSuccess.__call__", "HeldSuccess.reset", "ReleasedSuccess.__call__"),
     ],
     "tasks/stack.py": [
-        *("StackCheck.placed", "RestWindow.append", "RestWindow.compare", "StackSuccess.__call__")
+        *("StackCheck.placed", "RestWindow.append", "RestWindow.compare"),
+        *("StackSuccess._stands", "StackSuccess.__call__"),
     ],
     "tasks/box.py": [
         *(f"BoxCheck.{n}" for n in ("airborne", "resting", "placed")),
@@ -116,7 +117,7 @@ PATHS: dict[str, list[str] | None] = {
         *(f"{n}.__call__" for n in ("ToSlot", "Place", "InBox", "ReachNext", "GraspNext")),
         *("_ByObject._inside", "_ByObject._next"),
     ],
-    "tasks/reach.py": ["ReachSuccess.__call__", "ReachSuccess.reset"],
+    "tasks/reach.py": ["ReachSuccess.__init__"],
     "drivers/open_loop.py": ["JointTrajectory.command"],
     "drivers/driver.py": ["Recorded.append", "Recorded.command", "OpenLoopDriver.command"],
     "drivers/closed_loop.py": [

@@ -5,6 +5,8 @@ import statistics
 import time
 from typing import TYPE_CHECKING, cast
 
+import numpy as np
+
 from mjstack.bench.timing import (
     WARM_UP,
     EnergyMeter,
@@ -14,8 +16,8 @@ from mjstack.bench.timing import (
 )
 from mjstack.config.schema import GraphMode
 from mjstack.drivers.driver import Recorded
-from mjstack.episodes.context import RunContext, TimedEpisode
-from mjstack.episodes.observers import CommandRecorder
+from mjstack.episodes.context import RunContext
+from mjstack.episodes.observers import CommandRecorder, Episode
 from mjstack.episodes.rollout import CLOSED_LOOP, Observer, rollout
 from mjstack.errors import name_worlds
 from mjstack.sim import Simulation
@@ -52,7 +54,10 @@ def measure_episode(
     out = Measurement(name="episode")
     steps = context.planner.phases[-1].stop
     before = context.artifacts.timed_episode
-    if before is not None and (before.description, before.nworld) != (sim.description, sim.nworld):
+    if before is not None and (before.description, len(before.start)) != (
+        sim.description,
+        sim.nworld,
+    ):
         before = None
 
     # About how long a repetition takes
@@ -82,7 +87,7 @@ def measure_episode(
         return out
 
     # The result
-    failed = sorted({world for p in played for world in p.failed})
+    failed = sorted({world for p in played for world in np.flatnonzero(p.failed).tolist()})
     timings = [p.timing for p in played]
     times = [timing.seconds for timing in timings]
     out.samples = {"seconds": times, **out.samples}
@@ -145,9 +150,7 @@ def play_bare(
     return seconds, f"{fallen} worlds did not do the task with bare steps" if fallen else ""
 
 
-def _play(
-    context: RunContext, sim: Simulation, meter: EnergyMeter, out: Measurement
-) -> TimedEpisode:
+def _play(context: RunContext, sim: Simulation, meter: EnergyMeter, out: Measurement) -> Episode:
     """Play one repetition: the episode and, on MJWarp, the bare steps.
 
     Joint trajectories can be evaluated again; the commands of a driver with feedback are recorded.
@@ -164,4 +167,4 @@ def _play(
         out.problem = out.problem or problem
         out.samples.setdefault("bare_seconds", []).append(bare)
         out.samples.setdefault("bare_ratio", []).append(episode.timing.seconds / bare)
-    return TimedEpisode.of(episode, sim)
+    return episode

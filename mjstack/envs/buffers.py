@@ -36,6 +36,9 @@ SIZED = ROWS | POOL | int(Overflow.CCD)
 _GROWTHS = 3  # of the room to measure in, each by 2
 _STEP = 8  # sizes are multiples of this
 
+Advance = Callable[[str, int, int], None]
+"""Reports progress: the work in progress, how much is done, and of how much."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Peaks:
@@ -124,66 +127,100 @@ def recommend_sizes(peaks: Peaks, margin: float, source: str) -> BatchSizes:
     )
 
 
-def measure_peaks(cfg: Config, run: Callable[[BatchSizes], Peaks]) -> tuple[Peaks, BatchSizes]:
-    """Runs something with room to spare, and with twice the room wherever even that was too little.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Workload:
+    """One run and what it used.
+
+    Attributes:
+        peaks: The most it used.
+        sizes: The room it had, or None on native MuJoCo, which has no fixed buffers.
+        final: State at the end, shape ``(nworld, nq)``.
+        failed: Bits of the rules that each world broke, shape ``(nworld,)``; zero for random
+            actions, which nothing judges.
+        description: Backend and hardware.
+    """
+
+    peaks: Peaks
+    sizes: BatchSizes | None
+    final: np.ndarray
+    failed: np.ndarray
+    description: str
+
+
+def play_workload(
+    cfg: Config,
+    make: Callable[[BatchSizes], Simulation],
+    play: Callable[[Simulation], np.ndarray],
+    sizes: BatchSizes | None = None,
+) -> Workload:
+    """Plays something in worlds of these sizes; without, with room to spare, and with twice the
+    room wherever even that was too little.
 
     Peaks of a run that lost physics are those of another motion. Where the last run has lost some
     too, its ``overflow`` tells: nothing may be sized from it (`require_physics`).
 
     Args:
         cfg: The configuration.
-        run: Plays it in worlds of some sizes.
+        make: Makes the worlds.
+        play: Plays in them, and returns the bits of the rules that each world broke.
+        sizes: Of the buffers.
 
     Returns:
-        Peaks of the last run, and the room that it had.
+        The last run.
     """
-    sizes = resolve_measuring_sizes(cfg)
-    peaks = run(sizes)
-    for _ in range(_GROWTHS):
-        bits = int(np.bitwise_or.reduce(peaks.overflow)) & SIZED
-        if not bits:
+    room = sizes or resolve_measuring_sizes(cfg)
+    for growths_left in reversed(range(_GROWTHS + 1)):
+        sim = make(room)
+        try:
+            failed = play(sim)
+            done = Workload(
+                peaks=read_peaks(sim),
+                sizes=sim.sizes,
+                final=sim.qpos.cpu().numpy().copy(),
+                failed=failed,
+                description=sim.description,
+            )
+        finally:
+            sim.close()
+            del sim
+            gc.collect()  # an environment and its managers refer to each other, and hold the worlds
+        bits = int(np.bitwise_or.reduce(done.peaks.overflow)) & SIZED
+        if sizes or done.sizes is None or not (bits and growths_left):
             break
         # In this room convex pairs have as much as contacts, so they grow together.
-        sizes = replace(
-            sizes,
-            njmax=sizes.njmax * (2 if bits & ROWS else 1),
-            nconmax=sizes.nconmax * (2 if bits & ~ROWS else 1),
+        room = replace(
+            room,
+            njmax=room.njmax * (2 if bits & ROWS else 1),
+            nconmax=room.nconmax * (2 if bits & ~ROWS else 1),
         )
-        log.info("%s overflow while measuring: again with %s", Overflow(bits), sizes.as_overrides())
-        peaks = run(sizes)
-    return peaks, sizes
+        log.info("%s overflow while measuring: again with %s", Overflow(bits), room.as_overrides())
+    return done
 
 
-def describe_lost(peaks: Peaks, sizes: BatchSizes | None) -> tuple[str, str]:
-    """What a run lost although there was room to spare, and what to do; both empty if nothing.
-
-    Args:
-        peaks: What it used and lost.
-        sizes: The room there was, or None on native MuJoCo.
-    """
-    loss, keys = describe_loss(peaks.overflow, sizes)
+def describe_lost(run: Workload) -> tuple[str, str]:
+    """What a run lost although there was room to spare, and what to do; both empty if nothing."""
+    loss, keys = describe_loss(run.peaks.overflow, run.sizes)
     fix = f"Set {' and '.join(f'batch.{key}' for key in keys)} higher still" if keys else NO_KEY
-    room = f" even with {sizes.as_overrides()}" if loss and sizes is not None else ""
+    room = f" even with {run.sizes.as_overrides()}" if loss and run.sizes is not None else ""
     return f"{loss}{room}", fix
 
 
-def require_physics(what: str, peaks: Peaks, sizes: BatchSizes | None) -> None:
-    """Refuses to size anything from motion that lost physics; arguments as of `describe_lost`.
+def require_physics(what: str, run: Workload) -> None:
+    """Refuses to size anything from motion that lost physics.
 
     Args:
         what: What was run, such as ``the scripted task``.
-        peaks: What it used and lost.
-        sizes: The room it had.
+        run: The run.
 
     Raises:
         FaultError: A world lost physics; names the worlds and what to do.
     """
-    loss, fix = describe_lost(peaks, sizes)
+    loss, fix = describe_lost(run)
     if loss:
         raise FaultError(f"batch=auto: what {what} needs cannot be measured: {loss}", fix)
 
 
-def play_random_actions(env: Env, steps: int, advance: Callable[[int], None] | None = None) -> None:
+def play_random_actions(env: Env, steps: int, advance: Advance | None = None) -> None:
     """Steps worlds that have started with actions drawn evenly from the action range; worlds that
     end start anew.
 
@@ -200,7 +237,23 @@ def play_random_actions(env: Env, steps: int, advance: Callable[[int], None] | N
         )
         env.step(low + (high - low) * draw)
         if advance is not None:
-            advance(step + 1)
+            advance("random actions", step + 1, steps)
+
+
+def random_actions(
+    cfg: Config, steps: int, advance: Advance | None = None
+) -> Callable[[Simulation], np.ndarray]:
+    """What `play_workload` plays for random actions; arguments as of `play_random_actions`."""
+
+    def play(sim: Simulation) -> np.ndarray:
+        # A lack of room is what this looks for.
+        index = SceneIndex(sim.model, cfg.robot, cfg.scene)
+        env = Env(sim, index, cfg, check_faults=False)
+        env.reset(seed=cfg.seed)
+        play_random_actions(env, steps, advance)
+        return np.zeros(sim.nworld, dtype=np.int64)
+
+    return play
 
 
 def probe_env_sizes(
@@ -224,35 +277,20 @@ def probe_env_sizes(
     c = cfg.gate.capacity
     worlds = min(nworld, c.probe_nworld if device.startswith("cuda") else c.cpu_nworld)
 
-    def play(sizes: BatchSizes) -> Peaks:
+    def make(sizes: BatchSizes) -> Simulation:
         fields = required_fields(cfg.reset)
-        sim = make_simulation(
+        return make_simulation(
             model, cfg, worlds, backend=backend, device=device, fields=fields, sizes=sizes
         )
-        # A lack of room is what it looks for.
-        env = Env(sim, SceneIndex(model, cfg.robot, cfg.scene), cfg, check_faults=False)
-        try:
-            env.reset(seed=cfg.seed)
-            play_random_actions(env, c.probe_steps)
-            return read_peaks(sim)
-        finally:
-            env.close()
-
-    def run(sizes: BatchSizes) -> Peaks:
-        try:
-            return play(sizes)
-        finally:
-            # the environment and its managers refer to each other, and hold the worlds
-            gc.collect()
 
     with torch.no_grad():
-        peaks, room = measure_peaks(cfg, run)
-    require_physics(f"an environment of {worlds} worlds", peaks, room)
+        probe = play_workload(cfg, make, random_actions(cfg, c.probe_steps))
+    require_physics(f"an environment of {worlds} worlds", probe)
     source = (
         f"batch=auto: {c.probe_steps} steps of random actions in {worlds} worlds, times"
         f" {c.margin:g}"
     )
-    sizes = apply_configured(cfg, recommend_sizes(peaks, c.margin, source))
+    sizes = apply_configured(cfg, recommend_sizes(probe.peaks, c.margin, source))
     log.info("%s (%s)", sizes.as_overrides(), source)
     return sizes
 

@@ -14,6 +14,7 @@ from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import Driver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env
+from mjstack.envs.buffers import Advance, Workload, play_workload, recommend_sizes, require_physics
 from mjstack.episodes.observers import (
     Episode,
     Hook,
@@ -25,17 +26,14 @@ from mjstack.episodes.observers import (
 from mjstack.episodes.record import measured_values
 from mjstack.episodes.rollout import (
     NOMINAL,
-    Advance,
     Observer,
     Reset,
-    RolloutTiming,
     State,
     make_driver,
     rollout,
     snapshot,
     start_worlds,
 )
-from mjstack.episodes.workloads import size_batch
 from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
 from mjstack.report.record import GateResult, Status
@@ -55,31 +53,6 @@ log = logging.getLogger(__name__)
 
 Say = Callable[[str], None]
 AnyGate = TypeVar("AnyGate", bound=Callable)
-
-
-@dataclass(kw_only=True, slots=True)
-class TimedEpisode:
-    """How long an episode took, and where it failed; kept once its simulation is gone.
-
-    Attributes:
-        description: Backend and hardware.
-        nworld: Number of worlds.
-        timing: The rollout's.
-        failed: Worlds that failed.
-    """
-
-    description: str
-    nworld: int
-    timing: RolloutTiming
-    failed: list[int]
-
-    @classmethod
-    def of(cls, episode: Episode, sim: Simulation) -> "TimedEpisode":
-        """The time of an episode."""
-        failed = np.flatnonzero(episode.result.failed.cpu().numpy()).tolist()
-        return cls(
-            description=sim.description, nworld=sim.nworld, timing=episode.timing, failed=failed
-        )
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -151,7 +124,7 @@ class Artifacts:
     sizes: BatchSizes | None = None
     env_sizes: BatchSizes | None = None
     carry_start: State | None = None
-    timed_episode: TimedEpisode | None = None
+    timed_episode: Episode | None = None
     shown: WorldRecorder | None = None
     shown_by: str = ""
     pictures: list[str] = field(default_factory=list)
@@ -320,10 +293,39 @@ class RunContext:
             return resolve_sizes(self.cfg)
         found = self.artifacts.sizes
         if found is None:
-            found = self.artifacts.sizes = size_batch(self)
+            task = self.play_task(self.cfg.reset)
+            require_physics("the scripted task", task)
+            margin = self.cfg.gate.capacity.margin
+            source = (
+                f"batch=auto: the scripted task in {self.measuring_nworld} worlds, times {margin:g}"
+            )
+            found = self.artifacts.sizes = recommend_sizes(task.peaks, margin, source)
             sizes = apply_configured(self.cfg, found)
             self.say(f"{sizes.as_overrides()} ({found.source})")
         return apply_configured(self.cfg, found)
+
+    @property
+    def measuring_nworld(self) -> int:
+        """How many worlds size the buffers."""
+        most = self.cfg.gate.capacity.cpu_nworld
+        on_cuda = self.backend[1].startswith("cuda")
+        return self.cfg.nworld if on_cuda else min(self.cfg.nworld, most)
+
+    def measuring_simulation(self, sizes: BatchSizes, reset: Reset | None = None) -> Simulation:
+        """Worlds that size the buffers."""
+        return self.simulation(self.measuring_nworld, *self.backend, reset=reset, sizes=sizes)
+
+    def play_task(self, reset: Reset, sizes: BatchSizes | None = None) -> Workload:
+        """Play the driven task once, in worlds of exactly these sizes; without, with room to
+        spare.
+        """
+
+        def play(sim: Simulation) -> np.ndarray:
+            return self.play(sim, reset).failed
+
+        return play_workload(
+            self.cfg, lambda sizes: self.measuring_simulation(sizes, reset), play, sizes
+        )
 
     @property
     def env_sizes(self) -> BatchSizes | None:
@@ -338,13 +340,13 @@ class RunContext:
         device = resolve_device(self.cfg.sim.device)
         return make_simulation(self.model, self.cfg, 1, backend=Backend.mjwarp, device=device)
 
-    def phase_end(self, name: str) -> int:
-        """Last step of a phase."""
-        return next(phase.stop for phase in self.planner.phases if phase.name == name) - 1
-
     def phase_start(self, name: str) -> int:
         """First step of a phase."""
         return next(phase.start for phase in self.planner.phases if phase.name == name)
+
+    def phase_end(self, name: str) -> int:
+        """Last step of a phase."""
+        return next(phase.stop for phase in self.planner.phases if phase.name == name) - 1
 
 
 def lacks_episode(cfg: Config) -> str:

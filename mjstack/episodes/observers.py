@@ -7,7 +7,8 @@ import numpy as np
 
 from mjstack.drivers.driver import Driver, Recorded
 from mjstack.envs import Env
-from mjstack.episodes.rollout import Advance, Observer, RolloutTiming, State, rollout, snapshot
+from mjstack.envs.buffers import Advance
+from mjstack.episodes.rollout import Observer, RolloutTiming, State, rollout, snapshot
 from mjstack.sim import Simulation
 from mjstack.tasks.check import CheckResult, make_check
 
@@ -25,6 +26,7 @@ class Episode:
             ``(nworld,)``.
         retries: Grasps that were tried again, shape ``(nworld,)``.
         timing: The rollout's.
+        description: Backend and hardware.
     """
 
     result: CheckResult
@@ -32,6 +34,12 @@ class Episode:
     waypoint_error: np.ndarray
     retries: np.ndarray
     timing: RolloutTiming
+    description: str
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Bits of the task's rules, shape ``(nworld,)``, int32."""
+        return self.result.failed.cpu().numpy()
 
 
 def play_episode(
@@ -60,6 +68,7 @@ def play_episode(
         waypoint_error=driver.error.double().cpu().numpy(),
         retries=driver.retries.cpu().numpy(),
         timing=timing,
+        description=env.sim.description,
     )
 
 

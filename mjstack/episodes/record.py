@@ -135,7 +135,7 @@ class EpisodeRecord:
             seed=seed,
             backend=sim.backend,
             device=str(sim.device),
-            failed=episode.result.failed.cpu().numpy(),
+            failed=episode.failed,
             values=measured_values(episode.result),
             qpos=sim.qpos.cpu().numpy().copy(),
             start=episode.start,

@@ -11,7 +11,6 @@ from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Episode, WorldRecorder
-from mjstack.episodes.record import measured_values
 from mjstack.episodes.rollout import Observer
 from mjstack.sim import Simulation, describe_overflow, resolve_sizes
 from mjstack.sim.sizes import BatchSizes
@@ -30,7 +29,6 @@ class ReplayedWorld:
         recorder: Its positions and phases.
         arrays: Its start, and its state and the check's values at step ends, for an npz file.
         findings: A line for each rule.
-        description: Backend and hardware.
         qpos_end: Final positions in the backend's precision, shape ``(nq,)``.
     """
 
@@ -38,13 +36,7 @@ class ReplayedWorld:
     recorder: WorldRecorder
     arrays: dict[str, Any]
     findings: list[str]
-    description: str
     qpos_end: np.ndarray
-
-    @property
-    def failed(self) -> int:
-        """Bits of the task's rules."""
-        return int(self.episode.result.failed[0])
 
 
 def replay_world(
@@ -81,13 +73,12 @@ def replay_world(
         steps["time_s"] = np.arange(1, len(recorder.phase) + 1) * cfg.timing.step_dt
         steps["phase"] = names[recorder.phase]
         facts = {"seed": seed, "world": world, "backend": sim.description}
-        facts["failed"] = int(episode.result.failed[0])
+        facts["failed"] = int(episode.failed[0])
         return ReplayedWorld(
             episode=episode,
             recorder=recorder,
             arrays=facts | trace.start_arrays | steps,
             findings=_explain(episode, steps, sim, context),
-            description=sim.description,
             qpos_end=sim.qpos[0].cpu().numpy().copy(),
         )
     finally:
@@ -158,9 +149,8 @@ def _explain(
     episode: Episode, steps: dict[str, np.ndarray], sim: Simulation, context: RunContext
 ) -> list[str]:
     """A line for each rule. Whether it held is the check's own result; the numbers say why."""
-    bits = int(episode.result.failed[0])
+    bits = int(episode.failed[0])
     rules = context.check.rules
-    values = {name: float(v[0]) for name, v in measured_values(episode.result).items()}
     finite = np.isfinite(steps["qpos"]).all(1) & np.isfinite(steps["qvel"]).all(1)
     lost = int(finite.argmin())  # the first step, if any
     count = len(finite) * context.cfg.timing.decimation
@@ -169,7 +159,7 @@ def _explain(
         "FINITE": (always, "always"),
         "STEPS": (f"{int(sim.step_count[0])} steps", f"{count} steps"),
         "OVERFLOW": (describe_overflow(int(sim.overflow[0])) or "none", "none"),
-        **context.check.report(values),
+        **context.check.report(episode.result),
     }
     return [
         f"{name}: {f'BROKEN, {rules.texts[name]}' if bits & bit else 'held'}: {told[name][0]}"

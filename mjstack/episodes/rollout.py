@@ -12,6 +12,7 @@ from mjstack.config.schema import Config, GraphMode, TermCfg
 from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, driven_config
+from mjstack.envs.buffers import Advance
 from mjstack.mdp.geometry import source_xy
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
@@ -20,8 +21,6 @@ from mjstack.sim.graph import StepGraph
 CLOSED_LOOP = "closed_loop"  # the controller with feedback; any other name plays a plan
 Reset = dict[str, TermCfg]
 NOMINAL: Reset = {"home": TermCfg(func="mjstack.mdp.reset.home")}
-Advance = Callable[[str, int, int], None]
-"""Reports progress: the work in progress, how much is done, and of how much."""
 
 
 class Observer:

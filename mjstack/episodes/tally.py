@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mjstack.episodes.context import TimedEpisode
 from mjstack.episodes.failures import describe_sign
 from mjstack.episodes.observers import Episode
 from mjstack.episodes.record import FAILING, Circumstances, EpisodeRecord
@@ -43,7 +42,7 @@ class EpisodeTally:
         rows: Cells of the table of failing episodes, by column.
         seconds: Wall time of the steps [s].
         steps: Physics steps of all worlds.
-        first: Time of the first seed's episode.
+        first: The first seed's episode.
         notes: Backend and buffer sizes in words.
         problems: Why the gate fails, whatever the rate.
         details: Remarks.
@@ -66,7 +65,7 @@ class EpisodeTally:
     rows: list[dict[str, object]] = field(default_factory=list)
     seconds: float = 0.0
     steps: int = 0
-    first: TimedEpisode | None = None
+    first: Episode | None = None
     notes: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     details: list[str] = field(default_factory=list)
@@ -93,7 +92,7 @@ class EpisodeTally:
         self.seconds += episode.timing.seconds
         self.steps += int(sim.step_count.sum())
         if self.first is None:
-            self.first = TimedEpisode.of(episode, sim)
+            self.first = episode
         self.failed += self.names(record.seed, np.flatnonzero(record.failed).tolist())
         for rule, worlds in self.check.rules.failing(record.failed).items():
             self.broken.setdefault(rule, []).extend(self.names(record.seed, worlds))

@@ -227,7 +227,7 @@ def _replay(
             reason=reason,
             thresholds=context.check.thresholds(),
             metrics={"seed": plan.seed, "world": plan.world, **metrics},
-            notes={"backend": done.description, "recorded": recorded, "trajectory": name},
+            notes={"backend": done.episode.description, "recorded": recorded, "trajectory": name},
             details=told + changes,
         )
     ]
@@ -256,7 +256,8 @@ def _compare(
     record = plan.record
     rules = context.check.rules
     bits = int(record.failed[plan.world])
-    same = bits == done.failed
+    now = int(done.episode.failed[0])
+    same = bits == now
     result = "the same result" if same else rules.describe(bits) or "succeeded"
     if record.backend != backend.value:
         another = "" if same else "another result: "
@@ -271,7 +272,7 @@ def _compare(
     reasons = []
     if "cuda" in device + record.device:
         reasons.append("runs on CUDA agree to rounding only")
-    if (bits | done.failed) & rules["OVERFLOW"]:
+    if (bits | now) & rules["OVERFLOW"]:
         reasons.append("a world alone shares no contact pool")
     if changes:
         reasons.append("not all is as it was in that run")

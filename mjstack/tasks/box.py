@@ -17,8 +17,8 @@ from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
 from mjstack.tasks.parts import (
     AtLeast,
     Carried,
-    HeldSuccess,
     InWindow,
+    ReleasedSuccess,
     Streak,
     away,
     in_hand,
@@ -123,7 +123,6 @@ class BoxCheck(EpisodeCheck):
             self.resting,
             t.window,
             measure=self.trace,
-            shown=["beyond_m", "corner_speed_m_per_s"],
         )
         drop = _Drop(self, grasp, lift, carry)
         settled = _Settled(self, release)
@@ -196,8 +195,6 @@ class _CarriedOver(Carried):
             phases=check.during("carry"),
             after=lift,
         )
-        for shown, suffix in zip(self.shown, self.suffixes, strict=True):
-            shown.append(f"over_box{suffix}")
         self._check = check
 
     def start(self, view: TaskView) -> None:
@@ -301,7 +298,7 @@ class _Order(Rule):
     def __init__(self, check: BoxCheck, release: _Release) -> None:
         pairs = itertools.pairwise(check.objects)
         text = " or ".join(f"{later} grasped before {each} was released" for each, later in pairs)
-        super().__init__("ORDER", text or "never broken", shown=["too_early"], wanted="0")
+        super().__init__("ORDER", text or "never broken", wanted="0")
         self._release = release
 
     def start(self, view: TaskView) -> None:
@@ -321,9 +318,8 @@ class _JawClear(Rule):
     at_end = True
 
     def __init__(self, check: BoxCheck) -> None:
-        least = f"at least {check.t.jaw_clearance:g}"
-        text = "gripper too low at the end"
-        super().__init__("JAW_CLEAR", text, shown=["jaw_clearance_m"], wanted=least)
+        wanted = f"at least {check.t.jaw_clearance:g}"
+        super().__init__("JAW_CLEAR", "gripper too low at the end", wanted=wanted)
         self._check = check
 
     def judge(self, end: Step) -> Judgement:
@@ -335,16 +331,16 @@ class _JawClear(Rule):
         return clearance >= self._check.t.jaw_clearance, {"jaw_clearance_m": clearance}
 
 
-class BoxSuccess(HeldSuccess):
+class BoxSuccess(ReleasedSuccess):
     """Achieved while all objects have been at rest in the box, out of the jaws, for the whole
     window, and the gripper is open. It shares the thresholds of the task's check.
     """
 
     def __init__(self, env: EnvView, *, open_fraction: float) -> None:
-        """Allocates the streak; see `HeldSuccess`.
+        """Allocates the streak; see `ReleasedSuccess`.
 
         Raises:
             MjstackError: The fraction is out of range, or the task has another check.
         """
         check = BoxCheck(env.cfg)
-        super().__init__(env, check, check.resting, open_fraction)
+        super().__init__(env, check, lambda step: check.resting(step).all(1), open_fraction)

@@ -20,7 +20,7 @@ Example:
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -92,10 +92,12 @@ class CheckResult:
     Attributes:
         failed: Bits of the task's rules, shape ``(nworld,)``, int32.
         values: Measured values, by name with unit, each ``(nworld,)``.
+        shown: Names of those that tell about each rule, by its name.
     """
 
     failed: Tensor
     values: dict[str, Tensor]
+    shown: dict[str, list[str]] = field(default_factory=dict)
 
 
 class Rule(ABC):
@@ -105,8 +107,8 @@ class Rule(ABC):
 
     Attributes:
         texts: What went wrong if it is broken, by name; one entry, or one for each object.
-        shown: Names of the measured values that tell about each of them.
-        wanted: What the rule wants of those, in words.
+        suffixes: Ends of the names of the measured values that tell about each of them.
+        wanted: What the rule wants of those values, in words.
         phases: For each object, the phases in which it counts.
         at_end: Whether it can only hold at the end of a whole episode.
     """
@@ -120,7 +122,6 @@ class Rule(ABC):
         text: str,
         objects: Sequence[str] = (),
         *,
-        shown: Sequence[str] = (),
         wanted: str = "see the thresholds",
     ) -> None:
         """Names the rule.
@@ -129,9 +130,7 @@ class Rule(ABC):
             name: In capital letters. The rule of one of several objects is ``NAME_OBJECT``.
             text: What went wrong if it is broken; ``{object}`` is the object's name.
             objects: The objects that it judges one by one.
-            shown: Names of the measured values that tell about it, such as ``grasp_steps{}``, where
-                ``{}`` is the suffix of the object.
-            wanted: What the rule wants of those, in words.
+            wanted: What the rule wants of its measured values, in words.
         """
         self.objects = list(objects)
         self.suffixes = [f"_{each}" for each in objects] if len(objects) > 1 else [""]
@@ -140,7 +139,6 @@ class Rule(ABC):
             f"{name}{suffix.upper()}": text.format(object=each)
             for suffix, each in zip(self.suffixes, names, strict=True)
         }
-        self.shown = [[value.format(suffix) for value in shown] for suffix in self.suffixes]
         self.wanted = [wanted] * len(self.suffixes)
 
     def start(self, view: TaskView) -> None:  # noqa: B027
@@ -156,16 +154,6 @@ class Rule(ABC):
         Args:
             end: The state at its end.
         """
-
-    def report(self, values: Mapping[str, float]) -> dict[str, tuple[str, str]]:
-        """Report the values of one world, and what the rule wants, by each of its names.
-
-        Args:
-            values: Measured values of that world.
-        """
-        found = [", ".join(f"{name} {values[name]:.4g}" for name in names) for names in self.shown]
-        told = ((text or "see the values") for text in found)
-        return dict(zip(self.texts, zip(told, self.wanted, strict=True), strict=True))
 
     def by_object(self, name: str, value: Tensor) -> dict[str, Tensor]:
         """Columns by name: ``{}`` in it is the object, if there are several.
@@ -288,6 +276,7 @@ class EpisodeCheck(ABC):
             "OVERFLOW": (sim.overflow & LOST_PHYSICS) == 0,
         }
         values: dict[str, Tensor] = {}
+        shown: dict[str, list[str]] = {}
         end = self._view.step()
         for rule in self._rules:
             ok, measured = rule.judge(end)
@@ -295,10 +284,12 @@ class EpisodeCheck(ABC):
                 ok = ok & complete
             held |= zip(rule.texts, ok.view(len(ok), -1).unbind(1), strict=True)
             values |= measured
+            for name, suffix in zip(rule.texts, rule.suffixes, strict=True):
+                shown[name] = [value for value in measured if value.endswith(suffix)]
         failed = torch.zeros_like(self._finite, dtype=torch.int32)
         for name, bit in self.rules.items():
             failed |= bit * (~held[name]).to(failed.dtype)
-        return CheckResult(failed, values)
+        return CheckResult(failed, values, shown)
 
     @abstractmethod
     def placed(self, step: Step) -> Tensor:
@@ -322,14 +313,24 @@ class EpisodeCheck(ABC):
                 numbers[item.name if bare else f"{item.name}_{suffix}"] = value
         return numbers
 
-    def report(self, values: Mapping[str, float]) -> dict[str, tuple[str, str]]:
-        """Report the values of one world, and what is wanted, by the name of each of the task's
-        rules.
-
-        Args:
-            values: Measured values of that world.
+    def report(self, result: CheckResult) -> dict[str, tuple[str, str]]:
+        """Report the values of the first world, and what is wanted, by the name of each of the
+        task's rules.
         """
-        return {name: told for rule in self._rules for name, told in rule.report(values).items()}
+        wanted = {
+            name: words
+            for rule in self._rules
+            for name, words in zip(rule.texts, rule.wanted, strict=True)
+        }
+        values = result.values
+        return {
+            name: (
+                ", ".join(f"{each} {float(values[each][0]):.4g}" for each in names)
+                or "see the values",
+                wanted[name],
+            )
+            for name, names in result.shown.items()
+        }
 
     def headline(self, values: Mapping[str, float]) -> str:
         """A world's values in a few words."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mjstack.errors import ParameterError
+from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView
 from mjstack.math import quat_angle
 from mjstack.mdp.geometry import gripper_opening, place_xy
@@ -125,7 +126,7 @@ class AtLeast(Rule):
             least: The threshold.
             phases: For each object, the phases in which it counts.
         """
-        super().__init__(name, text, objects, shown=[value])
+        super().__init__(name, text, objects)
         self.wanted = [f"at least {least:g}{_in(each)}" for each in phases]
         self.least = least
         self._value = value
@@ -209,7 +210,6 @@ class Carried(Streak):
         self._steps = self.least
         self.least = distance
         self._value = self._value.replace("_steps{}", "{}_m")
-        self.shown = [[self._value.format(suffix)] for suffix in self.suffixes]
         self.wanted = [f"at least {distance:g}{_in(each)}" for each in self.phases]
 
     def start(self, view: TaskView) -> None:
@@ -245,7 +245,6 @@ class InWindow(Rule):
         window: int,
         *,
         measure: Callable[[Step], dict[str, Tensor]] = lambda end: {},
-        shown: Sequence[str] = (),
     ) -> None:
         """Describes the rule; see `Rule`.
 
@@ -255,10 +254,9 @@ class InWindow(Rule):
             condition: If it has several columns, all have to hold.
             window: How many steps.
             measure: Values at the end of the episode, by name with unit.
-            shown: Those that tell about the rule.
         """
         self._value = f"{name.lower()}_steps"
-        super().__init__(name, text, shown=[self._value, *shown], wanted=f"at least {window}")
+        super().__init__(name, text, wanted=f"at least {window}")
         self._condition = condition
         self._window = window
         self._measure = measure
@@ -272,13 +270,9 @@ class InWindow(Rule):
         holds = self._condition(step)
         self.length.add_(1.0).mul_(holds if holds.dim() == 1 else holds.all(1))
 
-    def held(self) -> Tensor:
-        """Whether it has held in the last steps, shape ``(nworld,)``, bool."""
-        return self.length >= self._window
-
     def judge(self, end: Step) -> Judgement:
         """See `Rule`."""
-        return self.held(), {**self._measure(end), self._value: self.length}
+        return self.length >= self._window, {self._value: self.length, **self._measure(end)}
 
 
 class AtRest(Rule):
@@ -303,11 +297,7 @@ class AtRest(Rule):
             "REST_POSITION": "object drifting",
             "REST_ROTATION": "object turning",
         }
-        self.shown = [
-            ["rest_speed_m_per_s", "peak_speed_m_per_s"],
-            ["rest_position_m"],
-            ["rest_rotation_deg"],
-        ]
+        self.suffixes = ["speed_m_per_s", "position_m", "rotation_deg"]
         self.wanted = [f"at most {limit:g}" for limit in (speed, position, rotation_deg)]
         self._window = window
         self._speed = speed
@@ -353,12 +343,41 @@ class AtRest(Rule):
 
 
 class HeldSuccess:
+    """Achieved while a condition has held for some steps in a row."""
+
+    def __init__(self, env: EnvView, condition: Callable[[], Tensor], steps: int) -> None:
+        """Allocates the streaks.
+
+        Args:
+            env: The environment.
+            condition: Whether it holds now, shape ``(nworld,)``, bool.
+            steps: How many steps in a row.
+
+        Raises:
+            ParameterError: The number is out of range.
+        """
+        require_positive("steps", steps)
+        self._condition = condition
+        self._steps = steps
+        self._length = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
+
+    def __call__(self, env: EnvView) -> Tensor:
+        """Processes a step; shape ``(nworld,)``, bool."""
+        self._length.add_(1).mul_(self._condition())
+        return self._length >= self._steps
+
+    def reset(self, mask: Tensor) -> None:
+        """Forgets the masked worlds."""
+        self._length.masked_fill_(mask, 0)
+
+
+class ReleasedSuccess(HeldSuccess):
     """Achieved while a condition has held for the window of a check, and the gripper is open."""
 
     def __init__(
         self, env: EnvView, check: EpisodeCheck, condition: Condition, open_fraction: float
     ) -> None:
-        """Allocates the streak.
+        """Allocates the streaks.
 
         Args:
             env: The environment.
@@ -372,22 +391,13 @@ class HeldSuccess:
         """
         if not 0.0 <= open_fraction <= 1.0:
             raise ParameterError("open_fraction", open_fraction, "a number from 0 to 1")
+        view = check.view(env)
+        super().__init__(env, lambda: condition(view.step()), check.settle_steps)
         self._open = open_fraction
-        self._view = check.view(env)
-        self._streak = InWindow("STREAK", "", condition, check.settle_steps)
-        self._streak.start(self._view)
 
     def __call__(self, env: EnvView) -> Tensor:
         """Processes a step; shape ``(nworld,)``, bool."""
-        self._streak.update(self._view.step())
-        return self._achieved(env)
-
-    def _achieved(self, env: EnvView) -> Tensor:
-        return self._streak.held() & (gripper_opening(env) >= self._open).all(1)
-
-    def reset(self, mask: Tensor) -> None:
-        """Forgets the masked worlds."""
-        self._streak.length.masked_fill_(mask, 0.0)
+        return super().__call__(env) & (gripper_opening(env) >= self._open).all(1)
 
 
 def _in(phases: Sequence[str]) -> str:

@@ -6,9 +6,10 @@ from torch import Tensor
 from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import grasp_point_to_object
+from mjstack.tasks.parts import HeldSuccess
 
 
-class ReachSuccess:
+class ReachSuccess(HeldSuccess):
     """Achieved while the grasp point has been near the point for some steps in a row."""
 
     def __init__(
@@ -28,20 +29,9 @@ class ReachSuccess:
         """
         env.index.object_address(object)
         require_positive("distance", distance)
-        require_positive("steps", steps)
-        self._object = object
-        self._height = height
-        self._distance = distance
-        self._steps = steps
-        self._run = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
 
-    def __call__(self, env: EnvView) -> Tensor:
-        """Processes a step; shape ``(nworld,)``, bool."""
-        offset = grasp_point_to_object(env, self._object, self._height)
-        near = torch.linalg.vector_norm(offset, dim=1) <= self._distance
-        self._run.add_(1).mul_(near)
-        return self._run >= self._steps
+        def near() -> Tensor:
+            offset = grasp_point_to_object(env, object, height)
+            return torch.linalg.vector_norm(offset, dim=1) <= distance
 
-    def reset(self, mask: Tensor) -> None:
-        """Forgets the masked worlds."""
-        self._run.masked_fill_(mask, 0)
+        super().__init__(env, near, steps)

@@ -13,8 +13,8 @@ from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import (
     AtRest,
     Carried,
-    HeldSuccess,
     InWindow,
+    ReleasedSuccess,
     Streak,
     airborne,
     offset,
@@ -117,7 +117,6 @@ class StackCheck(EpisodeCheck):
                 self.stacked,
                 t.window,
                 measure=self.trace,
-                shown=["xy_err_m", "dz_m"],
             ),
             InWindow("SUPPORTED", f"{t.onto} not on the table", self.supported, t.window),
             AtRest(t.window, **self.rest),
@@ -189,34 +188,33 @@ class RestWindow:
         return rest & (self._turned.amax((1, 2)) <= rotation)
 
 
-class StackSuccess(HeldSuccess):
+class StackSuccess(ReleasedSuccess):
     """Achieved while an object has stood at rest on another one through the whole window, and the
     gripper is open: rules 4 and 5 of the check, whose thresholds it shares.
     """
 
     def __init__(self, env: EnvView, *, open_fraction: float) -> None:
-        """Allocates the ring; see `HeldSuccess`.
+        """Allocates the ring; see `ReleasedSuccess`.
 
         Raises:
             MjstackError: The fraction is out of range, or the task has another check.
         """
         check = StackCheck(env.cfg)
-        super().__init__(
-            env, check, lambda step: check.stacked(step) & check.supported(step), open_fraction
-        )
-        self._rest = RestWindow(self._view, check.t.window, **check.rest)
+        super().__init__(env, check, self._stands, open_fraction)
+        self._check = check
+        self._rest = RestWindow(check.view(env), check.t.window, **check.rest)
+
+    def _stands(self, step: Step) -> Tensor:
+        """Takes a step; `reset` may leave the ring alone: every slot is written anew before the
+        streak can reach the window.
+        """
+        self._step = step
+        self._rest.append(step)
+        return self._check.placed(step).all(1)
 
     def __call__(self, env: EnvView) -> Tensor:
-        """Processes a step; shape ``(nworld,)``, bool.
-
-        `reset` may leave the ring alone: every slot is written anew before the streak can reach the
-        window.
-        """
-        step = self._view.step()
-        self._streak.update(step)
-        self._rest.append(step)
-        length = self._streak.length
-        if not length.is_cuda and not bool(length.any()):
-            # No window that holds this step can pass, in any world.
-            return torch.zeros_like(length, dtype=torch.bool)
-        return self._achieved(env) & self._rest.compare(step)
+        """Processes a step; shape ``(nworld,)``, bool."""
+        achieved = super().__call__(env)
+        if not achieved.is_cuda and not bool(self._length.any()):
+            return achieved  # no window that holds this step can pass, in any world
+        return achieved & self._rest.compare(self._step)
