@@ -316,7 +316,8 @@ def test_what_is_promised_of_another_end(
         qpos=np.stack((ours, theirs)),
     )
     plan = SimpleNamespace(record=record, world=1, gate="batch")
-    done = SimpleNamespace(failed=0, qpos_end=ours)
+    episode = SimpleNamespace(failed=np.zeros(1, dtype=np.int32))
+    done = SimpleNamespace(episode=episode, qpos_end=ours)
     found = _compare(plan, done, Backend.mjwarp, device, changes, context)
     assert found[0] is kept
     assert says in found[1]
