@@ -219,9 +219,9 @@ def test_vector_wrong_actions(make: Make, action: Any, message: str) -> None:
         ({"options": {"mask": None}}, "reset option 'mask' does not exist"),
         (
             {"options": {"reset_mask": np.ones(4, dtype=bool)}},
-            r"found torch.bool of shape \(4,\) on cpu, expected a bool tensor of shape",
+            r"found a torch.bool tensor of shape \(4,\) on cpu, expected a torch.bool",
         ),
-        ({"options": {"reset_mask": np.ones(3)}}, r"found torch.float64 of shape"),
+        ({"options": {"reset_mask": np.ones(3)}}, r"found a torch.float64 tensor of shape"),
         ({"options": {"reset_mask": np.ones(3, dtype=bool)}, "seed": 1}, "no mask beside it"),
     ],
 )

@@ -66,7 +66,7 @@ PATHS: dict[str, list[str] | None] = {
         "EndEffectorDelta.write_commands",
     ],
     "mdp/reset.py": [
-        *("home", "_write_robot", "_write_object"),
+        *("home", "_write_object"),
         *(
             f"{name}.__call__"
             for name in ("JointNoise", "JitterObjects", "RandomizeObjects", "_Randomized")

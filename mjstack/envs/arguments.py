@@ -1,9 +1,6 @@
-"""Checks of the arguments of an environment's reset."""
+"""Checks of an argument of an environment's reset."""
 
 import operator
-
-import torch
-from torch import Tensor
 
 from mjstack.errors import ArgumentError
 
@@ -21,21 +18,3 @@ def check_seed(seed: int, *, masked: bool) -> int:
     if isinstance(seed, bool) or not 0 <= number < 1 << 32:
         raise ArgumentError("seed", repr(seed), "an integer from 0 to 4294967295")
     return number
-
-
-def check_mask(mask: Tensor, nworld: int, device: torch.device, *, started: bool) -> None:
-    """Check a mask of worlds.
-
-    Raises:
-        ArgumentError: It has a wrong type, shape, dtype or device, or no world has started yet.
-    """
-    expected = f"a bool tensor of shape ({nworld},) on {device}"
-    if not isinstance(mask, Tensor):
-        raise ArgumentError("mask", type(mask).__name__, expected)
-    if tuple(mask.shape) != (nworld,) or mask.dtype is not torch.bool or mask.device != device:
-        found = f"{mask.dtype} of shape {tuple(mask.shape)} on {mask.device}"
-        raise ArgumentError("mask", found, expected)
-    if not started:
-        raise ArgumentError(
-            "mask", "a part of the worlds", "none at the first reset", "Call env.reset()"
-        )

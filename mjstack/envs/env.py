@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from mjstack.config.schema import Config, GraphMode
-from mjstack.envs.arguments import check_mask, check_seed
+from mjstack.envs.arguments import check_seed
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
@@ -180,7 +180,10 @@ class Env:
             found = "reset() after close()"
             raise ArgumentError("env", found, "an open environment", "Make a new one")
         if mask is not None:
-            check_mask(mask, self.nworld, self.device, started=self._started)
+            self.sim.check_mask(mask)
+            if not self._started:
+                expected = "none at the first reset"
+                raise ArgumentError("mask", "a part of the worlds", expected, "Call env.reset()")
         if seed is not None:
             self.seed = check_seed(seed, masked=mask is not None)
             self.episode.fill_(-1)

@@ -183,12 +183,9 @@ class EpisodeRecord:
 
     def write(self, folder: Path, gate: str = "batch") -> None:
         """Write the gate's file of this seed in one step."""
+        names = ("seed", "backend", "device", "failed", "qpos")
         arrays: dict[str, Any] = {
-            "seed": self.seed,
-            "backend": self.backend,
-            "device": self.device,
-            "failed": self.failed,
-            "qpos": self.qpos,
+            **{name: getattr(self, name) for name in names},
             "start_qpos": self.start,
             **{f"value.{name}": values for name, values in self.values.items()},
             **({} if self.circumstances is None else self.circumstances.arrays()),

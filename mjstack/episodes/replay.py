@@ -1,6 +1,7 @@
 """One world of a batch played again, alone: its trajectory, and a report on every rule."""
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -62,8 +63,7 @@ def replay_world(
         observers: Look on.
     """
     cfg = context.cfg
-    sim = _alone(context, backend, device)
-    try:
+    with closing(_alone(context, backend, device)) as sim:
         trace = _Trace()
         recorder = WorldRecorder()
         looking = [trace, *observers, recorder]
@@ -81,8 +81,6 @@ def replay_world(
             findings=_explain(episode, steps, sim, context),
             qpos_end=sim.qpos[0].cpu().numpy().copy(),
         )
-    finally:
-        sim.close()
 
 
 class _Trace(Observer):
@@ -122,12 +120,9 @@ def start_of_world(
     context: RunContext, *, seed: int, world: int, backend: Backend, device: str
 ) -> np.ndarray:
     """Positions at which a world starts, shape ``(nq,)``; arguments as of `replay_world`."""
-    sim = _alone(context, backend, device)
-    try:
+    with closing(_alone(context, backend, device)) as sim:
         context.start(sim, context.cfg.reset, seed=seed, worlds=[world])
         return sim.qpos[0].cpu().numpy().copy()
-    finally:
-        sim.close()
 
 
 def _alone(context: RunContext, backend: Backend, device: str) -> Simulation:

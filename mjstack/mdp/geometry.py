@@ -45,6 +45,13 @@ def named_pose(env: EnvView, pose: str) -> Tensor:
     return getattr(robot(env), pose)
 
 
+def write_robot(env: EnvView, mask: Tensor, command: Tensor) -> None:
+    """Put the masked worlds' robot at a command, shape ``(nworld, n)``: qpos and ctrl."""
+    tensors = robot(env)
+    tensors.qpos.write_masked(env.sim.qpos, mask, command)
+    tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
+
+
 def joint_positions(env: EnvView) -> Tensor:
     """Arm joints [rad], then gripper joints [rad or m], shape ``(nworld, n)``. Not to be written
     into.

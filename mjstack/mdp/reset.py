@@ -12,7 +12,7 @@ from mjstack.errors import ParameterError
 from mjstack.managers.term import require_positive, resolve_func
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
-from mjstack.mdp.geometry import joint_limits, named_pose, pose_w, robot
+from mjstack.mdp.geometry import joint_limits, named_pose, pose_w, robot, write_robot
 from mjstack.mdp.starts.placement import Placement
 from mjstack.mdp.starts.randomization import (
     ObjectMasses,
@@ -26,7 +26,7 @@ from mjstack.mdp.starts.reach import require_reach
 
 def home(env: EnvView, mask: Tensor, *, pose: str = "home") -> None:
     """Puts the robot at its home command, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
-    _write_robot(env, mask, named_pose(env, pose).expand(env.nworld, -1))
+    write_robot(env, mask, named_pose(env, pose).expand(env.nworld, -1))
     env.sim.qvel.masked_fill_(mask[:, None], 0.0)
 
 
@@ -56,7 +56,7 @@ class JointNoise:
         """Writes qpos and ctrl."""
         noise = random_uniform(env, self.label, self._width.shape[0])
         command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
-        _write_robot(env, mask, torch.clamp(command, self._low, self._high))
+        write_robot(env, mask, torch.clamp(command, self._low, self._high))
 
 
 class JitterObjects:
@@ -209,12 +209,6 @@ class ActuatorGains(_Randomized):
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Takes the smallest and largest factor."""
         super().__init__(env, ServoGains(env), bounds("scale", scale))
-
-
-def _write_robot(env: EnvView, mask: Tensor, command: Tensor) -> None:
-    tensors = robot(env)
-    tensors.qpos.write_masked(env.sim.qpos, mask, command)
-    tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
 
 
 def _write_object(

@@ -131,7 +131,7 @@ class MjwarpSimulation(Simulation):
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
         """Bring the poses of all worlds up to the current qpos: a mask would save nothing."""
-        self._check_mask(mask)
+        self.check_mask(mask)
         with torch_stream_scope(self._device):
             self._pose()
 
@@ -139,7 +139,7 @@ class MjwarpSimulation(Simulation):
         """Put the masked worlds back to qpos0, at rest, and clears their counters and overflow
         bits.
         """
-        self._check_mask(mask)
+        self.check_mask(mask)
         self._keep_peaks(mask)
         if mask is None:
             self._mask.fill_(True)

@@ -205,7 +205,7 @@ class NativeSimulation(Simulation):
 
     def _rows(self, mask: torch.Tensor | None) -> np.ndarray:
         """The mask as numpy sees it; every world for None."""
-        self._check_mask(mask)
+        self.check_mask(mask)
         return np.ones(self.nworld, dtype=bool) if mask is None else mask.numpy()
 
     def _compute(self, n: int, kinematics: bool) -> None:

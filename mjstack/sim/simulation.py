@@ -223,7 +223,7 @@ class Simulation(ABC):
     def close(self) -> None:
         """Give threads and buffers back."""
 
-    def _check_mask(self, mask: torch.Tensor | None) -> None:
+    def check_mask(self, mask: torch.Tensor | None) -> None:
         """Check what can be known of a mask without reading it; `reset` has the error."""
         expected = f"a torch.bool tensor of shape ({self.nworld},) on {self.device}"
         if mask is None:

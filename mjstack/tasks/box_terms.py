@@ -31,7 +31,6 @@ class ToSlot:
             MjstackError: There is no such object, or no box.
         """
         box = scene_box(env.cfg)
-        env.index.object_address(object)
         slots = BoxCheck(env.cfg).slots
         if object not in slots:
             raise UnknownName("object", object, slots)
@@ -64,7 +63,6 @@ class Place:
         Raises:
             MjstackError: There is no such cube, no box, or the scale is out of range.
         """
-        require_positive("scale", scale)
         self._to_slot = ToSlot(env, object=object)
         self._object = object
         self._scale = scale
@@ -123,7 +121,6 @@ class ReachNext(_ByObject):
         Raises:
             MjstackError: There is no box, or the scale is out of range.
         """
-        require_positive("scale", scale)
         super().__init__(env)
         self._scale = scale
 

@@ -6,7 +6,6 @@ A condition is a function of a `Step` that returns a bool tensor, shape ``(nworl
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -127,7 +126,8 @@ class AtLeast(Rule):
             phases: For each object, the phases in which it counts.
         """
         super().__init__(name, text, objects)
-        self.wanted = [f"at least {least:g}{_in(each)}" for each in phases]
+        during = [" and ".join(each) for each in phases]
+        self.wanted = [f"at least {least:g}{each and f' in {each}'}" for each in during]
         self.least = least
         self._value = value
         self.phases = phases
@@ -160,6 +160,7 @@ class Streak(AtLeast):
         phases: PhaseNames,
         after: AtLeast | None = None,
         anew: PhaseNames = (),
+        distance: float | None = None,
     ) -> None:
         """Describes the rule; see `Rule`.
 
@@ -172,9 +173,12 @@ class Streak(AtLeast):
             phases: For each object, the phases in which it counts.
             after: Without phases it counts once this one holds.
             anew: For each object, phases that clear every counter of the check.
+            distance: Of `Carried` [m].
         """
-        value = f"{name.lower()}_steps{{}}"
-        super().__init__(name, text, objects, value, steps, phases=phases)
+        value = f"{name.lower()}_steps{{}}" if distance is None else f"{name.lower()}{{}}_m"
+        least = steps if distance is None else distance
+        super().__init__(name, text, objects, value, least, phases=phases)
+        self._steps = steps
         self._condition = condition
         self._after = after
         self._anew = anew
@@ -201,16 +205,8 @@ class Streak(AtLeast):
 
 class Carried(Streak):
     """During an uninterrupted streak of at least some steps, an object gets some horizontal
-    distance away from where the streak began.
+    ``distance`` away from where the streak began.
     """
-
-    def __init__(self, *args: Any, distance: float, **kwargs: Any) -> None:
-        """Takes the arguments of `Streak` and the distance [m]."""
-        super().__init__(*args, **kwargs)
-        self._steps = self.least
-        self.least = distance
-        self._value = self._value.replace("_steps{}", "{}_m")
-        self.wanted = [f"at least {distance:g}{_in(each)}" for each in self.phases]
 
     def start(self, view: TaskView) -> None:
         """Allocates the streaks."""
@@ -398,7 +394,3 @@ class ReleasedSuccess(HeldSuccess):
     def __call__(self, env: EnvView) -> Tensor:
         """Processes a step; shape ``(nworld,)``, bool."""
         return super().__call__(env) & (gripper_opening(env) >= self._open).all(1)
-
-
-def _in(phases: Sequence[str]) -> str:
-    return f" in {' and '.join(phases)}" if phases else ""

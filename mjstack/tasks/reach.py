@@ -27,7 +27,6 @@ class ReachSuccess(HeldSuccess):
         Raises:
             MjstackError: There is no such object, or a number is out of range.
         """
-        env.index.object_address(object)
         require_positive("distance", distance)
 
         def near() -> Tensor:

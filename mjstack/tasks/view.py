@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mjstack.errors import UnknownName
 from mjstack.managers.view import EnvView
 from mjstack.math import lowest_point, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, pose_w
@@ -67,9 +66,6 @@ class TaskView:
             steps: Length of the episode; those after it count for no rule.
             window: The last steps, which count for no rule without phases.
             force: A jaw or a support that presses with more touches an object [N].
-
-        Raises:
-            UnknownName: There is no such object.
         """
         self.env = env
         self.objects = list(objects)
@@ -84,9 +80,6 @@ class TaskView:
 
         index = env.index
         scene = env.cfg.scene
-        for name in objects:
-            if name not in scene.objects:
-                raise UnknownName("object", name, scene.objects)
         self.things = [scene.objects[name] for name in objects]
         self.top = table_top(scene)
         self.half = torch.tensor([each.half for each in self.things], device=env.device)

@@ -60,8 +60,14 @@ class Placement:
         data.qpos[index.robot_qpos] = pose
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        arm = _arm_boxes(cfg, data, index, noise)
-        fixed = _fixed_boxes(data)
+        collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        bolted = model.body_weldid[model.geom_bodyid] == 0
+        loose = np.isin(model.geom_bodyid, list(index.bodies.values()))
+        arm = _arm_boxes(cfg, data, np.flatnonzero(collides & ~bolted & ~loose), noise)
+        # Floor, the only plane in a scene, and table are left out.
+        ground = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        ground[model.geom("table").id] = True
+        fixed = world_boxes(data, np.flatnonzero(collides & bolted & ~ground))
 
         rectangles = []
         top = table_top(scene)
@@ -172,16 +178,12 @@ def _around(
 
 
 def _arm_boxes(
-    cfg: Config, data: mujoco.MjData, index: SceneIndex, noise: float
+    cfg: Config, data: mujoco.MjData, geoms: np.ndarray, noise: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Centres and half sizes of boxes that hold the arm's colliding geoms, wherever noise puts
     them, shape ``(n, 3)`` each.
     """
     model = data.model
-    body = model.geom_bodyid
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    fixed = model.body_weldid[body] == 0
-    geoms = np.flatnonzero(collides & ~fixed & ~np.isin(body, list(index.bodies.values())))
     joints = [model.joint(name).id for name in cfg.robot.arm_joints]
     dofs = model.jnt_dofadr[joints]
     centers, halves = world_boxes(data, geoms)
@@ -191,24 +193,13 @@ def _arm_boxes(
         corners = centers[k] + signs * halves[k]
         moved = np.zeros(3)
         for corner in corners:
-            mujoco.mj_jac(model, data, jac, None, corner, body[g])
+            mujoco.mj_jac(model, data, jac, None, corner, model.geom_bodyid[g])
             moved = np.maximum(moved, noise * np.abs(jac[:, dofs]).sum(axis=1))
         # What a Jacobian leaves out: at most half the square of the angle, all joints together,
         # times the longest lever.
         lever = np.linalg.norm(data.xanchor[joints][None] - corners[:, None], axis=2).max()
         halves[k] += moved + 0.5 * (noise * len(joints)) ** 2 * lever
     return centers, halves
-
-
-def _fixed_boxes(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-    """The same of what collides and is fixed to the world, floor and table left out."""
-    model = data.model
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    fixed = model.body_weldid[model.geom_bodyid] == 0
-    # A plane has no end; the floor is the only one in a scene.
-    solid = model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
-    geoms = np.flatnonzero(collides & fixed & solid)
-    return world_boxes(data, geoms[geoms != model.geom("table").id])
 
 
 def world_boxes(

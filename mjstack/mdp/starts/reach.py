@@ -1,7 +1,6 @@
 """Whether the arm reaches what its phases ask of an object, wherever the object may stand."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -41,7 +40,7 @@ def reach_distances(
     distances = np.zeros((len(xy), len(targets)))
     for gripper, command in (("open", robot.gripper_open), ("closed", robot.gripper_closed)):
         columns = [k for k, (phase, _) in enumerate(targets) if phase.spec.gripper == gripper]
-        if not columns or not len(xy):
+        if not columns:
             continue
         points = np.empty((len(xy), len(columns), 3))
         for place, k in enumerate(columns):
@@ -60,21 +59,15 @@ def require_reach(env: EnvView, name: str, region: tuple[float, float]) -> None:
         ParameterError: The arm cannot follow a phase at an object somewhere there.
     """
     scene = env.cfg.scene
+    center = np.array(scene.table_center[:2])
     for thing, spec in scene.free.items():
-        axes = []
-        for k in (0, 1):
-            room = scene.table_half[k] - spec.footprint  # as `Placement` keeps them, for any yaw
-            low, high = (
-                np.clip(
-                    spec.xy[k] + s * region[k],
-                    scene.table_center[k] - room,
-                    scene.table_center[k] + room,
-                )
-                for s in (-1, 1)
-            )
-            axes.append(
-                np.unique(np.linspace(low, high, max(5, 1 + math.ceil((high - low) / _GRID))))
-            )
+        room = np.array(scene.table_half[:2]) - spec.footprint  # as `Placement` has it, for any yaw
+        lows = np.clip(np.subtract(spec.xy, region), center - room, center + room)
+        highs = np.clip(np.add(spec.xy, region), center - room, center + room)
+        axes = [
+            np.unique(np.linspace(low, high, max(5, 1 + math.ceil((high - low) / _GRID))))
+            for low, high in zip(lows, highs, strict=True)
+        ]
         xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
         if found := out_of_reach(env, thing, xy):
             fix = (
@@ -86,9 +79,7 @@ def require_reach(env: EnvView, name: str, region: tuple[float, float]) -> None:
             )
 
 
-def out_of_reach(
-    env: EnvView, name: str, xy: Sequence[Sequence[float]] | np.ndarray
-) -> tuple[int, str] | None:
+def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | None:
     """The position of an object that is farthest out of reach, by its row, and a sentence on it;
     None if the arm reaches them all.
 
@@ -97,12 +88,11 @@ def out_of_reach(
         name: The object.
         xy: Where it may stand [m], shape ``(n, 2)``.
     """
-    places = np.asarray(xy, dtype=float).reshape(-1, 2)
-    distances, targets = reach_distances(env, name, places)
+    distances, targets = reach_distances(env, name, xy)
     if (distances <= env.cfg.controller.ik_tolerance).all():
         return None
     row, column = (int(k) for k in np.unravel_index(distances.argmax(), distances.shape))
-    x, y = places[row]
+    x, y = xy[row]
     phase, target = targets[column]
     scene = env.cfg.scene
     height = target.z - table_top(scene) - scene.objects[name].half_height

@@ -1,5 +1,8 @@
 """Worlds that start from the rows of a file, and a file of how worlds have started."""
 
+import csv
+import math
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.errors import ArgumentError, ConfigError, ParameterError
+from mjstack.errors import ArgumentError, ConfigError, ParameterError, suggest
 from mjstack.files import to_csv, write_atomic
 from mjstack.managers.view import EnvView, offers, uses_fields
 from mjstack.mdp.geometry import (
@@ -17,8 +20,8 @@ from mjstack.mdp.geometry import (
     named_pose,
     place_xy,
     pose_w,
-    robot,
     robot_joints,
+    write_robot,
 )
 from mjstack.mdp.starts.placement import world_boxes
 from mjstack.mdp.starts.randomization import (
@@ -29,11 +32,100 @@ from mjstack.mdp.starts.randomization import (
     bounds,
 )
 from mjstack.mdp.starts.reach import out_of_reach
-from mjstack.mdp.starts.table import StartsTable, read_starts_table
 
 # [m], and of a quaternion: how far off upright an object on the table may be
 _FLAT = 1e-5
 _OVER = 1e-6  # [m] how far an object may reach over the edge of the table
+
+
+class StartsTable:
+    """The content of a file, a CSV with a header and one row per world.
+
+    Attributes:
+        columns: Values by column name, each ``(worlds,)``, float64, with world w in row w.
+        lines: The line of each world in the file, ``(worlds,)``.
+    """
+
+    def __init__(self, path: str, required: Sequence[str], optional: Sequence[str]) -> None:
+        """Reads a file and checks it cell by cell.
+
+        Args:
+            path: The file.
+            required: Names of columns that every file has, beside ``world``.
+            optional: Names of columns that a file may have.
+
+        Raises:
+            ParameterError: The file cannot be read, or a column, a cell or a world is wrong.
+        """
+        self._path = path
+        required = ["world", *required]
+        try:
+            with Path(path).open(encoding="utf-8-sig", newline="") as file:
+                reader = csv.reader(file)
+                header = [name.strip() for name in next(reader, [])]
+                rows = [(reader.line_num, cells) for cells in reader if "".join(cells).strip()]
+        except (OSError, UnicodeDecodeError, csv.Error) as error:
+            expected = "a CSV file with a header and one row per world; it cannot be read"
+            reason = getattr(error, "strerror", None) or error
+            raise self._wrong(f"{expected} ({reason})", "Name a file: starts=worlds.csv") from error
+
+        known = [*required, *optional]
+        for name in header:
+            if name not in known or header.count(name) > 1:
+                expected = f"columns separated by commas, each once; {reprlib.repr(name)} is wrong"
+                raise self._wrong(expected, suggest(name, known).rstrip("."), 1)
+        if lacking := [name for name in required if name not in header]:
+            expected = f"columns {', '.join(required)}; {', '.join(lacking)} missing"
+            raise self._wrong(expected, "Add the missing columns", 1)
+
+        values = np.empty((len(rows), len(header)))
+        for row, (line, cells) in enumerate(rows):
+            if len(cells) != len(header):
+                expected = f"{len(header)} cells as in the header, it has {len(cells)}"
+                raise self._wrong(expected, "Correct it; the decimal mark is a point", line)
+            for column, cell in enumerate(cells):
+                try:
+                    values[row, column] = float(cell)
+                except ValueError:
+                    values[row, column] = math.nan
+                if not math.isfinite(values[row, column]):
+                    expected = f"a finite number, {reprlib.repr(cell)} is none"
+                    raise self._wrong(expected, "Correct it", line, [header[column]])
+
+        table = dict(zip(header, values.T, strict=True))
+        worlds = table.pop("world")
+        if missing := set(range(max(1, len(rows)))).difference(worlds):
+            expected = f"worlds numbered from 0, a row each; {min(missing)} is missing"
+            raise self._wrong(expected, "Number the rows anew", columns=["world"])
+        order = np.argsort(worlds)
+        self.columns = {name: column[order] for name, column in table.items()}
+        self.lines = np.array([line for line, _ in rows])[order]
+
+    def misfit(
+        self, world: int, columns: Sequence[str], expected: str, fix: str = "Correct it"
+    ) -> ParameterError:
+        """The error that some cells of a world's line cannot be used."""
+        return self._wrong(expected, fix, self.lines[world], columns)
+
+    def require_range(self, column: str, low: float, high: float, fix: str = "Correct it") -> None:
+        """Refuse a value outside a range, if the file has the column.
+
+        Raises:
+            ParameterError: There is one; names its line.
+        """
+        values = self.columns.get(column, np.empty(0))
+        slack = 1e-6 * max(abs(low), abs(high))  # float32 does not hold the ends exactly
+        for world in np.flatnonzero((values < low - slack) | (values > high + slack)).tolist():
+            expected = f"{low:.6g} to {high:.6g}, it is {values[world]:.6g}"
+            raise self.misfit(world, [column], expected, fix)
+
+    def _wrong(
+        self, expected: str, fix: str, line: int | None = None, columns: Sequence[str] = ()
+    ) -> ParameterError:
+        where = self._path if line is None else f"{self._path}, line {line}"
+        if columns:
+            where += f", column{'s' if len(columns) > 1 else ''} {', '.join(columns)}"
+        return ParameterError("path", where, expected, fix)
 
 
 @offers(reads_file=True)
@@ -59,7 +151,7 @@ class FromStartsFile:
 
         Args:
             env: The environment.
-            path: The file; see `mjstack.mdp.starts.table`.
+            path: The file; see `StartsTable`.
             pose: Of joints that have no column, ``home`` or ``start``.
             mass: Smallest and largest mass of an object, over the model's own.
             friction: Smallest and largest coefficient. Where the file has any, the table gets the
@@ -74,34 +166,36 @@ class FromStartsFile:
         if path is None:
             expected = "a file with one row per world, which reset=starts_file reads"
             raise ConfigError("starts", "null", expected, "Set starts=worlds.csv")
-        ranges = {
-            "mass": bounds("mass", mass),
-            "friction": bounds("friction", friction),
-            "gain": bounds("gain", gain),
-        }
-        self._quantities: dict[str, Quantity] = {
+        ranges = {"mass": mass, "friction": friction, "gain": gain}
+        ends = {name: bounds(name, values) for name, values in ranges.items()}
+        quantities: dict[str, Quantity] = {
             "mass": ObjectMasses(env),
-            "friction": SlidingFriction(env, ranges["friction"][0]),
+            "friction": SlidingFriction(env, ends["friction"][0]),
             "gain": ServoGains(env),
         }
         try:
-            self._read(env, path, pose, ranges)
+            self._read(env, path, pose, quantities, ends)
         except ParameterError as error:
             if error.key == "path" and path == env.cfg.starts:
                 raise error.at("starts") from error
             raise
 
     def _read(
-        self, env: EnvView, path: str, pose: str, ranges: dict[str, tuple[float, float]]
+        self,
+        env: EnvView,
+        path: str,
+        pose: str,
+        quantities: dict[str, Quantity],
+        ends: dict[str, tuple[float, float]],
     ) -> None:
         # The table
         objects = list(env.index.objects)
         joints = [f"joint_{name}" for name in robot_joints(env)]
         drawn = {name: _xy(name) for name in _drawn_places(env)}
-        columns = [column for held in self._quantities.values() for column in held.columns]
+        columns = [column for held in quantities.values() for column in held.columns]
         required = [column for name in objects for column in (*_xy(name), f"{name}_yaw_rad")]
         optional = [*joints, *columns, *(column for pair in drawn.values() for column in pair)]
-        file = read_starts_table(path, required, optional)
+        file = StartsTable(path, required, optional)
         table = file.columns
         rows = len(file.lines)
         needed = max(env.nworld, env.cfg.nworld)
@@ -110,8 +204,8 @@ class FromStartsFile:
             raise ParameterError("path", path, f"at least {needed} worlds, it has {rows}", fix)
 
         # Values within their ranges
-        for name, held in self._quantities.items():
-            low, high = ranges[name]
+        for name, held in quantities.items():
+            low, high = ends[name]
             fix = f"Correct it, or widen reset.starts.params.{name}"
             for column, nominal in zip(held.columns, held.nominal.tolist(), strict=True):
                 file.require_range(column, nominal * low, nominal * high, fix)
@@ -134,12 +228,9 @@ class FromStartsFile:
             command[:, number] = table.get(column, command[:, number])
         poses = np.zeros((rows, len(objects), 6))  # x, y and the quaternion
         for number, name in enumerate(objects):
-            x, y = _xy(name)
             half = 0.5 * table[f"{name}_yaw_rad"]
-            poses[:, number, 0] = table[x]
-            poses[:, number, 1] = table[y]
-            poses[:, number, 2] = np.cos(half)
-            poses[:, number, 5] = np.sin(half)
+            stands = [*(table[column] for column in _xy(name)), np.cos(half), np.sin(half)]
+            poses[:, number, [0, 1, 2, 5]] = np.stack(stands, axis=1)
         _check_worlds(env, file, poses, command)
         for number, name in enumerate(objects):
             if found := out_of_reach(env, name, poses[:, number, :2]):
@@ -152,16 +243,14 @@ class FromStartsFile:
         self._poses = _on(env, poses)
         missing = np.full(rows, np.nan)
         self._given = []
-        for held in self._quantities.values():
+        for held in quantities.values():
             if table.keys() & set(held.columns):
                 values = np.stack([table.get(column, missing) for column in held.columns], axis=1)
                 self._given.append((held, torch.from_numpy(values).to(env.device)))
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Writes qpos, ctrl and the model fields that the file has columns for."""
-        command = self._command.index_select(0, env.world)
-        robot(env).qpos.write_masked(env.sim.qpos, mask, command)
-        robot(env).ctrl.write_masked(env.sim.ctrl, mask, command)
+        write_robot(env, mask, self._command.index_select(0, env.world))
         poses = self._poses.index_select(0, env.world)
         for number, name in enumerate(env.index.objects):
             view = pose_w(env, name)
@@ -235,11 +324,10 @@ def _on(env: EnvView, values: np.ndarray) -> Tensor:
 
 def _varies(env: EnvView, names: Sequence[str]) -> bool:
     """Whether the value of a field differs from the model's in some world."""
-    for name in names:
-        if name in env.sim.fields:
-            field = env.sim.fields[name]
-            if bool((field != torch.from_numpy(getattr(env.sim.model, name)).to(field)).any()):
-                return True
+    for name in set(names) & set(env.sim.fields):
+        field = env.sim.fields[name]
+        if bool((field != torch.from_numpy(getattr(env.sim.model, name)).to(field)).any()):
+            return True
     return False
 
 
