@@ -17,7 +17,8 @@ from test_stack_check import feed as feed_stack
 from mjstack.config.fields import spec
 from mjstack.config.schema import Backend
 from mjstack.config.schema.scene import PlaceCfg
-from mjstack.episodes.rollout import NOMINAL, start_worlds
+from mjstack.episodes.context import RunContext
+from mjstack.episodes.rollout import NOMINAL
 from mjstack.errors import MjstackError
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import make_simulation
@@ -70,7 +71,7 @@ def test_a_check_of_ones_own_judges_native_worlds() -> None:
     model = build_model(cfg)
     index = SceneIndex(model, cfg.robot, cfg.scene)
     sim = make_simulation(model, cfg, 3, backend=Backend.native, device="cpu")
-    env = start_worlds(sim, index, cfg, NOMINAL)
+    env = RunContext(cfg).start(sim, NOMINAL)
     address, _ = index.object_address("blue")
     sim.qpos[:, address : address + 2] = torch.tensor([[0.33, 0.15], [0.33, 0.18], [0.33, 0.15]])
     check = make_check(cfg)

@@ -16,9 +16,9 @@ from mjstack.bench.timing import (
     timed,
 )
 from mjstack.config.schema import Backend
-from mjstack.episodes.context import RunContext, play_to
+from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import CommandRecorder, Snapshots
-from mjstack.episodes.rollout import State, restore
+from mjstack.episodes.rollout import State, restore, rollout, snapshot
 from mjstack.errors import MjstackError
 from mjstack.mdp.geometry import objects_in_hand
 from mjstack.sim import Simulation, resolve_device
@@ -137,10 +137,20 @@ def carry_start(context: RunContext, sim: Simulation) -> State:
     t = context.cfg.gate.throughput
     count = min(sim.nworld, t.start_worlds)
     some = context.simulation(count, Backend.native, "cpu")
-    state = play_to(context, some, t.from_phase)
+    state = play_to_phase(context, some)
     some.close()
     rows = np.arange(sim.nworld) % count
     return State(state.qpos[rows], state.qvel[rows], state.ctrl[rows])
+
+
+def play_to_phase(context: RunContext, sim: Simulation) -> State:
+    """The state of every world as the measured phase begins, played from the configured starts."""
+    phase = context.cfg.gate.throughput.from_phase
+    env = context.start(sim, context.cfg.reset)
+    steps = context.phase_start(phase)
+    label = f"steps to {phase}"
+    rollout(env, context.driver(env), steps=steps, advance=context.advance, label=label)
+    return snapshot(sim)
 
 
 def measure_arrangements(

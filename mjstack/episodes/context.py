@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import Backend, Config
-from mjstack.drivers.driver import Driver
+from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
-from mjstack.envs import Env
+from mjstack.envs import Env, driven_config
 from mjstack.envs.buffers import Advance, Workload, play_workload, recommend_sizes, require_physics
 from mjstack.episodes.observers import (
     Episode,
@@ -23,19 +23,17 @@ from mjstack.episodes.observers import (
     WorldRecorder,
     play_episode,
 )
-from mjstack.episodes.record import measured_values
 from mjstack.episodes.rollout import (
+    CLOSED_LOOP,
     NOMINAL,
     Observer,
     Reset,
     State,
-    make_driver,
-    rollout,
-    snapshot,
-    start_worlds,
+    reset_worlds,
 )
 from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
+from mjstack.mdp.geometry import source_xy
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import (
@@ -43,11 +41,10 @@ from mjstack.sim import (
     Simulation,
     make_simulation,
     resolve_backend,
-    resolve_device,
     resolve_sizes,
 )
 from mjstack.sim.sizes import apply_configured
-from mjstack.tasks.check import CheckResult, EpisodeCheck, Rules, make_check
+from mjstack.tasks.check import EpisodeCheck, make_check
 
 log = logging.getLogger(__name__)
 
@@ -220,13 +217,32 @@ class RunContext:
         seed: int | None = None,
         worlds: Sequence[int] | None = None,
     ) -> Env:
-        """`start_worlds` in this context's scene, under the configured seed or another one."""
-        cfg = self.cfg if seed is None else replace(self.cfg, seed=seed)
-        return start_worlds(sim, self.index, cfg, reset, worlds)
+        """Build the environment of a driven episode, whose actions are the driver's commands, and
+        reset every world.
+
+        Args:
+            sim: The worlds.
+            reset: How worlds differ at the start.
+            seed: Seed, if not the configured one.
+            worlds: Their numbers, which random numbers depend on: ``[17]`` starts one world as
+                world 17 of any batch starts.
+        """
+        cfg = driven_config(self.cfg, reset=reset)
+        env = Env(sim, self.index, cfg, check_faults=False)
+        return reset_worlds(env, cfg.seed if seed is None else seed, worlds)
 
     def driver(self, env: Env) -> Driver:
         """The configured driver, for worlds that have started."""
-        return make_driver(env, self.planner, self.advance)
+        sim = env.sim
+        if env.cfg.controller.name == CLOSED_LOOP:
+            # Loads Warp, which a native open-loop run does not need.
+            from mjstack.drivers.closed_loop import ClosedLoopDriver
+
+            return ClosedLoopDriver(env, self.planner.nominal)
+        sources = source_xy(env).double().cpu().numpy()
+        planned = partial(self.tell, "planning", total=sim.nworld)
+        tape = self.planner.plan(sources, planned).to(sim.device, sim.ctrl.dtype)
+        return OpenLoopDriver(tape, self.planner.phases, sim.nworld, sim.device)
 
     def play(
         self,
@@ -244,7 +260,7 @@ class RunContext:
             reset: How they start.
             observers: Look on.
             seed: Seed, if not the configured one.
-            worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start_worlds`.
+            worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start`.
         """
         env = self.start(sim, reset, seed=seed, worlds=worlds)
         return play_episode(env, self.driver(env), observers, advance=self.advance)
@@ -337,8 +353,7 @@ class RunContext:
 
     def parity_simulation(self) -> Simulation:
         """One MJWarp world."""
-        device = resolve_device(self.cfg.sim.device)
-        return make_simulation(self.model, self.cfg, 1, backend=Backend.mjwarp, device=device)
+        return make_simulation(self.model, self.cfg, 1, backend=Backend.mjwarp)
 
     def phase_start(self, name: str) -> int:
         """First step of a phase."""
@@ -375,18 +390,9 @@ def require_episode(cfg: Config) -> None:
         raise ConfigError("task", cfg.task.name, expected, "Train it: mjstack.make_env")
 
 
-def play_to(context: RunContext, sim: Simulation, phase: str) -> State:
-    """The state of every world as a phase begins, played from the configured starts."""
-    env = context.start(sim, context.cfg.reset)
-    first = context.phase_start(phase)
-    label = f"steps to {phase}"
-    rollout(env, context.driver(env), steps=first, advance=context.advance, label=label)
-    return snapshot(sim)
-
-
-def judge_one(rules: Rules, result: CheckResult) -> tuple[Status, str, dict]:
+def judge_one(context: RunContext, episode: Episode) -> tuple[Status, str, dict]:
     """Status, reason and metrics of a one-world episode."""
-    bits = int(result.failed[0])
-    metrics = {name: float(values[0]) for name, values in measured_values(result).items()}
+    bits = int(episode.failed[0])
+    metrics = {name: float(values[0]) for name, values in episode.values.items()}
     status = Status.failed if bits else Status.passed
-    return status, f"failed: {rules.describe(bits)}" if bits else "", metrics
+    return status, f"failed: {context.check.rules.describe(bits)}" if bits else "", metrics

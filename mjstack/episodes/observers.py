@@ -41,6 +41,11 @@ class Episode:
         """Bits of the task's rules, shape ``(nworld,)``, int32."""
         return self.result.failed.cpu().numpy()
 
+    @property
+    def values(self) -> dict[str, np.ndarray]:
+        """Measurements of the check, by name with unit, each of shape ``(nworld,)``."""
+        return {name: value.double().cpu().numpy() for name, value in self.result.values.items()}
+
 
 def play_episode(
     env: Env,

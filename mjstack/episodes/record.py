@@ -15,8 +15,7 @@ from mjstack.episodes.observers import Episode
 from mjstack.errors import RunError
 from mjstack.files import write_npz
 from mjstack.scene import SceneIndex
-from mjstack.sim import Simulation
-from mjstack.tasks.check import CheckResult, Rules
+from mjstack.tasks.check import Rules
 
 STEMS = {"batch": "worlds", "success": "success"}
 """The beginning of the files of each gate."""
@@ -123,26 +122,6 @@ class EpisodeRecord:
     circumstances: Circumstances | None = None
 
     @classmethod
-    def of(
-        cls,
-        seed: int,
-        sim: Simulation,
-        episode: Episode,
-        circumstances: Circumstances | None = None,
-    ) -> "EpisodeRecord":
-        """Copy the results to the host."""
-        return cls(
-            seed=seed,
-            backend=sim.backend,
-            device=str(sim.device),
-            failed=episode.failed,
-            values=measured_values(episode.result),
-            qpos=sim.qpos.cpu().numpy().copy(),
-            start=episode.start,
-            circumstances=circumstances,
-        )
-
-    @classmethod
     def read(cls, folder: Path, seed: int, gate: str = "batch") -> "EpisodeRecord | None":
         """Read the record of a gate's seed, without circumstances.
 
@@ -204,11 +183,6 @@ class EpisodeRecord:
             }
             for world in np.flatnonzero(self.failed).tolist()
         ]
-
-
-def measured_values(result: CheckResult) -> dict[str, np.ndarray]:
-    """Measurements of the check, by name with unit, on the host; each of shape ``(nworld,)``."""
-    return {name: value.double().cpu().numpy() for name, value in result.values.items()}
 
 
 def starts_name(seed: int | str) -> str:

@@ -8,13 +8,10 @@ from typing import cast
 import numpy as np
 import torch
 
-from mjstack.config.schema import Config, GraphMode, TermCfg
-from mjstack.drivers.driver import Driver, OpenLoopDriver
-from mjstack.drivers.open_loop import OpenLoopPlanner
-from mjstack.envs import Env, driven_config
+from mjstack.config.schema import GraphMode, TermCfg
+from mjstack.drivers.driver import Driver
+from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
-from mjstack.mdp.geometry import source_xy
-from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
 from mjstack.sim.graph import StepGraph
 
@@ -155,31 +152,6 @@ def rollout(
     )
 
 
-def start_worlds(
-    sim: Simulation,
-    index: SceneIndex,
-    cfg: Config,
-    reset: Reset,
-    worlds: Sequence[int] | None = None,
-) -> Env:
-    """Build the environment of a driven episode and reset every world.
-
-    Args:
-        sim: The worlds.
-        index: Addresses.
-        cfg: The configuration.
-        reset: How worlds differ at the start.
-        worlds: Their numbers, which random numbers depend on: ``[17]`` starts one world as world 17
-            of any batch starts.
-
-    Returns:
-        The environment, whose actions are the driver's commands.
-    """
-    return reset_worlds(
-        Env(sim, index, driven_config(cfg, reset=reset), check_faults=False), cfg.seed, worlds
-    )
-
-
 def reset_worlds(env: Env, seed: int, worlds: Sequence[int] | None = None) -> Env:
     """Reset every world, under these numbers if there are any, and bring everything that derives
     from their state up to date.
@@ -189,26 +161,6 @@ def reset_worlds(env: Env, seed: int, worlds: Sequence[int] | None = None) -> En
     env.reset(seed=seed)
     env.sim.forward()
     return env
-
-
-def make_driver(env: Env, planner: OpenLoopPlanner, advance: Advance | None = None) -> Driver:
-    """Make the configured driver, for worlds that have started.
-
-    Args:
-        env: The environment, whose action terms are the controller's.
-        planner: Plans the joint trajectories, from where objects and places are.
-        advance: Told about progress.
-    """
-    sim = env.sim
-    if env.cfg.controller.name == CLOSED_LOOP:
-        # Loads Warp, which a native open-loop run does not need.
-        from mjstack.drivers.closed_loop import ClosedLoopDriver
-
-        return ClosedLoopDriver(env, planner.nominal)
-    progress = None if advance is None else (lambda done: advance("planning", done, sim.nworld))
-    sources = source_xy(env).double().cpu().numpy()
-    tape = planner.plan(sources, progress).to(sim.device, sim.ctrl.dtype)
-    return OpenLoopDriver(tape, planner.phases, sim.nworld, sim.device)
 
 
 @dataclass(slots=True)

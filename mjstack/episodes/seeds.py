@@ -58,15 +58,21 @@ def play_seeds(
     try:
         for seed in range(cfg.seed, last + 1):
             try:
-                monitor = FailureMonitor(cfg)
-                looking = [*([monitor] if circumstances else []), *observers(seed)]
+                monitors = [FailureMonitor(cfg)] if circumstances else []
+                looking = [*monitors, *observers(seed)]
                 episode = context.play(sim, cfg.reset, looking, seed=seed)
-                found = (
-                    Circumstances.of(episode, monitor, cfg, context.index)
-                    if circumstances
-                    else None
+                record = EpisodeRecord(
+                    seed=seed,
+                    backend=sim.backend,
+                    device=str(sim.device),
+                    failed=episode.failed,
+                    values=episode.values,
+                    qpos=sim.qpos.cpu().numpy().copy(),
+                    start=episode.start,
                 )
-                record = EpisodeRecord.of(seed, sim, episode, found)
+                for monitor in monitors:
+                    found = Circumstances.of(episode, monitor, cfg, context.index)
+                    record.circumstances = found
                 tally.add(record, episode, sim)
             except Exception as error:
                 if seed == cfg.seed:

@@ -12,7 +12,7 @@ def run_baseline(context: RunContext) -> list[GateResult]:
     sim = nominal.sim
     episode = nominal.episode
     timing = episode.timing
-    status, reason, metrics = judge_one(context.check.rules, episode.result)
+    status, reason, metrics = judge_one(context, episode)
     headline = context.check.headline(metrics)
     context.say(f"{cfg.task.name} check: {headline}")
     metrics["episode_s"] = timing.seconds

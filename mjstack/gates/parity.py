@@ -34,7 +34,7 @@ def run_parity(context: RunContext) -> list[GateResult]:
 
     world = WorldRecorder()
     episode = context.play(mjwarp, NOMINAL, [*context.viewers, world])
-    status, reason, judged = judge_one(context.check.rules, episode.result)
+    status, reason, judged = judge_one(context, episode)
     if status is Status.failed:
         problems.append(reason)
     if int(mjwarp.overflow[0]):

@@ -203,7 +203,7 @@ def _replay(
         observers=[*(context.viewers if first else []), *monitors],
     )
     rules = context.check.rules
-    status, reason, metrics = judge_one(rules, done.episode.result)
+    status, reason, metrics = judge_one(context, done.episode)
     kept, compared = _compare(plan, done, backend, device, changes, context)
     reason = f"{reason or f'succeeded, {context.check.headline(metrics)}'}; {compared}"
     if not kept:

@@ -14,10 +14,10 @@ from typing import Any, cast
 import numpy as np
 from rich.markup import escape
 
-from mjstack.bench.physics import HeldPhysics
+from mjstack.bench.physics import HeldPhysics, play_to_phase
 from mjstack.bench.timing import describe_lost, steps_that_fit
 from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
-from mjstack.episodes.context import RunContext, Stage, play_to, require_episode
+from mjstack.episodes.context import RunContext, Stage, require_episode
 from mjstack.errors import MjstackError
 from mjstack.files import to_csv
 from mjstack.gates.runner import describe_error
@@ -73,7 +73,7 @@ def run_study_job(context: RunContext, folder: Path, overrides: list[str]) -> Jo
             # The configured solver's worlds are kept beside every variant, so that the repetitions
             # of both are interleaved and start from one state.
             sim = _simulation(context)
-            state = play_to(context, sim, cfg.gate.throughput.from_phase)
+            state = play_to_phase(context, sim)
             base = HeldPhysics(sim, state, cfg.timing.decimation)
             steps = steps_that_fit(job.steps, job.max_seconds, base.warm_up())
         except Exception as error:  # nothing can be compared with it

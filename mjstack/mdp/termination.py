@@ -28,9 +28,8 @@ class ObjectOffTable:
     def __init__(self, env: EnvView) -> None:
         """Reads the table's place."""
         scene = env.cfg.scene
-        dtype = env.sim.qpos.dtype
-        self._center = torch.tensor(scene.table_center[:2], dtype=dtype, device=env.device)
-        self._half = torch.tensor(scene.table_half[:2], dtype=dtype, device=env.device)
+        self._center = env.index.constant(scene.table_center[:2], env.sim.qpos)
+        self._half = env.index.constant(scene.table_half[:2], env.sim.qpos)
         self._top = table_top(scene)
 
     def __call__(self, env: EnvView) -> Tensor:
