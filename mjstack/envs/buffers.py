@@ -94,17 +94,16 @@ def read_peaks(sim: Simulation) -> Peaks:
 def join_peaks(a: Peaks, b: Peaks) -> Peaks:
     """The larger of the peaks of two runs of the same worlds."""
 
-    def larger(x: int | None, y: int | None) -> int | None:
-        return None if x is None or y is None else max(x, y)
+    def larger(name: str) -> Any:
+        counts = getattr(a, name), getattr(b, name)
+        return None if None in counts else max(counts)
 
     return Peaks(
         nworld=a.nworld,
         contacts=np.maximum(a.contacts, b.contacts),
         rows=np.maximum(a.rows, b.rows),
         overflow=a.overflow | b.overflow,
-        pool_contacts=max(a.pool_contacts, b.pool_contacts),
-        pool_pairs=larger(a.pool_pairs, b.pool_pairs),
-        pool_ccd_pairs=larger(a.pool_ccd_pairs, b.pool_ccd_pairs),
+        **{name: larger(name) for name in ("pool_contacts", "pool_pairs", "pool_ccd_pairs")},
     )
 
 

@@ -1,6 +1,5 @@
 """Where an episode goes wrong: the first sign of failure of every world, kept on the device."""
 
-from collections.abc import Sequence
 from enum import IntEnum
 
 import torch
@@ -86,7 +85,11 @@ class FailureMonitor(Observer):
             [column.get(number, -1) for number in table] or [-1]
             for table in ([p.grasped for p in phases], [p.carried for p in phases])
         )
-        self._releases = _releases(self._tables[1], len(objects))
+        # Number of the phase in which each object is let go for good; one that never comes for one
+        # that is not carried.
+        last = {carried: number for number, carried in enumerate(self._tables[1])}
+        never = len(self._tables[1]) - 1
+        self._releases = [last.get(place, never) + 1 for place in range(len(objects))]
 
     def start(self, env: Env, driver: Driver) -> None:
         """Allocate for the environment's worlds."""
@@ -148,11 +151,3 @@ class FailureMonitor(Observer):
 def _of(table: Tensor, cube: Tensor) -> Tensor:
     """Each world's column, shape ``(nworld,)``; the first one where there is none (-1)."""
     return table.gather(1, cube.clamp(min=0)[:, None])[:, 0]
-
-
-def _releases(carried: Sequence[int], objects: int) -> list[int]:
-    """Number of the phase in which each cube is let go for good; one that never comes for a cube
-    that is not carried.
-    """
-    last = {cube: number for number, cube in enumerate(carried)}
-    return [last[cube] + 1 if cube in last else len(carried) for cube in range(objects)]

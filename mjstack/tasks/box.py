@@ -88,14 +88,16 @@ class BoxCheck(EpisodeCheck):
         self.slots = dict(zip(t.objects, t.places, strict=True))
         self._check_places()
         self.summaries = {
-            **{f"slot_err_{each}_max_m": (f"slot_err_{each}_m", "max") for each in self.objects},
             "beyond_max_m": ("beyond_m", "max"),
             "corner_speed_max_m_per_s": ("corner_speed_m_per_s", "max"),
             "jaw_clearance_min_m": ("jaw_clearance_m", "min"),
         }
-        for value in ("grasp_steps", "settled_steps"):
-            for each in self.objects:
-                self.summaries[f"{value}_{each}_min"] = (f"{value}_{each}", "min")
+        for each in self.objects:
+            self.summaries |= {
+                f"slot_err_{each}_max_m": (f"slot_err_{each}_m", "max"),
+                f"grasp_steps_{each}_min": (f"grasp_steps_{each}", "min"),
+                f"settled_steps_{each}_min": (f"settled_steps_{each}", "min"),
+            }
 
         grasp = Streak(
             "GRASP",
