@@ -602,7 +602,7 @@ def test_explained_rules_are_the_rules() -> None:
     rec = planned()
     values = {name: float(v[0]) for name, v in rec.result.values.items()}
     check = rec.context.check
-    told = check.report(values)
+    told = check.report(rec.result)
     assert set(told) | {"FINITE", "STEPS", "OVERFLOW"} == set(RULES)
     assert all(found and wanted for found, wanted in told.values())
     assert {value for value, _ in check.summaries.values()} <= set(values)
