@@ -451,7 +451,8 @@ def test_random_stacks_come_to_rest_on_mjwarp() -> None:
     """
     cfg = load_config([])
     n = 16
-    model = build_scene(mujoco.MjSpec(), cfg.scene, cfg.timing, cfg.solver)
+    cfg.robot.jaw_bodies = []  # a scene without a robot
+    model = build_scene(mujoco.MjSpec(), cfg)
     sim = make_simulation(model, cfg, n, backend=Backend.mjwarp, device="cpu")
     rng = np.random.default_rng(7)
     top = table_top(cfg.scene)

@@ -100,7 +100,7 @@ def _problem(cfg: Config, ik: "BatchedIk") -> tuple[torch.Tensor, torch.Tensor]:
     Shapes ``(nworld, n)`` and ``(nworld, 3)``.
     """
     robot = cfg.robot
-    names = [*robot.arm_joints, *robot.gripper_joints]
+    names = robot.joints
     home = torch.tensor(robot.home).repeat(ik.nworld, 1)
     moved = [names.index(name) for name in robot.ik_joints]
     away = home.clone()

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.drivers.open_loop import OpenLoopPlanner
+from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.drivers.tilt import CarryTilt
 from mjstack.envs import Env
 from mjstack.errors import ArgumentError
@@ -135,11 +135,11 @@ class ClosedLoopDriver:
         self._advance(fresh)
         length = self._length[self.phase]
         u = (self._time / length).clamp(max=1.0)
-        s = _smoothstep(u)[:, None]
+        s = smoothstep(u)[:, None]
         # After an empty grasp straight up first, and only then to where the object is now: it may
         # stand beside the jaws.
-        up = _smoothstep((2.0 * u).clamp(max=1.0))
-        over = _smoothstep((2.0 * u - 1.0).clamp(min=0.0))
+        up = smoothstep((2.0 * u).clamp(max=1.0))
+        over = smoothstep((2.0 * u - 1.0).clamp(min=0.0))
         share = torch.where(self._again[:, None], torch.stack((over, over, up), dim=1), s)
         target = torch.lerp(self._from[:, :3], self._to[:, :3], share)
         posture = self._nominal[self.phase]
@@ -260,8 +260,7 @@ class ClosedLoopDriver:
         """Column of the joint that rolls the gripper, and which way it turns the closing axis, seen
         from above.
         """
-        names = [*self._cfg.robot.arm_joints, *self._cfg.robot.gripper_joints]
-        column = names.index(str(self._cfg.robot.roll_joint))
+        column = self._cfg.robot.joints.index(str(self._cfg.robot.roll_joint))
         command = self._nominal[:1].expand(self._env.nworld, -1).clone()
         closing = []
         for turn in (0.0, 0.1):
@@ -286,48 +285,47 @@ class ClosedLoopDriver:
             self._seen[:, number, :2] = place_xy(self._env, name).float()
 
     def _build_tables(self, cfg: Config, device: torch.device) -> None:
-        """What each phase says, as tensors."""
-        phases = self.phases
-        names = [phase.name for phase in phases]
-        specs = [phase.spec for phase in phases]
-        targets = [phase.target or Target(0, -1, (0.0, 0.0), 0.0) for phase in phases]
-        grips = {"open": cfg.robot.gripper_open, "closed": cfg.robot.gripper_closed}
-        thing_names = list(cfg.scene.objects)
-
-        def table(values: list, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-            return torch.tensor(values, dtype=dtype, device=device)
-
-        self._length = table([phase.stop - phase.start for phase in phases])
-        # From the start of a phase to that of the last one, where the arm rests.
-        self._needed = table([phases[-1].start - phase.start for phase in phases])
-        self._target = table([[*target.offset, target.z] for target in targets])
-        self._grip = table([grips[spec.gripper] for spec in specs])
-        self._turns = table([float(target.toward >= 0) for target in targets])
-        numbers = [
-            [
-                target.source,
-                max(target.toward, 0),
-                phase.grasped,
-                names.index(spec.retry or names[0]),
-            ]
-            for target, phase, spec in zip(targets, phases, specs, strict=True)
-        ]
-        self._source, self._toward, self._grasps, self._retry_to = table(numbers, torch.int64).T
-        flags = [
-            [
-                phase.target is None,
-                spec.retry is not None,
-                spec.observe and spec.gripper == "open" and spec.anchor in thing_names,
-            ]
-            for phase, spec in zip(phases, specs, strict=True)
-        ]
-        self._holds, self._can_retry, self._aligns = table(flags, torch.bool).T
-        observes = [
-            [spec.observe and name in (spec.anchor, spec.toward) for name in thing_names]
-            for spec in specs
-        ]
-        self._observes = table(observes, torch.bool)
-        self._numbers = torch.arange(len(thing_names), device=device)
+        """What each phase says, as tensors: a row per phase."""
+        names = [phase.name for phase in self.phases]
+        things = list(cfg.scene.objects)
+        rows = []
+        for phase in self.phases:
+            spec = phase.spec
+            target = phase.target or Target(0, -1, (0.0, 0.0), 0.0)
+            rows.append(
+                (
+                    float(phase.stop - phase.start),
+                    # From its start to that of the last phase, where the arm rests.
+                    float(self.phases[-1].start - phase.start),
+                    [*target.offset, target.z],
+                    cfg.robot.grips[spec.gripper],
+                    target.source,
+                    max(target.toward, 0),
+                    float(target.toward >= 0),
+                    phase.target is None,
+                    phase.grasped,
+                    names.index(spec.retry or names[0]),
+                    spec.retry is not None,
+                    spec.observe and spec.gripper == "open" and spec.anchor in things,
+                    [spec.observe and name in (spec.anchor, spec.toward) for name in things],
+                )
+            )
+        (
+            self._length,
+            self._needed,
+            self._target,
+            self._grip,
+            self._source,
+            self._toward,
+            self._turns,
+            self._holds,
+            self._grasps,
+            self._retry_to,
+            self._can_retry,
+            self._aligns,
+            self._observes,
+        ) = (torch.tensor(column, device=device) for column in zip(*rows, strict=True))
+        self._numbers = torch.arange(len(things), device=device)
         self._speed_limit = cfg.controller.speed_limit
         window = 0 if cfg.task.check is None else make_check(cfg).settle_steps
         self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)
@@ -337,10 +335,6 @@ def _put(buffer: torch.Tensor, mask: torch.Tensor, values: torch.Tensor) -> None
     """Writes the rows of a ``(nworld,)`` bool mask; the buffer keeps its address."""
     rows = mask if buffer.dim() == 1 else mask[:, None]
     buffer.copy_(torch.where(rows, values, buffer))
-
-
-def _smoothstep(u: torch.Tensor) -> torch.Tensor:
-    return u * u * (3.0 - 2.0 * u)
 
 
 def make_expert(env: Env) -> ClosedLoopDriver:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from multiprocessing import get_context, parent_process
 from threading import Thread
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -163,7 +164,7 @@ class OpenLoopPlanner:
         worst = 0.0
         for phase, (start, end) in zip(self.phases, self._targets(nominal), strict=True):
             for step in range(phase.start, phase.stop):
-                s = _smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
+                s = smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
                 at = self.ik.grasp_point(trajectory.command(step)[0].numpy())
                 worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start))[:3])))
         return worst
@@ -219,7 +220,6 @@ class OpenLoopPlanner:
         robot = self._cfg.robot
         where = xy.copy()  # of each object after the phases so far
         held = -1
-        grips = {"open": robot.gripper_open, "closed": robot.gripper_closed}
         out: list[tuple[np.ndarray, np.ndarray]] = []
         for phase in self.phases:
             if held >= 0 and phase.carried < 0:  # let go where the last target was
@@ -227,7 +227,7 @@ class OpenLoopPlanner:
             held = phase.carried
             target = phase.target
             point = out[-1][1][:3] if target is None else [*target_xy(target, where), target.z]
-            end = np.array([*point, *grips[phase.spec.gripper]])
+            end = np.array([*point, *robot.grips[phase.spec.gripper]])
             # The first phase's target stands from the first step; only the gripper moves from home.
             home = np.array([*point, *robot.home[len(robot.arm_joints) :]])
             out.append((out[-1][1] if out else home, end))
@@ -244,7 +244,7 @@ class OpenLoopPlanner:
         numbers = []
         for i, phase in enumerate(self.phases):
             for step in range(phase.start, phase.stop):
-                s = _smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
+                s = smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
                 gap = s - self._nodes
                 hit = np.abs(gap) < 1e-12
                 rows.append(hit.astype(float) if hit.any() else (bary / gap) / (bary / gap).sum())
@@ -321,5 +321,6 @@ def _plan(world: int, xy: np.ndarray) -> Plan:
     return world, *_planner.plan_world(world, xy)
 
 
-def _smoothstep(u: float) -> float:
+def smoothstep(u: Any) -> Any:
+    """From 0 to 1 with no speed at either end, for numbers or tensors ``u`` from 0 to 1."""
     return u * u * (3.0 - 2.0 * u)

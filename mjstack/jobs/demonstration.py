@@ -212,7 +212,7 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
         ConfigError: An observation group has a name that is taken.
     """
     config = episode_config(cfg)
-    joints = (*cfg.robot.arm_joints, *cfg.robot.gripper_joints)
+    joints = tuple(cfg.robot.joints)
     units = joint_units(env)
     positions = Feature(dtype="float32", names=tuple(f"{name}.pos" for name in joints), units=units)
     features = {STATE: positions}

@@ -152,39 +152,35 @@ class BatchedIk:
         """
         self._copy_in("q", q)
         self._copy_in("target", target)
-        for name, given in (("posture", posture), ("approach", approach)):
-            if given is not None:
-                same = name == "posture" and given.dim() == 1
-                self._copy_in(name, given.expand(self.nworld, -1) if same else given)
-        self._launch(
-            self._kernel,
-            [
-                "q",
-                "target",
-                "home" if posture is None else "posture",
-                "down" if approach is None else "approach",
-            ],
-            self._settings,
-            ["solution", "distance", "unreachable"],
-        )
+        if posture is not None:
+            same = posture.dim() == 1
+            self._copy_in("posture", posture.expand(self.nworld, -1) if same else posture)
+        if approach is not None:
+            self._copy_in("approach", approach)
+        wanted = "home" if posture is None else "posture"
+        pointing = "down" if approach is None else "approach"
+        given = ["q", "target", wanted, pointing]
+        results = ["solution", "distance", "unreachable"]
+        self._launch(self._kernel, given, self._settings, results)
         return self._view["solution"], self._view["distance"]
 
     def _allocate(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
         """Make the chain, the kernel and all buffers, each a Warp array and a torch view of it."""
-        names = [*robot.arm_joints, *robot.gripper_joints]
-        joints = [find(model, "joint", name) for name in names]
+        joints = [find(model, "joint", name) for name in robot.joints]
         for name in robot.ik_joints:
             if name not in robot.arm_joints:
                 raise UnknownName("arm joint", name, robot.arm_joints)
         moved = [robot.arm_joints.index(name) for name in robot.ik_joints]
-        limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(names))
+        limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(joints))
         for side, values in enumerate(joint_limits(model, robot.ik_joints)):
             limits[side, moved] = _round_inwards(values, 1.0 - 2.0 * side)
         n = self.nworld
         with wp.ScopedDevice(self._device):
             self._chain, shape = build_chain(model, robot, joints, moved, *limits)
             self._array = {
-                **{k: wp.zeros((n, len(names)), dtype=float) for k in ("q", "posture", "solution")},
+                **{
+                    k: wp.zeros((n, len(joints)), dtype=float) for k in ("q", "posture", "solution")
+                },
                 **{
                     k: wp.zeros(n, dtype=wp.vec3)
                     for k in ("target", "approach", "point", "closing", "pointing")

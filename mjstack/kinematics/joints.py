@@ -36,10 +36,8 @@ def joint_limits(model: mujoco.MjModel, names: Sequence[str]) -> tuple[np.ndarra
 
 def locked_home(robot: RobotCfg) -> np.ndarray:
     """The robot's home with the locked joints where they are locked [rad, m], shape ``(nu,)``."""
-    names = [*robot.arm_joints, *robot.gripper_joints]
-    return np.array(
-        [robot.locked.get(name, value) for name, value in zip(names, robot.home, strict=True)]
-    )
+    pairs = zip(robot.joints, robot.home, strict=True)
+    return np.array([robot.locked.get(name, value) for name, value in pairs])
 
 
 def approach_body(model: mujoco.MjModel, robot: RobotCfg) -> int:

@@ -60,14 +60,10 @@ class GraspIk:
         self.model = spec.compile()
         self.tolerance = tolerance
         self._iterations = iterations
-        names = [*robot.arm_joints, *robot.gripper_joints]
-        joints = [find(self.model, "joint", name) for name in names]
-        for key, values in (
-            ("home", robot.home),
-            ("gripper_open", robot.gripper_open),
-            ("gripper_closed", robot.gripper_closed),
-        ):
-            for name, value in zip(names[-len(values) :], values, strict=True):
+        joints = [find(self.model, "joint", name) for name in robot.joints]
+        for key in ("home", "gripper_open", "gripper_closed"):
+            values = getattr(robot, key)
+            for name, value in zip(robot.joints[-len(values) :], values, strict=True):
                 low, high = self.model.joint(name).range
                 if not low <= value <= high:
                     raise ConfigError(

@@ -58,10 +58,9 @@ class PointReach:
             UnknownName: The model lacks a joint or site of the robot.
         """
         data = mujoco.MjData(model)
-        names = [*robot.arm_joints, *robot.gripper_joints]
         home = locked_home(robot)
         home[len(robot.arm_joints) :] = gripper
-        data.qpos[[model.jnt_qposadr[find(model, "joint", name)] for name in names]] = home
+        data.qpos[[model.jnt_qposadr[find(model, "joint", name)] for name in robot.joints]] = home
         mujoco.mj_kinematics(model, data)
         joints = sorted(
             (find(model, "joint", name) for name in robot.ik_joints),

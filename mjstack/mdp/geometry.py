@@ -21,7 +21,7 @@ def robot(env: EnvView) -> RobotTensors:
 
 def robot_joints(env: EnvView) -> list[str]:
     """Names of the robot's joints: the arm's, then the gripper's."""
-    return [*env.cfg.robot.arm_joints, *env.cfg.robot.gripper_joints]
+    return env.cfg.robot.joints
 
 
 def joint_limits(env: EnvView) -> tuple[Tensor, Tensor]:

@@ -48,7 +48,7 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     for name in robot.jaw_bodies:
         _require("body", name, spec.bodies)
     _add_grasp_sites(spec, robot)
-    for name in (*robot.arm_joints, *robot.gripper_joints):
+    for name in robot.joints:
         _prepare_joint(spec, name)
     fresh = mujoco.MjSpec().default.geom
     for field in _GEOM_DEFAULTS:  # the file's own would count for the scene's geoms too

@@ -4,11 +4,10 @@ set before compilation.
 
 import itertools
 import math
-from collections.abc import Sequence
 
 import mujoco
 
-from mjstack.config.schema import BoxCfg, Config, ObjectCfg, SceneCfg, SolverCfg, TimingCfg
+from mjstack.config.schema import BoxCfg, Config, ObjectCfg, SceneCfg
 from mjstack.errors import SourceError
 from mjstack.robots import robot_spec
 
@@ -28,11 +27,8 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
         SourceError: The robot's file does not fit the scene, such as one with a geom named table.
     """
     spec = robot_spec(cfg.robot, cfg.model)
-    jaws = cfg.robot.jaw_bodies
     try:
-        return build_scene(
-            spec, cfg.scene, cfg.timing, cfg.solver, jaw_bodies=jaws, visuals=visuals
-        )
+        return build_scene(spec, cfg, visuals=visuals)
     except ValueError as error:
         problem = str(error).splitlines()[0].removeprefix("Error: ")
         raise SourceError(
@@ -42,30 +38,23 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
         ) from error
 
 
-def build_scene(
-    spec: mujoco.MjSpec,
-    scene: SceneCfg,
-    timing: TimingCfg,
-    solver: SolverCfg,
-    *,
-    jaw_bodies: Sequence[str] = (),
-    visuals: bool = False,
-) -> mujoco.MjModel:
+def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
     """Adds the scene to a robot and compiles it.
 
     Args:
         spec: The robot; it is changed in place.
-        scene: Table and objects, and perhaps a box.
-        timing: Physics timestep.
-        solver: Solver settings; ``None`` keeps the robot file's own.
-        jaw_bodies: Bodies of the gripper, whose contact force on each object a sensor measures.
+        cfg: Table, objects and perhaps a box, the physics timestep, the solver's settings (``None``
+            keeps the robot file's own), and the jaws, whose force on each object a sensor measures.
         visuals: Keep geoms that only pictures need.
 
     Returns:
         The compiled model; its ``qpos0`` has the objects at their nominal positions.
     """
+    scene = cfg.scene
+    solver = cfg.solver
+    jaw_bodies = cfg.robot.jaw_bodies
     option = spec.option
-    option.timestep = timing.physics_dt
+    option.timestep = cfg.timing.physics_dt
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = getattr(mujoco.mjtCone, f"mjCONE_{solver.cone.name.upper()}")
     for name in ("iterations", "ls_iterations", "impratio", "tolerance"):
@@ -100,8 +89,16 @@ def build_scene(
     if scene.support_sensors:
         pairs += [(WORLD, name) for name in scene.objects]
         pairs += itertools.combinations(scene.objects, 2)
-    for first, second in pairs:
-        _add_force_sensor(spec, first, second)
+    for first, second in pairs:  # the net contact force [N]: 3 numbers, world frame
+        spec.add_sensor(
+            name=force_sensor(first, second),
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=first,
+            reftype=mujoco.mjtObj.mjOBJ_BODY,
+            refname=second,
+            intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NETFORCE, 1],
+        )
     if visuals:
         world.add_light(pos=[0.2, -0.6, 1.6], dir=[0.1, 0.4, -1.0], diffuse=[0.6, 0.6, 0.6])
         spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
@@ -167,19 +164,6 @@ def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
             solref=solref,
             rgba=[0.50, 0.55, 0.52, 1],
         )
-
-
-def _add_force_sensor(spec: mujoco.MjSpec, first: str, second: str) -> None:
-    """Measures the net contact force [N] between two bodies: 3 numbers, world frame."""
-    spec.add_sensor(
-        name=force_sensor(first, second),
-        type=mujoco.mjtSensor.mjSENS_CONTACT,
-        objtype=mujoco.mjtObj.mjOBJ_BODY,
-        objname=first,
-        reftype=mujoco.mjtObj.mjOBJ_BODY,
-        refname=second,
-        intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NETFORCE, 1],
-    )
 
 
 def table_top(scene: SceneCfg) -> float:

@@ -108,14 +108,13 @@ class SceneIndex:
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg, scene: SceneCfg) -> None:
-        names = [*robot.arm_joints, *robot.gripper_joints]
-        joints = [find(model, "joint", n) for n in names]
+        joints = [find(model, "joint", name) for name in robot.joints]
         self._robot = robot
         self._tensors: dict[tuple[torch.device, torch.dtype], RobotTensors] = {}
         self.robot_qpos = np.array([model.jnt_qposadr[j] for j in joints])
         self.robot_qvel = np.array([model.jnt_dofadr[j] for j in joints])
         self.robot_range = model.jnt_range[joints].copy()
-        self.ctrl = np.array([find(model, "actuator", n) for n in names])
+        self.ctrl = np.array([find(model, "actuator", name) for name in robot.joints])
         self.ctrl_range = model.actuator_ctrlrange[self.ctrl].copy()
         self.n_arm = len(robot.arm_joints)
         self.grasp_sites = [find(model, "site", n) for n in robot.grasp_sites]
@@ -132,7 +131,8 @@ class SceneIndex:
             if name not in self.objects
         }
         self.geoms = {
-            n: np.flatnonzero(model.geom_bodyid == body).tolist() for n, body in self.bodies.items()
+            name: np.flatnonzero(model.geom_bodyid == body).tolist()
+            for name, body in self.bodies.items()
         }
         self._constants: dict[tuple, torch.Tensor] = {}
 
@@ -190,15 +190,8 @@ def find(model: mujoco.MjModel, kind: str, name: str) -> int:
     """
     index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
     if index < 0:
-        counts = {
-            "body": model.nbody,
-            "joint": model.njnt,
-            "actuator": model.nu,
-            "site": model.nsite,
-            "sensor": model.nsensor,
-        }
-        known = [getattr(model, kind)(i).name for i in range(counts[kind])]
-        raise UnknownName(kind, name, known)
+        count = getattr(model, {"joint": "njnt", "actuator": "nu"}.get(kind, f"n{kind}"))
+        raise UnknownName(kind, name, [getattr(model, kind)(i).name for i in range(count)])
     return index
 
 

@@ -242,3 +242,13 @@ class RobotCfg:
     """Free room around an object for the open jaws."""
     placements: dict[str, PlacementsCfg] = field(default_factory=dict)
     """Where the objects of each scene stand for this robot."""
+
+    @property
+    def joints(self) -> list[str]:
+        """The arm's joints and then the gripper's, in the order of all joint values."""
+        return [*self.arm_joints, *self.gripper_joints]
+
+    @property
+    def grips(self) -> dict[str, list[float]]:
+        """Joint targets of the gripper by the word for it in a phase."""
+        return {"open": self.gripper_open, "closed": self.gripper_closed}

@@ -38,7 +38,7 @@ def reach_distances(
     sources = np.tile(nominal_xy(env.cfg.scene), (len(xy), 1, 1))
     sources[:, source_names(env.cfg.scene).index(name)] = xy
     distances = np.zeros((len(xy), len(targets)))
-    for gripper, command in (("open", robot.gripper_open), ("closed", robot.gripper_closed)):
+    for gripper, command in robot.grips.items():
         columns = [k for k, (phase, _) in enumerate(targets) if phase.spec.gripper == gripper]
         if not columns:
             continue
