@@ -19,7 +19,7 @@ from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
 from mjstack.math import quat_to_matrix
-from mjstack.scene import LowestPoint, SceneIndex, build_model
+from mjstack.scene import SceneIndex, build_model, lowest_height
 from mjstack.scene.phases import nominal_xy
 from mjstack.tasks.box import BoxSuccess
 from mjstack.tasks.box_terms import GraspNext, InBox, Place, ReachNext, ToSlot
@@ -325,7 +325,6 @@ def test_lowest_point_of_the_jaws(robot: str) -> None:
     data = mujoco.MjData(model)
     low = index.robot_range[:, 0]
     high = index.robot_range[:, 1]
-    measure = LowestPoint(model, cfg.robot.jaw_bodies, torch.device("cpu"))
     draw = np.random.default_rng(0)
     empty = np.zeros((0, 2, 0))
     for _ in range(30):
@@ -336,12 +335,13 @@ def test_lowest_point_of_the_jaws(robot: str) -> None:
             cfg.robot.jaw_bodies,
             model,
         )
-        got = measure.height(torch.tensor(data.xpos)[None], torch.tensor(data.xquat)[None])
+        pose = (torch.tensor(data.xpos)[None], torch.tensor(data.xquat)[None])
+        got = lowest_height(model, cfg.robot.jaw_bodies, *pose)
         assert float(got[0]) == pytest.approx(wanted, abs=1e-6)
 
 
 def turned(geom: dict, quats: np.ndarray) -> tuple[np.ndarray, mujoco.MjModel, list[np.ndarray]]:
-    """What `LowestPoint` says of a body with one geom at each orientation, the model, and the
+    """What `lowest_height` says of a body with one geom at each orientation, the model, and the
     geom's axes and place.
     """
     spec = mujoco.MjSpec()
@@ -357,13 +357,11 @@ def turned(geom: dict, quats: np.ndarray) -> tuple[np.ndarray, mujoco.MjModel, l
     data = mujoco.MjData(model)
     found = []
     turns = []
-    measure = LowestPoint(model, ["jaw"], torch.device("cpu"))
     for quat in quats:
         data.qpos[:7] = [0.0, 0.0, 0.0, *quat]
         mujoco.mj_kinematics(model, data)
-        found.append(
-            float(measure.height(torch.tensor(data.xpos)[None], torch.tensor(data.xquat)[None])[0])
-        )
+        pose = (torch.tensor(data.xpos)[None], torch.tensor(data.xquat)[None])
+        found.append(float(lowest_height(model, ["jaw"], *pose)[0]))
         turns.append(np.column_stack((data.geom_xmat[0].reshape(3, 3), data.geom_xpos[0])))
     return np.array(found), model, turns
 

@@ -118,7 +118,7 @@ def axes(cfg: Config) -> list[np.ndarray]:
 def map_level(context: RunContext, name: str, height: float, gripper: str) -> ReachLevel:
     """Solve every point of one height."""
     cfg = context.cfg
-    command = cfg.robot.gripper_open if gripper == "open" else cfg.robot.gripper_closed
+    command = cfg.robot.grips[gripper]
     reach = PointReach(context.model, cfg.robot, command)
     tolerance = cfg.controller.ik_tolerance
     x, y = np.meshgrid(*axes(cfg))

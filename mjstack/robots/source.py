@@ -41,7 +41,7 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, FileNotFoundError) as error:
-        fix = "Use model=builtin." if menagerie else "Correct the file (robot.file)."
+        fix = _MENAGERIE_FIX if menagerie else "Correct the file (robot.file)."
         raise SourceError(f"{path} cannot be read: {str(error).splitlines()[0]}. {fix}") from error
     if menagerie and robot.replace_collision:
         _replace_collision(spec, robot)
@@ -81,14 +81,7 @@ def _menagerie_path(robot: RobotCfg) -> Path:
             "robot.menagerie_name", robot.menagerie_name, expected, "Use model=builtin"
         )
     if root := os.environ.get("MENAGERIE_ROOT"):
-        path = Path(root) / robot.menagerie_name / robot.menagerie_file
-        if not path.is_file():
-            raise SourceError(
-                f"MENAGERIE_ROOT={root}: there is no {robot.menagerie_name}/{robot.menagerie_file}"
-                " below it, expected a checkout of MuJoCo Menagerie. Correct or unset it, or use"
-                " model=builtin."
-            )
-        return path
+        return Path(root) / robot.menagerie_name / robot.menagerie_file
     import mujoco_menagerie
 
     try:

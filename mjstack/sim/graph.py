@@ -94,10 +94,7 @@ class StepGraph:
         self._culprit = culprit
         self._scratch = scratch
         self._device = str(device)
-        self._replay: Callable[[], None] | None = None
-        self._memory: tuple[torch.cuda.MemPool, Scratch | None] | None = None
-        self._warm = self._failed = False
-        self._seen = version()
+        self.drop()
 
     @property
     def captured(self) -> bool:
@@ -122,8 +119,8 @@ class StepGraph:
 
     def drop(self) -> None:
         """Clear the capture: the next call runs eagerly again, and the one after it captures."""
-        self._replay = None
-        self._memory = None
+        self._replay: Callable[[], None] | None = None
+        self._memory: tuple[torch.cuda.MemPool, Scratch | None] | None = None
         self._warm = False
         self._failed = False
         self._seen = self._version()
@@ -155,14 +152,13 @@ class StepGraph:
                 capture = self._capture_cuda if device.is_cuda else self._capture_cpu
                 self._replay = capture(device)
         except Exception as error:
-            self._failed = True
             failure = CaptureError(self._name, self._culprit(), error)
             if device.is_cuda:
                 with suppress(RuntimeError):  # it reports the failed capture once more
                     torch.cuda.synchronize(wp.device_to_torch(device))
             if self._mode is GraphMode.require:
-                self._failed = False
                 raise failure from error
+            self._failed = True
             log.warning("%s It runs eagerly.", failure)
             return False
         finally:

@@ -11,7 +11,7 @@ from mjstack.config.fields import spec
 from mjstack.errors import ConfigError, UnknownName
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import gripper_opening
-from mjstack.scene import LowestPoint
+from mjstack.scene import lowest_height
 from mjstack.tasks.box_geometry import Inside, corner_speed, scene_box
 from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
 from mjstack.tasks.parts import (
@@ -327,9 +327,8 @@ class _JawClear(Rule):
     def judge(self, end: Step) -> Judgement:
         sim = end.view.env.sim
         sim.kinematics()
-        jaws = LowestPoint(sim.model, self._check.cfg.robot.jaw_bodies, sim.device)
-        # The rim is above the table.
-        clearance = jaws.height(sim.xpos, sim.xquat) - self._check.inside.rim
+        jaws = lowest_height(sim.model, self._check.cfg.robot.jaw_bodies, sim.xpos, sim.xquat)
+        clearance = jaws - self._check.inside.rim  # which is above the table
         return clearance >= self._check.t.jaw_clearance, {"jaw_clearance_m": clearance}
 
 
