@@ -127,23 +127,21 @@ class OpenLoopPlanner:
         if self._last is not None and np.array_equal(self._last[0], sources_xy):
             return self._last[1]  # the gates of one run play the same batch
         nworld = sources_xy.shape[0]
-        n_knots = len(self.phases) * len(self._nodes)
-        knots = np.full((nworld, n_knots, len(self._cfg.robot.home)), np.nan)
-        error = np.full(nworld, np.nan)
         flat = sources_xy.reshape(nworld, -1)
         _, first, kind = np.unique(flat, axis=0, return_index=True, return_inverse=True)
         twin = first[kind.reshape(-1)]
-        alike = np.bincount(twin, minlength=nworld)
+        alike = np.bincount(twin)
         done = 0
+        found = {}
         with closing(self._plans(sorted(first.tolist()), sources_xy)) as plans:
             for world, *plan in plans:
-                knots[world], error[world] = plan
+                found[world] = plan
                 done += int(alike[world])
                 if progress is not None:
                     progress(done)
-        if len(first) < nworld:
-            knots = knots[twin]
-            error = error[twin]
+        knots, error = (
+            np.array(parts) for parts in zip(*(found[world] for world in twin), strict=True)
+        )
         trajectory = JointTrajectory(torch.from_numpy(knots), self._weights, self._numbers, error)
         if nworld > 1:
             self._last = (sources_xy.copy(), trajectory)

@@ -11,8 +11,7 @@ from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError, UnknownName
 from mjstack.kinematics.chain import build_chain
 from mjstack.kinematics.ik_kernels import forward_kernel, solve_kernel
-from mjstack.kinematics.joints import joint_limits, locked_home
-from mjstack.scene.index import find
+from mjstack.scene.index import find, joint_limits, locked_home
 from mjstack.sim.warp_setup import torch_stream_scope
 
 # m: with a gain, an iterate this close to the target replaces a closer one that came before

@@ -7,8 +7,7 @@ import warp as wp
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape
-from mjstack.kinematics.joints import approach_body
-from mjstack.scene.index import find
+from mjstack.scene.index import approach_body, find
 
 _KINDS = {int(mujoco.mjtJoint.mjJNT_HINGE): HINGE, int(mujoco.mjtJoint.mjJNT_SLIDE): SLIDE}
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])

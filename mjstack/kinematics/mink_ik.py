@@ -8,9 +8,8 @@ import numpy as np
 
 from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError
-from mjstack.kinematics.joints import locked_home
 from mjstack.robots import robot_spec
-from mjstack.scene.index import find
+from mjstack.scene.index import find, locked_home
 
 _POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the grasp point by micrometres
 _CONVERGED = 0.1  # share of the tolerance: Newton's method squares the error, so that is enough

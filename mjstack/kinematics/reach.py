@@ -11,8 +11,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import RobotCfg
-from mjstack.kinematics.joints import approach_body, joint_limits, locked_home
-from mjstack.scene.index import find
+from mjstack.scene.index import approach_body, find, joint_limits, locked_home
 
 _ITERATIONS = 60  # at most, per start
 _DAMPING = 1e-3  # [m/rad] of the steps towards a point

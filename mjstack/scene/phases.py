@@ -55,8 +55,8 @@ def source_names(scene: SceneCfg) -> list[str]:
 
 def nominal_xy(scene: SceneCfg) -> np.ndarray:
     """Nominal position of every source [m], shape ``(sources, 2)``."""
-    sources = [*scene.objects.values(), *scene.places.values()]
-    return np.array([source.xy for source in sources]).reshape(-1, 2)
+    objects = [thing.xy for thing in scene.objects.values()]
+    return np.array([*objects, *(place.xy for place in scene.places.values())]).reshape(-1, 2)
 
 
 def build_phases(cfg: Config) -> list[Phase]:
