@@ -8,14 +8,18 @@ import torch
 import warp as wp
 
 from mjstack.config.schema import RobotCfg
-from mjstack.errors import ArgumentError, UnknownName
+from mjstack.errors import ArgumentError
 from mjstack.kinematics.chain import build_chain
 from mjstack.kinematics.ik_kernels import forward_kernel, solve_kernel
-from mjstack.scene.index import find, joint_limits, locked_home
+from mjstack.scene.index import locked_home
 from mjstack.sim.warp_setup import torch_stream_scope
 
 # m: with a gain, an iterate this close to the target replaces a closer one that came before
 _NEAR = 0.00002
+# [m/rad] at the target; it grows with the distance. More is calmer near a stretched arm, and slower
+# there.
+_DAMPING = 0.005
+_MAX_STEP = 0.3  # [rad, m] largest change of any joint per iteration
 
 
 class BatchedIk:
@@ -51,8 +55,6 @@ class BatchedIk:
         device: str | torch.device,
         *,
         iterations: int = 8,
-        damping: float = 0.005,
-        max_step: float = 0.3,
         posture_gain: float = 0.0,
         approach_gain: float = 0.0,
         tolerance: float = 0.0005,
@@ -70,9 +72,6 @@ class BatchedIk:
             device: Device of the worlds: ``"cpu"`` or ``"cuda:N"``.
             iterations: Steps per solve. With a gain at least 4, because the last two or three, or a
                 quarter of many, go for the target alone.
-            damping: Damping at the target [m/rad]; it grows with the distance. More is calmer near
-                a stretched arm, and slower there.
-            max_step: Largest change of any joint per iteration [rad, m].
             posture_gain: Share per iteration of the way to the posture, from 0 to 1.
             approach_gain: Turn per iteration where the approach axis is a quarter turn off [rad],
                 from 0 to 1.
@@ -94,7 +93,7 @@ class BatchedIk:
         # of 4, 3 of 8, 10 of 40.
         guided = iterations - max(min(3, iterations // 2), iterations // 4) if gained else 0
         near = _NEAR if gained else -1.0
-        self._settings = [iterations, guided, damping, max_step]
+        self._settings = [iterations, guided, _DAMPING, _MAX_STEP]
         self._settings += [posture_gain, approach_gain, near, tolerance]
 
         # Memory and kernels
@@ -165,20 +164,13 @@ class BatchedIk:
 
     def _allocate(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
         """Make the chain, the kernel and all buffers, each a Warp array and a torch view of it."""
-        joints = [find(model, "joint", name) for name in robot.joints]
-        for name in robot.ik_joints:
-            if name not in robot.arm_joints:
-                raise UnknownName("arm joint", name, robot.arm_joints)
-        moved = [robot.arm_joints.index(name) for name in robot.ik_joints]
-        limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(joints))
-        for side, values in enumerate(joint_limits(model, robot.ik_joints)):
-            limits[side, moved] = _round_inwards(values, 1.0 - 2.0 * side)
         n = self.nworld
         with wp.ScopedDevice(self._device):
-            self._chain, shape = build_chain(model, robot, joints, moved, *limits)
+            self._chain, shape = build_chain(model, robot)
             self._array = {
                 **{
-                    k: wp.zeros((n, len(joints)), dtype=float) for k in ("q", "posture", "solution")
+                    k: wp.zeros((n, len(robot.joints)), dtype=float)
+                    for k in ("q", "posture", "solution")
                 },
                 **{
                     k: wp.zeros(n, dtype=wp.vec3)
@@ -213,10 +205,3 @@ class BatchedIk:
                 name, f"shape {tuple(values.shape)}", f"shape {tuple(buffer.shape)}"
             )
         buffer.copy_(values)
-
-
-def _round_inwards(limits: np.ndarray, sign: float) -> np.ndarray:
-    """Limits as float32 that are not outside of the given ones; sign is 1 for low ones, else -1."""
-    rounded = limits.astype(np.float32)
-    inwards = np.nextafter(rounded, np.float32(sign * np.inf))
-    return np.where(sign * rounded < sign * limits, inwards, rounded)

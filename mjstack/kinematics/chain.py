@@ -5,9 +5,9 @@ import numpy as np
 import warp as wp
 
 from mjstack.config.schema import RobotCfg
-from mjstack.errors import ConfigError, MjstackError
+from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape
-from mjstack.scene.index import approach_body, find
+from mjstack.scene.index import approach_body, find, joint_limits
 
 _KINDS = {int(mujoco.mjtJoint.mjJNT_HINGE): HINGE, int(mujoco.mjtJoint.mjJNT_SLIDE): SLIDE}
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -16,32 +16,31 @@ _Pose = tuple[np.ndarray, np.ndarray]  # position and quaternion (wxyz)
 _Link = tuple[_Pose, np.ndarray, int, int]  # frame, axis, kind, column of the joint targets
 
 
-def build_chain(
-    model: mujoco.MjModel,
-    robot: RobotCfg,
-    joints: list[int],
-    moved: list[int],
-    low: np.ndarray,
-    high: np.ndarray,
-) -> tuple[Chain, Shape]:
+def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     """Read the bodies from the world to each site.
 
     Args:
         model: The compiled model.
         robot: The robot's profile.
-        joints: Joint index of each column of the joint targets.
-        moved: Columns that inverse kinematics moves.
-        low: Lower limit of each column [rad, m].
-        high: Upper limit of each column [rad, m].
 
     Returns:
         The chain, in Warp arrays on the current device, and its shape.
     """
+    # Columns of the joint targets: the joint of each, those that move, and their limits
+    columns = {find(model, "joint", name): column for column, name in enumerate(robot.joints)}
+    for name in robot.ik_joints:
+        if name not in robot.arm_joints:
+            raise UnknownName("arm joint", name, robot.arm_joints)
+    moved = [robot.arm_joints.index(name) for name in robot.ik_joints]
+    limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(columns))
+    for side, values in enumerate(joint_limits(model, robot.ik_joints)):
+        limits[side, moved] = _round_inwards(values, 1.0 - 2.0 * side)
+
+    # Links from the world to the jaws, and from there to each site
     first, second = (find(model, "site", name) for name in robot.grasp_sites)
     first_path = _path(model, model.site_bodyid[first])
     second_path = _path(model, model.site_bodyid[second])
     shared = len([body for body in first_path if body in second_path])
-    columns = {joint: column for column, joint in enumerate(joints)}
     chain = Chain()
     links: list[_Link] = []
     turned: dict[int, np.ndarray] = {}  # quaternions of the bodies on the last link, seen from it
@@ -85,8 +84,8 @@ def build_chain(
     chain.axis = wp.array(axes, dtype=wp.vec3)
     chain.kind = wp.array(kinds, dtype=int)
     chain.column = wp.array(column, dtype=int)
-    chain.low = wp.array(low[column], dtype=float)
-    chain.high = wp.array(high[column], dtype=float)
+    chain.low = wp.array(limits[0, column], dtype=float)
+    chain.high = wp.array(limits[1, column], dtype=float)
     shape = Shape(tuple(kinds), tuple(c in moved for c in column), chain.trunk, chain.fork)
     return chain, shape
 
@@ -127,3 +126,10 @@ def _compose(a: _Pose, b: _Pose) -> _Pose:
     quat = np.empty(4)
     mujoco.mju_mulPose(pos, quat, a[0], a[1], b[0], b[1])
     return pos, quat
+
+
+def _round_inwards(limits: np.ndarray, sign: float) -> np.ndarray:
+    """Limits as float32 that are not outside of the given ones; sign is 1 for low ones, else -1."""
+    rounded = limits.astype(np.float32)
+    inwards = np.nextafter(rounded, np.float32(sign * np.inf))
+    return np.where(sign * rounded < sign * limits, inwards, rounded)

@@ -85,7 +85,7 @@ class PointReach:
         for off in _STARTS:
             if (best.distance <= _CONVERGED).all():
                 break
-            found = self._look(self._descend(self._start(points, off), points), points)
+            found = self._search(self._start(points, off), points)
             best = _choose(found.distance < best.distance, found, best)
         return best
 
@@ -102,7 +102,7 @@ class PointReach:
         upright = self._look(best.q[reached], goals)
         for start in [upright.q, *(self._start(goals, off) for off in _STARTS)]:
             turned = self._descend(start, goals, _POINTING)
-            found = self._look(self._descend(turned, goals), goals)
+            found = self._search(turned, goals)
             better = (found.distance <= tolerance) & (found.tilt < upright.tilt)
             upright = _choose(better, found, upright)
         for name in ("q", "distance", "tilt"):
@@ -187,6 +187,9 @@ class PointReach:
         pointing = turning * np.cross(axes, direction[:, None])
         jacobian = np.concatenate((rows, pointing), axis=2).swapaxes(1, 2)
         return jacobian, np.column_stack((tip, direction))
+
+    def _search(self, start: np.ndarray, points: np.ndarray) -> Reached:
+        return self._look(self._descend(start, points), points)
 
     def _look(self, q: np.ndarray, points: np.ndarray) -> Reached:
         pose = self._forward(q)[1]

@@ -118,10 +118,10 @@ class SceneIndex:
         self.ctrl_range = model.actuator_ctrlrange[self.ctrl].copy()
         self.n_arm = len(robot.arm_joints)
         self.grasp_sites = [find(model, "site", n) for n in robot.grasp_sites]
-        self.objects: dict[str, tuple[int, int]] = {}
-        for name in scene.free:
-            joint = find(model, "joint", name)
-            self.objects[name] = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        free = {name: model.joint(name) for name in scene.free}
+        self.objects = {
+            name: (int(joint.qposadr[0]), int(joint.dofadr[0])) for name, joint in free.items()
+        }
         self.object_qpos = [qpos for qpos, _ in self.objects.values()]
         self.object_qvel = [qvel for _, qvel in self.objects.values()]
         self.bodies = {name: find(model, "body", name) for name in scene.objects}
