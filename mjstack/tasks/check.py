@@ -107,7 +107,7 @@ class Rule(ABC):
 
     Attributes:
         texts: What went wrong if it is broken, by name; one entry, or one for each object.
-        suffixes: Ends of the names of the measured values that tell about each of them.
+        suffixes: Part of the names of the measured values that tell about each of them.
         wanted: What the rule wants of those values, in words.
         phases: For each object, the phases in which it counts.
         at_end: Whether it can only hold at the end of a whole episode.
@@ -285,7 +285,7 @@ class EpisodeCheck(ABC):
             held |= zip(rule.texts, ok.view(len(ok), -1).unbind(1), strict=True)
             values |= measured
             for name, suffix in zip(rule.texts, rule.suffixes, strict=True):
-                shown[name] = [value for value in measured if value.endswith(suffix)]
+                shown[name] = [value for value in measured if f"{suffix}_" in f"{value}_"]
         failed = torch.zeros_like(self._finite, dtype=torch.int32)
         for name, bit in self.rules.items():
             failed |= bit * (~held[name]).to(failed.dtype)
