@@ -97,6 +97,11 @@ def test_a_check_of_ones_own_judges_native_worlds() -> None:
     sim.close()
 
 
+class Halfway(EpisodeCheck):
+    def build(self) -> list[Rule]:
+        return []
+
+
 @pytest.mark.parametrize(
     ("override", "parts"),
     [
@@ -108,6 +113,7 @@ def test_a_check_of_ones_own_judges_native_worlds() -> None:
         ("task.check.object=green", ["task.check: object", "green", "red"]),
         ("task.check.func=mjstack.tasks.stack.StackChek", ["task.check.func", "StackCheck"]),
         ("task.check.func=mjstack.tasks.stack.StackSuccess", ["a subclass of", "EpisodeCheck"]),
+        (f"task.check.func={__name__}.Halfway", ["Halfway: method 'placed' is missing."]),
         ("task.check=null", ["task.check=null", "trained, not verified"]),
     ],
 )

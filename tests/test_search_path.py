@@ -120,7 +120,7 @@ def test_help_and_cfg_see_the_folder(lean: Path, capsys: pytest.CaptureFixture[s
         ("taks: {a: 1}", "Did you mean 'task'?"),
         ("scene: {objects: {puck: {szie: [1]}}}", "Did you mean 'scene.objects.puck.size'?"),
         ("controller: {phases: {go: {secnds: 2}}}", "Did you mean 'controller.phases.go.seconds'?"),
-        ("task: {episode_steps: many}", "task.episode_steps: Value 'many'"),
+        ("task: {episode_steps: many}", "task.episode_steps=many: expected an integer"),
         ("reward: [", "while parsing"),
     ],
 )
@@ -174,6 +174,10 @@ def test_a_gate_of_one_s_own(
 
 
 def test_a_bad_folder_is_refused(lean: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert f"Name {lean}." in refused(["--config-dir", str(lean.parent)], capsys)
+    missing = refused(["task=lean"], capsys)
+    assert missing.startswith("mjstack: task=lean: 'lean' does not exist. Available: ")
+    assert missing.endswith(" A choice of your own needs --config-dir DIR.")
     assert "no such folder" in refused(["--config-dir", "nowhere"], capsys)
     assert "no such package" in refused(["hydra.searchpath=[pkg://nowhere.conf]"], capsys)
     assert "expected a list" in refused(["hydra.searchpath=3"], capsys)

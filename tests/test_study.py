@@ -101,7 +101,9 @@ def test_a_broken_variant_stops_no_other(tmp_path: Path, monkeypatch: pytest.Mon
     assert outcome.exit_code == 1
     rows = table(tmp_path)
     assert [row["status"] for row in rows.values()] == ["fail", "fail", "pass"]
-    assert rows["iterations_20"]["reason"] == "RuntimeError: it is bad (run.log has the traceback)"
+    reason = rows["iterations_20"]["reason"]
+    assert reason.startswith("RuntimeError: it is bad (test_study.py:")
+    assert reason.endswith("; run.log has the traceback)")
     assert rows["iterations_10"]["reason"] == "this one cannot be."
     assert rows["iterations_20"]["ratio"] == ""
     assert report(tmp_path)["status"] == "fail"

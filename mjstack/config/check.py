@@ -133,11 +133,12 @@ def _scene(scene: SceneCfg) -> None:
     """Objects, places and the box are on the table and clear of each other."""
     for name, thing in scene.objects.items():
         key = f"scene.objects.{name}"
+        count, words = SHAPES[thing.shape]
         _refuse(
-            len(thing.size) != SHAPES[thing.shape],
+            len(thing.size) != count,
             f"{key}.size",
             thing.size,
-            f"{SHAPES[thing.shape]} numbers",
+            f"{count} number{'s' * (count > 1)}: {words}",
         )
         edge = min(thing.size[:2]) if thing.shape == "box" else thing.footprint
         _on_table(scene, f"{key}.xy", thing.xy, (edge, edge))
@@ -203,9 +204,12 @@ def _phases(cfg: Config) -> None:
         key = f"controller.phases.{name}"
         _require(f"{key}.grasps: object", phase.grasps, cfg.scene.objects)
         _require(f"{key}.retry: phase", phase.retry, phases)
-        for source in filter(None, (phase.anchor, phase.toward)):
+        for role in ("anchor", "toward"):
+            source = getattr(phase, role)
+            if source is None:
+                continue
             known = [*cfg.scene.objects, *cfg.scene.places]
-            _require(f"{key}.anchor, {key}.toward: object or place", source, known)
+            _require(f"{key}.{role}: object or place", source, known)
             if phase.observe:
                 observed.add(source)
             elif closed_loop and source not in observed:

@@ -17,7 +17,7 @@ from omegaconf.errors import ConfigKeyError
 
 from mjstack.config.fields import accepted, find_field
 from mjstack.config.schema import JOB_SCHEMAS, Config
-from mjstack.config.session import compose_raw, config_folders, list_choices
+from mjstack.config.session import CONFIG_NAME, compose_raw, config_folders, list_choices
 from mjstack.errors import CompositionError, MjstackError, UnknownName, suggest
 
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
@@ -70,7 +70,7 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     """
     found = _explain(error, overrides)
     inside = re.match(r"In '([^']+)': ", str(error))
-    if inside is None:
+    if inside is None or inside[1] == CONFIG_NAME:  # mjstack's own: an override does not fit
         return found
     name = f"{inside[1]}.yaml"
     paths = [folder / name for folder in config_folders() if (folder / name).is_file()]
@@ -80,7 +80,9 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
 def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        return UnknownName(f"{group}={name}:", name, list_choices().get(group, ()))
+        unknown = UnknownName(f"{group}={name}:", name, list_choices().get(group, ()))
+        own = "" if config_folders() else " A choice of your own needs --config-dir DIR."
+        return CompositionError(f"{unknown}{own}")
     # Hydra raises its own inside of the handler of one of OmegaConf's, which knows the key.
     cause = error.__cause__ or (error.__context__ if str(error).startswith("In '") else None)
     cause = cause or error
@@ -103,7 +105,10 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
         else find_field(Config, re.sub(r"\[\d+\]$", "", key))
     )
     given = [override for override in overrides if override.lstrip("+~").partition("=")[0] == key]
-    if error.__cause__ and field and given:
+    value = re.match("Value '(.*)' of type", text)
+    if value and not given:  # of a file
+        given = [f"{key}={value[1]}"]
+    if (error.__cause__ or value) and field and given:
         return CompositionError(f"{given[-1]}: expected {accepted(*field)}.")
     where = key or " ".join(overrides) or "the values"
     return CompositionError(f"{where}: {text}.")
@@ -126,7 +131,10 @@ def _unknown_key(key: str, known: Sequence[str], overrides: Sequence[str]) -> Co
                 f"{key} is a key of {' and '.join(owners)}, and this is"
                 f" {jobs[-1] if jobs else 'job=gates'}. Set {owners[0]}."
             )
-    keys = [*_keys(jobs), *list_choices(), *(f"{parent}.{name}".lstrip(".") for name in known)]
+    groups = list_choices()
+    chosen = _keys([o for o in overrides if o.partition("=")[0] in groups])
+    keys = [*chosen, *groups, *(f"{parent}.{name}".lstrip(".") for name in known)]
+    keys = [name for name in keys if not f"{key}.".startswith(f"{name}.")]
 
     def likeness(name: str) -> tuple[float, float]:
         return (

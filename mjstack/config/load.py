@@ -18,8 +18,8 @@ from mjstack.config.complete import complete
 from mjstack.config.explain import check_overrides, explain, parse
 from mjstack.config.schema import JOB_SCHEMAS, Config
 from mjstack.config.session import (
-    ADD_FOLDER,
     CONFIG_NAME,
+    add_folder,
     check_trusted,
     hydra_session,
     search_path,
@@ -145,13 +145,13 @@ def load_saved(path: Path) -> Config:
         ) from error
     if missing:
         raise CompositionError(f"{missing[0]} is missing, expected every key of this version.")
-    check_trusted(cast(DictConfig, merged))
+    check_trusted(cast(DictConfig, merged), path)
     try:
         return to_config(cast(DictConfig, merged))
     except ConfigError as error:
         if error.key != "robot.file":
             raise
-        raise CompositionError(f"{error} {ADD_FOLDER}") from error
+        raise CompositionError(f"{error} {add_folder(path)}") from error
 
 
 def to_config(cfg: DictConfig) -> Config:

@@ -7,6 +7,7 @@ beside an added one is importable, so that its YAML can name functions by module
 
 import copy
 import os
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -38,10 +39,6 @@ CONFIG_FOLDER = next(
 CONFIG_NAME = "config"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
-ADD_FOLDER = (
-    "If you trust the folder that the run had used (its .hydra/hydra.yaml names it), add"
-    " --config-dir DIR."
-)
 _FILE = "file://"
 _PACKAGE = "pkg://"
 
@@ -78,6 +75,24 @@ def search_path_override() -> list[str]:
     return [f"hydra.searchpath=[{listed}]"] if quoted else []
 
 
+def search_path_flag(entries: Sequence[str] | None = None) -> str:
+    """Entries, those of the current search path if None, as a command line adds them."""
+    entries = _added.get() if entries is None else entries
+    if len(entries) == 1 and entries[0].startswith(_FILE):
+        return f"--config-dir {shlex.quote(entries[0].removeprefix(_FILE))}"
+    return shlex.quote(f"hydra.searchpath=[{','.join(entries)}]") if entries else ""
+
+
+def add_folder(saved: Path) -> str:
+    """What to do if the search path lacks a folder that a run had used, by its ``config.yaml``."""
+    file = saved.with_name("hydra.yaml")
+    sources = OmegaConf.load(file).hydra.runtime.config_sources if file.is_file() else []
+    used = [Path(source.path) for source in sources if source.provider == PROVIDER]
+    entries = [f"{_FILE}{folder}" for folder in used if folder not in config_folders()]
+    flag = search_path_flag(entries) or "--config-dir DIR"
+    return f"If you trust the folder that the run had used, add {flag}."
+
+
 def config_folders() -> list[Path]:
     """Folders of the search path beside mjstack's: added ones, and those of packages."""
     folders = []
@@ -112,11 +127,12 @@ def is_trusted(dotted: str) -> bool:
     return any(Path(place).resolve().parent in parents for place in places if place)
 
 
-def check_trusted(cfg: DictConfig) -> None:
+def check_trusted(cfg: DictConfig, saved: Path) -> None:
     """Check that every function that a saved configuration names is in the current search path.
 
     Args:
         cfg: The configuration of an earlier run.
+        saved: Its file.
 
     Raises:
         CompositionError: A function is elsewhere; names it.
@@ -125,7 +141,7 @@ def check_trusted(cfg: DictConfig) -> None:
         if not is_trusted(name):
             raise CompositionError(
                 f"{key}={name}: expected a name of mjstack, of a package registered under"
-                f" mjstack.configs, or beside a folder of the search path. {ADD_FOLDER}"
+                f" mjstack.configs, or beside a folder of the search path. {add_folder(saved)}"
             )
 
 
@@ -232,6 +248,11 @@ def _entry(text: str) -> str:
         raise CompositionError(
             f"configuration folder {folder}: there is no such folder, expected one with YAML files"
             " in folders such as task/. Name an existing one."
+        )
+    if (folder / "conf").is_dir() and not any(folder.glob("*/*.yaml")):
+        raise CompositionError(
+            f"configuration folder {folder}: has no group such as task/, and its folder conf may."
+            f" Name {folder / 'conf'}."
         )
     for path in sorted(folder.rglob("*.yaml")):
         name = path.relative_to(folder)

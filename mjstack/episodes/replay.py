@@ -152,7 +152,7 @@ def _explain(
     always = "always" if finite.all() else f"not in step {lost}, in {steps['phase'][lost]}"
     told = {
         "FINITE": (always, "always"),
-        "STEPS": (f"{int(sim.step_count[0])} steps", f"{count} steps"),
+        "STEPS": (f"{int(sim.step_count[0])} physics steps", f"{count}"),
         "OVERFLOW": (describe_overflow(int(sim.overflow[0])) or "none", "none"),
         **context.check.report(episode.result),
     }

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mjstack.config.session import search_path_flag
 from mjstack.episodes.failures import describe_sign
 from mjstack.episodes.observers import Episode
 from mjstack.episodes.record import FAILING, Circumstances, EpisodeRecord
@@ -177,7 +178,9 @@ class EpisodeTally:
         if not self.failed or self.path is None:
             return ""
         gate = "" if self.path.name == FAILING else f"{self.gate}:"
-        return f". To look at one: job=replay run={self.path.parent} world={gate}{self.failed[0]}"
+        flag = f"{search_path_flag()} ".lstrip()
+        run = f"job=replay run={self.path.parent}"
+        return f". To look at one: {flag}{run} world={gate}{self.failed[0]}"
 
     def tables(self) -> list[Table]:
         """Tables of the report: seeds, and first signs of failure."""

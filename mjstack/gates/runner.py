@@ -1,8 +1,11 @@
 """Runs the chosen gates in their order and keeps the report current."""
 
 import logging
+import sysconfig
 import time
+import traceback
 from collections.abc import Callable
+from pathlib import Path
 
 from mjstack.config.complete import typed
 from mjstack.config.fields import check_fields
@@ -14,6 +17,11 @@ from mjstack.report.record import GateResult, Status
 
 log = logging.getLogger(__name__)
 
+_LIBRARIES = (  # whose frames tell a user nothing
+    *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")),
+    str(Path(__file__).parents[1]),
+    "<",
+)
 Gate = Callable[[RunContext], list[GateResult]]
 
 
@@ -86,4 +94,10 @@ def describe_error(error: Exception) -> str:
     if is_out_of_memory(f"{type(error).__name__}: {error}"):
         smaller = "Run fewer worlds, or with smaller buffers (batch.nconmax, batch.njmax)"
         return f"out of memory ({first}). {smaller}"
-    return f"{type(error).__name__}: {first} (run.log has the traceback)"
+    frames = [
+        f"{Path(frame.filename).name}:{frame.lineno}; "
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith(_LIBRARIES)
+    ]
+    where = "".join(frames[-1:])  # of the user's own code
+    return f"{type(error).__name__}: {first} ({where}run.log has the traceback)"

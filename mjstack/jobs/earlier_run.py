@@ -52,8 +52,7 @@ class EarlierRun:
             provenance = dict(json.loads(report.read_text())["provenance"])
         except MjstackError as error:
             raise RunError(
-                f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error} Use"
-                " the one that ran it."
+                f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error}"
             ) from error
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise RunError(

@@ -46,10 +46,12 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     if menagerie and robot.replace_collision:
         _replace_collision(spec, robot)
     for name in robot.jaw_bodies:
-        _require("body", name, spec.bodies)
+        _require("robot.jaw_bodies: body", name, spec.bodies)
     _add_grasp_sites(spec, robot)
-    for name in robot.joints:
-        _prepare_joint(spec, name)
+    for key in ("arm_joints", "gripper_joints"):
+        for name in getattr(robot, key):
+            _require(f"robot.{key}: joint", name, spec.joints)
+            _prepare_joint(spec, name)
     fresh = mujoco.MjSpec().default.geom
     for field in _GEOM_DEFAULTS:  # the file's own would count for the scene's geoms too
         setattr(spec.default.geom, field, getattr(fresh, field))
@@ -127,7 +129,6 @@ def _prepare_joint(spec: mujoco.MjSpec, name: str) -> None:
     """Name a joint's servo after it, and let it take targets in the joint's range unless it has its
     own.
     """
-    _require("joint", name, spec.joints)
     low, high = spec.joint(name).range
     if not low < high:
         raise ConfigError(f"range of joint {name}", [low, high], "a range in the robot's file")

@@ -14,8 +14,12 @@ Example:
     ...
     ...     def build(self) -> list[Rule]:
     ...         t = self.t
-    ...         up = airborne(t.object, height=t.height)
-    ...         return [InWindow("UP", f"{t.object} not in the air", up, t.window)]
+    ...         self.objects = [t.object]
+    ...         self.up = airborne(t.object, height=t.height)
+    ...         return [InWindow("UP", f"{t.object} not in the air", self.up, t.window)]
+    ...
+    ...     def placed(self, step: Step) -> Tensor:
+    ...         return self.up(step)
 """
 
 from abc import ABC, abstractmethod
@@ -199,8 +203,11 @@ class EpisodeCheck(ABC):
         node = dict(cfg.task.check or {})
         name = node.pop("func", None)
         if not issubclass(check_class(cfg) or object, type(self)):
-            expected = f"{type(self).__module__}.{type(self).__name__}, which a term shares"
-            raise ConfigError("task.check.func", name, expected)
+            expected = f"{type(self).__module__}.{type(self).__name__}, whose rules a term needs"
+            by = f", such as task.success ({cfg.task.success.func})" if cfg.task.success else ""
+            raise ConfigError(
+                "task.check.func" if name else "task.check", name or "null", expected + by
+            )
         self.cfg = cfg
         self.t: Any = typed("task.check", node, self.Thresholds)
         check_fields("task.check", self.t)
@@ -341,7 +348,7 @@ def check_class(cfg: Config) -> type[EpisodeCheck] | None:
     """The class of the task's check; None for a task that can be trained, not verified.
 
     Raises:
-        TermError: ``task.check.func`` names none.
+        TermError: ``task.check.func`` names none, or one that lacks a method.
     """
     if cfg.task.check is None:
         return None
@@ -350,6 +357,8 @@ def check_class(cfg: Config) -> type[EpisodeCheck] | None:
     if not (isinstance(found, type) and issubclass(found, EpisodeCheck)):
         expected = "expected a subclass of mjstack.tasks.check.EpisodeCheck"
         raise TermError("task.check.func", f"{name}: {expected}")
+    for method in sorted(found.__abstractmethods__):
+        raise TermError("task.check.func", f"{name}: method '{method}' is missing")
     return cast(type[EpisodeCheck], found)
 
 

@@ -8,7 +8,13 @@ from omegaconf import MISSING
 
 from mjstack.config.fields import spec
 
-SHAPES = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}  # and how many sizes each has
+_ROUND = (2, "radius and half length")
+SHAPES = {  # and the sizes of each
+    "box": (3, "half sizes"),
+    "cylinder": _ROUND,
+    "sphere": (1, "the radius"),
+    "capsule": _ROUND,
+}
 
 
 def _friction() -> list[float]:
