@@ -115,19 +115,27 @@ class Unreachable(InputError):
     """The arm cannot bring its grasp point to a target."""
 
     def __init__(
-        self, world: int, phase: str, target: Sequence[float], distance: float, tolerance: float
+        self,
+        world: int,
+        phase: str,
+        anchor: str | None,
+        target: Sequence[float],
+        distance: float,
+        tolerance: float,
     ) -> None:
-        super().__init__(world, phase, target, distance, tolerance)  # a process hands them on
+        super().__init__(
+            world, phase, anchor, target, distance, tolerance
+        )  # a process hands them on
         self.world = world
         self.phase = phase
         self.distance = distance
 
     def __str__(self) -> str:
-        world, phase, target, distance, tolerance = self.args
+        world, phase, anchor, target, distance, tolerance = self.args
         where = ", ".join(f"{x:.3f}" for x in target)
         return (
             f"world {world}, phase {phase}: target ({where}) m is {1e3 * distance:.1f} mm out of"
-            f" reach of the grasp point, expected at most {1e3 * tolerance:.1f} mm. Move the object"
+            f" reach of the grasp point, expected at most {1e3 * tolerance:.1f} mm. Move {anchor}"
             f" closer, or change controller.phases.{phase}."
         )
 

@@ -454,7 +454,7 @@ def test_a_layout_out_of_reach_leaves_the_other_workloads(
 
     def unreachable(context: RunContext, reset: dict) -> Workload:
         if reset is context.cfg.gate.capacity.reset:
-            raise Unreachable(0, "grasp_red", (0.9, 0.0, 0.0), 0.3, 5e-4)
+            raise Unreachable(0, "grasp_red", "red", (0.9, 0.0, 0.0), 0.3, 5e-4)
         return play(context, reset)
 
     monkeypatch.setattr(RunContext, "play_task", unreachable)

@@ -182,6 +182,7 @@ def test_unreachable_target_names_world_phase_and_distance(robot: str, stage: St
     assert caught.value.world == 1
     assert caught.value.phase == "above_red"
     assert 0.3 < caught.value.distance < 1.5
+    assert "Move red closer, or change controller.phases.above_red." in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

@@ -164,8 +164,11 @@ def test_a_gate_of_one_s_own(
     assert [gate["name"] for gate in report["gates"]] == ["upright"]
     assert "gate=" not in (tmp_path / "a" / ".hydra" / "overrides.yaml").read_text()
     assert run([*flags, "gate.upright.limit=3.0", "hydra.run.dir=b"]) == 1
-    assert run([*flags, "--help", "gate.upright"]) == 0
     capsys.readouterr()
+    assert run([*flags, "--help", "gate.upright", "task.check.window"]) == 0
+    told = capsys.readouterr().out
+    assert "gate.upright.limit=1.0\n  Accepts a number above 0 [m]." in told
+    assert "task.check.window=50\n" in told
     said = refused([*flags, "gate.upright.limit=0.0"], capsys)
     assert said == "mjstack: gate.upright.limit=0.0: expected a number above 0 [m]."
     assert "Did you mean 'limit'?" in refused([*flags, "+gate.upright.limits=1.0"], capsys)

@@ -5,6 +5,7 @@ import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from mjstack.config.fields import check_fields
 from mjstack.config.schema import SHAPES, BoxCfg, Config, SceneCfg, TermCfg
@@ -47,24 +48,30 @@ def validate(cfg: Config) -> None:
 
 def reads_starts_file(reset: Mapping[str, TermCfg]) -> bool:
     """Whether worlds start as a file says."""
-    return any("path" in term.params and _offers(term, "reads_file") for term in reset.values())
+    return any(
+        "path" in term.params and offered(term.func, "reads_file") for term in reset.values()
+    )
 
 
 def places_objects(term: TermCfg) -> bool:
     """Whether a reset term puts objects anywhere in a region, its parameter ``xy``."""
-    return "xy" in term.params and _offers(term, "places_objects")
+    return "xy" in term.params and bool(offered(term.func, "places_objects"))
 
 
-def _offers(term: TermCfg, name: str) -> bool:
-    """Whether a term's function has an attribute; see `mjstack.managers.offers`. One that cannot be
-    imported has none: its manager says why.
+def offered(path: str, name: str) -> Any:
+    """An attribute of a function or class, see `mjstack.managers.offers`; None if it has none, or
+    cannot be imported: who uses it says why.
+
+    Args:
+        path: Dotted name of the function.
+        name: The attribute.
     """
-    module, _, attribute = term.func.rpartition(".")
+    module, _, attribute = path.rpartition(".")
     try:
         func = getattr(importlib.import_module(module), attribute, None)
     except Exception:
-        return False
-    return bool(getattr(func, name, False))
+        return None
+    return getattr(func, name, None)
 
 
 def _require(what: str, name: str | None, known: Mapping | Sequence) -> None:

@@ -9,8 +9,10 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from mjstack.config.check import offered
+from mjstack.config.complete import typed
 from mjstack.config.fields import accepted, field_docs
 from mjstack.config.schema import Config
 from mjstack.config.session import CONFIG_FOLDER, list_choices
@@ -130,11 +132,12 @@ def key_help(cfg: Config, prefix: str, width: int) -> str:
     Raises:
         UnknownName: There is no such key.
     """
-    keys = [key for key in list_keys(cfg) if key.name != "gate.added"]
-    for name, params in cfg.gate.added.items():  # typed only when its module is loaded
-        keys += [
-            Key(f"gate.{name}.{k}", _yaml(v), "what its gate does", "") for k, v in params.items()
-        ]
+    nodes = {f"gate.{name}": (node, "config") for name, node in cfg.gate.added.items()}
+    if cfg.task.check:
+        nodes["task.check"] = (cfg.task.check, "Thresholds")
+    keys = [key for key in list_keys(cfg) if key.name not in ("gate.added", *nodes)]
+    for name, (node, attribute) in nodes.items():
+        keys += _declared_keys(name, node, attribute)
     found = [key for key in keys if f"{key.name}.".startswith(f"{prefix}.")]
     if not found:
         parent = prefix.rpartition(".")[0]
@@ -146,6 +149,18 @@ def key_help(cfg: Config, prefix: str, width: int) -> str:
         words = textwrap.wrap(f"{key.words} Accepts {key.accepts}.".strip(), width - 2)
         lines += [f"{key.name}={key.value}", *(f"  {line}" for line in words)]
     return "\n".join(lines)
+
+
+def _declared_keys(key: str, node: dict[str, Any], attribute: str) -> Iterator[Key]:
+    """Keys that a function declares by a dataclass, its attribute."""
+    kind = offered(str(node["func"]), attribute)
+    names = [item.name for item in fields(kind)] if kind else []
+    for name in [name for name in node if name not in names]:
+        accepts = "a dotted name" if name == "func" else "the values of its function"
+        yield Key(f"{key}.{name}", _yaml(node[name]), accepts, "")
+    if kind:
+        given = {name: value for name, value in node.items() if name in names}
+        yield from list_keys(typed(key, given, kind), key)
 
 
 def help_text(cfg: Config, width: int) -> str:

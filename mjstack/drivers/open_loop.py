@@ -195,8 +195,10 @@ class OpenLoopPlanner:
                     way = start + s * (end - start)
                     command, distance = self.ik.solve(way[:3], way[3:], guess)
                     if not distance <= self.ik.tolerance:
+                        anchor = phase.spec.anchor
+                        at = way[:3].tolist()
                         raise Unreachable(
-                            world, phase.name, way[:3].tolist(), distance, self.ik.tolerance
+                            world, phase.name, anchor, at, distance, self.ik.tolerance
                         )
                     worst = max(worst, distance)
                 knots[k] = command
