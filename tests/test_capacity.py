@@ -60,6 +60,7 @@ def start(sim: Simulation, context: RunContext) -> None:
 # What the simulations keep
 
 
+@pytest.mark.full
 def test_peaks_survive_masked_resets(
     backend: str, make_sim: Make, stage: Callable[[str], RunContext]
 ) -> None:

@@ -162,6 +162,7 @@ def test_world_k_of_n_is_world_k_of_one(backend: str, task: str, robot: str) -> 
 # Reproducibility
 
 
+@pytest.mark.full
 @scenes
 def test_the_seed_decides_the_episode(backend: str, task: str, robot: str) -> None:
     cfg = randomized(task, robot, steps=6)
@@ -280,6 +281,7 @@ def test_terminal_observation_and_the_one_to_go_on_with(
             assert torch.equal(row[f"obs.{group}"], row[f"final.{group}"])
 
 
+@pytest.mark.full
 def test_returned_tensors_are_the_callers(backend: str) -> None:
     env = on_shared_sim(backend, 3, randomized("stack", "so101", steps=3))
     moves = actions(env, 7)
@@ -589,6 +591,7 @@ def assert_ends(env: Env, term: str, worlds: list[int]) -> None:
     assert not env.step(hold(env))[2].any()
 
 
+@pytest.mark.full
 def test_end_by_a_cube_beside_the_table(ended: Env) -> None:
     red, blue = ended.index.object_qpos
     center = ended.cfg.scene.table_center
@@ -610,6 +613,7 @@ def test_end_by_a_cube_below_the_table(ended: Env) -> None:
     assert_ends(ended, "object_off_table", [0])
 
 
+@pytest.mark.full
 def test_end_by_a_joint_beyond_its_range(ended: Env) -> None:
     """With more margin than a step can bring back: MuJoCo pushes with all its might."""
     index = ended.index
@@ -639,6 +643,7 @@ def test_time_out_at_exactly_its_step(backend: str) -> None:
         assert truncated.tolist() == [step in (5, 10), step == 7, step in (5, 10)]
 
 
+@pytest.mark.full
 def test_what_happened_outweighs_the_clock(backend: str) -> None:
     env = on_shared_sim(backend, 3, randomized("stack", "so101", steps=2))
     env.reset(seed=0)

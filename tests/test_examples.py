@@ -13,6 +13,7 @@ from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.schema import Config
 from mjstack.episodes.context import RunContext
+from mjstack.episodes.observers import play_episode
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 ROBOTS = ("so101", "rebot")
@@ -64,7 +65,7 @@ def test_the_tower_stands_alike_on_both_engines(robot: str, tmp_path: Path) -> N
     play_gates("tower", robot, tmp_path, "gates=[baseline,parity]")
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", ["so101", pytest.param("rebot", marks=pytest.mark.full)])
 def test_the_puck_is_pushed_alike_on_both_engines(robot: str, tmp_path: Path) -> None:
     gates = play_gates("push", robot, tmp_path, "nworld=4", "gates=[baseline,parity,batch]")
     assert gates["batch"]["metrics"]["succeeded"] == 4
@@ -130,7 +131,8 @@ class Still:
 def test_worlds_that_are_not_driven_fail(example: str, rules: list[str]) -> None:
     cfg = configure(example, "so101", "nworld=2", "reset=randomized")
     context = RunContext(cfg)
-    played = context.play(context.batch_simulation(2), cfg.reset, repeat=Still(cfg))
+    env = context.start(context.batch_simulation(2), cfg.reset)
+    played = play_episode(env, Still(cfg))
     assert context.check.rules.failing(played.result.failed.numpy()) == {
         name: [0, 1] for name in rules
     }

@@ -132,6 +132,7 @@ def test_failing_world_fails_again_bit_for_bit(
     ]
 
 
+@pytest.mark.full
 def test_accepted_world_of_another_seed(earlier: Path, succeeded: tuple[Path, int, dict]) -> None:
     record = record_of(earlier, 1)
     assert record.failed[3] == 0
