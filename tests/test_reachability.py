@@ -231,7 +231,7 @@ def with_wall(
         size=[*half, 0.0275],
         quat=quat,
     )
-    return build_scene(spec, cfg.scene, cfg.timing, cfg.solver, jaw_bodies=cfg.robot.jaw_bodies)
+    return build_scene(spec, cfg)
 
 
 @pytest.mark.full

@@ -117,7 +117,7 @@ def test_without_a_base_there_is_a_report(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(study, "_simulation", broken)
     assert run_study_job(RunContext(configure(keep=("base",))), tmp_path, []).exit_code == 1
     (only,) = report(tmp_path)["gates"]
-    says = "the configured solver cannot be timed: RuntimeError: no room (run.log"
+    says = "the configured solver cannot be timed: RuntimeError: no room (test_study.py:"
     assert only["reason"].startswith(says)
 
 
