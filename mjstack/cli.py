@@ -29,16 +29,11 @@ from rich.console import Console
 
 import mjstack
 from mjstack.config import Config
-from mjstack.config.explain import check_overrides, parse
+from mjstack.config.explain import own_overrides, parse
 from mjstack.config.help import help_text, key_help
 from mjstack.config.load import compose, split_search_path, to_config
-from mjstack.config.session import (
-    CONFIG_NAME,
-    PROVIDER,
-    hydra_session,
-    search_path,
-)
-from mjstack.errors import CompositionError, MjstackError, UnknownName
+from mjstack.config.session import CONFIG_NAME, PROVIDER, hydra_session, search_path
+from mjstack.errors import CompositionError, MjstackError, UnknownName, first_line
 from mjstack.report.record import Status
 from mjstack.report.table import Table
 
@@ -105,7 +100,6 @@ def _show(hydra: Hydra, flags: Namespace, overrides: list[str]) -> None:
     """Checks the values of a configuration and prints it."""
     if flags.multirun:
         raise CompositionError("--cfg shows one configuration, and -m makes several. Leave -m out.")
-    check_overrides(_own(overrides))
     to_config(compose(hydra, overrides))
     run_and_report(
         lambda: hydra.show_cfg(CONFIG_NAME, overrides, flags.cfg, flags.package, flags.resolve)
@@ -114,7 +108,6 @@ def _show(hydra: Hydra, flags: Namespace, overrides: list[str]) -> None:
 
 def _run_one(hydra: Hydra, overrides: list[str]) -> int:
     """Composes, checks and runs one job."""
-    check_overrides(_own(overrides))
     cfg = compose(hydra, overrides)
     checked = _check(cfg, overrides)
     if checked.folder is not None and not any(o.startswith("hydra.run.dir=") for o in overrides):
@@ -130,8 +123,6 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
     """
     jobs = _expand(overrides)
-    for job in jobs:
-        check_overrides(job)
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
     master = compose(hydra, overrides, RunMode.MULTIRUN)
     for job in jobs:
@@ -183,7 +174,7 @@ def _check(cfg: DictConfig, overrides: list[str]) -> "CheckedJob":
         check_job,
     )  # loads torch and Warp, for which a misspelt key need not wait
 
-    own = _own(overrides)
+    own = own_overrides(overrides)
     checked = check_job(to_config(cfg), own)
     _checked[tuple(own)] = checked
     return checked
@@ -198,15 +189,9 @@ def _parse(args: list[str]) -> Namespace:
         if arg.startswith("-") and arg.partition("=")[0] not in known:
             raise _unknown_flag(arg, known)
     try:
-        flags = parser.parse_intermixed_args(args)
+        return parser.parse_intermixed_args(args)
     except ArgumentError as error:
-        raise CompositionError(f"{error}.") from error
-    for arg in flags.overrides:
-        if "=" not in arg and not arg.startswith("~") and not flags.help:
-            raise CompositionError(
-                f"argument '{arg}' is not an override. Write key=value, such as nworld=64."
-            )
-    return flags
+        raise CompositionError(str(error)) from error
 
 
 def _unknown_flag(arg: str, known: set[str]) -> MjstackError:
@@ -219,21 +204,16 @@ def _unknown_flag(arg: str, known: set[str]) -> MjstackError:
     )
 
 
-def _own(overrides: Sequence[str]) -> list[str]:
-    """The overrides that are not Hydra's."""
-    return [o for o in overrides if not o.lstrip("+~").startswith(("hydra.", "hydra/"))]
-
-
 def _expand(overrides: Sequence[str]) -> list[list[str]]:
     """The jobs of a sweep as Hydra's basic sweeper makes them; none for another sweeper."""
     if any(o.startswith("hydra/sweeper=") and o != "hydra/sweeper=basic" for o in overrides):
         return []
-    parsed = [parse(override) for override in _own(overrides)]
+    parsed = [parse(override) for override in own_overrides(overrides)]
     try:
         batches = BasicSweeper.split_arguments(parsed, max_batch_size=None)
     except HydraException as error:
         raise CompositionError(
-            f"this sweep cannot be expanded: {str(error).splitlines()[0]}. List its values, such as"
+            f"this sweep cannot be expanded: {first_line(error)}. List its values, such as"
             " robot=so101,rebot."
         ) from error
     return [list(job) for batch in batches for job in batch]
@@ -249,9 +229,7 @@ def _check_writable(cfg: DictConfig, kind: str) -> None:
             existing = existing.parent
         tempfile.TemporaryFile(dir=existing).close()
     except OmegaConfBaseException as error:
-        raise CompositionError(
-            f"hydra.{kind}.dir cannot be used: {str(error).splitlines()[0]}."
-        ) from error
+        raise CompositionError(f"hydra.{kind}.dir cannot be used: {first_line(error)}.") from error
     except OSError as error:
         raise CompositionError(
             f"outputs folder {folder}: {existing} cannot be written ({error.strerror}), expected a"

@@ -26,6 +26,15 @@ class MjstackError(Exception):
 
     exit_code = 1
 
+    def __init__(self, problem: str, fix: str = "") -> None:
+        """Builds the message.
+
+        Args:
+            problem: A value or an event, and what was expected; with or without its full stop.
+            fix: What to do about it, a sentence without its full stop.
+        """
+        super().__init__(f"{problem.removesuffix('.')}.{f' {fix}.' if fix else ''}")
+
 
 class InputError(MjstackError):
     """Bad configuration or input. Raised before anything is written."""
@@ -45,7 +54,7 @@ class ConfigError(InputError):
             expected: What would have been accepted.
             fix: What to do about it, a sentence without its full stop.
         """
-        super().__init__(_sentences(f"{key}={value}: expected {expected}", fix))
+        super().__init__(f"{key}={value}: expected {expected}", fix)
         self.key = key
         self._facts = (value, expected, fix)
 
@@ -92,7 +101,7 @@ class TermError(InputError):
 
     def __init__(self, label: str, problem: str) -> None:
         """Builds the message from the term's dotted configuration key and what is wrong with it."""
-        super().__init__(f"{label}: {problem.rstrip('.')}.")
+        super().__init__(f"{label}: {problem}")
 
 
 class ParameterError(ConfigError):
@@ -103,12 +112,6 @@ class ParameterError(ConfigError):
 
 class FaultError(MjstackError):
     """Something went wrong while worlds were stepped."""
-
-    def __init__(self, what: str, fix: str) -> None:
-        """Builds the message from what went wrong and what to do, each a sentence without its full
-        stop.
-        """
-        super().__init__(_sentences(what, fix))
 
 
 class Unreachable(InputError):
@@ -123,9 +126,7 @@ class Unreachable(InputError):
         distance: float,
         tolerance: float,
     ) -> None:
-        super().__init__(
-            world, phase, anchor, target, distance, tolerance
-        )  # a process hands them on
+        # `args` stays as Python has set it: a process hands them on.
         self.world = world
         self.phase = phase
         self.distance = distance
@@ -191,11 +192,10 @@ class CaptureError(MjstackError):
             culprit: What was current_term, if that is known.
             error: What the capture says.
         """
-        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
         where = f" because of {culprit}" if culprit else ""
         super().__init__(
-            f"{name} cannot be captured{where} ({reason}): expected fixed shapes and no host read"
-            " (.item(), .cpu(), nonzero, if tensor). Correct it, or set graph=off."
+            f"{name} cannot be captured{where} ({first_line(error)}): expected fixed shapes and no"
+            " host read (.item(), .cpu(), nonzero, if tensor). Correct it, or set graph=off."
         )
 
 
@@ -211,19 +211,13 @@ class ArgumentError(InputError):
             expected: What would have been accepted.
             fix: What to do about it, a sentence without its full stop.
         """
-        super().__init__(_sentences(f"{name}: found {found}, expected {expected}", fix))
+        super().__init__(f"{name}: found {found}, expected {expected}", fix)
 
 
 class DatasetError(InputError):
     """A dataset of demonstrations that cannot be opened or read, or an episode that does not fit
     into it.
     """
-
-    def __init__(self, message: str) -> None:
-        """Takes the message without its full stop: what is wrong with its value, what was expected,
-        and what to do.
-        """
-        super().__init__(f"{message}.")
 
 
 class UnwrittenError(MjstackError):
@@ -253,8 +247,9 @@ class MissingExtra(InputError):
         )
 
 
-def _sentences(problem: str, fix: str) -> str:
-    return f"{problem}. {fix}." if fix else f"{problem}."
+def first_line(error: BaseException) -> str:
+    """The first line of an error's text without its full stop; its type where it has no text."""
+    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
 def suggest(name: str, available: Iterable[str]) -> str:

@@ -109,6 +109,13 @@ def lowest_point(
     return pos[..., 2] - reach
 
 
+def describe_tensor(value: object) -> str:
+    """A tensor's type, shape and device in words; the type of anything else."""
+    if not isinstance(value, torch.Tensor):
+        return f"a {type(value).__name__}"
+    return f"a {value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"
+
+
 def not_finite(*parts: torch.Tensor) -> torch.Tensor:
     """Rows in which a number is NaN or infinite.
 

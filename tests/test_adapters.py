@@ -196,10 +196,9 @@ def test_vector_wrappers_of_gymnasium_work(make: Make) -> None:
     [
         (
             np.zeros((3, 2)),
-            r"action: found shape \(3, 2\), expected a float32 array of shape \(3, 6\)",
+            r"action: found .* shape \(3, 2\) on cpu, expected a float32 tensor of shape \(3, 6\)",
         ),
-        (np.zeros(6), r"action: found shape \(6,\), expected"),
-        ("up", r"action: found str, expected"),
+        (np.zeros(6), r"action: found .* shape \(6,\) on cpu, expected"),
         (np.full((3, 6), np.nan), r"action: found \[nan.* in world 0, expected finite numbers"),
     ],
 )
@@ -310,7 +309,7 @@ def test_single_env_wrong_use(make: Make) -> None:
     env.reset()
     with pytest.raises(
         ArgumentError,
-        match=r"action: found shape \(1, 6\), expected a float32 array of shape \(6,\)",
+        match=r"action: found .* shape \(1, 1, 6\) on cpu, expected .* shape \(1, 6\)",
     ):
         env.step(np.zeros((1, 6)))
 
@@ -392,7 +391,10 @@ def test_rsl_rl_actions_are_clamped_and_checked(make: Make) -> None:
     action = torch.tensor([[-3.0, -1.0, -0.5, 0.5, 1.0, 3.0]]).expand(3, -1)
     env.step(action)
     assert torch.equal(inner.action.float(), action.clamp(-1.0, 1.0))
-    for wrong, found in ((torch.zeros(3, 1), r"shape \(3, 1\)"), (np.zeros((3, 6)), "ndarray")):
+    for wrong, found in (
+        (torch.zeros(3, 1), r".* shape \(3, 1\)"),
+        (np.zeros((3, 6)), "a ndarray"),
+    ):
         with pytest.raises(ArgumentError, match=f"action: found {found}"):
             env.step(wrong)
 

@@ -15,7 +15,7 @@ import mjstack
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.load import load_saved
-from mjstack.config.session import is_trusted, search_path, search_path_override
+from mjstack.config.session import is_trusted, search_path, search_path_args
 from mjstack.errors import MjstackError
 
 TASK = """# @package _global_
@@ -99,8 +99,12 @@ def test_an_environment_of_another_folder(lean: Path) -> None:
 def test_the_search_path_is_an_override_too(lean: Path) -> None:
     cfg = load_config([f"hydra.searchpath=[file://{lean}]", "task=lean"])
     assert cfg.reward["height"].func == "lean.height"
+    other = lean.parent / "it's mine"
+    (other / "task").mkdir(parents=True)
     with search_path([lean]):
-        (override,) = search_path_override()
+        assert search_path_args() == ["--config-dir", str(lean)]
+        with search_path([other]):
+            (override,) = search_path_args()
     assert load_config([override, "task=lean"]).task.name == "lean"
 
 
@@ -182,7 +186,6 @@ def test_a_bad_folder_is_refused(lean: Path, capsys: pytest.CaptureFixture[str])
     assert missing.startswith("mjstack: task=lean: 'lean' does not exist. Available: ")
     assert missing.endswith(" A choice of your own needs --config-dir DIR.")
     assert "no such folder" in refused(["--config-dir", "nowhere"], capsys)
-    assert "no such package" in refused(["hydra.searchpath=[pkg://nowhere.conf]"], capsys)
     assert "expected a list" in refused(["hydra.searchpath=3"], capsys)
     shutil.copy(lean / "task" / "lean.yaml", lean / "task" / "box.yaml")
     assert "task/box.yaml is mjstack's own" in refused(["--config-dir", str(lean)], capsys)
@@ -206,3 +209,13 @@ def test_an_installed_package_registers_its_configuration(lean: Path) -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout.split() == ["leaning.height", "True"], done.stderr
     assert not is_trusted("leaning.height")
+
+
+def test_only_modules_beside_the_folder_are_trusted(
+    lean: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(lean.parent)  # a built-in module has no file: it is not beside the folder
+    with search_path([lean]):
+        assert is_trusted("lean.height")
+        for name in ("os.system", "sys.exit", "shutil.rmtree", "nowhere.at_all"):
+            assert not is_trusted(name), name

@@ -114,7 +114,7 @@ class GymnasiumVectorEnv(VectorEnv):
         Raises:
             MjstackError: The actions cannot be used, or something went wrong in the worlds.
         """
-        action = torch.from_numpy(_array(actions, self.action_space)).to(self.inner.device)
+        action = torch.tensor(np.asarray(actions, np.float32), device=self.inner.device)
         obs, reward, terminated, truncated, extras = self.inner.step(action)
         success = extras["success"].cpu().numpy()
         infos = {"success": success, "_success": np.ones(self.num_envs, dtype=np.bool_)}
@@ -222,7 +222,7 @@ class GymnasiumEnv(gymnasium.Env):
             raise ArgumentError(
                 "env", "step() after the end of an episode", "reset() first", "Call env.reset()"
             )
-        actions = _array(action, self.action_space)[None]
+        actions = np.asarray(action, np.float32)[None]
         obs, reward, terminated, truncated, infos = self._worlds.step(actions)
         info = {"success": bool(infos["success"])}
         ended = bool(terminated), bool(truncated)
@@ -245,14 +245,3 @@ def _row(obs: Observation, world: int) -> Observation:
     if isinstance(obs, dict):
         return {name: value[world] for name, value in obs.items()}
     return obs[world]
-
-
-def _array(action: Any, space: spaces.Space) -> np.ndarray:
-    expected = f"a float32 array of shape {space.shape}"
-    try:
-        array = np.array(action, dtype=np.float32)  # a copy: torch wants memory it may write to
-    except (TypeError, ValueError) as error:
-        raise ArgumentError("action", type(action).__name__, expected) from error
-    if array.shape != space.shape:
-        raise ArgumentError("action", f"shape {array.shape}", expected)
-    return array

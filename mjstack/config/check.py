@@ -284,26 +284,10 @@ def _success(cfg: Config) -> None:
         success.seeds,
         "1, because with reset=starts_file worlds start alike under every seed",
     )
-    if success.region is None:
-        return
     _refuse(
-        from_file or not any(map(places_objects, success.reset.values())),
+        success.region is not None
+        and (from_file or not any(map(places_objects, success.reset.values()))),
         "gate.success.region",
         success.region,
         "null, because no reset term of the success gate has a region",
     )
-    scene = cfg.scene
-    for axis, name in enumerate("xy"):
-        # An object of any yaw is a disc.
-        most = min(
-            scene.table_half[axis]
-            - thing.footprint
-            - abs(thing.xy[axis] - scene.table_center[axis])
-            for thing in scene.free.values()
-        )
-        if success.region[axis] > most:
-            expected = (
-                f"half-widths that leave every object on the table, {name} from 0 to"
-                f" {max(most, 0.0):.3f} m"
-            )
-            raise ConfigError("gate.success.region", success.region, expected)

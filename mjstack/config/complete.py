@@ -8,7 +8,7 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mjstack.config.fields import accepted
+from mjstack.config.fields import accepted, check_fields
 from mjstack.config.schema import (
     ActionTermCfg,
     Config,
@@ -81,7 +81,7 @@ def typed(key: str, node: Any, kind: type) -> Any:
         kind: The dataclass.
 
     Raises:
-        MjstackError: A key is unknown or missing, or a value has the wrong type.
+        MjstackError: A key is unknown or missing, or its field does not accept a value.
     """
     items = {field.name: field for field in fields(kind)}
     if not isinstance(node, dict):
@@ -97,7 +97,9 @@ def typed(key: str, node: Any, kind: type) -> Any:
     missing = sorted(OmegaConf.missing_keys(typed))
     if missing:
         raise TermError(key, f"'{missing[0]}' is missing: set {key}.{missing[0]}")
-    return OmegaConf.to_object(typed)
+    found = OmegaConf.to_object(typed)
+    check_fields(key, found)
+    return found
 
 
 @cache

@@ -12,26 +12,25 @@ from difflib import SequenceMatcher
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, MissingConfigException
-from omegaconf import OmegaConf
 from omegaconf.errors import ConfigKeyError
 
 from mjstack.config.fields import accepted, find_field
 from mjstack.config.schema import JOB_SCHEMAS, Config
-from mjstack.config.session import CONFIG_NAME, compose_raw, config_folders, list_choices
-from mjstack.errors import CompositionError, MjstackError, UnknownName, suggest
+from mjstack.config.session import (
+    CONFIG_NAME,
+    compose_raw,
+    config_folders,
+    list_choices,
+    list_items,
+)
+from mjstack.errors import CompositionError, MjstackError, UnknownName, first_line, suggest
 
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 
 
 def check_overrides(overrides: Sequence[str]) -> None:
     """Raise a `CompositionError` for the first override that cannot be used alone."""
-    for override in overrides:
-        key, equals, _ = override.partition("=")
-        if not key.strip("+~ ") or not (equals or override.startswith("~")):
-            raise CompositionError(
-                f"override '{override}' has no {'value' if key else 'key'}. Write key=value without"
-                " spaces, such as nworld=64."
-            )
+    for override in own_overrides(overrides):
         parsed = parse(override)
         key = parsed.key_or_group
         if parsed.is_sweep_override():
@@ -59,9 +58,15 @@ def parse(override: str) -> Override:
     except HydraException as error:
         raise CompositionError(
             f"override {override!r} cannot be read: expected key=value without spaces around the"
-            " sign. A value with brackets, signs or letters beyond ASCII wants quotes of its own:"
+            " sign, such as nworld=64. A value with a bracket, a quote, a letter beyond ASCII or"
+            " one of , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
             " 'starts=\"run(1).csv\"'."
         ) from error
+
+
+def own_overrides(overrides: Iterable[str]) -> list[str]:
+    """The overrides that are not Hydra's."""
+    return [o for o in overrides if not o.lstrip("+~").startswith(("hydra.", "hydra/"))]
 
 
 def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
@@ -86,7 +91,7 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
     # Hydra raises its own inside of the handler of one of OmegaConf's, which knows the key.
     cause = error.__cause__ or (error.__context__ if str(error).startswith("In '") else None)
     cause = cause or error
-    text = (str(cause).splitlines() or [type(cause).__name__])[0].rstrip(".")
+    text = first_line(cause)
     key = getattr(cause, "full_key", None) or ""
     deleted = re.match(r"Could not delete from config\. '([^']+)'", text)
     if deleted:
@@ -161,10 +166,4 @@ def _keys(overrides: Iterable[str]) -> list[str]:
         cfg = compose_raw(list(overrides))
     except HydraException:
         cfg = compose_raw([])
-    return list(_flat_keys(OmegaConf.to_container(cfg, resolve=False)))
-
-
-def _flat_keys(node: object, prefix: str = "") -> Iterable[str]:
-    for name, value in node.items() if isinstance(node, dict) else ():
-        yield f"{prefix}{name}"
-        yield from _flat_keys(value, f"{prefix}{name}.")
+    return [key for key, _ in list_items(cfg)]

@@ -100,7 +100,7 @@ def find_field(owner: type, key: str) -> tuple[type, Field] | None:
     return find_field(kind, below) if below else (owner, item)
 
 
-def check_fields(key: str, value: object) -> None:
+def check_fields(key: str, value: Any) -> None:
     """Hold every number, list and choice below a key against its field's range.
 
     Args:
@@ -110,8 +110,6 @@ def check_fields(key: str, value: object) -> None:
     Raises:
         ConfigError: The first value that its field does not accept.
     """
-    if not is_dataclass(value) or isinstance(value, type):
-        return
     for item in fields(value):
         path = f"{key}.{item.name}" if key else item.name
         _check(path, getattr(value, item.name), type(value), item)

@@ -8,7 +8,7 @@ import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from enum import Enum
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from mjstack.config.check import offered
@@ -204,11 +204,7 @@ def _yaml(value: object) -> str:
     """A value as a command line has it."""
     if isinstance(value, str):
         return value
-    if isinstance(value, Enum):
-        return str(value.value)
-    if isinstance(value, list | tuple) and all(isinstance(part, str) for part in value):
-        return f"[{','.join(value)}]"
-    return json.dumps(value, default=str).replace(", ", ",").replace('"', "")
+    return json.dumps(value, default=attrgetter("value")).replace(", ", ",").replace('"', "")
 
 
 def _table(rows: Sequence[tuple[str, str]], width: int) -> list[str]:

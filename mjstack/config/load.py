@@ -52,10 +52,9 @@ def load_config(
         MjstackError: An override does not fit; the message says which and what would.
     """
     entries, own = split_search_path(overrides)
-    with search_path([*([config_dir] if config_dir is not None else []), *entries]):
-        check_overrides(own)
-        with hydra_session() as hydra:
-            return to_config(compose(hydra, own))
+    folders = [] if config_dir is None else [config_dir]
+    with search_path([*folders, *entries]), hydra_session() as hydra:
+        return to_config(compose(hydra, own))
 
 
 def split_search_path(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -84,6 +83,8 @@ def compose(
     """Compose without validating values, as a job of a sweep if there is one; Hydra's part is in
     it, and errors are one line each.
     """
+    if run_mode is RunMode.RUN:
+        check_overrides(overrides)
     try:
         if sweep is None:
             cfg = hydra.compose_config(CONFIG_NAME, list(overrides), run_mode, from_shell=False)
@@ -156,10 +157,8 @@ def load_saved(path: Path) -> Config:
 
 def to_config(cfg: DictConfig) -> Config:
     """Turn a composed configuration into dataclasses and check their values."""
-    if "hydra" in cfg:
-        cfg = without_hydra(cfg)
     try:
-        config = cast(Config, OmegaConf.to_object(cfg))
+        config = cast(Config, OmegaConf.to_object(without_hydra(cfg)))
     except (OmegaConfBaseException, AttributeError, TypeError) as error:
         raise explain(error) from error
     complete(config)

@@ -21,7 +21,6 @@ from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.object_type import ObjectType
 from hydra.core.singleton import Singleton
 from hydra.types import RunMode
 from hydra.version import setbase
@@ -40,47 +39,40 @@ CONFIG_NAME = "config"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
 _FILE = "file://"
-_PACKAGE = "pkg://"
 
-_added: ContextVar[tuple[str, ...]] = ContextVar("search path", default=())
+_added: ContextVar[tuple[Path, ...]] = ContextVar("search path", default=())
 
 
 @contextmanager
 def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
-    """Add folders and packages to the search path of every composition inside.
+    """Add folders to the search path of every composition inside.
 
     Args:
-        entries: Folders, or ``file://...`` and ``pkg://...`` as Hydra writes them.
+        entries: Folders, also as Hydra writes them: ``file://...``.
 
     Raises:
         CompositionError: There is no such folder, or it has a file of mjstack's name.
     """
-    found = [_entry(str(entry)) for entry in entries]
+    found = [_checked_folder(str(entry)) for entry in entries]
     token = _added.set(tuple(dict.fromkeys((*_added.get(), *found))))
     # The folder beside a configuration folder is importable.
-    for entry in found:
-        parent = str(Path(entry.removeprefix(_FILE)).parent)
-        if entry.startswith(_FILE) and parent not in sys.path:
-            sys.path.insert(0, parent)
+    for folder in found:
+        if str(folder.parent) not in sys.path:
+            sys.path.insert(0, str(folder.parent))
     try:
         yield
     finally:
         _added.reset(token)
 
 
-def search_path_override() -> list[str]:
-    """The override that gives another process the current search path; none where it is bare."""
-    quoted = [entry.replace("\\", "\\\\").replace("'", "\\'") for entry in _added.get()]
-    listed = ",".join(f"'{entry}'" for entry in quoted)
-    return [f"hydra.searchpath=[{listed}]"] if quoted else []
-
-
-def search_path_flag(entries: Sequence[str] | None = None) -> str:
-    """Entries, those of the current search path if None, as a command line adds them."""
-    entries = _added.get() if entries is None else entries
-    if len(entries) == 1 and entries[0].startswith(_FILE):
-        return f"--config-dir {shlex.quote(entries[0].removeprefix(_FILE))}"
-    return shlex.quote(f"hydra.searchpath=[{','.join(entries)}]") if entries else ""
+def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
+    """Arguments of a command that adds folders; those of the current search path if None."""
+    folders = _added.get() if folders is None else folders
+    if len(folders) < 2:
+        return [arg for folder in folders for arg in ("--config-dir", str(folder))]
+    quoted = [str(folder).replace("\\", "\\\\").replace("'", "\\'") for folder in folders]
+    listed = ",".join(f"'{folder}'" for folder in quoted)
+    return [f"hydra.searchpath=[{listed}]"]
 
 
 def add_folder(saved: Path) -> str:
@@ -88,28 +80,21 @@ def add_folder(saved: Path) -> str:
     file = saved.with_name("hydra.yaml")
     sources = OmegaConf.load(file).hydra.runtime.config_sources if file.is_file() else []
     used = [Path(source.path) for source in sources if source.provider == PROVIDER]
-    entries = [f"{_FILE}{folder}" for folder in used if folder not in config_folders()]
-    flag = search_path_flag(entries) or "--config-dir DIR"
+    lacking = [folder for folder in used if folder not in config_folders()]
+    flag = shlex.join(search_path_args(lacking)) or "--config-dir DIR"
     return f"If you trust the folder that the run had used, add {flag}."
 
 
 def config_folders() -> list[Path]:
-    """Folders of the search path beside mjstack's: added ones, and those of packages."""
-    folders = []
-    for entry in _entries():
-        if entry.startswith(_FILE):
-            folders.append(Path(entry.removeprefix(_FILE)))
-        else:
-            package = find_spec(entry.removeprefix(_PACKAGE))
-            locations = package.submodule_search_locations if package else None
-            folders += map(Path, locations or ())
-    return folders
+    """Folders of the search path beside mjstack's: those of registered packages, and added ones."""
+    specs = [spec for name in _registered() if (spec := find_spec(name)) is not None]
+    places = [Path(place) for spec in specs for place in spec.submodule_search_locations or ()]
+    return list(dict.fromkeys((*places, *_added.get())))
 
 
-def _entries() -> list[str]:
-    """Entries of registered packages, and added ones."""
-    registered = [f"{_PACKAGE}{point.value}" for point in entry_points(group=ENTRY_POINTS)]
-    return list(dict.fromkeys((*registered, *_added.get())))
+def _registered() -> list[str]:
+    """Configuration modules that installed packages register."""
+    return [point.value for point in entry_points(group=ENTRY_POINTS)]
 
 
 def is_trusted(dotted: str) -> bool:
@@ -118,13 +103,13 @@ def is_trusted(dotted: str) -> bool:
     A saved run may name any function; only these may be imported on its word.
     """
     package = dotted.partition(".")[0]
-    packages = [e.removeprefix(_PACKAGE) for e in _entries() if e.startswith(_PACKAGE)]
-    if package in {"mjstack", *(name.partition(".")[0] for name in packages)}:
+    if package in {"mjstack", *(name.partition(".")[0] for name in _registered())}:
         return True
     found = find_spec(package)
     places = [*(found.submodule_search_locations or ()), found.origin or ""] if found else []
-    parents = [folder.parent for folder in config_folders()]
-    return any(Path(place).resolve().parent in parents for place in places if place)
+    parents = [folder.parent for folder in _added.get()]
+    # The origin of a module of Python's own is a word, such as frozen.
+    return any(Path(p).is_absolute() and Path(p).resolve().parent in parents for p in places)
 
 
 def check_trusted(cfg: DictConfig, saved: Path) -> None:
@@ -137,21 +122,21 @@ def check_trusted(cfg: DictConfig, saved: Path) -> None:
     Raises:
         CompositionError: A function is elsewhere; names it.
     """
-    for key, name in _functions("", OmegaConf.to_container(cfg, resolve=False)):
-        if not is_trusted(name):
+    for key, name in list_items(cfg):
+        if key.endswith(".func") and isinstance(name, str) and not is_trusted(name):
             raise CompositionError(
                 f"{key}={name}: expected a name of mjstack, of a package registered under"
                 f" mjstack.configs, or beside a folder of the search path. {add_folder(saved)}"
             )
 
 
-def _functions(prefix: str, node: object) -> Iterator[tuple[str, str]]:
-    """Every dotted name that terms, checks and gates would import, with its key."""
+def list_items(node: object, prefix: str = "") -> Iterator[tuple[str, object]]:
+    """Every dotted key of a composition, in OmegaConf's types or plain, and its value."""
+    if isinstance(node, DictConfig):
+        node = OmegaConf.to_container(node, resolve=False)
     for name, value in node.items() if isinstance(node, dict) else ():
-        key = f"{prefix}{name}"
-        if name == "func" and isinstance(value, str):
-            yield key, value
-        yield from _functions(f"{key}.", value)
+        yield f"{prefix}{name}", value
+        yield from list_items(value, f"{prefix}{name}.")
 
 
 @contextmanager
@@ -218,7 +203,11 @@ class _Loader(ConfigLoaderImpl):
         """Compose, or return the composition of an earlier call."""
         key = (config_name, *overrides, run_mode)
         if key not in self._composed:
-            gates = [f"+gate@gate.{name}={name}" for name in self._added_gates()]
+            # All gates of the search path are composed, as mjstack's are.
+            names = {
+                path.stem for folder in config_folders() for path in folder.glob("gate/*.yaml")
+            }
+            gates = [f"+gate@gate.{name}={name}" for name in sorted(names)]
             cfg = super().load_configuration(
                 config_name, [*gates, *overrides], run_mode, from_shell, validate_sweep_overrides
             )
@@ -227,22 +216,9 @@ class _Loader(ConfigLoaderImpl):
             self._composed[key] = cfg
         return self._composed[key]
 
-    def _added_gates(self) -> list[str]:
-        """Gates of the search path that are not mjstack's: all of them are composed."""
-        names = set(self.repository.get_group_options("gate", ObjectType.CONFIG))
-        for source in self.repository.get_sources():
-            if source.provider == "main":
-                names -= set(source.list("gate", ObjectType.CONFIG))
-        return sorted(names)
 
-
-def _entry(text: str) -> str:
-    """An entry as Hydra writes it, its folder checked and absolute."""
-    if text.startswith(_PACKAGE):
-        package = text.removeprefix(_PACKAGE)
-        if find_spec(package.partition(".")[0]) is None or find_spec(package) is None:
-            raise CompositionError(f"{text}: there is no such package. Install it.")
-        return text
+def _checked_folder(text: str) -> Path:
+    """A folder with configuration files, absolute."""
     folder = Path(text.removeprefix(_FILE)).absolute()
     if not folder.is_dir():
         raise CompositionError(
@@ -261,4 +237,4 @@ def _entry(text: str) -> str:
                 f"{path}: {name} is mjstack's own, expected a name that mjstack does not have."
                 " Rename the file."
             )
-    return f"{_FILE}{folder.resolve()}"
+    return folder.resolve()

@@ -15,7 +15,7 @@ from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError
 from mjstack.managers.episode import required_fields
 from mjstack.scene import SceneIndex, build_model
-from mjstack.sim import BatchSizes, make_simulation, resolve_backend, resolve_device
+from mjstack.sim import BatchSizes, make_simulation, resolve_backend
 from mjstack.sim.sizes import resolve_env_sizes
 
 
@@ -79,10 +79,7 @@ def build_env(
     """
     model = build_model(cfg) if model is None else model
     nworld = cfg.nworld if nworld is None else nworld
-    if backend is None:
-        backend, device = resolve_backend(cfg)
-    elif device is None:
-        device = resolve_device(cfg.sim.device)
+    backend, device = resolve_backend(cfg, backend, device)
     if sizes is None and cfg.batch.auto:
         sizes = probe_env_sizes(cfg, model, nworld, backend, device)
     sizes = sizes or resolve_env_sizes(cfg)

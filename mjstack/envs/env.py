@@ -107,7 +107,7 @@ class Env:
         self._success: Term | None = None
         if cfg.task.success is not None:
             self._success = Term("task.success", cfg.task.success, self)
-            first_value(self._success, self, dims=(1,), boolean=True)
+            first_value(self._success, self, boolean=True)
         self.termination_manager = TerminationManager(self, cfg.termination)
         self.reward_manager = RewardManager(self, cfg.reward)
         self.observation_manager = ObservationManager(self, cfg.observation)

@@ -8,6 +8,7 @@ from mjstack.episodes.failures import FailureMonitor
 from mjstack.episodes.record import FAILING, SUCCESS_FAILING, Circumstances, EpisodeRecord
 from mjstack.episodes.rollout import Observer
 from mjstack.episodes.tally import EpisodeTally
+from mjstack.errors import first_line
 from mjstack.files import to_csv, write_atomic
 
 log = logging.getLogger(__name__)
@@ -78,7 +79,7 @@ def play_seeds(
                 if seed == cfg.seed:
                     raise
                 log.exception("seed %d broke", seed)
-                why = (str(error) or type(error).__name__).splitlines()[0]
+                why = first_line(error)
                 left = f"seed {seed}" if seed == last else f"seeds {seed} to {last}"
                 tally.problems.append(f"{left} not played: {why} (run.log has the traceback)")
                 break

@@ -1,13 +1,14 @@
 """Episodes of a gate, counted seed after seed."""
 
 import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from mjstack.config.session import search_path_flag
+from mjstack.config.session import search_path_args
 from mjstack.episodes.failures import describe_sign
 from mjstack.episodes.observers import Episode
 from mjstack.episodes.record import FAILING, Circumstances, EpisodeRecord
@@ -178,9 +179,8 @@ class EpisodeTally:
         if not self.failed or self.path is None:
             return ""
         gate = "" if self.path.name == FAILING else f"{self.gate}:"
-        flag = f"{search_path_flag()} ".lstrip()
-        run = f"job=replay run={self.path.parent}"
-        return f". To look at one: {flag}{run} world={gate}{self.failed[0]}"
+        run = shlex.join([*search_path_args(), "job=replay", f"run={self.path.parent}"])
+        return f". To look at one: {run} world={gate}{self.failed[0]}"
 
     def tables(self) -> list[Table]:
         """Tables of the report: seeds, and first signs of failure."""

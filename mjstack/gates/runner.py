@@ -8,10 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mjstack.config.complete import typed
-from mjstack.config.fields import check_fields
 from mjstack.config.schema import Config
 from mjstack.episodes.context import RunContext, lacks_episode
-from mjstack.errors import MjstackError, is_out_of_memory
+from mjstack.errors import MjstackError, first_line, is_out_of_memory
 from mjstack.managers.term import resolve_func
 from mjstack.report.record import GateResult, Status
 
@@ -42,7 +41,6 @@ def find_gates(cfg: Config) -> dict[str, Gate]:
         kind = getattr(func, "config", None)
         if kind is not None and isinstance(cfg.gate[name], dict):
             cfg.gate.added[name] = typed(f"gate.{name}", cfg.gate[name], kind)
-            check_fields(f"gate.{name}", cfg.gate[name])
         gates[name] = func
     return gates
 
@@ -90,7 +88,7 @@ def describe_error(error: Exception) -> str:
     if isinstance(error, MjstackError):
         return str(error)
     log.error("unexpected error", exc_info=error)
-    first = (str(error).splitlines() or ["no message"])[0].rstrip(".")
+    first = first_line(error)
     if is_out_of_memory(f"{type(error).__name__}: {error}"):
         smaller = "Run fewer worlds, or with smaller buffers (batch.nconmax, batch.njmax)"
         return f"out of memory ({first}). {smaller}"

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mjstack.config.session import search_path_override
+from mjstack.config.session import search_path_args
 from mjstack.errors import MjstackError, is_out_of_memory
 from mjstack.files import write_atomic
 from mjstack.report.scaling import NOT_RUN, PASS, Row
@@ -68,7 +68,7 @@ def run_process(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "report.json").unlink(missing_ok=True)  # an earlier try's
     target = str(folder).replace("\\", "\\\\").replace("'", "\\'")
-    command = [sys.executable, "-c", _START, *overrides, *search_path_override()]
+    command = [sys.executable, "-c", _START, *overrides, *search_path_args()]
     began = time.monotonic()
     with (folder / "output.log").open("w") as log:
         process = subprocess.Popen(

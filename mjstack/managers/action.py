@@ -9,15 +9,9 @@ import torch
 
 from mjstack.config.schema import ActionTermCfg
 from mjstack.errors import ArgumentError, TermError
-from mjstack.managers.term import (
-    build_instance,
-    check_params,
-    current_term,
-    render_table,
-    resolve_func,
-    show_params,
-)
+from mjstack.managers.term import Term, current_term, render_table
 from mjstack.managers.view import EnvView
+from mjstack.math import describe_tensor
 
 
 class ActionTerm(ABC):
@@ -69,14 +63,7 @@ class ActionManager:
         driven: dict[int, str] = {}
         for name, term_cfg in cfg.items():
             label = f"action.{name}"
-            cls = resolve_func(label, term_cfg.func)
-            if not (isinstance(cls, type) and issubclass(cls, ActionTerm)):
-                raise TermError(
-                    label,
-                    f"func={term_cfg.func}: expected a subclass of mjstack.managers.ActionTerm",
-                )
-            check_params(label, cls, dict(term_cfg.params), 1)
-            term = build_instance(label, cls, env, dict(term_cfg.params))
+            term: ActionTerm = Term(label, term_cfg, env, base=ActionTerm).call
             for actuator in term.actuators:
                 if actuator in driven:
                     raise TermError(
@@ -139,15 +126,13 @@ class ActionManager:
             f"a float32 tensor of shape ({self._env.nworld}, {self.action_dim}) on"
             f" {self._env.device}"
         )
-        if not isinstance(action, torch.Tensor):
-            raise ArgumentError("action", type(action).__name__, expected)
         if (
-            action.shape != self.action.shape
+            not isinstance(action, torch.Tensor)
+            or action.shape != self.action.shape
             or action.dtype not in (torch.float32, torch.float64)
             or action.device != self._env.device
         ):
-            found = f"shape {tuple(action.shape)}, dtype {action.dtype}, device {action.device}"
-            raise ArgumentError("action", found, expected)
+            raise ArgumentError("action", describe_tensor(action), expected)
 
     def reset(self, mask: torch.Tensor) -> None:
         """Zero the actions of the masked worlds."""
@@ -156,9 +141,6 @@ class ActionManager:
 
     def __str__(self) -> str:
         rows = [
-            (name, term.dim, term.unit, show_params(self._cfg[name].params))
-            for name, term in self.terms.items()
+            (name, term.dim, term.unit, self._cfg[name].params) for name, term in self.terms.items()
         ]
-        return render_table(
-            f"action: {self.action_dim} numbers", ("term", "dim", "range", "parameters"), rows
-        )
+        return render_table(f"action: {self.action_dim} numbers", ("term", "dim", "range"), rows)

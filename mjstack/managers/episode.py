@@ -7,15 +7,8 @@ from collections.abc import Mapping
 import torch
 
 from mjstack.config.schema import RewardTermCfg, TermCfg, TerminationTermCfg
-from mjstack.errors import MjstackError, TermError
-from mjstack.managers.term import (
-    Term,
-    first_value,
-    raised,
-    render_table,
-    resolve_func,
-    show_params,
-)
+from mjstack.errors import TermError
+from mjstack.managers.term import Term, blamed, first_value, render_table, resolve_func
 from mjstack.managers.view import EnvView
 
 
@@ -45,21 +38,12 @@ class ResetManager:
         """Resets the worlds of a ``(nworld,)`` bool mask: qpos0 first, then every term."""
         self._env.sim.reset(mask)
         for term in self._terms.values():
-            try:
+            with blamed(term.label):
                 term(self._env, mask)
-            except MjstackError:
-                raise
-            except Exception as error:
-                raise raised(term.label, error) from error
 
     def __str__(self) -> str:
-        rows = [
-            (name, show_params(term.params), ", ".join(term.model_fields))
-            for name, term in self._terms.items()
-        ]
-        return render_table(
-            f"reset: {len(rows)} terms", ("term", "parameters", "model fields"), rows
-        )
+        rows = [(n, ", ".join(term.model_fields), term.params) for n, term in self._terms.items()]
+        return render_table(f"reset: {len(rows)} terms", ("term", "model fields"), rows)
 
 
 def required_fields(cfg: Mapping[str, TermCfg]) -> tuple[str, ...]:
@@ -72,7 +56,25 @@ def required_fields(cfg: Mapping[str, TermCfg]) -> tuple[str, ...]:
     return tuple(names)
 
 
-class RewardManager:
+class _ValueManager:
+    """Terms that give every world a value at every step, by name."""
+
+    def __init__(
+        self, kind: str, env: EnvView, cfg: Mapping[str, TermCfg], *, boolean: bool = False
+    ) -> None:
+        self._env = env
+        self._terms = {name: Term(f"{kind}.{name}", term, env) for name, term in cfg.items()}
+        for term in self._terms.values():
+            first_value(term, env, boolean=boolean)
+        self.names = list(self._terms)
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Clear what the terms keep of the masked worlds."""
+        for term in self._terms.values():
+            term.reset(mask)
+
+
+class RewardManager(_ValueManager):
     """Adds up ``weight x value x step_dt`` over the terms.
 
     Attributes:
@@ -92,12 +94,8 @@ class RewardManager:
             TermError: A term cannot be found, does not return ``(nworld,)`` numbers, or has a
                 weight that is not finite.
         """
-        self._env = env
+        super().__init__("reward", env, cfg)
         self._cfg = dict(cfg)
-        self._terms = {name: Term(f"reward.{name}", term, env) for name, term in cfg.items()}
-        for term in self._terms.values():
-            first_value(term, env, dims=(1,))
-        self.names = list(self._terms)
         weights = [cfg[name].weight * env.cfg.timing.step_dt for name in self.names]
         self.weights = torch.tensor(weights, dtype=torch.float32, device=env.device)
         self.reward = torch.zeros(env.nworld, dtype=torch.float32, device=env.device)
@@ -126,21 +124,15 @@ class RewardManager:
 
     def reset(self, mask: torch.Tensor) -> None:
         """Starts the sums of the masked worlds anew."""
+        super().reset(mask)
         self.episode_sums.masked_fill_(mask[:, None], 0.0)
-        for term in self._terms.values():
-            term.reset(mask)
 
     def __str__(self) -> str:
-        rows = [
-            (name, self._cfg[name].weight, show_params(term.params))
-            for name, term in self._terms.items()
-        ]
-        return render_table(
-            f"reward: {len(rows)} terms", ("term", "weight per s", "parameters"), rows
-        )
+        rows = [(name, term.weight, term.params) for name, term in self._cfg.items()]
+        return render_table(f"reward: {len(rows)} terms", ("term", "weight per s"), rows)
 
 
-class TerminationManager:
+class TerminationManager(_ValueManager):
     """Asks every term about every world.
 
     Attributes:
@@ -156,12 +148,8 @@ class TerminationManager:
         Raises:
             TermError: A term cannot be found, or does not return ``(nworld,)`` bool.
         """
-        self._env = env
+        super().__init__("termination", env, cfg, boolean=True)
         self._cfg = dict(cfg)
-        self._terms = {name: Term(f"termination.{name}", term, env) for name, term in cfg.items()}
-        for term in self._terms.values():
-            first_value(term, env, dims=(1,), boolean=True)
-        self.names = list(self._terms)
 
         def flags(*shape: int) -> torch.Tensor:
             return torch.zeros((env.nworld, *shape), dtype=torch.bool, device=env.device)
@@ -184,20 +172,9 @@ class TerminationManager:
         torch.any(self.values, dim=1, out=self.truncated)
         self.truncated ^= self.terminated
 
-    def reset(self, mask: torch.Tensor) -> None:
-        """Lets terms with a memory forget the masked worlds."""
-        for term in self._terms.values():
-            term.reset(mask)
-
     def __str__(self) -> str:
         rows = [
-            (
-                name,
-                "truncated" if self._cfg[name].time_out else "terminated",
-                show_params(term.params),
-            )
-            for name, term in self._terms.items()
+            (name, "truncated" if term.time_out else "terminated", term.params)
+            for name, term in self._cfg.items()
         ]
-        return render_table(
-            f"termination: {len(rows)} terms", ("term", "episode counts as", "parameters"), rows
-        )
+        return render_table(f"termination: {len(rows)} terms", ("term", "episode counts as"), rows)

@@ -9,7 +9,7 @@ import torch
 
 from mjstack.config.schema import ObservationGroupCfg, ObservationTermCfg
 from mjstack.errors import TermError
-from mjstack.managers.term import Term, first_value, render_table, show_params
+from mjstack.managers.term import Term, first_value, render_table
 from mjstack.managers.view import EnvView, random_uniform
 
 
@@ -72,26 +72,20 @@ class _Group:
         self._high = row(high for _, high in clips)
         self._scales = any(part.cfg.scale != 1.0 for part in parts)
         self._scale = row(part.cfg.scale for part in parts)
-        # Where each step of the history stands in the group: all columns of the newest one, and for
-        # older ones those that have a history that long. A step moves to where the next older one
-        # was.
-        newest: list[int] = []
-        older: list[int] = []
-        following: list[int] = []
+        # Where each column of the group comes from: for `append` in the group before and the new
+        # step behind it, where a part's steps move up by one; for `restart` in the new step.
+        shift: list[int] = []
         repeat: list[int] = []
         first = 0  # of the part's columns within one step
         for part in parts:
-            start = len(newest) + len(older)
-            columns = range(start, start + part.dim)
-            newest += columns[-part.width :]
-            older += columns[: -part.width]
-            following += columns[part.width :]
-            repeat += [*range(first, first + part.width)] * part.cfg.history
+            newest = range(first, first + part.width)
+            start = len(shift)
+            shift += range(start + part.width, start + part.dim)
+            shift += [self.dim + column for column in newest]
+            repeat += [*newest] * part.cfg.history
             first += part.width
-        self._has_history = bool(older)
-        self._newest = indices(newest)
-        self._older = indices(older)
-        self._next = indices(following)
+        self._has_history = first < self.dim
+        self._shift = indices(shift)
         self._repeat = indices(repeat)
         self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
 
@@ -118,8 +112,8 @@ class _Group:
         if not self._has_history:
             out.copy_(step)
             return
-        self._past[:, self._older] = self._past.index_select(1, self._next)
-        self._past[:, self._newest] = step
+        both = torch.cat((self._past, step), dim=1)
+        torch.index_select(both, 1, self._shift, out=self._past)
         out.copy_(self._past)
 
     def restart(self, out: torch.Tensor, mask: torch.Tensor) -> None:
@@ -189,13 +183,8 @@ class ObservationManager:
             for name, part in terms.parts.items():
                 cfg = part.cfg
                 noise = cfg.noise if terms.noisy else 0.0
-                params = show_params(part.term.params)
-                rows.append(
-                    (group, name, part.dim, cfg.history, noise, cfg.clip or "", cfg.scale, params)
-                )
-        title = "observation: " + ", ".join(
-            f"{group} {dim}" for group, dim in self.group_dims.items()
-        )
-        return render_table(
-            title, ("group", "term", "dim", "history", "noise", "clip", "scale", "parameters"), rows
-        )
+                shown = (part.dim, cfg.history, noise, cfg.clip or "", cfg.scale)
+                rows.append((group, name, *shown, part.term.params))
+        dims = ", ".join(f"{group} {dim}" for group, dim in self.group_dims.items())
+        columns = ("group", "term", "dim", "history", "noise", "clip", "scale")
+        return render_table(f"observation: {dims}", columns, rows)

@@ -4,7 +4,7 @@ import importlib
 import inspect
 import io
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from types import UnionType
@@ -16,8 +16,16 @@ from rich.table import Table
 
 from mjstack.config.fields import check_fields
 from mjstack.config.schema import TermCfg
-from mjstack.errors import ConfigError, MjstackError, ParameterError, TermError, suggest
+from mjstack.errors import (
+    ConfigError,
+    MjstackError,
+    ParameterError,
+    TermError,
+    first_line,
+    suggest,
+)
 from mjstack.managers.view import EnvView
+from mjstack.math import describe_tensor
 
 _WORDS = {
     float: "a number",
@@ -28,8 +36,13 @@ _WORDS = {
 }
 
 
-def resolve_func(label: str, path: str) -> Callable[..., Any]:
+def resolve_func(label: str, path: str, base: type | None = None) -> Callable[..., Any]:
     """Finds a function or class by its dotted name.
+
+    Args:
+        label: Dotted configuration key, for errors.
+        path: The dotted name.
+        base: The class that it must be a subclass of.
 
     Raises:
         TermError: There is no such module, or nothing callable of that name in it.
@@ -37,6 +50,9 @@ def resolve_func(label: str, path: str) -> Callable[..., Any]:
     func = find_object(label, path)
     if not callable(func):
         raise TermError(label, f"func={path}: expected a function or a class")
+    if base is not None and not (isinstance(func, type) and issubclass(func, base)):
+        expected = f"expected a subclass of {base.__module__}.{base.__name__}"
+        raise TermError(label, f"func={path}: {expected}")
     return func
 
 
@@ -54,10 +70,10 @@ def find_object(label: str, path: str) -> Any:
     try:
         module = importlib.import_module(module_name)
     except Exception as error:  # the module is the user's, and may raise anything
-        reason = str(error).splitlines()[0] if str(error) else "no message"
         kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
+        reason = f"{kind}{first_line(error)}"
         raise TermError(
-            label, f"func={path}: module '{module_name}' cannot be imported ({kind}{reason})"
+            label, f"func={path}: module '{module_name}' cannot be imported ({reason})"
         ) from error
     if not hasattr(module, attribute):
         names = [
@@ -79,25 +95,24 @@ def check_params(
     Raises:
         TermError: A parameter is unknown or missing.
     """
-    every = list(inspect.signature(func).parameters.values())
-    given = [
-        p for p in every if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD, p.VAR_POSITIONAL)
-    ]
-    if len(given) < leading and not any(p.kind is p.VAR_POSITIONAL for p in given):
+    signature = inspect.signature(func)
+    try:
+        given = signature.bind_partial(*[None] * leading).arguments
+    except TypeError as error:
         form = "(env, mask, *, ...)" if leading == 2 else "(env, *, ...)"
         raise TermError(
             label,
             f"{getattr(func, '__name__', func)} does not take what its manager gives, expected"
             f" {form}",
-        )
-    succeeded = every[leading:]
-    if any(p.kind is p.VAR_KEYWORD for p in succeeded):
+        ) from error
+    others = [p for name, p in signature.parameters.items() if name not in given]
+    if any(p.kind is p.VAR_KEYWORD for p in others):
         return
-    names = [p.name for p in succeeded]
+    names = [p.name for p in others]
     for name in params:
         if name not in names:
             raise TermError(label, f"parameter '{name}' does not exist. {suggest(name, names)}")
-    missing = [p.name for p in succeeded if p.default is p.empty and p.name not in params]
+    missing = [p.name for p in others if p.default is p.empty and p.name not in params]
     if missing:
         raise TermError(
             label, f"parameter '{missing[0]}' is missing: set {label}.params.{missing[0]}"
@@ -130,22 +145,6 @@ def _mismatch(value: Any, hint: Any) -> str:
     return "" if fits and (hint is bool or not isinstance(value, bool)) else _WORDS[hint]
 
 
-def build_instance(
-    label: str, cls: Callable[..., Any], env: EnvView, params: dict[str, Any]
-) -> Any:
-    """Builds a term that is a class.
-
-    Raises:
-        ConfigError: One of its parameters has a value that it cannot use.
-        TermError: It raised an error of its own.
-    """
-    with blamed(label):
-        instance = cls(env, **params)
-    if hasattr(cls, "label"):
-        instance.label = label
-    return instance
-
-
 @contextmanager
 def blamed(label: str) -> Iterator[None]:
     """Raise what a term raises under its dotted configuration key.
@@ -163,13 +162,7 @@ def blamed(label: str) -> Iterator[None]:
     except MjstackError as error:
         raise TermError(label, str(error)) from error
     except Exception as error:
-        raise raised(label, error) from error
-
-
-def raised(label: str, error: Exception) -> TermError:
-    """The error of a term that raised one that is not mjstack's."""
-    reason = str(error).splitlines()[0] if str(error) else "no message"
-    return TermError(label, f"raised {type(error).__name__}: {reason}")
+        raise TermError(label, f"raised {type(error).__name__}: {first_line(error)}") from error
 
 
 class CurrentTerm:
@@ -231,12 +224,21 @@ class Term:
 
     Attributes:
         label: Dotted configuration key, for errors.
+        call: The function or instance.
         params: Its parameters.
         model_fields: Per-world model fields that it writes.
         has_memory: Whether it keeps something from step to step.
     """
 
-    def __init__(self, label: str, cfg: TermCfg, env: EnvView, *, masked: bool = False) -> None:
+    def __init__(
+        self,
+        label: str,
+        cfg: TermCfg,
+        env: EnvView,
+        *,
+        masked: bool = False,
+        base: type | None = None,
+    ) -> None:
         """Finds the function or class and checks its parameters.
 
         Args:
@@ -244,20 +246,27 @@ class Term:
             cfg: Dotted name and parameters.
             env: What the term is built on.
             masked: The term takes a mask after the environment, as reset terms do.
+            base: The class that it must be a subclass of.
 
         Raises:
-            TermError: The name or a parameter is wrong.
+            ConfigError: One of its parameters has a value that it cannot use.
+            TermError: The name or a parameter is wrong, or the class raised an error.
         """
         self.label = label
         check_fields(label, cfg)
-        func = resolve_func(label, cfg.func)
+        func = resolve_func(label, cfg.func, base)
         self.params = dict(cfg.params)
         is_class = inspect.isclass(func)
         check_params(label, func, self.params, 1 if is_class or not masked else 2)
         self.model_fields: Sequence[str] = getattr(func, "model_fields", ())
-        self._call = build_instance(label, func, env, self.params) if is_class else func
+        self.call: Any = func
+        if is_class:
+            with blamed(label):
+                self.call = func(env, **self.params)
+            if hasattr(func, "label"):
+                self.call.label = label
         self._call_params = {} if is_class else self.params
-        self._reset = getattr(self._call, "reset", None) if is_class else None
+        self._reset = getattr(self.call, "reset", None)
         self.has_memory = self._reset is not None
         # Two groups may ask for the same: a function of the state gives both the same answer.
         # Others may keep something.
@@ -267,9 +276,9 @@ class Term:
         """Calls the term with the environment, and a mask if it takes one."""
         current_term.label = self.label
         if self._shared_by is None:
-            return self._call(*args, **self._call_params)
+            return self.call(*args, **self._call_params)
         return shared(
-            (id(args[0]), *self._shared_by), partial(self._call, *args, **self._call_params)
+            (id(args[0]), *self._shared_by), partial(self.call, *args, **self._call_params)
         )
 
     def reset(self, mask: torch.Tensor) -> None:
@@ -279,7 +288,7 @@ class Term:
 
 
 def first_value(
-    term: Term, env: EnvView, *, dims: tuple[int, ...], boolean: bool = False
+    term: Term, env: EnvView, *, dims: tuple[int, ...] = (1,), boolean: bool = False
 ) -> torch.Tensor:
     """Call a value term for the first time and check what it returns.
 
@@ -297,30 +306,24 @@ def first_value(
         value = term(env)
     shape = f"({env.nworld},)" if dims == (1,) else f"({env.nworld},) or ({env.nworld}, d)"
     kind = "bool" if boolean else "floating point"
-    expected = f"expected a {kind} tensor of shape {shape} on {env.device}"
-    if not isinstance(value, torch.Tensor):
-        raise TermError(term.label, f"returned {type(value).__name__}, {expected}")
-    if value.dim() not in dims or value.shape[0] != env.nworld:
-        raise TermError(term.label, f"returned shape {tuple(value.shape)}, {expected}")
-    if value.dtype is not torch.bool if boolean else not value.dtype.is_floating_point:
-        raise TermError(term.label, f"returned {value.dtype}, {expected}")
-    if value.device != env.device:
-        raise TermError(term.label, f"returned a tensor on {value.device}, {expected}")
+    if (
+        not isinstance(value, torch.Tensor)
+        or value.dim() not in dims
+        or len(value) != env.nworld
+        or not (value.dtype is torch.bool if boolean else value.is_floating_point())
+        or value.device != env.device
+    ):
+        expected = f"expected a {kind} tensor of shape {shape} on {env.device}"
+        raise TermError(term.label, f"returned {describe_tensor(value)}, {expected}")
     return value
 
 
-def render_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A manager's terms as text."""
-    table = Table(title=title, title_justify="left")
-    for column in columns:
-        table.add_column(column)
-    for row in rows:
-        table.add_row(*(str(cell) for cell in row))
+def render_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A manager's terms as text; the last cell of a row has the parameters by name."""
+    table = Table(*columns, "parameters", title=title, title_justify="left")
+    for *cells, params in rows:
+        shown = ", ".join(f"{name}={value}" for name, value in params.items())
+        table.add_row(*map(str, cells), shown)
     out = io.StringIO()
     Console(file=out, width=120, color_system=None, markup=False).print(table)
     return out.getvalue().rstrip()
-
-
-def show_params(params: dict[str, Any]) -> str:
-    """Parameters as ``name=value`` pairs."""
-    return ", ".join(f"{name}={value}" for name, value in params.items())

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import ModelCfg, RobotCfg, RobotSource
-from mjstack.errors import ConfigError, SourceError, UnknownName
+from mjstack.errors import ConfigError, SourceError, UnknownName, first_line
 
 BUILTIN = Path(__file__).parent
 _MENAGERIE_FIX = "Set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie, or use model=builtin."
@@ -42,7 +42,7 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
         spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, FileNotFoundError) as error:
         fix = _MENAGERIE_FIX if menagerie else "Correct the file (robot.file)."
-        raise SourceError(f"{path} cannot be read: {str(error).splitlines()[0]}. {fix}") from error
+        raise SourceError(f"{path} cannot be read: {first_line(error)}. {fix}") from error
     if menagerie and robot.replace_collision:
         _replace_collision(spec, robot)
     for name in robot.jaw_bodies:

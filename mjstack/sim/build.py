@@ -32,13 +32,21 @@ def resolve_device(requested: str) -> str:
     return requested
 
 
-def resolve_backend(cfg: Config) -> tuple[Backend, str]:
-    """Backend (never auto) and device of the batch and throughput gates."""
-    device = resolve_device(cfg.sim.device)
-    backend = cfg.sim.backend
+def resolve_backend(
+    cfg: Config, backend: Backend | None = None, device: str | None = None
+) -> tuple[Backend, str]:
+    """Backend (never auto) and device of the batch and throughput gates.
+
+    Args:
+        cfg: The configuration.
+        backend: Overrides the configured backend.
+        device: Overrides the configured device.
+    """
+    device = device or resolve_device(cfg.sim.device)
+    backend = backend or cfg.sim.backend
     if backend is Backend.auto:
         backend = Backend.mjwarp if device.startswith("cuda") else Backend.native
-    if backend is Backend.native and cfg.sim.device.startswith("cuda"):
+    if cfg.sim.backend is Backend.native and cfg.sim.device.startswith("cuda"):
         raise ConfigError(
             "sim.device",
             cfg.sim.device,
@@ -73,17 +81,13 @@ def make_simulation(
         UnknownName: A field does not exist, or cannot differ.
         UnsupportedModel: MJWarp does not implement a feature of the model.
     """
-    chosen, where = (
-        resolve_backend(cfg)
-        if backend is None
-        else (backend, device or resolve_device(cfg.sim.device))
-    )
-    if chosen is Backend.native:
+    backend, device = resolve_backend(cfg, backend, device)
+    if backend is Backend.native:
         return NativeSimulation(model, nworld, fields=fields)
     from mjstack.sim.mjwarp import MjwarpSimulation  # loads Warp, which native runs do not need
 
     return MjwarpSimulation(
-        model, nworld, sizes or resolve_sizes(cfg), where, cfg.graph, fields=fields
+        model, nworld, sizes or resolve_sizes(cfg), device, cfg.graph, fields=fields
     )
 
 

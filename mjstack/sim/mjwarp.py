@@ -8,7 +8,7 @@ import mujoco
 import torch
 
 from mjstack.config.schema import GraphMode
-from mjstack.errors import UnsupportedModel
+from mjstack.errors import UnsupportedModel, first_line
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
 from mjstack.sim.simulation import Simulation, named_options
@@ -78,9 +78,7 @@ class MjwarpSimulation(Simulation):
                     warnings.filterwarnings("error", category=UserWarning)
                     self._m = mjw.put_model(model, batch_sizes=dict.fromkeys(names, nworld))
             except (NotImplementedError, ValueError, UserWarning) as error:
-                raise UnsupportedModel(
-                    (str(error) or repr(error)).splitlines()[0].rstrip(".")
-                ) from error
+                raise UnsupportedModel(first_line(error)) from error
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))

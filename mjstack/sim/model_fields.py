@@ -1,6 +1,6 @@
 """Model fields that may differ from world to world, and what native MuJoCo derives from them."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 
 import mujoco
 import numpy as np
@@ -61,30 +61,17 @@ def check_fields(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-class Fields(Mapping[str, torch.Tensor]):
-    """Per-world model fields by MuJoCo's name. Write into a tensor; the mapping itself cannot be
-    changed.
-    """
+class Fields(dict[str, torch.Tensor]):
+    """Per-world model fields by MuJoCo's name. Write into a tensor; an item cannot be replaced."""
 
-    def __init__(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        self._tensors = dict(tensors)
-
-    def __getitem__(self, name: str) -> torch.Tensor:
-        if name not in self._tensors:
-            raise MissingField(name)
-        return self._tensors[name]
+    def __missing__(self, name: str) -> torch.Tensor:
+        raise MissingField(name)
 
     def __setitem__(self, name: str, value: torch.Tensor) -> None:
         # Python ends `fields[name] *= 2` by setting the item to the tensor that it has just changed
         # in place.
         if self[name] is not value:
             raise RebindError(f"sim.fields['{name}']")
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._tensors)
-
-    def __len__(self) -> int:
-        return len(self._tensors)
 
 
 class SimpleBodies:
@@ -98,7 +85,7 @@ class SimpleBodies:
         dof_M0: Diagonal of the mass matrix at qpos0 [kg, kg m2], shape ``(nworld, nv)``.
     """
 
-    FIELDS = frozenset({"body_mass", "body_inertia", "dof_armature"})
+    FIELDS = ("body_mass", "body_inertia", "dof_armature")
 
     def __init__(
         self, model: mujoco.MjModel, fields: Mapping[str, np.ndarray], nworld: int
@@ -113,10 +100,7 @@ class SimpleBodies:
         self.dof_M0 = np.repeat(model.dof_M0[None], nworld, axis=0)
         self._dofs = np.flatnonzero(model.dof_simplenum)
         self._bodies = model.dof_bodyid[self._dofs]
-        self._sources = [
-            fields.get(name, getattr(model, name)[None])
-            for name in ("body_mass", "body_inertia", "dof_armature")
-        ]
+        self._sources = [fields.get(name, getattr(model, name)[None]) for name in self.FIELDS]
         # A simple body's inertial step is its own frame, so inertia is diagonal there: M0 =
         # armature + a * mass + b . inertia.
         joint = model.dof_jntid[self._dofs]

@@ -133,7 +133,7 @@ class NativeSimulation(Simulation):
         self.fields = Fields(
             {name: torch.from_numpy(values) for name, values in self._fields.items()}
         )
-        derive = not SimpleBodies.FIELDS.isdisjoint(self._fields) and m.dof_simplenum.any()
+        derive = not self._fields.keys().isdisjoint(SimpleBodies.FIELDS) and m.dof_simplenum.any()
         self._simple = SimpleBodies(m, self._fields, nworld) if derive else None
         self._workers = [self._worker() for _ in range(nthread)]
         self.reset()

@@ -7,6 +7,7 @@ import mujoco
 import torch
 
 from mjstack.errors import ArgumentError, RebindError
+from mjstack.math import describe_tensor
 from mjstack.sim.graph import StepGraph
 from mjstack.sim.model_fields import Fields
 from mjstack.sim.sizes import BatchSizes
@@ -228,11 +229,12 @@ class Simulation(ABC):
         expected = f"a torch.bool tensor of shape ({self.nworld},) on {self.device}"
         if mask is None:
             return
-        if not isinstance(mask, torch.Tensor):
-            raise ArgumentError("mask", f"a {type(mask).__name__}", expected)
-        if (mask.dtype, mask.shape, mask.device) != (torch.bool, (self.nworld,), self.device):
-            given = f"a {mask.dtype} tensor of shape {tuple(mask.shape)} on {mask.device}"
-            raise ArgumentError("mask", given, expected)
+        if not isinstance(mask, torch.Tensor) or (mask.dtype, mask.shape, mask.device) != (
+            torch.bool,
+            (self.nworld,),
+            self.device,
+        ):
+            raise ArgumentError("mask", describe_tensor(mask), expected)
 
     def _keep_peaks(self, mask: torch.Tensor | None) -> None:
         """Keep the peaks that a reset of some worlds would erase; drop all in a full one."""

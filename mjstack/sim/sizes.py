@@ -69,11 +69,10 @@ def resolve_sizes(cfg: Config) -> BatchSizes:
 
 
 def resolve_env_sizes(cfg: Config) -> BatchSizes:
-    """Likewise with room for random actions, the worst case for contacts."""
-    placements = _placements(cfg)
-    return apply_configured(
-        cfg, BatchSizes(nconmax=placements.env_nconmax, njmax=placements.env_njmax)
-    )
+    """The configured sizes, where they are null with room for random actions: the worst case for
+    contacts.
+    """
+    return apply_configured(cfg, resolve_measuring_sizes(cfg))
 
 
 def resolve_measuring_sizes(cfg: Config) -> BatchSizes:
@@ -84,7 +83,6 @@ def resolve_measuring_sizes(cfg: Config) -> BatchSizes:
     return BatchSizes(
         nconmax=max(placements.env_nconmax, cfg.batch.nconmax or 0),
         njmax=max(placements.env_njmax, cfg.batch.njmax or 0),
-        source="room to measure in",
     )
 
 

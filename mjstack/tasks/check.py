@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from mjstack.config.complete import typed
-from mjstack.config.fields import check_fields, field_range
+from mjstack.config.fields import field_range
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError, TermError, UnknownName
 from mjstack.managers.term import resolve_func
@@ -210,7 +210,6 @@ class EpisodeCheck(ABC):
             )
         self.cfg = cfg
         self.t: Any = typed("task.check", node, self.Thresholds)
-        check_fields("task.check", self.t)
         phases = cfg.controller.phases
         steps = sum(round(phase.seconds / cfg.timing.step_dt) for phase in phases.values())
         steps = steps or cfg.task.episode_steps
@@ -353,13 +352,10 @@ def check_class(cfg: Config) -> type[EpisodeCheck] | None:
     if cfg.task.check is None:
         return None
     name = str(cfg.task.check.get("func"))
-    found = resolve_func("task.check.func", name)
-    if not (isinstance(found, type) and issubclass(found, EpisodeCheck)):
-        expected = "expected a subclass of mjstack.tasks.check.EpisodeCheck"
-        raise TermError("task.check.func", f"{name}: {expected}")
+    found = cast(type[EpisodeCheck], resolve_func("task.check", name, EpisodeCheck))
     for method in sorted(found.__abstractmethods__):
         raise TermError("task.check.func", f"{name}: method '{method}' is missing")
-    return cast(type[EpisodeCheck], found)
+    return found
 
 
 def make_check(cfg: Config) -> EpisodeCheck:

@@ -41,7 +41,7 @@ class ObservationGroupCfg:
 
     noise: bool = True
     """Whether its terms have their noise."""
-    terms: dict[str, Any] = spec(factory=dict)
+    terms: dict[str, Any] = spec(factory=dict, finite=False)
     """Its terms, by name."""
 
 
