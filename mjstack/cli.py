@@ -239,14 +239,19 @@ def _check_writable(cfg: DictConfig, kind: str) -> None:
 
 def _print_sweep(outcomes: list["JobResult"]) -> None:
     """One row per job, also written beside the jobs as summary.md."""
-    names = list(dict.fromkeys(gate.name for outcome in outcomes for gate in outcome.gates))
-    rows = []
-    for number, outcome in enumerate(outcomes):
-        found = {gate.name: f"{gate.status.value}: {gate.reason}" for gate in outcome.gates}
-        cells = [found.get(name, "not run") for name in names]
-        rows.append([str(number), " ".join(outcome.overrides), *cells, outcome.status.value])
+    names = dict.fromkeys(gate.name for outcome in outcomes for gate in outcome.gates)
+    columns = ["job", "overrides", *names, "status"]
+    rows = [
+        {gate.name: f"{gate.status.value}: {gate.reason}" for gate in outcome.gates}
+        | {
+            "job": str(job),
+            "overrides": " ".join(outcome.overrides),
+            "status": outcome.status.value,
+        }
+        for job, outcome in enumerate(outcomes)
+    ]
     title = f"sweep of {len(outcomes)} jobs"
-    table = Table(title=title, header=["job", "overrides", *names, "status"], rows=rows)
+    table = Table.of(title, {name: name for name in columns}, rows)
     Console().print(table.to_console())
     sweep_folder = os.path.commonpath([str(outcome.folder) for outcome in outcomes])
     if len(outcomes) > 1:

@@ -8,7 +8,7 @@ import difflib
 import re
 from collections.abc import Iterable, Sequence
 
-# As Python, C++, NumPy, torch, Warp and CUDA put it, each with an exception of its own.
+# As Python, C++, NumPy, torch, Warp and CUDA put it, each with another exception.
 _OUT_OF_MEMORY = re.compile(
     r"out of memory|OutOfMemory|MemoryError|bad_alloc|failed to allocate|unable to allocate"
     r"|can't allocate memory|not enough memory",

@@ -5,9 +5,12 @@ int64 tensors. World 5 of 16 draws what world 5 of 2048 draws, and no draw depen
 worlds reset.
 """
 
+import operator
 from functools import lru_cache
 
 import torch
+
+from mjstack.errors import ArgumentError
 
 _MASK = 0xFFFFFFFF
 _M0 = 0xD2511F53
@@ -79,3 +82,18 @@ def uniform(
     words = philox(counter & _MASK, (seed & _MASK, stream & _MASK)).flatten(1)[:, :size]
     # 24 bits fill a float32 mantissa exactly, so that no rounding can reach 1.
     return (words >> 8).to(torch.float32) * (2.0 / (1 << 24)) - 1.0
+
+
+def check_seed(seed: int, *, masked: bool) -> int:
+    """The seed as a Python integer.
+
+    Raises:
+        ArgumentError: It is no 32-bit integer, or a mask is given beside it.
+    """
+    if masked:
+        expected = "no mask beside it, because a seed starts every world anew"
+        raise ArgumentError("seed", str(seed), expected, "Leave one out")
+    number = operator.index(seed) if hasattr(seed, "__index__") else -1
+    if isinstance(seed, bool) or not 0 <= number < 1 << 32:
+        raise ArgumentError("seed", repr(seed), "an integer from 0 to 4294967295")
+    return number

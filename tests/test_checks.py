@@ -111,7 +111,7 @@ class Halfway(EpisodeCheck):
         ("task.check.rest_speed=0", ["task.check.rest_speed=0", "above 0 [m/s]"]),
         ("task.check.window=601", ["task.check.window=601", "600 steps"]),
         ("task.check.object=green", ["task.check: object", "green", "red"]),
-        ("task.check.func=mjstack.tasks.stack.StackChek", ["task.check.func", "StackCheck"]),
+        ("task.check.func=mjstack.tasks.stack.StackChek", ["task.check: func=", "StackCheck"]),
         ("task.check.func=mjstack.tasks.stack.StackSuccess", ["a subclass of", "EpisodeCheck"]),
         (f"task.check.func={__name__}.Halfway", ["Halfway: method 'placed' is missing."]),
         ("task.check=null", ["task.check=null", "trained, not verified"]),

@@ -303,7 +303,7 @@ def test_replay_refuses_worlds_that_were_not(
 BAD = [
     (
         ["gate.success.region=[0.5,0.02]"],
-        "gate.success.region=[0.5, 0.02]: expected a region that the arm reaches",
+        "gate.success.region=[0.5, 0.02]: expected a region with a free position for every object",
     ),
     (
         ["gate.success.region=[0.1,0.1]"],

@@ -89,7 +89,7 @@ class RslRlVecEnv(VecEnv):
         Returns:
             ``observations``: every group, each ``(num_envs, dim)``, float32.
             ``rewards``: shape ``(num_envs,)``, float32.
-            ``dones``: whether the episode ended, for whatever reason, shape ``(num_envs,)``, int64.
+            ``dones``: whether the episode ended for any reason, shape ``(num_envs,)``, int64.
             ``extras``: ``time_outs``, ended by the clock alone, shape ``(num_envs,)``, bool; and
                 every ``log_interval``
             steps ``log``, means over the episodes that ended since the last one.
@@ -104,7 +104,7 @@ class RslRlVecEnv(VecEnv):
         extras: dict[str, Any] = {"time_outs": truncated}
         self._steps += 1
         if self._steps % self._log_interval == 0:
-            # The slash keeps the runner's logger from putting names of its own in front.
+            # The slash keeps the runner's logger from putting other names in front.
             extras["log"] = {
                 f"episode/{name}": value for name, value in self.env.read_statistics().items()
             }

@@ -29,9 +29,9 @@ from mjstack.bench.timing import (
     steps_that_fit,
     timed,
 )
+from mjstack.config.functions import resolve_func
 from mjstack.envs import Env
 from mjstack.episodes.rollout import State, restore, snapshot
-from mjstack.managers.term import resolve_func
 
 _COST = 4.0  # of a repetition over that of its whole steps from the start, when fewer things touch
 

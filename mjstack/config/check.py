@@ -1,13 +1,12 @@
 """Checks values that types and ranges cannot: how they fit together."""
 
-import importlib
 import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from mjstack.config.fields import check_fields
+from mjstack.config.functions import offered
 from mjstack.config.schema import SHAPES, BoxCfg, Config, SceneCfg, TermCfg
 from mjstack.errors import ConfigError, UnknownName
 
@@ -56,22 +55,6 @@ def reads_starts_file(reset: Mapping[str, TermCfg]) -> bool:
 def places_objects(term: TermCfg) -> bool:
     """Whether a reset term puts objects anywhere in a region, its parameter ``xy``."""
     return "xy" in term.params and bool(offered(term.func, "places_objects"))
-
-
-def offered(path: str, name: str) -> Any:
-    """An attribute of a function or class, see `mjstack.managers.offers`; None if it has none, or
-    cannot be imported: who uses it says why.
-
-    Args:
-        path: Dotted name of the function.
-        name: The attribute.
-    """
-    module, _, attribute = path.rpartition(".")
-    try:
-        func = getattr(importlib.import_module(module), attribute, None)
-    except Exception:
-        return None
-    return getattr(func, name, None)
 
 
 def _require(what: str, name: str | None, known: Mapping | Sequence) -> None:

@@ -15,7 +15,7 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf.errors import ConfigKeyError
 
 from mjstack.config.fields import accepted, find_field
-from mjstack.config.schema import JOB_SCHEMAS, Config
+from mjstack.config.schema import JOB_SCHEMAS, Config, JobCfg
 from mjstack.config.session import (
     CONFIG_NAME,
     compose_raw,
@@ -103,10 +103,10 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
         owner = getattr(cause, "object_type", None)
         known = [field.name for field in fields(owner)] if is_dataclass(owner) else []
         return _unknown_key(key, known, overrides)
-    schemas = [JOB_SCHEMAS[name] for name in JOB_SCHEMAS if f"job={name}" in overrides]
+    schema = JOB_SCHEMAS.get(_job(overrides), JobCfg)
     field = (
-        find_field(schemas[-1], key.removeprefix("job."))
-        if key.startswith("job.") and schemas
+        find_field(schema, key.removeprefix("job."))
+        if key.startswith("job.")
         else find_field(Config, re.sub(r"\[\d+\]$", "", key))
     )
     given = [override for override in overrides if override.lstrip("+~").partition("=")[0] == key]
@@ -123,19 +123,15 @@ def _unknown_key(key: str, known: Sequence[str], overrides: Sequence[str]) -> Co
     """A key that does not exist, with the one that may have been meant: one beside it (*known*), or
     one elsewhere.
     """
-    jobs = [override for override in overrides if override.removeprefix("job=") in JOB_SCHEMAS]
+    job = _job(overrides)
     parent, _, leaf = key.rpartition(".")
-    if parent == "job":
-        owners = [
-            f"job={name}"
-            for name, schema in JOB_SCHEMAS.items()
-            if find_field(schema, leaf) and f"job={name}" not in jobs
-        ]
-        if owners:
-            return CompositionError(
-                f"{key} is a key of {' and '.join(owners)}, and this is"
-                f" {jobs[-1] if jobs else 'job=gates'}. Set {owners[0]}."
-            )
+    owners = [
+        f"job={n}" for n, schema in JOB_SCHEMAS.items() if n != job and find_field(schema, leaf)
+    ]
+    if parent == "job" and owners:
+        return CompositionError(
+            f"{key} is a key of {' and '.join(owners)}, and this is job={job}. Set {owners[0]}."
+        )
     groups = list_choices()
     chosen = _keys([o for o in overrides if o.partition("=")[0] in groups])
     keys = [*chosen, *groups, *(f"{parent}.{name}".lstrip(".") for name in known)]
@@ -158,6 +154,12 @@ def _unknown_key(key: str, known: Sequence[str], overrides: Sequence[str]) -> Co
     return CompositionError(
         f"configuration key '{key}' does not exist.{hint or ' ' + suggest(key, beside)}"
     )
+
+
+def _job(overrides: Sequence[str]) -> str:
+    """The job that overrides choose."""
+    chosen = [override for override in overrides if override.startswith("job=")]
+    return chosen[-1].removeprefix("job=") if chosen else "gates"
 
 
 def _keys(overrides: Iterable[str]) -> list[str]:

@@ -11,9 +11,9 @@ from dataclasses import fields, is_dataclass
 from operator import attrgetter
 from typing import Any, NamedTuple
 
-from mjstack.config.check import offered
 from mjstack.config.complete import typed
 from mjstack.config.fields import accepted, field_docs
+from mjstack.config.functions import offered
 from mjstack.config.schema import Config
 from mjstack.config.session import CONFIG_FOLDER, list_choices
 from mjstack.errors import UnknownName

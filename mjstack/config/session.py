@@ -76,7 +76,11 @@ def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
 
 
 def add_folder(saved: Path) -> str:
-    """What to do if the search path lacks a folder that a run had used, by its ``config.yaml``."""
+    """The advice where the search path lacks a folder that a run had used.
+
+    Args:
+        saved: The run's ``config.yaml``.
+    """
     file = saved.with_name("hydra.yaml")
     sources = OmegaConf.load(file).hydra.runtime.config_sources if file.is_file() else []
     used = [Path(source.path) for source in sources if source.provider == PROVIDER]

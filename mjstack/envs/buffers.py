@@ -197,7 +197,9 @@ def play_workload(
 
 
 def describe_lost(run: Workload) -> tuple[str, str]:
-    """What a run lost although there was room to spare, and what to do; both empty if nothing."""
+    """The physics that a run lost although there was room to spare, and what to do; both empty if
+    it lost none.
+    """
     loss, keys = describe_loss(run.peaks.overflow, run.sizes)
     fix = f"Set {' and '.join(f'batch.{key}' for key in keys)} higher still" if keys else NO_KEY
     room = f" even with {run.sizes.as_overrides()}" if loss and run.sizes is not None else ""
@@ -242,7 +244,7 @@ def play_random_actions(env: Env, steps: int, advance: Advance | None = None) ->
 def random_actions(
     cfg: Config, steps: int, advance: Advance | None = None
 ) -> Callable[[Simulation], np.ndarray]:
-    """What `play_workload` plays for random actions; arguments as of `play_random_actions`."""
+    """Random actions for `play_workload`; arguments as of `play_random_actions`."""
 
     def play(sim: Simulation) -> np.ndarray:
         # A lack of room is what this looks for.

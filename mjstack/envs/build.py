@@ -64,8 +64,8 @@ def build_env(
     device: str | None = None,
     sizes: BatchSizes | None = None,
 ) -> Env:
-    """Builds an environment on a simulation of its own. Gates, whose simulation is shared, build
-    `Env` on that.
+    """Builds an environment with its simulation. Gates, whose simulation is shared, build `Env` on
+    that.
 
     Args:
         cfg: The configuration.

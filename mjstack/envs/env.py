@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from mjstack.config.schema import Config, GraphMode
-from mjstack.envs.arguments import check_seed
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
@@ -17,6 +16,7 @@ from mjstack.managers.episode import ResetManager, RewardManager, TerminationMan
 from mjstack.managers.observation import ObservationManager
 from mjstack.managers.term import Term, current_term, first_value, step_cache
 from mjstack.math import not_finite
+from mjstack.rng import check_seed
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
 from mjstack.sim.graph import StepGraph, side_by_side
@@ -41,8 +41,8 @@ class Env:
     captured, and later ones replay it. After a change of anything that it has
     baked in, such as a term's Python number, call `recapture`.
 
-    What derives from contacts (``sensordata``, ``contact_count``) is that of the last physics step
-    before, and zero in a world that has just been reset.
+    Values that derive from contacts (``sensordata``, ``contact_count``) are those of the last
+    physics step before, and zero in a world that has just been reset.
 
     Attributes:
         sim: The worlds.

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mjstack.config.functions import resolve_func
 from mjstack.config.schema import TerminationTermCfg
 from mjstack.errors import FaultError, name_worlds
 from mjstack.managers.action import ActionManager
 from mjstack.managers.episode import RewardManager
 from mjstack.managers.observation import ObservationManager
-from mjstack.managers.term import resolve_func
 from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Overflow, Simulation, describe_overflow
 

@@ -1,7 +1,7 @@
-"""Results of a step, laid side by side in memory: one copy makes all of it the caller's own.
+"""Results of a step, laid side by side in memory: one copy makes all of it the caller's.
 
-The copies share memory, so that keeping one of them keeps all of a step. To autograd each is a
-tensor of its own.
+The copies share memory, so that keeping one of them keeps all of a step. To autograd each is
+a separate tensor.
 """
 
 import math
@@ -30,10 +30,14 @@ class Outputs:
     ) -> None:
         """Allocate the block, and move the managers' results into it."""
         self._groups = list(observations.groups)
-        like = {f"obs/{name}": group for name, group in observations.groups.items()}
-        like |= {f"final/{name}": group for name, group in observations.groups.items()}
-        like |= {"reward": rewards.reward, "terminated": ends.terminated}
-        like |= {"truncated": ends.truncated, "success": success}
+        like = {
+            "reward": rewards.reward,
+            "terminated": ends.terminated,
+            "truncated": ends.truncated,
+            "success": success,
+        }
+        for name, group in observations.groups.items():
+            like[f"obs/{name}"] = like[f"final/{name}"] = group
         self._layout: dict[str, tuple[int, torch.dtype, torch.Size]] = {}
         size = 0
         for name, tensor in like.items():

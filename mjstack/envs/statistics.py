@@ -1,6 +1,4 @@
-"""What happened in the episodes that ended, added up on the device and read by the host now and
-then.
-"""
+"""Statistics of the episodes that ended, added up on the device and read by the host now and then."""
 
 import torch
 from torch import Tensor
@@ -13,12 +11,14 @@ class EpisodeStatistics:
         self, reward_names: list[str], termination_names: list[str], device: torch.device
     ) -> None:
         """Allocates the sums."""
-        self._rewards = reward_names
-        self._terminations = termination_names
-        width = 4 + len(reward_names) + len(termination_names)
+        self._names = [
+            *("steps", "success", "return"),
+            *(f"reward/{name}" for name in reward_names),
+            *(f"termination/{name}" for name in termination_names),
+        ]
         self._one = torch.ones((1, 1), device=device)
         # float64 counts exactly far beyond the 16.7 million at which float32 stops.
-        self._sums = torch.zeros(width, dtype=torch.float64, device=device)
+        self._sums = torch.zeros(1 + len(self._names), dtype=torch.float64, device=device)
 
     def update(
         self,
@@ -55,12 +55,7 @@ class EpisodeStatistics:
             ``episodes``; and if there were any ``steps``, ``success``, ``return``,
             ``reward/<term>`` (sums per episode) and ``termination/<term>`` (fraction of episodes).
         """
-        sums = self._sums.tolist()
+        episodes, *sums = self._sums.tolist()
         self._sums.zero_()
-        episodes = sums[0]
-        out = {"episodes": episodes}
-        if not episodes:
-            return out
-        names = ["steps", "success", "return", *(f"reward/{n}" for n in self._rewards)]
-        names += [f"termination/{n}" for n in self._terminations]
-        return out | {name: value / episodes for name, value in zip(names, sums[1:], strict=True)}
+        means = zip(self._names, sums, strict=True) if episodes else ()
+        return {"episodes": episodes} | {name: total / episodes for name, total in means}

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mjstack.config.complete import typed
+from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
 from mjstack.episodes.context import RunContext, lacks_episode
 from mjstack.errors import MjstackError, first_line, is_out_of_memory
-from mjstack.managers.term import resolve_func
 from mjstack.report.record import GateResult, Status
 
 log = logging.getLogger(__name__)

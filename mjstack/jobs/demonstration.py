@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from mjstack.config.fingerprint import config_content, config_hash
+from mjstack.config.functions import resolve_func
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
 from mjstack.datasets import DatasetSpec, Feature
 from mjstack.drivers.driver import Driver
@@ -19,7 +20,6 @@ from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import play_episode
 from mjstack.episodes.rollout import Observer, reset_worlds
 from mjstack.errors import ConfigError
-from mjstack.managers.term import resolve_func
 from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation, resolve_backend
 

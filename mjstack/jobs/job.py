@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mjstack.config.functions import find_object
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
-from mjstack.managers.term import find_object
 from mjstack.report.record import GateResult, Status
 
 

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 
 import torch
 
+from mjstack.config.functions import resolve_func
 from mjstack.config.schema import RewardTermCfg, TermCfg, TerminationTermCfg
 from mjstack.errors import TermError
-from mjstack.managers.term import Term, blamed, first_value, render_table, resolve_func
+from mjstack.managers.term import Term, blamed, first_value, render_table
 from mjstack.managers.view import EnvView
 
 

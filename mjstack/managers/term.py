@@ -1,6 +1,5 @@
 """Terms: how they are found, built, checked, called and shown."""
 
-import importlib
 import inspect
 import io
 import math
@@ -15,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mjstack.config.fields import check_fields
+from mjstack.config.functions import resolve_func
 from mjstack.config.schema import TermCfg
 from mjstack.errors import (
     ConfigError,
@@ -34,57 +34,6 @@ _WORDS = {
     str: "a name",
     type(None): "null",
 }
-
-
-def resolve_func(label: str, path: str, base: type | None = None) -> Callable[..., Any]:
-    """Finds a function or class by its dotted name.
-
-    Args:
-        label: Dotted configuration key, for errors.
-        path: The dotted name.
-        base: The class that it must be a subclass of.
-
-    Raises:
-        TermError: There is no such module, or nothing callable of that name in it.
-    """
-    func = find_object(label, path)
-    if not callable(func):
-        raise TermError(label, f"func={path}: expected a function or a class")
-    if base is not None and not (isinstance(func, type) and issubclass(func, base)):
-        expected = f"expected a subclass of {base.__module__}.{base.__name__}"
-        raise TermError(label, f"func={path}: {expected}")
-    return func
-
-
-def find_object(label: str, path: str) -> Any:
-    """Finds anything in a module by its dotted name.
-
-    Raises:
-        TermError: There is no such module, or nothing of that name in it.
-    """
-    module_name, _, attribute = path.rpartition(".")
-    if not module_name:
-        raise TermError(
-            label, f"func={path}: expected a dotted name, such as mjstack.mdp.reward.reach"
-        )
-    try:
-        module = importlib.import_module(module_name)
-    except Exception as error:  # the module is the user's, and may raise anything
-        kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
-        reason = f"{kind}{first_line(error)}"
-        raise TermError(
-            label, f"func={path}: module '{module_name}' cannot be imported ({reason})"
-        ) from error
-    if not hasattr(module, attribute):
-        names = [
-            name
-            for name, value in vars(module).items()
-            if callable(value) and getattr(value, "__module__", "") == module_name
-        ]
-        raise TermError(
-            label, f"func={path}: '{attribute}' does not exist. {suggest(attribute, names)}"
-        )
-    return getattr(module, attribute)
 
 
 def check_params(
@@ -128,7 +77,7 @@ def check_params(
 
 
 def _mismatch(value: Any, hint: Any) -> str:
-    """What an annotation expects where a value from YAML does not fit it; empty where it fits or
+    """The words for an annotation that a value from YAML does not fit; empty where it fits or
     cannot be judged.
     """
     inner = get_args(hint)
@@ -151,7 +100,7 @@ def blamed(label: str) -> Iterator[None]:
 
     Raises:
         ConfigError: One of its parameters has a value that it cannot use.
-        TermError: It raised an error of its own.
+        TermError: It raised another error.
     """
     try:
         yield
@@ -166,12 +115,12 @@ def blamed(label: str) -> Iterator[None]:
 
 
 class CurrentTerm:
-    """What terms are doing right now.
+    """The work of terms right now.
 
     Attributes:
         label: Dotted configuration key of the term that was called last: the one to name if a
             capture fails.
-        values: What has been computed from the state that a pass looks at, by what and for whom;
+        values: Values computed from the state that a pass looks at, by function and environment;
             None outside a pass.
     """
 
@@ -205,7 +154,7 @@ def require_positive(name: str, value: float, *, zero: bool = False) -> None:
 
 
 def shared(key: Any, compute: Callable[[], torch.Tensor]) -> torch.Tensor:
-    """A value that others may want in the same pass too. Nobody may write into it.
+    """A value that others may want in the same pass too. No term may write into it.
 
     Args:
         key: What it is, the environment included.
@@ -299,7 +248,7 @@ def first_value(
         boolean: Whether truth values are expected, not numbers.
 
     Raises:
-        TermError: It raised something of its own, or returned no tensor, or one of a wrong shape,
+        TermError: It raised an error, or returned no tensor, or one of a wrong shape,
             dtype or device.
     """
     with blamed(term.label):

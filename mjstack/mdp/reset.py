@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from mjstack.config.functions import resolve_func
 from mjstack.errors import ParameterError
-from mjstack.managers.term import require_positive, resolve_func
+from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import joint_limits, named_pose, pose_w, robot, write_robot

@@ -25,7 +25,7 @@ _ALIGNMENT = 512  # bytes
 log = logging.getLogger(__name__)
 
 _nesting = 0
-# What a broken capture leaves is kept: torch counts its memory as in use for ever.
+# The rest of a broken capture is kept: torch counts its memory as in use for ever.
 _abandoned: list[tuple[torch.cuda.CUDAGraph, torch.cuda.MemPool]] = []
 _capture_streams: dict[str, torch.cuda.Stream] = {}
 _side_streams: dict[str, list[torch.cuda.Stream]] = {}

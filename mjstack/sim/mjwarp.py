@@ -221,8 +221,8 @@ class MjwarpSimulation(Simulation):
             if kinematics:
                 self._pose()
             return
-        # What a step has used is counted while the next one begins, which touches neither contacts
-        # nor rows.
+        # The use of a step is counted while the next one begins, which touches neither contacts nor
+        # rows.
         beside: tuple[Callable[[], None], ...] = ()
         for i in range(n):
             rearranged_step(

@@ -1,6 +1,4 @@
-"""What the worlds use of MJWarp's buffers, counted on the device by Warp kernels, and what the
-buffers take.
-"""
+"""The use of MJWarp's buffers, counted on the device by Warp kernels, and their memory."""
 
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
 import dataclasses
@@ -38,8 +36,8 @@ class Usage:
         self._arrays = [wp.from_torch(view) for view in (*counts, self.peak_pool, self.steps)]
         self._perworld = counts
         kinds = convex_kinds(model)
-        self._kinds = None if kinds is None else wp.array(kinds, dtype=int)
-        self._kind_counts = wp.zeros(0 if kinds is None else int(kinds.max()) + 1, dtype=int)
+        self._kinds = wp.array(kinds, dtype=int)
+        self._kind_counts = wp.zeros(int(kinds.max()) + 1, dtype=int)
 
     def count(self, m: mjw.Model, d: mjw.Data, steps: int) -> None:
         """Count what the worlds use now, and the steps that they have just made."""
@@ -65,7 +63,7 @@ class Usage:
             ],
             outputs=[contacts, peak_contacts, peak_rows, peak_pool, lost, limits, steps_made],
         )
-        if self._kinds is not None:
+        if self._kind_counts.size:
             self._kind_counts.zero_()
             wp.launch(
                 record_convex_contacts,
@@ -80,9 +78,8 @@ class Usage:
         self.steps.masked_fill_(mask, 0)
 
 
-def convex_kinds(model: mujoco.MjModel) -> np.ndarray | None:
-    """Numbers the combinations of geom types that collide by the convex algorithm, else -1; None if
-    the model has none.
+def convex_kinds(model: mujoco.MjModel) -> np.ndarray:
+    """Numbers the combinations of geom types that collide by the convex algorithm, else -1.
 
     Planes are always primitive, and so is everything among spheres, capsules and boxes, and a
     sphere with a cylinder.
@@ -97,7 +94,7 @@ def convex_kinds(model: mujoco.MjModel) -> np.ndarray | None:
         if not ({a, b} <= primitive or {a, b} == round_):
             kinds[a, b] = kinds[b, a] = number
             number += 1
-    return kinds if number else None
+    return kinds
 
 
 def array_bytes(node: object) -> int:

@@ -33,9 +33,9 @@ from torch import Tensor
 
 from mjstack.config.complete import typed
 from mjstack.config.fields import field_range
+from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError, TermError, UnknownName
-from mjstack.managers.term import resolve_func
 from mjstack.managers.view import EnvView
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED

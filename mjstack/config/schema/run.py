@@ -223,13 +223,12 @@ class GateCfg:
 
     def functions(self) -> dict[str, str]:
         """Dotted name of every gate's function, by the gate's name."""
-        funcs = {}
-        for name, gate in {**vars(self), **self.added}.items():
-            if isinstance(gate, GateFuncCfg):
-                funcs[name] = gate.func
-            elif isinstance(gate, dict) and "func" in gate:
-                funcs[name] = gate["func"]
-        return funcs
+        gates = vars(self) | self.added
+        return {
+            name: gate.func if isinstance(gate, GateFuncCfg) else gate["func"]
+            for name, gate in gates.items()
+            if isinstance(gate, GateFuncCfg) or "func" in gate
+        }
 
 
 @dataclass(slots=True)

@@ -63,7 +63,7 @@ class TerminationTermCfg(TermCfg):
 
 @dataclass(slots=True)
 class TaskCfg:
-    """What has to be achieved, sampled at step ends."""
+    """The goal of an episode, sampled at step ends."""
 
     name: str = spec()
     """Name of the task."""
