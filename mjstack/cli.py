@@ -7,13 +7,11 @@ Hydra runs what was composed.
 """
 
 import os
-import re
 import shutil
 import sys
 import tempfile
 from argparse import ArgumentError, Namespace
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,12 +26,11 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 import mjstack
-from mjstack.config import Config
 from mjstack.config.explain import own_overrides, parse
 from mjstack.config.help import help_text, key_help
 from mjstack.config.load import compose, split_search_path, to_config
 from mjstack.config.session import CONFIG_NAME, PROVIDER, hydra_session, search_path
-from mjstack.errors import CompositionError, MjstackError, UnknownName, first_line
+from mjstack.errors import CompositionError, MjstackError, first_line, suggest
 from mjstack.report.record import Status
 from mjstack.report.table import Table
 
@@ -187,21 +184,14 @@ def _parse(args: list[str]) -> Namespace:
     known = set(parser._option_string_actions) - _OTHER_CONFIG
     for arg in args:
         if arg.startswith("-") and arg.partition("=")[0] not in known:
-            raise _unknown_flag(arg, known)
+            raise CompositionError(
+                f"flag '{arg}' does not exist. {suggest(arg, known)} Keys are set without dashes:"
+                " nworld=64."
+            )
     try:
         return parser.parse_intermixed_args(args)
     except ArgumentError as error:
         raise CompositionError(str(error)) from error
-
-
-def _unknown_flag(arg: str, known: set[str]) -> MjstackError:
-    override = arg.lstrip("-")
-    if re.split(r"[.=]", override)[0] not in {field.name for field in fields(Config)}:
-        return UnknownName("flag", arg, known)
-    meant = override if "=" in override else f"{override}=VALUE"
-    return CompositionError(
-        f"flag '{arg}' does not exist. Write {meant}, an override without dashes."
-    )
 
 
 def _expand(overrides: Sequence[str]) -> list[list[str]]:

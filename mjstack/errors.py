@@ -89,12 +89,6 @@ class RunError(InputError):
 class UnsupportedModel(MjstackError):
     """MJWarp does not implement a feature of the model."""
 
-    def __init__(self, feature: str) -> None:
-        super().__init__(
-            f"MJWarp does not support this model: {feature}. Remove the feature from the model, or"
-            " run sim=native."
-        )
-
 
 class TermError(InputError):
     """A term of a manager that cannot be found, built or used."""
@@ -143,12 +137,6 @@ class Unreachable(InputError):
 
 class WorkerLost(MjstackError):
     """A process that plans worlds has ended before its work was done."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "a planning process was killed or ended before every world was planned. Run again with"
-            " more free memory, or on one core (taskset -c 0), which starts no processes."
-        )
 
 
 class MissingField(MjstackError, KeyError):

@@ -179,21 +179,15 @@ for args in (["robo=so101"], ["nworld=many"], ["--nworld=3"], ["--version"], ["-
 
 
 @pytest.mark.parametrize(
-    ("args", "wrong", "meant"),
-    [
-        (["--gate.batch.seeds=[1]"], "--gate.batch.seeds=[1]", "gate.batch.seeds=[1]"),
-        (["--nworld", "64"], "--nworld", "nworld=VALUE"),
-        (["--seed", "nworld=2"], "--seed", "seed=VALUE"),
-    ],
+    "args", [["--gate.batch.seeds=[1]"], ["--nworld", "64"], ["--seed", "nworld=2"]], ids=" ".join
 )
 def test_an_override_with_dashes_is_told_without(
-    args: list[str], wrong: str, meant: str, capsys: pytest.CaptureFixture[str]
+    args: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(args) == 2
-    assert (
-        capsys.readouterr().err.strip()
-        == f"mjstack: flag '{wrong}' does not exist. Write {meant}, an override without dashes."
-    )
+    said = capsys.readouterr().err.strip()
+    assert said.startswith(f"mjstack: flag '{args[0]}' does not exist. ")
+    assert said.endswith(" Keys are set without dashes: nworld=64.")
 
 
 @pytest.mark.full

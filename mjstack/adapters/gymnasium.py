@@ -87,11 +87,10 @@ class GymnasiumVectorEnv(VectorEnv):
         Raises:
             MjstackError: The seed or an option cannot be used.
         """
-        options = options or {}
-        for name in options:
-            if name != "reset_mask":
-                raise UnknownName("reset option", name, ("reset_mask",))
-        mask = options.get("reset_mask")
+        others = dict(options or {})
+        mask = others.pop("reset_mask", None)
+        for name in others:
+            raise UnknownName("reset option", name, ("reset_mask",))
         if mask is not None:
             mask = torch.as_tensor(mask, device=self.inner.device)
         obs, _ = self.inner.reset(seed=seed, mask=mask)

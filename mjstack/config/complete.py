@@ -10,7 +10,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mjstack.config.fields import accepted, check_fields
 from mjstack.config.schema import (
-    ActionTermCfg,
     Config,
     ObservationGroupCfg,
     ObservationTermCfg,
@@ -26,8 +25,8 @@ from mjstack.errors import ConfigError, TermError, UnknownName
 
 # Terms are untyped in the schema: OmegaConf would not let a command line add one to a typed dict.
 _TERMS = {
-    "action": ActionTermCfg,
-    "controller.action": ActionTermCfg,
+    "action": TermCfg,
+    "controller.action": TermCfg,
     "reset": TermCfg,
     "gate.capacity.reset": TermCfg,
     "gate.success.reset": TermCfg,

@@ -279,7 +279,11 @@ def plan_in_parallel(
             plans = pool.map(_plan, worlds, sources_xy[list(worlds)], chunksize=_CHUNK)
         yield from plans
     except BrokenProcessPool:
-        raise WorkerLost from None
+        raise WorkerLost(
+            "a planning process was killed or ended before every world was planned",
+            "Run again with more free memory, or on one core (taskset -c 0), which starts no"
+            " processes",
+        ) from None
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -1,4 +1,4 @@
-"""Statistics of the episodes that ended, added up on the device and read by the host now and then."""
+"""Statistics of the episodes that ended, added up on the device and read now and then."""
 
 import torch
 from torch import Tensor

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import torch
 
-from mjstack.config.schema import ActionTermCfg
+from mjstack.config.schema import TermCfg
 from mjstack.errors import ArgumentError, TermError
 from mjstack.managers.term import Term, current_term, render_table
 from mjstack.managers.view import EnvView
@@ -51,7 +51,7 @@ class ActionManager:
             ``(nworld,)``, bool.
     """
 
-    def __init__(self, env: EnvView, cfg: Mapping[str, ActionTermCfg]) -> None:
+    def __init__(self, env: EnvView, cfg: Mapping[str, TermCfg]) -> None:
         """Builds the terms.
 
         Raises:

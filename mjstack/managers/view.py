@@ -13,7 +13,8 @@ from mjstack.sim import Simulation
 
 
 class EnvView(Protocol):
-    """The part of an environment that a term may read. Any object with these attributes can have managers.
+    """The part of an environment that a term may read. Any object with these attributes can have
+    managers.
 
     Attributes:
         sim: The worlds. Terms read its views; reset terms and actions write into them.

@@ -78,7 +78,10 @@ class MjwarpSimulation(Simulation):
                     warnings.filterwarnings("error", category=UserWarning)
                     self._m = mjw.put_model(model, batch_sizes=dict.fromkeys(names, nworld))
             except (NotImplementedError, ValueError, UserWarning) as error:
-                raise UnsupportedModel(first_line(error)) from error
+                raise UnsupportedModel(
+                    f"MJWarp does not support this model: {first_line(error)}",
+                    "Remove the feature from the model, or run sim=native",
+                ) from error
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))

@@ -17,11 +17,6 @@ class TermCfg:
 
 
 @dataclass(slots=True)
-class ActionTermCfg(TermCfg):
-    """A part of the action vector; ``func`` names a subclass of ``ActionTerm``."""
-
-
-@dataclass(slots=True)
 class ObservationTermCfg(TermCfg):
     """A part of an observation group: value, plus noise, clipped, times scale."""
 
