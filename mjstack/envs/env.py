@@ -56,6 +56,8 @@ class Env:
         episode: Episode of each world, shape ``(nworld,)``, int64.
         episode_step: Steps since each world's last reset, shape ``(nworld,)``, int64.
         success: Whether the task is achieved, shape ``(nworld,)``, bool.
+        action: The policy's last action, shape ``(nworld, action_dim)``.
+        previous_action: The one before.
         action_manager: Actions; ``action_dim`` is the policy's output.
         observation_manager: Observation groups; ``group_dims`` are the policy's inputs.
         reset_manager: How episodes start.
@@ -104,6 +106,8 @@ class Env:
         self.episode.zero_()
         self._start_worlds(self._all_worlds)
         self.action_manager = ActionManager(self, cfg.action)
+        self.action = self.action_manager.action
+        self.previous_action = self.action_manager.previous_action
         self._success: Term | None = None
         if cfg.task.success is not None:
             self._success = Term("task.success", cfg.task.success, self)
@@ -137,16 +141,6 @@ class Env:
     def seed(self, value: int) -> None:
         self._seed = value
         self.key.fill_(value)
-
-    @property
-    def action(self) -> Tensor:
-        """The policy's last action, shape ``(nworld, action_dim)``."""
-        return self.action_manager.action
-
-    @property
-    def previous_action(self) -> Tensor:
-        """The one before."""
-        return self.action_manager.previous_action
 
     @property
     def max_episode_steps(self) -> int:

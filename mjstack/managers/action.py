@@ -57,7 +57,6 @@ class ActionManager:
         Raises:
             TermError: A term cannot be found, built, or is no `ActionTerm`.
         """
-        self._env = env
         self._cfg = dict(cfg)
         self.terms: dict[str, ActionTerm] = {}
         driven: dict[int, str] = {}
@@ -122,16 +121,14 @@ class ActionManager:
 
     def check(self, action: torch.Tensor) -> None:
         """Raises an `ArgumentError` for an action of wrong type, shape, dtype or device."""
-        expected = (
-            f"a float32 tensor of shape ({self._env.nworld}, {self.action_dim}) on"
-            f" {self._env.device}"
-        )
         if (
             not isinstance(action, torch.Tensor)
             or action.shape != self.action.shape
             or action.dtype not in (torch.float32, torch.float64)
-            or action.device != self._env.device
+            or action.device != self.action.device
         ):
+            shape = tuple(self.action.shape)
+            expected = f"a float32 tensor of shape {shape} on {self.action.device}"
             raise ArgumentError("action", describe_tensor(action), expected)
 
     def reset(self, mask: torch.Tensor) -> None:

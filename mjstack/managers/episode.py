@@ -99,10 +99,10 @@ class RewardManager(_ValueManager):
         self._cfg = dict(cfg)
         weights = [cfg[name].weight * env.cfg.timing.step_dt for name in self.names]
         self.weights = torch.tensor(weights, dtype=torch.float32, device=env.device)
-        self.reward = torch.zeros(env.nworld, dtype=torch.float32, device=env.device)
         self.values = torch.zeros(
             (env.nworld, len(self.names)), dtype=torch.float32, device=env.device
         )
+        self.reward = self.values.sum(1)
         self.episode_sums = torch.zeros_like(self.values)
 
     def compute(self, void: torch.Tensor | None = None) -> torch.Tensor:
@@ -151,13 +151,11 @@ class TerminationManager(_ValueManager):
         """
         super().__init__("termination", env, cfg, boolean=True)
         self._cfg = dict(cfg)
-
-        def flags(*shape: int) -> torch.Tensor:
-            return torch.zeros((env.nworld, *shape), dtype=torch.bool, device=env.device)
-
-        self.terminated = flags()
-        self.truncated = flags()
-        self.values = flags(len(self.names))
+        self.values = torch.zeros(
+            (env.nworld, len(self.names)), dtype=torch.bool, device=env.device
+        )
+        self.terminated = self.values.any(1)
+        self.truncated = self.values.any(1)
         self._ends = torch.tensor(
             [not cfg[name].time_out for name in self.names], dtype=torch.bool, device=env.device
         )

@@ -44,19 +44,10 @@ class EnvView(Protocol):
     world: torch.Tensor
     episode: torch.Tensor
     episode_step: torch.Tensor
+    action: torch.Tensor
+    previous_action: torch.Tensor
+    success: torch.Tensor
     given_places: dict[str, torch.Tensor]
-
-    @property
-    def action(self) -> torch.Tensor:
-        """The policy's last action."""
-
-    @property
-    def previous_action(self) -> torch.Tensor:
-        """The one before."""
-
-    @property
-    def success(self) -> torch.Tensor:
-        """Whether the task is achieved."""
 
 
 def offers(**attributes: Any) -> Callable[[Any], Any]:
