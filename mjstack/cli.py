@@ -28,7 +28,7 @@ from rich.console import Console
 import mjstack
 from mjstack.config.explain import own_overrides, parse
 from mjstack.config.help import help_text, key_help
-from mjstack.config.load import compose, split_search_path, to_config
+from mjstack.config.load import compose, extended_search_path, to_config
 from mjstack.config.session import CONFIG_NAME, PROVIDER, hydra_session, search_path
 from mjstack.errors import CompositionError, MjstackError, first_line, suggest
 from mjstack.report.record import Status
@@ -58,9 +58,7 @@ def run(args: list[str]) -> int:
             print(f"mjstack {mjstack.__version__}")
             return 0
         flags = _parse(args)
-        entries, overrides = split_search_path(flags.overrides)
-        folders = [] if flags.config_dir is None else [flags.config_dir]
-        with search_path([*folders, *entries]):
+        with extended_search_path(flags.overrides, flags.config_dir) as overrides:
             return _dispatch(flags, overrides)
     except MjstackError as error:
         errors.print(f"mjstack: {error}")

@@ -139,19 +139,14 @@ class WorkerLost(MjstackError):
     """A process that plans worlds has ended before its work was done."""
 
 
-class MissingField(MjstackError, KeyError):
-    """A per-world model field that the simulation was made without. It is a KeyError too, as of any
-    mapping.
-    """
+class MissingField(MjstackError):
+    """A per-world model field that the simulation was made without."""
 
     def __init__(self, name: str) -> None:
         super().__init__(
             f"sim.fields['{name}'] is not a per-world field of this simulation: make it with"
             f" fields=['{name}'], or mark the reset term with uses_fields('{name}')."
         )
-
-    def __str__(self) -> str:  # KeyError's own would quote the message
-        return str(self.args[0])
 
 
 class RebindError(MjstackError):

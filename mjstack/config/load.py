@@ -1,7 +1,8 @@
 """Composes `conf/` into the dataclasses of `schema`."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
@@ -51,15 +52,21 @@ def load_config(
     Raises:
         MjstackError: An override does not fit; the message says which and what would.
     """
-    entries, own = split_search_path(overrides)
-    folders = [] if config_dir is None else [config_dir]
-    with search_path([*folders, *entries]), hydra_session() as hydra:
+    with extended_search_path(overrides, config_dir) as own, hydra_session() as hydra:
         return to_config(compose(hydra, own))
 
 
-def split_search_path(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Entries that overrides of ``hydra.searchpath`` add, and the other overrides."""
-    entries: list[str] = []
+@contextmanager
+def extended_search_path(
+    overrides: Sequence[str], config_dir: str | os.PathLike | None
+) -> Iterator[list[str]]:
+    """Add a folder, and those of overrides of ``hydra.searchpath``, to the search path of every
+    composition inside.
+
+    Yields:
+        The other overrides.
+    """
+    entries = [] if config_dir is None else [str(config_dir)]
     others = []
     for override in overrides:
         if override.lstrip("+").startswith("hydra.searchpath="):
@@ -71,7 +78,8 @@ def split_search_path(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
             entries += map(str, value)
         else:
             others.append(override)
-    return entries, others
+    with search_path(entries):
+        yield others
 
 
 def compose(

@@ -27,7 +27,7 @@ from mjstack.sim import (
     Simulation,
     make_simulation,
 )
-from mjstack.sim.sizes import apply_configured, resolve_env_sizes, resolve_measuring_sizes
+from mjstack.sim.sizes import apply_configured, resolve_measuring_sizes
 
 log = logging.getLogger(__name__)
 
@@ -257,31 +257,26 @@ def random_actions(
     return play
 
 
-def probe_env_sizes(
-    cfg: Config, model: mujoco.MjModel, nworld: int, backend: Backend, device: str
-) -> BatchSizes:
-    """Sizes for an environment with ``batch=auto``, from a probe of random actions; what the
-    configuration sets wins.
+def probe_env_sizes(cfg: Config, model: mujoco.MjModel, nworld: int, device: str) -> BatchSizes:
+    """Sizes for an environment on MJWarp with ``batch=auto``, from a probe of random actions; sizes
+    that the configuration sets win.
 
     Args:
         cfg: The configuration.
         model: The compiled scene.
         nworld: Worlds of the environment.
-        backend: Its backend. Native MuJoCo has no buffers: nothing is measured there.
         device: Its device.
 
     Raises:
         FaultError: Physics was lost in all the room that the probe tried.
     """
-    if backend is Backend.native:
-        return resolve_env_sizes(cfg)
     c = cfg.gate.capacity
     worlds = min(nworld, c.probe_nworld if device.startswith("cuda") else c.cpu_nworld)
 
     def make(sizes: BatchSizes) -> Simulation:
         fields = required_fields(cfg.reset)
         return make_simulation(
-            model, cfg, worlds, backend=backend, device=device, fields=fields, sizes=sizes
+            model, cfg, worlds, backend=Backend.mjwarp, device=device, fields=fields, sizes=sizes
         )
 
     with torch.no_grad():

@@ -80,8 +80,8 @@ def build_env(
     model = build_model(cfg) if model is None else model
     nworld = cfg.nworld if nworld is None else nworld
     backend, device = resolve_backend(cfg, backend, device)
-    if sizes is None and cfg.batch.auto:
-        sizes = probe_env_sizes(cfg, model, nworld, backend, device)
+    if sizes is None and cfg.batch.auto and backend is Backend.mjwarp:
+        sizes = probe_env_sizes(cfg, model, nworld, device)
     sizes = sizes or resolve_env_sizes(cfg)
     fields = required_fields(cfg.reset)
     sim = make_simulation(
