@@ -44,7 +44,7 @@ PATHS: dict[str, list[str] | None] = {
         "RewardManager.compute",
         "RewardManager.reset",
         "TerminationManager.compute",
-        "TerminationManager.reset",
+        "_ValueManager.reset",
         "ResetManager.reset",
     ],
     "managers/view.py": ["random_uniform"],

@@ -8,7 +8,6 @@ import torch
 
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import RewardTermCfg, TermCfg, TerminationTermCfg
-from mjstack.errors import TermError
 from mjstack.managers.term import Term, blamed, first_value, render_table
 from mjstack.managers.view import EnvView
 
@@ -20,17 +19,10 @@ class ResetManager:
         """Builds the terms.
 
         Raises:
-            TermError: A term cannot be found, or a parameter is wrong.
+            TermError: A term cannot be found, a parameter is wrong, or the simulation was made
+                without a model field that it writes.
         """
         self._env = env
-        for name, term in cfg.items():
-            wanted = required_fields({name: term})
-            lacking = [field for field in wanted if field not in env.sim.fields]
-            if lacking:
-                raise TermError(
-                    f"reset.{name}",
-                    f"writes {', '.join(lacking)}: build the simulation with fields={list(wanted)}",
-                )
         self._terms = {
             name: Term(f"reset.{name}", term, env, masked=True) for name, term in cfg.items()
         }
