@@ -31,11 +31,11 @@ from mjstack.config.help import help_text, key_help
 from mjstack.config.load import compose, extended_search_path, to_config
 from mjstack.config.session import CONFIG_NAME, PROVIDER, hydra_session, search_path
 from mjstack.errors import CompositionError, MjstackError, first_line, suggest
-from mjstack.report.record import Status
+from mjstack.report.record import Report, Status
 from mjstack.report.table import Table
 
 if TYPE_CHECKING:
-    from mjstack.jobs import CheckedJob, JobResult
+    from mjstack.jobs import CheckedJob
 
 _OTHER_CONFIG = {  # mjstack runs its own configuration
     "--config-name",
@@ -45,7 +45,7 @@ _OTHER_CONFIG = {  # mjstack runs its own configuration
 }
 
 _checked: dict[tuple[str, ...], "CheckedJob"] = {}  # by their overrides, until Hydra runs them
-_results: list["JobResult"] = []  # of the jobs that ran in this process
+_results: list[Report] = []  # of the jobs that ran in this process
 
 
 def run(args: list[str]) -> int:
@@ -147,7 +147,7 @@ def _print_help(hydra: Hydra, args: list[str]) -> None:
         )  # Python writes there once more at its end
 
 
-def run_job(cfg: DictConfig) -> "JobResult":
+def run_job(cfg: DictConfig) -> Report:
     """Runs a job in the folder that Hydra made. A launcher may call it in another process, where
     nothing has been checked yet.
     """
@@ -225,7 +225,7 @@ def _check_writable(cfg: DictConfig, kind: str) -> None:
         ) from error
 
 
-def _print_sweep(outcomes: list["JobResult"]) -> None:
+def _print_sweep(outcomes: list[Report]) -> None:
     """One row per job, also written beside the jobs as summary.md."""
     names = dict.fromkeys(gate.name for outcome in outcomes for gate in outcome.gates)
     columns = ["job", "overrides", *names, "status"]
@@ -239,7 +239,7 @@ def _print_sweep(outcomes: list["JobResult"]) -> None:
         for job, outcome in enumerate(outcomes)
     ]
     title = f"sweep of {len(outcomes)} jobs"
-    table = Table.of(title, {name: name for name in columns}, rows)
+    table = Table.of({name: name for name in columns}, rows, title)
     Console().print(table.to_console())
     sweep_folder = os.path.commonpath([str(outcome.folder) for outcome in outcomes])
     if len(outcomes) > 1:

@@ -290,7 +290,7 @@ def test_gates_of_a_task_without_an_episode_are_skipped(lacks: str) -> None:
     else:
         cfg.controller.phases = {}
     results: list[GateResult] = []
-    run_gates(RunContext(cfg), lambda _: None, results.append)
+    run_gates(RunContext(cfg, record=results.append))
     assert [result.name for result in results] == cfg.gates
     assert all(result.status is Status.skipped for result in results)
     assert all(f"task stack has no {lacks}" in result.reason for result in results)

@@ -841,8 +841,8 @@ def test_the_benchmark_prints_a_table(
     small = ["sim.device=cpu", "--nworld", "8", "--repetitions", "2"]
     cli.main("ik", [*small, "--iterations", "4", "8"])
     assert "SO-101, cpu" in capsys.readouterr().out
-    cases = [(r.facts["iterations"], r.facts["gained"]) for r in results]
-    assert cases == [(4, False), (4, True), (8, False), (8, True)]
+    cases = [(r.facts["iterations"], r.facts["gain"]) for r in results]
+    assert cases == [(4, 0.0), (4, 0.1), (8, 0.0), (8, 0.1)]
     for result in results:
         assert list(result.samples) == ["eager_ms"]
         assert len(result.samples["eager_ms"]) == 2

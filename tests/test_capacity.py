@@ -497,7 +497,7 @@ def test_a_second_run_that_differs(again: dict, on_cpu: str, on_cuda: str) -> No
     for exact, says in ((True, on_cpu), (False, on_cuda)):
         result = GateResult(name="capacity", status=Status.passed)
         problem = capacity_module._compare(
-            "task", workload(), workload(**again), result, judged=True, exact=exact
+            "task", workload(), workload(**again), result, exact=exact
         )
         assert bool(problem) is bool(says)
         assert says in problem
@@ -561,7 +561,7 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([0, int(Overflow.NEFC)])))
     monkeypatch.setattr(RunContext, "play_task", lambda *_: workload())
 
-    def play_random(context: RunContext, *sizes: BatchSizes) -> Workload:
+    def play_random(context: RunContext, **sizes: BatchSizes) -> Workload:
         assert not sizes, "tried sizes that are not known"
         return lost
 

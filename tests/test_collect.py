@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -33,8 +34,8 @@ from mjstack.envs import build_env, demonstration_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import CommandRecorder
 from mjstack.errors import ConfigError
-from mjstack.jobs import collection
-from mjstack.jobs.collect import LOADING, collect_folder, plan_collection, run_collect_job
+from mjstack.jobs import CheckedJob, collection
+from mjstack.jobs.collect import LOADING, collect_folder, plan_collection, run_collect
 from mjstack.jobs.collection import FILE, CollectPlan
 from mjstack.jobs.demonstration import (
     Played,
@@ -455,7 +456,9 @@ def collect(*overrides: str) -> int:
     cfg = load_config([*COMMAND, *overrides])
     home = collect_folder(cfg)
     home.mkdir(parents=True, exist_ok=True)
-    return run_collect_job(plan_collection(RunContext(cfg)), home, []).exit_code
+    context = RunContext(cfg)
+    work = partial(run_collect, plan_collection(context))
+    return CheckedJob(context=context, title="collect", work=work).run(home).exit_code
 
 
 @pytest.mark.full

@@ -45,9 +45,7 @@ def some_fail(seed: int, world: int) -> bool:
 
 _stage = cache(lambda: Stage(configure(*COMMAND)))
 _env = cache(lambda: build_env(demonstration_config(configure(*COMMAND)), nworld=1))
-_provenance = cache(
-    lambda: run_provenance(configure(*COMMAND), RunContext(cfg=configure(*COMMAND)))
-)
+_provenance = cache(lambda: run_provenance(RunContext(cfg=configure(*COMMAND))))
 _content = cache(
     lambda keep_failures: config_content(configure(*COMMAND, f"job.keep_failures={keep_failures}"))
 )
@@ -61,7 +59,7 @@ def patch_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         collection, "play_demonstrations", fake_demonstrations(some_fail, noise=True)
     )
-    monkeypatch.setattr(collection, "run_provenance", lambda cfg, context: dict(_provenance()))
+    monkeypatch.setattr(collection, "run_provenance", lambda context: dict(_provenance()))
     monkeypatch.setattr(
         demonstration,
         "config_content",

@@ -250,7 +250,7 @@ def test_memory_that_runs_out_is_said(error: Exception, so101_cfg: Config) -> No
         raise error
 
     results: list[GateResult] = []
-    run_guarded(RunContext(cfg=so101_cfg), "batch", gate, results.append)
+    run_guarded(RunContext(cfg=so101_cfg, record=results.append), "batch", gate)
     (result,) = results
     assert result.status is Status.failed
     assert result.reason.startswith(f"out of memory ({error}). Run fewer worlds")

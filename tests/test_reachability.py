@@ -22,11 +22,10 @@ from mjstack.config.schema import Config
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, ParameterError
 from mjstack.jobs import check_job, reachability
-from mjstack.jobs.reachability import find_levels, find_region
+from mjstack.jobs.reachability import ReachLevel, find_levels, find_region
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.kinematics.reach import PointReach
 from mjstack.mdp.starts.placement import Placement
-from mjstack.report.reachability import ReachLevel
 from mjstack.scene import SceneIndex, build_model, table_top
 
 Stage = Callable[[str], RunContext]

@@ -22,10 +22,10 @@ from mjstack.cli import run
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Backend, TermCfg
 from mjstack.episodes.context import RunContext
+from mjstack.episodes.earlier_run import STEM, archive_starts, copy_names
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.replay import _sizes_alone
 from mjstack.episodes.rollout import snapshot
-from mjstack.jobs.earlier_run import STEM, archive_starts, copy_names
 from mjstack.jobs.replay import _compare
 from mjstack.sim import BatchSizes
 

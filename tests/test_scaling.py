@@ -20,20 +20,20 @@ from environments import one_second_episode
 from matplotlib.axes import Axes
 
 from mjstack.cli import run
+from mjstack.config.schema import Backend
 from mjstack.errors import ConfigError
 from mjstack.jobs import scaling
-from mjstack.jobs.scaling import run_overrides, scaling_folder
-from mjstack.jobs.scaling_run import OutOfTime, new_row, read_report, read_run
-from mjstack.report.scaling import (
-    NOT_RUN,
-    PASS,
+from mjstack.jobs.scaling import (
     RATE,
-    Row,
+    SHOWN,
     crossover,
     describe_crossover,
+    run_overrides,
     save_scaling_curves,
-    scaling_table,
+    scaling_folder,
 )
+from mjstack.jobs.scaling_run import NOT_RUN, PASS, Row, new_row, read_report, read_run
+from mjstack.report.table import Table
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
 TINY = [
@@ -225,17 +225,13 @@ def simulated(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, str]]:
     clock = [0.0]
 
     def simulate(
-        _: Path,
-        nworld: int,
-        backend: str,
-        __: list[str],
-        *,
-        run_seconds: float,
-        job_seconds: float,
+        _: Path, row: Row, __: list[str], *, run_seconds: float, job_seconds: float
     ) -> Row:
+        nworld = row["nworld"]
+        backend = row["backend"]
         clock[0] += min(40.0, job_seconds)
         if job_seconds < 40.0:
-            raise OutOfTime("stopped")
+            return new_row(nworld, backend, reason="stopped")
         ran.append((nworld, backend))
         return new_row(
             nworld=nworld,
@@ -404,29 +400,25 @@ def test_runs_get_the_command_line() -> None:
         "robot=rebot",
         "nworld=3",
         "job.nworlds=[4]",
-        "sim=mjwarp",
+        "sim=native",
         "sim.device=cpu",
+        "gate.throughput.steps=3",
         "+reward.x={func: f}",
     ]
     warp, native = (run_overrides(cfg, given, 4096, backend) for backend in ("mjwarp", "native"))
-    assert warp[:3] == ["robot=rebot", "sim.device=cpu", "+reward.x={func: f}"]
-    assert {
-        "job=gates",
-        "sim=mjwarp",
-        "nworld=4096",
-        "gate.throughput.repetitions=1",
-        "gates=[batch,throughput]",
-    } <= set(warp)
-    assert {
-        "sim=native",
-        "sim.device=cpu",
-        "gates=[throughput]",
-        "gate.throughput.steps=60",
-    } <= set(native)
+    assert not [override for override in warp + native if override.startswith("job")]
+    assert "+reward.x={func: f}" in warp
+    warp.remove("+reward.x={func: f}")
+    native.remove("+reward.x={func: f}")
+    gates = load_config(warp)
+    assert (gates.job.name, gates.robot.name, gates.nworld) == ("gates", "rebot", 4096)
+    assert (gates.sim.backend, gates.sim.device) == (Backend.mjwarp, "cpu")
+    assert gates.gates == ["batch", "throughput"]
+    assert gates.gate.throughput.repetitions == 1
+    gates = load_config(native)
+    assert (gates.sim.backend, gates.sim.device, gates.nworld) == (Backend.native, "cpu", 4096)
+    assert (gates.gates, gates.gate.throughput.steps) == (["throughput"], 60)
     assert "gate.throughput.repetitions=5" in run_overrides(cfg, given, 2048, "mjwarp")
-    for overrides in (warp, native):
-        keys = [override.lstrip("+").partition("=")[0] for override in overrides]
-        assert len(keys) == len(set(keys))
 
 
 BAD = [
@@ -528,7 +520,7 @@ def test_table_shows_gaps() -> None:
         **{"env_step.gpu_memory_whole_gpu_mib": 7.0},
     )
     bad = new_row(4096, "mjwarp", status="out of memory", reason="a | b")
-    lines = scaling_table([good, bad]).to_markdown()
+    lines = Table.of(SHOWN, [good, bad]).to_markdown()
     assert lines[2].startswith("| 2048 | mjwarp | - | 1.376 |")
     assert "| 1.02 | 7 |" in lines[2]
     assert lines[3].endswith("| out of memory | a \\| b |")

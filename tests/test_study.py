@@ -21,9 +21,8 @@ from mjstack.config.schema import Backend, Config, StudyJobCfg
 from mjstack.episodes.context import RunContext
 from mjstack.errors import MjstackError
 from mjstack.gates.parity import compare_options
-from mjstack.jobs import check_job, study
-from mjstack.jobs.study import run_study_job
-from mjstack.report.record import Status
+from mjstack.jobs import CheckedJob, check_job, study
+from mjstack.report.record import Report, Status
 from mjstack.scene import build_model
 from mjstack.sim import LOST_PHYSICS, Simulation, SolverLimit, make_simulation
 
@@ -38,6 +37,12 @@ def configure(*overrides: str, keep: tuple[str, ...]) -> Config:
     return cfg
 
 
+def run_study(cfg: Config, folder: Path) -> Report:
+    """Run the job without its check, which builds what `configure` has not changed."""
+    job = CheckedJob(context=RunContext(cfg), title="study", work=study.run_study)
+    return job.run(folder)
+
+
 def table(folder: Path) -> dict[str, dict[str, str]]:
     with (folder / "study.csv").open() as file:
         return {row["variant"]: row for row in csv.DictReader(file)}
@@ -49,7 +54,7 @@ def report(folder: Path) -> dict:
 
 def test_native_study(tmp_path: Path) -> None:
     cfg = configure(keep=("base", "iterations_5", "iterations_100", "condim_3", "cone_pyramidal"))
-    outcome = run_study_job(RunContext(cfg), tmp_path, [])
+    outcome = run_study(cfg, tmp_path)
     assert outcome.exit_code == 0
     rows = table(tmp_path)
     assert list(rows) == ["base", "iterations_5", "iterations_100", "condim_3", "cone_pyramidal"]
@@ -97,7 +102,7 @@ def test_a_broken_variant_stops_no_other(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(study, "_simulation", fragile)
     cfg = configure(keep=("iterations_20", "iterations_10", "base"))
-    outcome = run_study_job(RunContext(cfg), tmp_path, [])
+    outcome = run_study(cfg, tmp_path)
     assert outcome.exit_code == 1
     rows = table(tmp_path)
     assert [row["status"] for row in rows.values()] == ["fail", "fail", "pass"]
@@ -115,7 +120,7 @@ def test_without_a_base_there_is_a_report(tmp_path: Path, monkeypatch: pytest.Mo
         raise RuntimeError("no room")
 
     monkeypatch.setattr(study, "_simulation", broken)
-    assert run_study_job(RunContext(configure(keep=("base",))), tmp_path, []).exit_code == 1
+    assert run_study(configure(keep=("base",)), tmp_path).exit_code == 1
     (only,) = report(tmp_path)["gates"]
     says = "the configured solver cannot be timed: RuntimeError: no room (test_study.py:"
     assert only["reason"].startswith(says)
@@ -134,7 +139,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(study, "_measure", interrupted)
     cfg = configure(keep=("base", "condim_3", "condim_4"))
-    outcome = run_study_job(RunContext(cfg), tmp_path, [])
+    outcome = run_study(cfg, tmp_path)
     assert outcome.exit_code == 130
     assert list(table(tmp_path)) == ["base"]
     found = report(tmp_path)
@@ -145,7 +150,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 @pytest.mark.full
 def test_mjwarp_tells_who_stopped_at_a_limit(tmp_path: Path) -> None:
     cfg = configure("sim=mjwarp", "sim.device=cpu", "nworld=1", keep=("base", "ls_iterations_5"))
-    assert run_study_job(RunContext(cfg), tmp_path, []).status is Status.passed
+    assert run_study(cfg, tmp_path).status is Status.passed
     rows = table(tmp_path)
     assert rows["base"]["iteration_limit_worlds"] == rows["base"]["line_search_limit_worlds"] == "0"
     assert rows["ls_iterations_5"]["line_search_limit_worlds"] == "1"
@@ -178,7 +183,7 @@ def test_a_variant_without_its_steps_has_no_time(
         play(self, steps - 1)
 
     monkeypatch.setattr(study.HeldPhysics, "_play", lazy)
-    assert run_study_job(RunContext(configure(keep=("base",))), tmp_path, []).exit_code == 1
+    assert run_study(configure(keep=("base",)), tmp_path).exit_code == 1
     assert table(tmp_path)["base"]["reason"].startswith("no time: 2 worlds overflowed, diverged")
 
 
@@ -271,7 +276,7 @@ def test_an_own_variant_takes_the_rest_from_the_configured_solver() -> None:
 @pytest.mark.full
 def test_the_box_is_studied_too(tmp_path: Path) -> None:
     cfg = configure("task=box", keep=("base",))
-    assert run_study_job(RunContext(cfg), tmp_path, []).exit_code == 0
+    assert run_study(cfg, tmp_path).exit_code == 0
     (row,) = table(tmp_path).values()
     assert row["status"] == "pass"
     assert row["succeeded"] == "2"

@@ -20,6 +20,7 @@ from mjstack.bench.env_step import measure_env_step
 from mjstack.bench.timing import EnergyMeter, Measurement, steps_that_fit, timed
 from mjstack.config.schema import Config, GraphMode
 from mjstack.envs import Env, build_env
+from mjstack.envs.buffers import Advance
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import State
 from mjstack.gates import throughput
@@ -50,9 +51,20 @@ def speeds(result: GateResult, measurement: str = "") -> list[str]:
     return named
 
 
-def test_rates_are_arithmetic() -> None:
+def worlds(
+    monkeypatch: pytest.MonkeyPatch, device: str, mode: GraphMode = GraphMode.auto
+) -> tuple[Any, Any]:
+    """Four worlds that have no memory and no graph, and their configuration."""
+    monkeypatch.setattr(timing, "device_memory", lambda _: None)
+    sim = SimpleNamespace(device=torch.device(device), nworld=4, graph_of=lambda *_, **__: None)
+    return sim, SimpleNamespace(graph=mode, timing=SimpleNamespace(decimation=10))
+
+
+def test_rates_are_arithmetic(monkeypatch: pytest.MonkeyPatch) -> None:
     measured = Measurement(name="m")
-    measured.add_rates([2.0, 0.5, 1.0], 4, 5, 10, whole=True)
+    some = worlds(monkeypatch, "cpu")
+    measured.add_repetitions(*some, [2.0, 0.5, 1.0], 5, EnergyMeter("cpu"), captured=False)
+    measured.facts.clear()
     metrics = measured.metrics()
     expected = {
         "ms_per_batched_step": (20.0, 10.0, 40.0),
@@ -88,7 +100,15 @@ def test_native_measurements(new_context: Callable[..., RunContext]) -> None:
     assert cuda.status is Status.skipped or torch.cuda.is_available()
     m = result.metrics
     assert (m["worlds"], m["physics.repetitions"], m["physics.steps_per_repetition"]) == (2, 3, 3)
-    assert (m["episode.succeeded"], m["episode.repetitions"], m["episode.steps"]) == (2, 3, 300)
+    assert (
+        m["episode.succeeded"],
+        m["episode.repetitions"],
+        m["episode.steps_per_repetition"],
+    ) == (
+        2,
+        3,
+        300,
+    )
     assert (m["env_step.repetitions"], m["env_step.steps_per_repetition"]) == (3, 2)
     for name in ("physics", "episode", "env_step"):
         # With three repetitions the median of the rates is the rate of the median.
@@ -166,14 +186,19 @@ def test_warm_up_and_capture_are_apart_on_mjwarp(new_context: Callable[..., RunC
     ],
 )
 def test_eager_work_is_void_where_it_should_be_captured(
-    device: str, mode: GraphMode, captured: bool, void: bool
+    device: str, mode: GraphMode, captured: bool, void: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sim: Any = SimpleNamespace(device=torch.device(device), graph_of=lambda *_, **__: None)
-    cfg: Any = SimpleNamespace(graph=mode, timing=SimpleNamespace(decimation=10))
     measured = Measurement(name="m")
-    measured.add_capture(sim, cfg, captured, [])
+    some = worlds(monkeypatch, device, mode)
+    measured.add_repetitions(*some, [1.0], 5, EnergyMeter("cpu"), captured=captured)
     assert bool(measured.problem) is void
-    assert measured.facts == {"warm_up_s": 0.0, "capture_s": 0.0, "captured": captured}
+    assert measured.facts == {
+        "steps_per_repetition": 5,
+        "repetitions": 1,
+        "warm_up_s": 0.0,
+        "capture_s": 0.0,
+        "captured": captured,
+    }
 
 
 @pytest.mark.full
@@ -534,8 +559,8 @@ def test_bad_options_of_a_benchmark_are_one_line(
 def test_a_benchmark_prints_its_table(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def work(args: argparse.Namespace, cfg: Config, progress: Callable[[str], None]) -> Table:
-        progress("working")
+    def work(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
+        advance("working", 1, 2)
         row = [str(args.steps), f"{cfg.robot.name}|{cfg.nworld}", str(args.many_numbers)]
         return Table(title="T", header=["steps", "robot", "many"], rows=[row])
 

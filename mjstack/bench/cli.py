@@ -12,13 +12,13 @@ from mjstack.bench import env_step, ik, physics
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import build_env
+from mjstack.envs.buffers import Advance
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.report.table import Table
 from mjstack.sim import resolve_device
 
-Progress = Callable[[str], None]
-Work = Callable[[argparse.Namespace, Config, Progress], Table]
+Work = Callable[[argparse.Namespace, Config, Advance], Table]
 
 
 def main(name: str, argv: Sequence[str] | None = None) -> None:
@@ -48,7 +48,11 @@ def main(name: str, argv: Sequence[str] | None = None) -> None:
         console = Console(soft_wrap=True)
         cfg = load_config(["nworld=256", *args.overrides])
         with console.status("preparing") as status:
-            table = work(args, cfg, status.update)
+
+            def advance(what: str, done: int, total: int) -> None:
+                status.update(f"{what}: {done} of {total}")
+
+            table = work(args, cfg, advance)
     except MjstackError as error:
         Console(stderr=True, soft_wrap=True, markup=False).print(f"mjstack: {error}")
         raise SystemExit(error.exit_code) from error
@@ -57,7 +61,7 @@ def main(name: str, argv: Sequence[str] | None = None) -> None:
     console.print(table.to_console())
 
 
-def _env_step(args: argparse.Namespace, cfg: Config, progress: Progress) -> Table:
+def _env_step(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
     """``env.step`` on both backends."""
     results = {}
     for backend in (Backend.native, Backend.mjwarp):
@@ -67,12 +71,7 @@ def _env_step(args: argparse.Namespace, cfg: Config, progress: Progress) -> Tabl
         env = build_env(cfg, nworld=nworld, backend=backend, device=device)
         title = f"{env.sim.description}, {nworld} worlds"
         result = env_step.measure_env_step(
-            env,
-            steps=args.steps,
-            repetitions=args.repetitions,
-            progress=lambda done, title=title: progress(  # type: ignore[misc]
-                f"{title}: repetition {done} of {args.repetitions}"
-            ),
+            env, steps=args.steps, repetitions=args.repetitions, advance=advance
         )
         env.close()
         if result.problem:
@@ -92,15 +91,10 @@ def _env_step(args: argparse.Namespace, cfg: Config, progress: Progress) -> Tabl
     return table
 
 
-def _physics(args: argparse.Namespace, cfg: Config, progress: Progress) -> Table:
+def _physics(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
     """The captured physics step in each arrangement."""
-    progress("playing the task up to the grasp")
-    times = physics.measure_arrangements(
-        RunContext(cfg=cfg),
-        steps=args.steps,
-        repetitions=args.repetitions,
-        progress=lambda done: progress(f"repetition {done} of {args.repetitions}"),
-    )
+    context = RunContext(cfg=cfg, advance=advance)
+    times = physics.measure_arrangements(context, steps=args.steps, repetitions=args.repetitions)
     bare = times[physics.BARE]
     return Table(
         title=(
@@ -115,43 +109,34 @@ def _physics(args: argparse.Namespace, cfg: Config, progress: Progress) -> Table
     )
 
 
-def _ik(args: argparse.Namespace, cfg: Config, progress: Progress) -> Table:
+def _ik(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
     """Batched inverse kinematics, in every combination of the options."""
     device = resolve_device(cfg.sim.device)
-    cases = list(itertools.product(args.nworld, args.iterations, args.block_dim, (False, True)))
-    results = []
-    for number, (nworld, iterations, block_dim, gained) in enumerate(cases, 1):
-        progress(f"case {number} of {len(cases)}: {nworld} worlds, {iterations} iterations")
-        results.append(
-            ik.measure_solve(
-                cfg,
-                device,
-                nworld=nworld,
-                iterations=iterations,
-                block_dim=block_dim,
-                gained=gained,
-                repetitions=args.repetitions,
-            )
+    cases = list(itertools.product(args.nworld, args.iterations, args.block_dim, (0.0, _GAIN)))
+    rows = []
+    for number, (nworld, iterations, block_dim, gain) in enumerate(cases, 1):
+        result = ik.measure_solve(
+            cfg,
+            device,
+            nworld=nworld,
+            iterations=iterations,
+            block_dim=block_dim,
+            gain=gain,
+            repetitions=args.repetitions,
         )
-    rows = [
-        {
-            **result.facts,
-            "eager": _spread(result.samples["eager_ms"]),
-            "graph": _spread(result.samples.get("graph_ms")),
-            "gain": ik.GAIN if result.facts["gained"] else 0.0,
-        }
-        for result in results
-    ]
+        times = {name: _spread(result.samples.get(name)) for name in ("eager_ms", "graph_ms")}
+        rows.append({**result.facts, **times})
+        advance("cases", number, len(cases))
     columns = {
         "worlds": "nworld",
         "iterations": "iterations",
         "block": "block_dim",
-        "eager, ms": "eager",
-        "in a graph, ms": "graph",
+        "eager, ms": "eager_ms",
+        "in a graph, ms": "graph_ms",
         "share within 0.5 mm": "reached",
         "gains": "gain",
     }
-    return Table.of(f"BatchedIk.solve: {cfg.robot.title}, {device}", columns, rows)
+    return Table.of(columns, rows, f"BatchedIk.solve: {cfg.robot.title}, {device}")
 
 
 def _spread(values: list[float] | None) -> str:
@@ -161,6 +146,7 @@ def _spread(values: list[float] | None) -> str:
     return f"{statistics.median(values):.4g} ({min(values):.4g} to {max(values):.4g})"
 
 
+_GAIN = 0.1  # of posture and approach, where they count
 Numbers = dict[str, tuple[int | list[int], str]]
 _STEPS = "control steps per repetition"
 _REPETITIONS = "measured repetitions"

@@ -15,12 +15,12 @@ parts are subtracted from the whole: where it is far from 0, the repetitions dif
 the managers.
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import torch
 
 from mjstack.bench.timing import (
+    NO_METER,
     WARM_UP,
     EnergyMeter,
     Measurement,
@@ -31,6 +31,7 @@ from mjstack.bench.timing import (
 )
 from mjstack.config.functions import resolve_func
 from mjstack.envs import Env
+from mjstack.envs.buffers import Advance
 from mjstack.episodes.rollout import State, restore, snapshot
 
 _COST = 4.0  # of a repetition over that of its whole steps from the start, when fewer things touch
@@ -42,8 +43,8 @@ def measure_env_step(
     steps: int,
     repetitions: int,
     seconds: float | None = None,
-    meter: EnergyMeter | None = None,
-    progress: Callable[[int], None] | None = None,
+    meter: EnergyMeter = NO_METER,
+    advance: Advance | None = None,
 ) -> Measurement:
     """Play random actions, uniform over their whole range, in interleaved repetitions.
 
@@ -53,7 +54,7 @@ def measure_env_step(
         repetitions: Measured repetitions; one before them warms up.
         seconds: Shortens the repetitions so that all of them take about this long [s].
         meter: Measures the energy of the whole steps.
-        progress: Gets the number of repetitions done.
+        advance: Told about progress.
 
     Returns:
         Samples of the whole step (``ms_per_env_step``), its physics and its managers.
@@ -72,21 +73,23 @@ def measure_env_step(
     # The repetitions
     times: list[tuple[float, float, float]] = []
     ended = 0.0
-    if meter is not None:
-        meter.clear()
     start = snapshot(sim)
     for repetition in range(repetitions + 1):
-        start, spent, episodes = parts.play(start, steps, meter if repetition else None)
-        if repetition:  # the first one warms up
-            ended += episodes
-            times.append(spent)
-            if progress is not None:
-                progress(repetition)
+        start, spent, episodes = parts.play(start, steps, meter)
+        if not repetition:  # it warms up
+            meter.clear()
+            continue
+        ended += episodes
+        times.append(spent)
+        if advance is not None:
+            advance("env.step, repetitions", repetition, repetitions)
 
     # The result
     out = Measurement(name="env_step")
     whole = [env_seconds for env_seconds, _, _ in times]
-    out.add_rates(whole, env.nworld, steps, decimation, whole=True)
+    graph = env.graph if parts.on_cuda else sim.graph_of(decimation, kinematics=True)
+    captured = env.graph.captured and parts.captured
+    out.add_repetitions(sim, env.cfg, whole, steps, meter, graph, captured=captured)
     ms = 1e3 / steps
     out.samples |= {
         "physics_ms_per_step": [ms * p for _, p, _ in times],
@@ -95,15 +98,7 @@ def measure_env_step(
         "managers_alone_over_physics": [m / p for _, p, m in times],
         "residual_ms_per_step": [ms * (e - p - m) for e, p, m in times],
     }
-    out.facts |= {
-        "steps_per_repetition": steps,
-        "repetitions": repetitions,
-        "episodes_ended": int(ended),
-    }
-    graph = env.graph if parts.on_cuda else sim.graph_of(decimation, kinematics=True)
-    captured = env.graph.captured and parts.captured
-    out.add_capture(sim, env.cfg, captured, [] if graph is None else [graph])
-    out.add_resources(sim, meter)
+    out.facts["episodes_ended"] = int(ended)
     out.problem = describe_lost(parts.lost) or parts.problem or out.problem
     out.headline = (
         f"{out.median('env_steps_per_s'):,.0f} env-steps/s, managers"
@@ -152,7 +147,7 @@ class _Parts:
         return seconds[-1]
 
     def play(
-        self, start: State, steps: int, meter: EnergyMeter | None
+        self, start: State, steps: int, meter: EnergyMeter
     ) -> tuple[State, tuple[float, float, float], float]:
         """Play one repetition.
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from mjstack.bench.timing import (
+    NO_METER,
     WARM_UP,
     EnergyMeter,
     EnergyObserver,
@@ -33,7 +34,7 @@ def measure_episode(
     seconds: float,
     repetitions: int,
     meter: EnergyMeter,
-    step_seconds: float | None = None,
+    step_seconds: float = 0.0,
 ) -> Measurement:
     """Measure whole episodes with their check, alternating with bare steps on MJWarp.
 
@@ -47,7 +48,7 @@ def measure_episode(
         seconds: Time budget [s].
         repetitions: Most repetitions.
         meter: Measures the energy.
-        step_seconds: About how long a control step takes [s], if it is known.
+        step_seconds: About how long a control step takes [s]; 0 if it is not known.
     """
     cfg = context.cfg
     mjwarp = sim.backend == "mjwarp"
@@ -61,7 +62,7 @@ def measure_episode(
         before = None
 
     # About how long a repetition takes
-    estimate = 0.0 if step_seconds is None else step_seconds * steps
+    estimate = step_seconds * steps
     if before is not None:
         estimate = max(estimate, before.timing.seconds)
     if mjwarp:
@@ -91,23 +92,19 @@ def measure_episode(
     timings = [p.timing for p in played]
     times = [timing.seconds for timing in timings]
     out.samples = {"seconds": times, **out.samples}
-    out.add_rates(times, sim.nworld, steps, cfg.timing.decimation, whole=True)
     out.facts = {
-        "repetitions": len(played),
         "of_the_batch_gate": sum(p is before for p in played),
-        "steps": steps,
         "succeeded": sim.nworld - len(failed),
     }
-    out.add_capture(sim, cfg, all(p.captured for p in timings), timings)
-    if any(p is not before for p in played):
-        out.add_resources(sim, meter)
+    used = meter if any(p is not before for p in played) else NO_METER
+    captured = all(p.captured for p in timings)
+    out.add_repetitions(sim, cfg, times, steps, used, *timings, captured=captured)
     out.headline = f"{statistics.median(times):.3g} s"
     if "bare_ratio" in out.samples:
         out.headline += f" ({out.median('bare_ratio'):.3f} x bare steps)"
     elif mjwarp:
         out.notes["bare_ratio"] = "not measured: no time for an episode and as many bare steps"
     if failed:
-        out.rejected = True
         out.problem = f"{name_worlds(failed, sim.nworld)} failed the check"
     return out
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from mjstack.kinematics.batched_ik import BatchedIk
 
 SOLVES = 10  # per measurement: a graph holds as many, as a step's graph holds other work beside one
-GAIN = 0.1
 
 
 def measure_solve(
@@ -30,7 +29,7 @@ def measure_solve(
     nworld: int,
     iterations: int,
     block_dim: int,
-    gained: bool,
+    gain: float,
     repetitions: int,
 ) -> Measurement:
     """Time one case.
@@ -41,7 +40,7 @@ def measure_solve(
         nworld: Number of worlds.
         iterations: Iterations per solve.
         block_dim: CUDA threads per block.
-        gained: Whether posture and approach count.
+        gain: Of posture and approach; 0 where they do not count.
         repetitions: Number of repetitions, each of `SOLVES` solves.
 
     Returns:
@@ -55,7 +54,6 @@ def measure_solve(
     from mjstack.kinematics.batched_ik import BatchedIk  # loads Warp
     from mjstack.sim.graph import StepGraph
 
-    gain = GAIN if gained else 0.0
     ik = BatchedIk(
         build_model(cfg),
         cfg.robot,
@@ -88,7 +86,7 @@ def measure_solve(
         "nworld": nworld,
         "iterations": iterations,
         "block_dim": block_dim,
-        "gained": gained,
+        "gain": gain,
         "reached": float((~ik.unreachable).float().mean()),
     }
     return out

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from mjstack.bench.timing import (
+    NO_METER,
     WARM_UP,
     EnergyMeter,
     Measurement,
@@ -52,7 +53,7 @@ class HeldPhysics:
         """Compile and capture the step; return the seconds that one takes then."""
         return [timed(self.sim, lambda: self._play(1)) for _ in range(WARM_UP)][-1]
 
-    def play(self, steps: int, meter: EnergyMeter | None = None) -> float:
+    def play(self, steps: int, meter: EnergyMeter = NO_METER) -> float:
         """Seconds that some control steps take from the state."""
         restore(self.sim, self.state)
         seconds = timed(self.sim, lambda: self._play(steps), meter)
@@ -106,16 +107,14 @@ def measure_physics(
 
     # The result
     graph = sim.graph_of(held.decimation)
-    out.add_rates(times, sim.nworld, steps, held.decimation)
+    captured = graph is not None and graph.captured
+    out.add_repetitions(
+        sim, context.cfg, times, steps, meter, graph, captured=captured, whole=False
+    )
     out.facts |= {
-        "steps_per_repetition": steps,
-        "repetitions": repetitions,
         "peak_contacts_per_world": int(sim.peak_contacts.max()),
         "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
     }
-    captured = graph is not None and graph.captured
-    out.add_capture(sim, context.cfg, captured, [] if graph is None else [graph])
-    out.add_resources(sim, meter)
     out.problem = describe_lost(held.lost) or out.problem
     out.headline = (
         f"{out.median('world_steps_per_s'):,.0f} world-steps/s,"
@@ -154,11 +153,7 @@ def play_to_phase(context: RunContext, sim: Simulation) -> State:
 
 
 def measure_arrangements(
-    context: RunContext,
-    *,
-    steps: int,
-    repetitions: int,
-    progress: Callable[[int], None] | None = None,
+    context: RunContext, *, steps: int, repetitions: int
 ) -> dict[str, list[float]]:
     """Time the captured step in each arrangement, beside a bare replayed ``mujoco_warp.step``.
 
@@ -169,7 +164,6 @@ def measure_arrangements(
         context: The configuration; its worlds run on MJWarp.
         steps: Control steps per repetition, from the phase ``gate.throughput.from_phase``.
         repetitions: Measured repetitions; one before them warms up.
-        progress: Gets the number of repetitions done.
 
     Returns:
         Milliseconds per batched physics step, one number per repetition, by arrangement.
@@ -227,8 +221,7 @@ def measure_arrangements(
                 raise MjstackError(
                     f"{name}: physics was lost, and a figure would be void. Run gates=[capacity]."
                 )
-        if repetition and progress is not None:
-            progress(repetition)
+        context.tell("repetitions", repetition, repetitions)
     sim.close()
     return times
 

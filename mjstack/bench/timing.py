@@ -2,19 +2,19 @@
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
 
 import torch
 
 from mjstack.config.schema import Config, GraphMode
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
-from mjstack.episodes.rollout import Observer
+from mjstack.episodes.rollout import Observer, RolloutTiming
 from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS, Simulation, cuda_uuid, device_memory
+from mjstack.sim.graph import StepGraph
 
 WARM_UP = 3  # calls: eager, captured, replayed
 _EAGER = 2  # steps: the warm-up, and the one that is captured
@@ -90,6 +90,9 @@ class EnergyMeter:
         return {"gpu_power_mean_w": f"not measured: {self.missing}"} if self.missing else {}
 
 
+NO_METER = EnergyMeter("cpu")  # which has no counter
+
+
 class EnergyObserver(Observer):
     """Measures the energy of a rollout's steps from the third on, when all are replayed."""
 
@@ -114,18 +117,6 @@ class EnergyObserver(Observer):
         self._meter.stop()
 
 
-class Captured(Protocol):
-    """Work that is captured into a graph at its second call."""
-
-    @property
-    def warm_up_seconds(self) -> float:
-        """Wall time of the eager first call [s]."""
-
-    @property
-    def capture_seconds(self) -> float:
-        """Wall time of the capture alone [s]."""
-
-
 @dataclass(kw_only=True, slots=True)
 class Measurement:
     """Repetitions of timed work, and facts on it.
@@ -139,7 +130,6 @@ class Measurement:
         problem: Why the figures are void; empty where they count.
         missing: Why there are no figures, which is no failure; empty where there are.
         headline: The measurement in a few words.
-        rejected: Whether worlds failed the task, so that no figure of these worlds counts.
     """
 
     name: str
@@ -150,61 +140,64 @@ class Measurement:
     problem: str = ""
     missing: str = ""
     headline: str = ""
-    rejected: bool = False
 
     def median(self, sample: str) -> float:
         """Median of a figure's repetitions."""
         return statistics.median(self.samples[sample])
 
-    def add_rates(
-        self, seconds: list[float], nworld: int, steps: int, decimation: int, *, whole: bool = False
+    def add_repetitions(
+        self,
+        sim: Simulation,
+        cfg: Config,
+        seconds: list[float],
+        steps: int,
+        meter: EnergyMeter,
+        *work: StepGraph | RolloutTiming | None,
+        captured: bool,
+        whole: bool = True,
     ) -> None:
-        """Add time and rate per physics step and, where whole steps were timed, per control step.
-
-        Args:
-            seconds: Wall time of each repetition [s].
-            nworld: Number of worlds.
-            steps: Control steps in a repetition.
-            decimation: Physics steps in one of them.
-            whole: Whether the control steps were whole ones.
-        """
-        counts = {("ms_per_batched_step", "world_steps_per_s"): steps * decimation}
-        if whole:
-            counts["ms_per_env_step", "env_steps_per_s"] = steps
-        for (ms, rate), count in counts.items():
-            self.samples[ms] = [1e3 * s / count for s in seconds]
-            self.samples[rate] = [nworld * count / s for s in seconds]
-
-    def add_resources(self, sim: Simulation, meter: EnergyMeter | None) -> None:
-        """Add the energy of the repetitions, and the memory that is taken on the GPU."""
-        if meter is not None:
-            self.totals |= meter.metrics()
-            self.notes |= meter.notes()
-        if (used := device_memory(str(sim.device))) is not None:
-            self.facts["gpu_memory_arrays_mib"] = used[0] / 2**20
-            self.facts["gpu_memory_whole_gpu_mib"] = used[1] / 2**20
-
-    def add_capture(
-        self, sim: Simulation, cfg: Config, captured: bool, work: Sequence[Captured]
-    ) -> None:
-        """Add whether the work was replayed from a graph, and the time that its capture took.
+        """Add the figures of timed repetitions, their energy, and how they were captured.
 
         On CUDA, work that should have been captured and ran eagerly has no figure.
 
         Args:
             sim: The worlds.
             cfg: Their configuration.
-            captured: Whether whole steps were replayed.
-            work: What was captured; the slowest counts.
+            seconds: Wall time of each repetition [s].
+            steps: Control steps in a repetition.
+            meter: Has measured their energy.
+            work: The captured work, if any; the slowest counts.
+            captured: Whether the steps were replayed from a graph.
+            whole: Whether the control steps were whole ones, not physics alone.
         """
+        # Time and rate per physics step and per whole control step
+        decimation = cfg.timing.decimation
+        counts = {("ms_per_batched_step", "world_steps_per_s"): steps * decimation}
+        if whole:
+            counts["ms_per_env_step", "env_steps_per_s"] = steps
+        for (ms, rate), count in counts.items():
+            self.samples[ms] = [1e3 * s / count for s in seconds]
+            self.samples[rate] = [sim.nworld * count / s for s in seconds]
+
+        # Energy, and the memory that is taken on the GPU
+        self.totals |= meter.metrics()
+        self.notes |= meter.notes()
+        if (used := device_memory(str(sim.device))) is not None:
+            self.facts["gpu_memory_arrays_mib"] = used[0] / 2**20
+            self.facts["gpu_memory_whole_gpu_mib"] = used[1] / 2**20
+
+        # The capture. On Warp's CPU device, whole steps are never captured: whether their physics
+        # was
+        graphs = [one for one in work if one is not None]
         cuda = sim.device.type == "cuda"
         self.facts |= {
-            "warm_up_s": max((one.warm_up_seconds for one in work), default=0.0),
-            "capture_s": max((one.capture_seconds for one in work), default=0.0),
+            "steps_per_repetition": steps,
+            "repetitions": len(seconds),
+            "warm_up_s": max((one.warm_up_seconds for one in graphs), default=0.0),
+            "capture_s": max((one.capture_seconds for one in graphs), default=0.0),
             "captured": captured,
         }
-        # On Warp's CPU device, whole steps are never captured: whether their physics was
-        graph = None if cuda else sim.graph_of(cfg.timing.decimation, kinematics=True)
+        graph = None if cuda else sim.graph_of(decimation, kinematics=True)
         if graph is not None:
             self.facts["physics_captured"] = graph.captured
         if cuda and not captured and cfg.graph is not GraphMode.off:
@@ -232,17 +225,15 @@ class Measurement:
         return {f"{self.name}.{key}": text for key, text in (self.notes | missing).items()}
 
 
-def timed(sim: Simulation, work: Callable[[], object], meter: EnergyMeter | None = None) -> float:
+def timed(sim: Simulation, work: Callable[[], object], meter: EnergyMeter = NO_METER) -> float:
     """Seconds that some work takes, the device idle at both ends; a meter adds its energy."""
     sim.synchronize()
-    if meter is not None:
-        meter.start()
+    meter.start()
     began = time.perf_counter()
     work()
     sim.synchronize()
     seconds = time.perf_counter() - began
-    if meter is not None:
-        meter.stop()
+    meter.stop()
     return seconds
 
 

@@ -52,14 +52,9 @@ def shard_indices(shard: int) -> dict[str, int]:
     return {"chunk_index": shard // CHUNK, "file_index": shard % CHUNK}
 
 
-def data_path(folder: Path, shard: int) -> Path:
-    """Where a shard's frames are."""
-    return folder / DATA.format(**shard_indices(shard))
-
-
-def episodes_path(folder: Path, shard: int) -> Path:
-    """Where a shard's episodes are."""
-    return folder / EPISODES.format(**shard_indices(shard))
+def shard_path(folder: Path, files: str, shard: int) -> Path:
+    """Where a shard's frames (`DATA`) or episodes (`EPISODES`) are."""
+    return folder / files.format(**shard_indices(shard))
 
 
 def all_features(features: Mapping[str, Feature]) -> dict[str, tuple[str, int]]:
@@ -83,7 +78,7 @@ def make_info(
     """The content of info.json. LeRobot does not read the block ``mjstack``.
 
     Args:
-        spec: What the dataset is.
+        spec: Names, units and types of the dataset.
         provenance: Of each writer that differed from the one before, with its first episode.
         file_mb: Size of a data file at which the next begins [MiB].
         episodes: Number of episodes.

@@ -51,7 +51,7 @@ class StoredDataset:
             raise UnknownName("feature", name, features)
         parts = []
         for shard in range(self.info["mjstack"]["shards"]):
-            column = _read_table(lerobot.data_path(self.folder, shard), [name])[name]
+            column = _read_table(lerobot.shard_path(self.folder, lerobot.DATA, shard), [name])[name]
             values = column.combine_chunks()
             if features[name]["shape"] != [1]:
                 values = values.flatten()
@@ -146,15 +146,8 @@ def read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
     return _read_table(folder / lerobot.TASKS, ["task"])["task"].to_pylist()[:count]
 
 
-def read_rows(
-    folder: Path, info: dict[str, Any], columns: Sequence[str] | None = None
-) -> list[dict[str, Any]]:
+def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
     """Rows of every episode that counts, in order.
-
-    Args:
-        folder: The dataset.
-        info: Its info.json.
-        columns: Columns to read; None: all.
 
     Raises:
         DatasetError: A file is missing or damaged, or has other episodes or frames than it should.
@@ -162,8 +155,8 @@ def read_rows(
     rows: list[dict[str, Any]] = []
     frames = 0
     for shard in range(info["mjstack"]["shards"]):
-        rows += _read_table(lerobot.episodes_path(folder, shard), columns).to_pylist()
-        path = lerobot.data_path(folder, shard)
+        rows += _read_table(lerobot.shard_path(folder, lerobot.EPISODES, shard)).to_pylist()
+        path = lerobot.shard_path(folder, lerobot.DATA, shard)
         with _readable(path):
             frames += lerobot.require_pyarrow()[1].read_metadata(path).num_rows
     found = (len(rows), frames)
@@ -204,8 +197,8 @@ def uncommitted(folder: Path, shards: int) -> list[Path]:
         shards: How many count.
     """
     counted = {
-        path(folder, shard)
-        for path in (lerobot.data_path, lerobot.episodes_path)
+        lerobot.shard_path(folder, files, shard)
+        for files in (lerobot.DATA, lerobot.EPISODES)
         for shard in range(shards)
     }
     places = [

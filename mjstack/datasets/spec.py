@@ -1,5 +1,5 @@
-"""What a dataset holds, and what one episode brings: names, units and types, checked before
-anything is written.
+"""Content of a dataset and of one episode: names, units and types, checked before anything is
+written.
 """
 
 import numbers
@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.errors import ArgumentError, DatasetError, suggest
+from mjstack.errors import ArgumentError, DatasetError
 
 DTYPES = ("float32", "float64", "int32", "int64", "bool")
-# What a value of an episode may be, and what it is kept as.
-VALUE_DTYPES: dict[str, tuple[tuple[type, ...], type]] = {
-    "float64": ((numbers.Real,), float),
-    "int64": ((numbers.Integral,), int),
-    "bool": ((bool, np.bool_), bool),
-    "string": ((str,), str),
+# Accepted types of an episode's values, and the type that is kept.
+VALUE_DTYPES: dict[str, tuple[Any, type]] = {
+    "float64": (numbers.Real, float),
+    "int64": (numbers.Integral, int),
+    "bool": (bool | np.bool_, bool),
+    "string": (str, str),
 }
 # Columns that the writer itself adds to every frame, with their types; LeRobot expects these names.
 INDICES = {
@@ -52,7 +52,7 @@ class Feature:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DatasetSpec:
-    """What is the same for all episodes of a dataset.
+    """Everything that all episodes of a dataset share.
 
     Attributes:
         robot_type: The robot, such as ``so101``.
@@ -62,9 +62,9 @@ class DatasetSpec:
             ``next.success`` by these names; others are kept as they are.
         config_sha256: Hash of what the episodes depend on. A dataset is gone on with under the same
             hash only.
-        values: What each episode brings beside success, seed and world, by name, as one of
+        values: Values that each episode has beside success, seed and world, by name, as one of
             `VALUE_DTYPES`.
-        provenance: What else is to be known of this call's episodes, such as seed and versions, in
+        provenance: Other facts about this call's episodes, such as seed and versions, in
             JSON's types.
     """
 
@@ -102,11 +102,11 @@ class EpisodeData:
 
     Attributes:
         arrays: The frames by feature, each ``(frames, dim)``, or ``(frames,)`` where dim is 1.
-        task: What was to be done, in words.
+        task: The task in words.
         success: Whether it was.
         seed: The seed it was played with.
         world: The world it was played in.
-        values: What else is to be kept of it, by the names of `DatasetSpec.values`.
+        values: Other values of the episode, by the names of `DatasetSpec.values`.
     """
 
     arrays: Mapping[str, np.ndarray]
@@ -180,13 +180,8 @@ def _where(episode: EpisodeData) -> str:
 def _check_names(
     where: str, what: str, found: Mapping[str, Any], expected: Mapping[str, Any]
 ) -> None:
-    for name in sorted(found.keys() ^ expected.keys()):
-        if name in found:
-            raise DatasetError(
-                f"{where}: {what} '{name}' is not in the DatasetSpec."
-                f" {suggest(name, expected).rstrip('.')}"
-            )
+    if found.keys() != expected.keys():
         raise DatasetError(
-            f"{where}: no {what} '{name}', expected {', '.join(expected)}. Give it, or change the"
-            " DatasetSpec"
+            f"{where}: {what} names are {', '.join(found) or 'missing'}, expected"
+            f" {', '.join(expected)}. Give these, or change the DatasetSpec"
         )

@@ -1,5 +1,5 @@
-"""Adds episodes to a dataset, shard by shard, so that whatever stops it loses no episode that it
-has committed.
+"""Adds episodes to a dataset, shard by shard: a kill or a full disk loses no episode that it has
+committed.
 """
 
 import contextlib
@@ -43,7 +43,7 @@ class DatasetWriter:
 
     Attributes:
         folder: The dataset.
-        spec: What it holds.
+        spec: Its columns and provenance.
         committed: Seed and world of every committed episode, in order.
         frames: Committed frames.
     """
@@ -53,7 +53,7 @@ class DatasetWriter:
 
         Args:
             folder: The dataset's own folder.
-            spec: What it holds.
+            spec: Its columns and provenance.
             file_mb: Size of a data file at which it is committed and the next one begins [MiB].
 
         Raises:
@@ -167,7 +167,7 @@ class DatasetWriter:
 
     def _hidden(self) -> Path:
         """The data file of the next shard until it is committed."""
-        path = lerobot.data_path(self.folder, self._shards)
+        path = lerobot.shard_path(self.folder, lerobot.DATA, self._shards)
         return path.with_name(f".{path.name}")
 
     def _begin_file(self) -> None:
@@ -230,10 +230,10 @@ class DatasetWriter:
         self._file.flush()
         os.fsync(self._file.fileno())
         self._file.close()
-        os.replace(self._hidden(), lerobot.data_path(self.folder, self._shards))
+        os.replace(self._hidden(), lerobot.shard_path(self.folder, lerobot.DATA, self._shards))
         self._write_table(lerobot.tasks_table(list(self._tasks)), self.folder / lerobot.TASKS)
         rows = self._pa.Table.from_pylist(self._rows)
-        self._write_table(rows, lerobot.episodes_path(self.folder, self._shards))
+        self._write_table(rows, lerobot.shard_path(self.folder, lerobot.EPISODES, self._shards))
         for row in self._rows:
             self._count(row)
         self._shards += 1

@@ -112,8 +112,7 @@ class Artifacts:
         carry_start: States of all worlds as the phase ``gate.throughput.from_phase`` begins, from
             *batch*.
         timed_episode: Time of the first seed's episode, from *batch*.
-        shown: The one-world episode that pictures show.
-        shown_by: Its title.
+        shown: Title of the one-world episode that pictures show, and its recording.
         pictures: Files that gates have drawn.
     """
 
@@ -122,8 +121,7 @@ class Artifacts:
     env_sizes: BatchSizes | None = None
     carry_start: State | None = None
     timed_episode: Episode | None = None
-    shown: WorldRecorder | None = None
-    shown_by: str = ""
+    shown: tuple[str, WorldRecorder] | None = None
     pictures: list[str] = field(default_factory=list)
 
 
@@ -137,7 +135,10 @@ class RunContext:
         cfg: The configuration.
         stage: Scene and plan; by default those of the configuration.
         folder: Where the run's files go, or None for none.
+        overrides: The command line of the run.
         say: Prints a line.
+        begin: Told the name of each part of the run as it begins.
+        record: Gets each result as soon as there is one.
         advance: Told about progress.
         on_step: Called after each step of the one-world episode that is shown (viewer).
         artifacts: Products of gates.
@@ -146,7 +147,10 @@ class RunContext:
     cfg: Config
     stage: Stage = None  # type: ignore[assignment]
     folder: Path | None = None
+    overrides: Sequence[str] = ()
     say: Say = lambda line: None
+    begin: Say = lambda name: None
+    record: Callable[[GateResult], None] = lambda result: None
     advance: Advance | None = None
     on_step: StepHook | None = None
     artifacts: Artifacts = field(default_factory=Artifacts)

@@ -14,6 +14,7 @@ from mjstack.episodes.observers import Episode
 from mjstack.episodes.record import FAILING, Circumstances, EpisodeRecord
 from mjstack.errors import name_worlds
 from mjstack.math import wilson_interval
+from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
 from mjstack.report.write import format_percent
 from mjstack.sim import Simulation
@@ -181,6 +182,36 @@ class EpisodeTally:
         gate = "" if self.path.name == FAILING else f"{self.gate}:"
         run = shlex.join([*search_path_args(), "job=replay", f"run={self.path.parent}"])
         return f". To look at one: {run} world={gate}{self.failed[0]}"
+
+    def result(
+        self,
+        parts: Sequence[str],
+        *,
+        good: bool,
+        metrics: dict[str, float],
+        thresholds: dict[str, float],
+        tables: Sequence[Table] = (),
+    ) -> GateResult:
+        """The episodes as the gate's result; with a problem it has failed.
+
+        Args:
+            parts: The result in words, before failures and problems.
+            good: Whether enough episodes succeeded.
+            metrics: More of them than `metrics`.
+            thresholds: More of them than the check's.
+            tables: More of them than `tables`.
+        """
+        return GateResult(
+            name=self.gate,
+            status=Status.passed if good and not self.problems else Status.failed,
+            reason="; ".join(filter(None, [*parts, self.failures, *self.problems]))
+            + self.way_to_look,
+            thresholds=self.check.thresholds() | thresholds,
+            metrics=self.metrics() | metrics,
+            notes=self.notes,
+            details=self.all_details(),
+            tables=[*self.tables(), *tables],
+        )
 
     def tables(self) -> list[Table]:
         """Tables of the report: seeds, and first signs of failure."""

@@ -15,22 +15,22 @@ def run_baseline(context: RunContext) -> list[GateResult]:
     status, reason, metrics = judge_one(context, episode)
     headline = context.check.headline(metrics)
     context.say(f"{cfg.task.name} check: {headline}")
-    metrics["episode_s"] = timing.seconds
-    metrics["world_steps_per_s"] = timing.steps * cfg.timing.decimation / timing.seconds
-    metrics["waypoint_error_m"] = float(episode.waypoint_error.max())
-    metrics["path_error_m"] = context.planner.path_error()
-    metrics["peak_contacts"] = int(sim.peak_contacts[0])
-    metrics["peak_constraint_rows"] = int(sim.peak_constraints[0])
-    context.artifacts.shown = nominal.world
-    context.artifacts.shown_by = "baseline world"
-    thresholds = context.check.thresholds() | {"waypoint_error_m": cfg.controller.ik_tolerance}
-    summary = reason or headline
+    metrics |= {
+        "episode_s": timing.seconds,
+        "world_steps_per_s": timing.steps * cfg.timing.decimation / timing.seconds,
+        "waypoint_error_m": float(episode.waypoint_error.max()),
+        "path_error_m": context.planner.path_error(),
+        "peak_contacts": int(sim.peak_contacts[0]),
+        "peak_constraint_rows": int(sim.peak_constraints[0]),
+    }
+    context.artifacts.shown = ("baseline world", nominal.world)
+    thresholds = {"waypoint_error_m": cfg.controller.ik_tolerance}
     return [
         GateResult(
             name="baseline",
             status=status,
-            reason=summary,
-            thresholds=thresholds,
+            reason=reason or headline,
+            thresholds=context.check.thresholds() | thresholds,
             metrics=metrics,
             notes={"backend": sim.description},
         )

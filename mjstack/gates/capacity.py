@@ -2,8 +2,9 @@
 they be?
 """
 
-from dataclasses import dataclass, replace
-from functools import reduce
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial, reduce
 
 import numpy as np
 
@@ -23,9 +24,6 @@ from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, resolve_sizes
 from mjstack.sim.sizes import apply_configured, resolve_env_sizes
 
-_NATIVE = "native MuJoCo has no fixed buffers"
-_NO_ORDER = "on CUDA sums have no fixed order"
-
 
 @dataclass(kw_only=True, slots=True)
 class _Group:
@@ -39,6 +37,7 @@ class _Group:
         sizes: In force.
         wanted: Recommended.
         lost: Physics that was lost with room to spare; nothing may be sized from it then.
+        broken: Problems of the same workloads at the recommended sizes.
     """
 
     title: str
@@ -48,6 +47,7 @@ class _Group:
     sizes: BatchSizes
     wanted: BatchSizes
     lost: str
+    broken: list[str] = field(default_factory=list)
 
 
 @needs_episode
@@ -61,25 +61,28 @@ def run_capacity(context: RunContext) -> list[GateResult]:
     cfg = context.cfg
     t = cfg.gate.capacity
     nworld = context.measuring_nworld
-    how = f"batch=auto: gate capacity, {nworld} worlds, times {t.margin:g}"
-    how = how if cfg.batch.auto else "gate capacity"
     result = GateResult(name="capacity", status=Status.passed, metrics={"worlds": nworld})
 
-    # Environments. Each start is planned once, for both of its runs, and the task's last: its plan
-    # is kept for the gates that follow.
-    runs = {"random_actions": play_random(context)}
-    try:
-        runs["randomized"] = context.play_task(t.reset)
-    except Unreachable as error:  # starts of the user's own; the other workloads stand
-        result.details.append(f"randomised starts: not measured: {error}")
-    title = "environments (random actions, randomised starts)"
-    env = _group(cfg, title, "recommended_env", runs, resolve_env_sizes(cfg), how)
-    broken = _try(context, env, result)
-
-    # The driven task
-    task_run = context.play_task(cfg.reset)
-    task = _group(cfg, "scripted task", "recommended", {"task": task_run}, resolve_sizes(cfg), how)
-    broken += _try(context, task, result)
+    # Environments first: each start is planned once, for both of its runs, and the plan of the
+    # task's is kept for the gates that follow.
+    env = _measure(
+        context,
+        result,
+        title="environments (random actions, randomised starts)",
+        prefix="recommended_env",
+        configured=resolve_env_sizes(cfg),
+        random_actions=partial(play_random, context),
+        randomized=partial(context.play_task, t.reset),
+    )
+    task = _measure(
+        context,
+        result,
+        title="scripted task",
+        prefix="recommended",
+        configured=resolve_sizes(cfg),
+        task=partial(context.play_task, cfg.reset),
+    )
+    task_run = task.runs["task"]
 
     # Problems. Motion that lost physics sizes nothing that follows.
     context.artifacts.sizes = None if task.lost else task.wanted
@@ -92,7 +95,7 @@ def run_capacity(context: RunContext) -> list[GateResult]:
         # do for both.
         chosen = any(getattr(cfg.batch, key) is not None for key in keys)
         (result.details if chosen else problems).append(f"environments: {text}")
-    problems += broken
+    problems += env.broken + task.broken
     if nworld < cfg.nworld:
         result.details.append(
             f"from {nworld} worlds: more of them meet rarer peaks, above all under random actions"
@@ -113,7 +116,7 @@ def run_capacity(context: RunContext) -> list[GateResult]:
     for group in (task, env):
         _report(context, group, result)
     if task_run.sizes is None:
-        result.notes["rerun"] = f"sizes were not tried: {_NATIVE}"
+        result.notes["rerun"] = "sizes were not tried: native MuJoCo has no fixed buffers"
     elif task.lost or env.lost:
         result.notes["rerun"] = "sizes were not tried where peaks are not known"
     return [result]
@@ -129,19 +132,32 @@ def play_random(context: RunContext, sizes: BatchSizes | None = None) -> Workloa
     return play_workload(cfg, context.measuring_simulation, play, sizes)
 
 
-def _group(
-    cfg: Config,
+def _measure(
+    context: RunContext,
+    result: GateResult,
+    *,
     title: str,
     prefix: str,
-    runs: dict[str, Workload],
     configured: BatchSizes,
-    source: str,
+    **plays: Callable[..., Workload],
 ) -> _Group:
-    """Join the peaks of some workloads, and recommend sizes for them."""
+    """Play some workloads, recommend sizes for them, and try those on MJWarp."""
+    cfg = context.cfg
+    margin = cfg.gate.capacity.margin
+    runs = {}
+    for name, play in plays.items():
+        try:
+            runs[name] = play()
+        except Unreachable as error:
+            if name != "randomized":
+                raise
+            # Starts of the user's own; the other workloads stand
+            result.details.append(f"randomised starts: not measured: {error}")
     peaks = reduce(join_peaks, (run.peaks for run in runs.values()))
-    wanted = recommend_sizes(peaks, cfg.gate.capacity.margin, source)
+    how = f"batch=auto: gate capacity, {context.measuring_nworld} worlds, times {margin:g}"
+    wanted = recommend_sizes(peaks, margin, how if cfg.batch.auto else "gate capacity")
     losses = [describe_lost(run) for run in runs.values() if run.sizes]
-    return _Group(
+    group = _Group(
         title=title,
         prefix=prefix,
         runs=runs,
@@ -150,28 +166,16 @@ def _group(
         wanted=wanted,
         lost="; ".join(f"{loss}. {fix}" for loss, fix in losses if loss),
     )
-
-
-def _try(context: RunContext, group: _Group, result: GateResult) -> list[str]:
-    """Play the workloads again at exactly the recommended sizes, on MJWarp; return the problems."""
     exact = not context.backend[1].startswith("cuda")
-    starts = {"task": context.cfg.reset, "randomized": context.cfg.gate.capacity.reset}
-    problems = []
-    for name, first in reversed(group.runs.items()):
-        if first.sizes is None or group.lost:
-            continue
-        judged = name in starts
-        again = (
-            context.play_task(starts[name], group.wanted)
-            if judged
-            else play_random(context, group.wanted)
-        )
-        problems.append(_compare(name, first, again, result, judged=judged, exact=exact))
-    return list(filter(None, problems))
+    for name, first in reversed(runs.items()):
+        if first.sizes is not None and not group.lost:
+            problem = _compare(name, first, plays[name](sizes=wanted), result, exact=exact)
+            group.broken += [problem] if problem else []
+    return group
 
 
 def _compare(
-    name: str, first: Workload, again: Workload, result: GateResult, *, judged: bool, exact: bool
+    name: str, first: Workload, again: Workload, result: GateResult, *, exact: bool
 ) -> str:
     """Hold a run at exactly the recommended sizes against the first one.
 
@@ -183,7 +187,6 @@ def _compare(
         first: The run with room to spare.
         again: The second one.
         result: Gets the figures.
-        judged: Whether the check judges it.
         exact: Whether runs repeat bit for bit, as they do on any CPU.
 
     Returns:
@@ -191,6 +194,7 @@ def _compare(
     """
     assert again.sizes is not None, "native MuJoCo has no sizes to try"
     sizes = again.sizes.as_overrides()
+    judged = name != "random_actions"
     count = len(first.failed)
     lost = np.flatnonzero(again.peaks.overflow).tolist()
     flipped = np.flatnonzero((first.failed == 0) != (again.failed == 0)).tolist()
@@ -217,7 +221,7 @@ def _compare(
         flip = f"{at}: another result in {name_worlds(flipped, count)}"
         if exact:
             return flip
-        result.details.append(f"{flip}: {_NO_ORDER}")
+        result.details.append(f"{flip}: on CUDA sums have no fixed order")
     elif exact and moved:
         return f"{at}: another final state in {name_worlds(moved, count)}"
     return ""

@@ -53,8 +53,7 @@ def run_parity(context: RunContext) -> list[GateResult]:
 
     headline = context.check.headline(judged)
     context.say(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
-    context.artifacts.shown = world
-    context.artifacts.shown_by = "parity world"
+    context.artifacts.shown = ("parity world", world)
     mjwarp.close()
     ends = [f"final.{name}.position_m" for name in context.index.objects]
     apart = max((result.metrics[end] for end in ends), default=0.0)
@@ -135,7 +134,7 @@ def compare_options(
     """Requested, native's and the uploaded options side by side, and whether they agree; numbers to
     float32.
 
-    What the configuration leaves to the robot's file is requested as ``the file's``.
+    The request is ``the file's`` where the configuration leaves an option to the robot's file.
     """
     solver = cfg.solver
     requested: dict[str, float | int | str | None] = {

@@ -45,29 +45,19 @@ def find_gates(cfg: Config) -> dict[str, Gate]:
     return gates
 
 
-def run_gates(
-    context: RunContext, on_start: Callable[[str], None], on_result: Callable[[GateResult], None]
-) -> None:
-    """Runs the gates that the configuration names, each once, in the order of ``cfg.gate``.
-
-    One that raises has failed, with the error as its reason; the others still run.
-
-    Args:
-        context: What they need. Its ``results`` fill up.
-        on_start: Told before a gate starts.
-        on_result: Told after each result, before the next gate starts.
+def run_gates(context: RunContext) -> None:
+    """Run the configured gates in their order. Each result goes to the context's ``record`` before
+    the next gate begins.
     """
     for name, run in find_gates(context.cfg).items():
-        on_start(name)
-        run_guarded(context, name, run, on_result)
+        run_guarded(context, name, run)
 
 
-def run_guarded(
-    context: RunContext, name: str, run: Gate, on_result: Callable[[GateResult], None]
-) -> None:
-    """Runs one gate, or whatever judges like one. If it raises it has failed, with the error as its
-    reason.
+def run_guarded(context: RunContext, name: str, run: Gate) -> None:
+    """Run one gate, or other work that judges like one, and record its results. If it raises it has
+    failed, with the error as its reason.
     """
+    context.begin(name)
     began = time.perf_counter()
     try:
         lack = lacks_episode(context.cfg) if getattr(run, "needs_episode", False) else ""
@@ -80,7 +70,7 @@ def run_guarded(
         if result.status is not Status.skipped and not result.seconds:
             result.seconds = seconds
         context.artifacts.results[result.name] = result
-        on_result(result)
+        context.record(result)
 
 
 def describe_error(error: Exception) -> str:

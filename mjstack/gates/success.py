@@ -18,7 +18,7 @@ from mjstack.episodes.rollout import CLOSED_LOOP, Observer
 from mjstack.episodes.seeds import play_seeds
 from mjstack.errors import MjstackError
 from mjstack.mdp.starts.starts_file import write_starts
-from mjstack.report.record import GateResult, Status
+from mjstack.report.record import GateResult
 from mjstack.report.write import format_percent
 
 
@@ -48,7 +48,7 @@ def run_success(context: RunContext) -> list[GateResult]:
         count=t.seeds,
         noun="episodes",
         circumstances=True,
-        observers=lambda seed: _starts_writers(own, seed, unwritten),
+        observers=lambda seed: [_StartsWriter(own.folder, seed, unwritten)],
     )
     tally.details = unwritten + tally.details
     kept = tally.circumstances
@@ -64,7 +64,7 @@ def run_success(context: RunContext) -> list[GateResult]:
         episodes=t.cell_episodes,
         objects=kept[0].objects,
     )
-    metrics = tally.metrics() | {
+    metrics = {
         "distinct_starts": len(np.unique(np.round(starts, 6).reshape(len(starts), -1), axis=0)),
         "retried": int(retried.sum()),
         "retries": int(retries.sum()),
@@ -78,51 +78,39 @@ def run_success(context: RunContext) -> list[GateResult]:
     parts = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
     if retried.any():
         parts.append(f"{retried.sum()} retried, {(retried & succeeded).sum()} of them succeeded")
-    parts += [tally.failures] if tally.failed else []
     if all(region.succeeded == region.episodes for region in regions):
         there = "had a failure" if regions else "(gate.success.cell_episodes): more seeds have more"
         tally.details.append(f"no region of at least {t.cell_episodes} episodes {there}")
     tally.details += save_regions(own, regions, starts, tally)
     context.artifacts.pictures += own.artifacts.pictures
-    good = metrics["success_rate"] >= t.rate and not tally.problems
-    return [
-        GateResult(
-            name="success",
-            status=Status.passed if good else Status.failed,
-            reason="; ".join([*parts, *tally.problems]) + tally.way_to_look,
-            thresholds=own.check.thresholds() | {"success_rate_min": t.rate},
-            metrics=metrics,
-            notes=tally.notes,
-            details=tally.all_details(),
-            tables=[*tally.tables(), *regions_table(cfg, regions)],
-        )
-    ]
+    result = tally.result(
+        parts,
+        good=tally.good / tally.episodes >= t.rate,
+        metrics=metrics,
+        thresholds={"success_rate_min": t.rate},
+        tables=regions_table(cfg, regions),
+    )
+    return [result]
 
 
 class _StartsWriter(Observer):
-    """Writes how worlds start into a file."""
+    """Writes how worlds start into a file of the run, unless they start from that very file."""
 
-    def __init__(self, path: Path, unwritten: list[str]) -> None:
+    def __init__(self, folder: Path | None, seed: int, unwritten: list[str]) -> None:
         """``unwritten`` gets the problem if the file cannot be written."""
-        self._path = path
+        self._path = None if folder is None else folder / starts_name(seed)
         self._unwritten = unwritten
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
+        path = self._path
+        starts = env.cfg.starts
+        if path is None or (starts is not None and path.resolve() == Path(starts).resolve()):
+            return
         try:
-            write_starts(env, self._path)
+            write_starts(env, path)
         except MjstackError as error:  # a full disk, say: the episodes are played all the same
-            self._unwritten.append(f"{self._path.name} could not be written: {error}")
-
-
-def _starts_writers(context: RunContext, seed: int, unwritten: list[str]) -> list[Observer]:
-    """The writer of a seed's starts; none if the worlds start from that very file."""
-    if context.folder is None:
-        return []
-    path = context.folder / starts_name(seed)
-    starts = context.cfg.starts
-    own = starts is not None and path.resolve() == Path(starts).resolve()
-    return [] if own else [_StartsWriter(path, unwritten)]
+            self._unwritten.append(f"{path.name} could not be written: {error}")
 
 
 def _describe_start(cfg: Config) -> str:

@@ -6,6 +6,7 @@ import json
 import os
 import time
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -22,9 +23,7 @@ from mjstack.files import write_atomic
 from mjstack.jobs.collection import DATASET, Collection, CollectPlan, read_batches
 from mjstack.jobs.demonstration import ACTION, STATE, differences, episode_config
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.job import Job, JobResult
-from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.runner import Record, run_reported
+from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table, format_value, to_document
 
@@ -49,7 +48,7 @@ def collect_folder(cfg: Config) -> Path:
     return Path(cast(CollectJobCfg, cfg.job).folder or f"outputs/collect/{name}")
 
 
-def check_collect(cfg: Config) -> CollectPlan:
+def check_collect(cfg: Config) -> CheckedJob:
     """Raise for what cannot be done, before anything is written."""
     require_pyarrow()
     require_episode(cfg)
@@ -57,7 +56,10 @@ def check_collect(cfg: Config) -> CollectPlan:
     check_task(context)
     plan = plan_collection(context)
     _check_folder(plan.home / DATASET, plan.spec)
-    return plan
+    count = cast(CollectJobCfg, cfg.job).episodes
+    title = f"task {cfg.task.name}, {count:,} demonstrations"
+    work = partial(run_collect, plan)
+    return CheckedJob(context=context, title=title, work=work, folder=plan.home)
 
 
 def plan_collection(context: RunContext) -> CollectPlan:
@@ -77,52 +79,35 @@ def plan_collection(context: RunContext) -> CollectPlan:
         env.close()
 
 
-def run_collect_job(plan: CollectPlan, folder: Path, overrides: list[str]) -> JobResult:
-    """Add the missing episodes to the dataset, and leave dataset.md and the report.
+def run_collect(plan: CollectPlan, context: RunContext, folder: Path) -> None:
+    """Add the missing episodes to the dataset, and leave dataset.md in the folder."""
+    context.begin("collect")
+    began = time.perf_counter()
+    collection = Collection(plan, context)
 
-    Args:
-        plan: The dataset.
-        folder: Where the report goes; the dataset's place is `collect_folder`'s.
-        overrides: The command line.
+    def conclude(status: Status, problem: str = "") -> None:
+        result = collection.result(status, problem, time.perf_counter() - began)
+        if collection.committed:
+            _write_table(context.cfg, plan, folder, result)
+            context.say(f"dataset: {collection.path}, described in {folder / 'dataset.md'}")
+        context.record(result)
 
-    Returns:
-        How it ended: a pass if the dataset has as many episodes as were asked for.
-    """
-    cfg = plan.context.cfg
-
-    def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
-        bar.start("collect")
-        began = time.perf_counter()
-        collection = Collection(plan, context)
-
-        def conclude(status: Status, problem: str = "") -> None:
-            result = collection.result(status, problem, time.perf_counter() - began)
-            if collection.committed:
-                _write_table(plan, folder, result)
-                bar.say(f"dataset: {collection.path}, described in {folder / 'dataset.md'}")
-            record(result)
-
-        try:
-            problem = collection.play()
-        except KeyboardInterrupt:
-            conclude(Status.interrupted, "interrupted")
-            raise
-        except (UnwrittenError, OSError) as error:
-            with suppress(OSError):  # there may be room for a report
-                conclude(Status.failed, str(error))
-            raise
-        conclude(Status.failed if problem else Status.passed, problem)
-
-    count = cast(CollectJobCfg, cfg.job).episodes
-    title = f"task {cfg.task.name}, {count:,} demonstrations"
-    return run_reported(plan.context, folder, overrides, title, work)
+    try:
+        problem = collection.play()
+    except KeyboardInterrupt:
+        conclude(Status.interrupted, "interrupted")
+        raise
+    except (UnwrittenError, OSError) as error:
+        with suppress(OSError):  # there may be room for a report
+            conclude(Status.failed, str(error))
+        raise
+    conclude(Status.failed if problem else Status.passed, problem)
 
 
-def _write_table(plan: CollectPlan, folder: Path, result: GateResult) -> None:
+def _write_table(cfg: Config, plan: CollectPlan, folder: Path, result: GateResult) -> None:
     """Write dataset.md: facts, the range of every joint and its target, and the lines that load the
     first episode.
     """
-    cfg = plan.context.cfg
     dataset = plan.home / DATASET
     statistics = json.loads((dataset / lerobot.STATS).read_text())
     ranges = []
@@ -134,8 +119,8 @@ def _write_table(plan: CollectPlan, folder: Path, result: GateResult) -> None:
     facts = [[key, format_value(value)] for key, value in (result.notes | result.metrics).items()]
     header = ["number", "unit", "smallest", "mean", "largest"]
     tables = [
-        Table(title="", header=["fact", "value"], rows=facts),
-        Table(title="", header=header, rows=ranges),
+        Table(header=["fact", "value"], rows=facts),
+        Table(header=header, rows=ranges),
     ]
     title = f"{cfg.robot.title}, task {cfg.task.name}: demonstrations"
     loading = LOADING.format(folder=dataset)
@@ -188,4 +173,4 @@ def _check_folder(dataset: Path, spec: DatasetSpec) -> None:
     read_batches(dataset.parent, [])
 
 
-JOB = Job(check_collect, run_collect_job, folder=collect_folder)
+JOB = Job(check_collect)

@@ -22,7 +22,6 @@ from mjstack.files import write_atomic
 from mjstack.jobs.demonstration import (
     STATE,
     Played,
-    column_widths,
     make_spec,
     play_demonstrations,
 )
@@ -43,13 +42,11 @@ class CollectPlan:
     """A dataset to be collected.
 
     Attributes:
-        context: Configuration, scene and plan.
         home: The job's folder.
         spec: The dataset's columns and provenance.
         most: Largest number of worlds of a batch: those whose steps fit into the buffer.
     """
 
-    context: RunContext
     home: Path
     spec: DatasetSpec
     most: int
@@ -64,15 +61,16 @@ class CollectPlan:
         """
         cfg = context.cfg
         gib = cast(CollectJobCfg, cfg.job).buffer_gib
-        world = 4.0 * build_phases(cfg)[-1].stop * sum(column_widths(env).values()) / 2**30
-        if gib < world:
-            expected = f"at least {world:.2g}, which the steps of one world take"
-            raise ConfigError("job.buffer_gib", gib, expected)
-        provenance = run_provenance(cfg, context)
+        provenance = run_provenance(context)
         # They differ between calls that make the same episodes.
         del provenance["date"], provenance["config_sha256"]
         spec = make_spec(env, cfg, provenance)
-        return cls(context=context, home=home, spec=spec, most=min(cfg.nworld, int(gib / world)))
+        step = 4 * sum(column.dim for column in spec.features.values() if column.dtype == "float32")
+        world = build_phases(cfg)[-1].stop * step / 2**30
+        if gib < world:
+            expected = f"at least {world:.2g}, which the steps of one world take"
+            raise ConfigError("job.buffer_gib", gib, expected)
+        return cls(home=home, spec=spec, most=min(cfg.nworld, int(gib / world)))
 
 
 @dataclass(kw_only=True, slots=True)
@@ -134,31 +132,41 @@ class Collection:
     """A dataset, and the worlds that add to it.
 
     A batch is one seed in as many worlds as are needed and fit; the next batch has the next seed,
-    in later calls too. So a pair of seed and world is one episode, whatever nworld was.
+    in later calls too. So a pair of seed and world is one episode for any nworld.
 
     A batch's record is written beside the dataset before its first episode is added. If a call is
     stopped in between, the next one plays the whole batch again and adds the missing episodes. What
     was committed stays as it is. On CUDA two plays of a world agree only nearly: the first play
-    counts in the success rate, and every episode has the result of its own play.
+    counts in the success rate, and every episode has the result of the play that recorded it.
 
     Attributes:
         path: The dataset.
         batches: All that were played, in earlier calls too; read by `play`.
-        committed: Number of episodes of the dataset.
     """
 
     def __init__(self, plan: CollectPlan, context: RunContext) -> None:
-        """Take a plan and the run's context."""
+        """Open the dataset of a plan, in the run's context.
+
+        Raises:
+            DatasetError: The folder has another dataset.
+            UnwrittenError: The dataset cannot be written.
+        """
         self._context = context
         self._plan = plan
         self._job = cast(CollectJobCfg, context.cfg.job)
         self._record_path = plan.home / FILE
         self.path = plan.home / DATASET
         self.batches: list[CollectedBatch] = []
-        self.committed = 0
-        self._steps = 0
-        self._before = 0
         self._sim: Simulation | None = None
+        if not (self.path / lerobot.INFO).exists():
+            self._record_path.unlink(missing_ok=True)  # of a dataset that was removed
+        self._writer = DatasetWriter(self.path, plan.spec)
+        self._before = self.committed
+
+    @property
+    def committed(self) -> int:
+        """Number of episodes of the dataset."""
+        return len(self._writer.committed)
 
     def play(self) -> str:
         """Play and write until the episodes are there.
@@ -167,37 +175,31 @@ class Collection:
             Why that cannot be done; empty if it is done.
 
         Raises:
-            DatasetError: The folder has another dataset.
             UnwrittenError: The dataset cannot be written any further; what was committed is kept.
             OSError: The record of the batches cannot be written; what was committed is kept.
         """
-        if not (self.path / lerobot.INFO).exists():
-            self._record_path.unlink(missing_ok=True)  # of a dataset that was removed
-        writer = DatasetWriter(self.path, self._plan.spec)
-        self._before = self.committed = len(writer.committed)
         try:
-            with writer:
-                self.batches = read_batches(self._plan.home, writer.committed)
-                return self._play(writer)
+            with self._writer:
+                self.batches = read_batches(self._plan.home, self._writer.committed)
+                return self._play()
         finally:
-            self.committed = len(writer.committed)
-            self._steps = writer.frames
             if self.batches:
                 with suppress(OSError):  # the next call counts again
-                    self._record(writer)
+                    self._record()
             if self._sim is not None:
                 self._sim.close()
 
-    def _play(self, writer: DatasetWriter) -> str:
+    def _play(self) -> str:
+        committed = self._writer.committed
         empty = 0
-        while (wanted := self._job.episodes - len(writer.committed)) > 0:
+        while (wanted := self._job.episodes - len(committed)) > 0:
             # A batch that was begun, or the next seed
             begun = next((batch for batch in self.batches if batch.kept < batch.keep), None)
             if begun is not None:
                 seed = begun.seed
                 worlds = begun.worlds
             else:
-                seeds = [seed for seed, _ in writer.committed] + [b.seed for b in self.batches]
+                seeds = [seed for seed, _ in committed] + [b.seed for b in self.batches]
                 seed = max([self._context.cfg.seed - 1, *seeds]) + 1
                 spare = 1.0 if self._job.keep_failures else _SPARE
                 worlds = min(self._plan.most, math.ceil(spare * wanted))
@@ -207,17 +209,17 @@ class Collection:
             batch, usable = self._judge(played, wanted)
             if begun is None:
                 self.batches.append(batch)
-                self._record(writer)
+                self._record()
             else:
                 batch = begun
-                there = {world for other, world in writer.committed if other == seed}
+                there = {world for other, world in committed if other == seed}
                 usable = [world for world in usable if world not in there]
                 batch.keep = min(batch.keep, batch.kept + len(usable))
-            self._add(writer, played, usable[: min(batch.keep - batch.kept, wanted)])
+            self._add(played, usable[: min(batch.keep - batch.kept, wanted)])
             del played.steps.values  # the device's memory, before the next batch takes as much
             self._context.say(
                 f"collect, seed {seed}: {batch.succeeded} of {worlds} worlds succeeded,"
-                f" {len(writer.committed)} of {self._job.episodes} episodes there"
+                f" {len(committed)} of {self._job.episodes} episodes there"
             )
             empty = 0 if batch.kept else empty + 1
             if empty == _GIVE_UP:
@@ -245,17 +247,17 @@ class Collection:
         )
         return batch, usable
 
-    def _add(self, writer: DatasetWriter, played: Played, worlds: list[int]) -> None:
+    def _add(self, played: Played, worlds: list[int]) -> None:
         """Commit the episodes of some worlds, and record it."""
         for count, (world, arrays) in enumerate(played.episodes(worlds), 1):
-            writer.add([self._episode(played, world, arrays)])
+            self._writer.add([self._episode(played, world, arrays)])
             self._context.tell(f"episodes of seed {played.seed}", count, len(worlds))
-        writer.flush()
-        self._record(writer)
+        self._writer.flush()
+        self._record()
 
-    def _record(self, writer: DatasetWriter) -> None:
+    def _record(self) -> None:
         """Write the record of all batches."""
-        _count_kept(self.batches, writer.committed)
+        _count_kept(self.batches, self._writer.committed)
         records = [asdict(batch) for batch in self.batches]
         write_atomic(self._record_path, json.dumps(records, indent=1) + "\n")
 
@@ -296,17 +298,18 @@ class Collection:
         """
         asked = self._job.episodes
         new = self.committed - self._before
+        steps = self._writer.frames
         size = sum(path.stat().st_size for path in self.path.rglob("*") if path.is_file()) / 1e6
         notes = {"dataset": str(self.path), "config_sha256": self._plan.spec.config_sha256}
         metrics: dict[str, float] = {
             "episodes": self.committed,
             "episodes_of_this_call": new,
-            "steps": self._steps,
+            "steps": steps,
             "megabytes": size,
         }
         reasons = [problem] if problem else []
-        steps = f"{self._steps:,} steps, {size:.1f} MB"
-        reasons.append(f"{self.committed:,} episodes, {asked:,} asked for ({steps})")
+        there = f"{steps:,} steps, {size:.1f} MB"
+        reasons.append(f"{self.committed:,} episodes, {asked:,} asked for ({there})")
         details = []
 
         # The expert, in the batches that are on record

@@ -46,15 +46,6 @@ _NO_MATTER = (
 )
 
 
-def column_widths(env: Env) -> dict[str, int]:
-    """How many numbers a step has of each kind, in the order in which `StepRecorder` keeps them."""
-    n = len(env.index.ctrl)
-    groups = {
-        f"observation.{name}": dim for name, dim in env.observation_manager.group_dims.items()
-    }
-    return {STATE: n, **groups, ACTION: n, REWARD: 1}
-
-
 class StepRecorder(Observer):
     """All steps of all worlds in one block on the device. Fixed shapes, no host read: a captured
     graph may hold it.
@@ -76,12 +67,15 @@ class StepRecorder(Observer):
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
-        self.layout = column_widths(env)
+        joints = len(env.index.ctrl)
+        dims = env.observation_manager.group_dims
+        groups = {f"observation.{name}": dim for name, dim in dims.items()}
+        self.layout = {STATE: joints, **groups, ACTION: joints, REWARD: 1}
         shape = (self._steps, env.nworld, sum(self.layout.values()))
         self.values = torch.zeros(shape, device=env.device)
         self._env = env
         self._robot = env.index.on(env.device, env.sim.qpos.dtype)
-        seen = self.layout[STATE] + sum(env.observation_manager.group_dims.values())
+        seen = joints + sum(dims.values())
         self._seen = torch.zeros((env.nworld, seen), device=env.device)
         self._next = torch.zeros(1, dtype=torch.int64, device=env.device)
         self._observe()
@@ -108,7 +102,7 @@ class Played:
     """A batch of episodes.
 
     Attributes:
-        seed: What it was played with.
+        seed: Seed of the starts.
         steps: All steps, on the device.
         failed: Bits of the task's rules, shape ``(worlds,)``, int32.
         retries: Grasps that were tried again, shape ``(worlds,)``.
@@ -278,7 +272,7 @@ def _term_units(func: str, width: int, joints: tuple[str, ...]) -> Sequence[str]
 
 
 def _scaled(units: Sequence[str], scale: float) -> list[str]:
-    """What 1 stands for after the scaling: ``10 rad/s`` where a speed is multiplied by 0.1."""
+    """Units of 1 after the scaling: ``10 rad/s`` where a speed is multiplied by 0.1."""
     if scale == 1.0:
         return list(units)
     if scale == 0.0:

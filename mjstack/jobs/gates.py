@@ -8,14 +8,12 @@ from mjstack.config.schema import Backend, Config
 from mjstack.drivers.tilt import turn_sign
 from mjstack.envs import build_env
 from mjstack.episodes.context import RunContext
+from mjstack.episodes.earlier_run import archive_starts
 from mjstack.episodes.record import clear_records
 from mjstack.errors import ConfigError
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
-from mjstack.jobs.earlier_run import archive_starts
-from mjstack.jobs.job import Job, JobResult
-from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.runner import Record, check_showing, run_reported
+from mjstack.jobs.runner import CheckedJob, Job, check_showing
 from mjstack.sim import resolve_backend
 
 
@@ -70,18 +68,18 @@ def check_env(context: RunContext, cfg: Config) -> None:
     build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu").close()
 
 
-def run_gates_job(context: RunContext, folder: Path, overrides: list[str]) -> JobResult:
-    """Run the gates of one configuration, and write its report after each; see `run_reported`."""
-    cfg = context.cfg
-
-    def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
-        context = replace(context, cfg=archive_starts(cfg, folder))
-        starts = context.cfg.starts
-        clear_records(folder, keep=None if starts is None else Path(starts))
-        run_gates(context, bar.start, record)
-
+def check_gates(cfg: Config) -> CheckedJob:
+    """Raise for what this machine cannot do, before anything is written."""
     title = f"task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)}"
-    return run_reported(context, folder, overrides, title, work)
+    return CheckedJob(context=check_machine(cfg), title=title, work=_run_gates)
 
 
-JOB = Job(check_machine, run_gates_job, shows=True)
+def _run_gates(context: RunContext, folder: Path) -> None:
+    """Run the gates in a folder without an earlier run's records."""
+    context = replace(context, cfg=archive_starts(context.cfg, folder))
+    starts = context.cfg.starts
+    clear_records(folder, keep=None if starts is None else Path(starts))
+    run_gates(context)
+
+
+JOB = Job(check_gates, shows=True)

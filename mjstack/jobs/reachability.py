@@ -2,29 +2,24 @@
 positions the objects may stand.
 """
 
+import io
 import math
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
 import numpy as np
-from rich.markup import escape
 
 from mjstack.config.schema import Config, ReachabilityJobCfg
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError
-from mjstack.jobs.job import Job, JobResult
-from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.runner import Record, run_reported
+from mjstack.jobs.runner import CheckedJob, Job, write_tables
 from mjstack.kinematics.reach import PointReach
-from mjstack.report.reachability import (
-    ObjectRegion,
-    ReachLevel,
-    points_csv,
-    save_map,
-)
+from mjstack.report.picture import figure, outline
 from mjstack.report.record import GateResult, Status
-from mjstack.report.write import summarize, write_tables
+from mjstack.report.write import summarize
 from mjstack.scene import table_top
 from mjstack.scene.phases import object_targets
 from mjstack.sim import resolve_backend
@@ -34,7 +29,58 @@ _SHARE = 500  # points between two looks at the clock
 _FINE = 0.001  # [m] to which regions are given
 
 
-def check_reachability(cfg: Config) -> RunContext:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReachLevel:
+    """One height of the map.
+
+    Attributes:
+        name: Such as ``grasp``.
+        height: Of the points above the table [m].
+        gripper: ``open`` or ``closed``.
+        residual: Distance that is left at each point [m], shape ``(ny, nx)``.
+        tilt: Smallest tilt of the gripper from vertical [deg], NaN where the point is not reached,
+            shape ``(ny, nx)``.
+    """
+
+    name: str
+    height: float
+    gripper: str
+    residual: np.ndarray
+    tilt: np.ndarray
+
+    @property
+    def reached(self) -> np.ndarray:
+        """Shape ``(ny, nx)``, bool."""
+        return np.isfinite(self.tilt)
+
+    @property
+    def tilts(self) -> tuple[float, float]:
+        """Smallest and largest tilt [deg]; NaN where no point is reached."""
+        some = self.tilt[self.reached]
+        return (float(some.min()), float(some.max())) if len(some) else (np.nan, np.nan)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ObjectRegion:
+    """Where one object may stand, around its nominal position.
+
+    Attributes:
+        name: The object.
+        square: Largest half-width of a square that is reached with the margin [m]; 0 where none is.
+        largest: Half-widths of the largest rectangle that is reached with the margin [m].
+        tilt: Largest of the smallest tilts in that region at the grasp [deg]; NaN where some is not
+            reached.
+        reached: Whether the region of ``reset=randomized`` is, with the margin.
+    """
+
+    name: str
+    square: float
+    largest: tuple[float, float]
+    tilt: float
+    reached: bool
+
+
+def check_reachability(cfg: Config) -> CheckedJob:
     """Raise for what cannot be done, before anything is written."""
     resolve_backend(cfg)
     find_levels(cfg)
@@ -45,42 +91,31 @@ def check_reachability(cfg: Config) -> RunContext:
         least = math.sqrt(4.0 * half[0] * half[1] / _MOST_POINTS)
         expected = f"{least:.4f} to {min(half[:2]):g} m; this table would have {points} points"
         raise ConfigError("job.step", step, expected)
-    return RunContext(cfg)
+    title = f"task {cfg.task.name}, what the arm reaches"
+    return CheckedJob(context=RunContext(cfg), title=title, work=run_reachability)
 
 
-def run_reachability_job(context: RunContext, folder: Path, overrides: list[str]) -> JobResult:
-    """Draw the map and leave reachability.csv, .md, .png and the report.
+def run_reachability(context: RunContext, folder: Path) -> None:
+    """Draw the map and leave reachability.csv, .md and .png in the folder.
 
-    Args:
-        context: The configuration.
-        folder: Where they go.
-        overrides: The command line.
-
-    Returns:
-        How it ended: a pass if the region of ``reset=randomized`` is reached with the margin,
-        around every object's position.
+    An object passes if the region of ``reset=randomized`` is reached with the margin around its
+    position.
     """
     cfg = context.cfg
-
-    def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
-        levels: list[ReachLevel] = []
-        results: list[GateResult] = []
-        for name, (height, gripper) in find_levels(cfg).items():
-            bar.start(name)
-            began = time.perf_counter()
-            levels.append(map_level(context, name, height, gripper))
-            results.append(_level_result(levels[-1], time.perf_counter() - began))
-            _write(cfg, folder, levels, [], results)
-            record(results[-1])
-        regions = [find_region(cfg, levels, name) for name in cfg.scene.free]
-        results += [_region_result(cfg, region) for region in regions]
-        if problem := _write(cfg, folder, levels, regions, results, draw=True):
-            bar.say(escape(problem))
-        for result in results[len(levels) :]:
-            record(result)
-
-    title = f"task {cfg.task.name}, what the arm reaches"
-    return run_reported(context, folder, overrides, title, work)
+    levels: list[ReachLevel] = []
+    results: list[GateResult] = []
+    for name, (height, gripper) in find_levels(cfg).items():
+        context.begin(name)
+        began = time.perf_counter()
+        levels.append(map_level(context, name, height, gripper))
+        results.append(_level_result(levels[-1], time.perf_counter() - began))
+        _write(context, levels, [], results)
+        context.record(results[-1])
+    regions = [find_region(cfg, levels, name) for name in cfg.scene.free]
+    results += [_region_result(cfg, region) for region in regions]
+    _write(context, levels, regions, results, draw=True)
+    for result in results[len(levels) :]:
+        context.record(result)
 
 
 def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
@@ -171,24 +206,17 @@ def find_region(cfg: Config, levels: list[ReachLevel], name: str) -> ObjectRegio
         scene.table_half[k] - thing.footprint - abs(place[k] - scene.table_center[k])
         for k in (0, 1)
     ]
-    square = 0.0
-    largest = (0.0, 0.0)
-    for half_x in np.arange(0.0, max(room[0], 0.0) + 1e-9, _FINE):
-        half_y = min(room[1], most_y(half_x))
-        if half_y < 0.0:
-            continue
-        half_y = _FINE * math.floor(half_y / _FINE + 1e-9)
-        if half_y >= half_x - 1e-9:
-            square = half_x
-        if half_x * half_y > largest[0] * largest[1]:
-            largest = float(half_x), half_y
+    half_x = np.arange(0.0, max(room[0], 0.0) + 1e-9, _FINE)
+    half_y = np.minimum(room[1], [most_y(one) for one in half_x])
+    half_y = _FINE * np.floor(half_y / _FINE + 1e-9)
+    area = half_x * half_y.clip(0.0)
+    best = area.argmax()
+    largest = (float(half_x[best]), float(half_y[best])) if area[best] > 0.0 else (0.0, 0.0)
     wide, deep = scene.random_xy
     inside = np.ix_(np.abs(y - place[1]) <= deep + 1e-9, np.abs(x - place[0]) <= wide + 1e-9)
     return ObjectRegion(
         name=name,
-        place=(place[0], place[1]),
-        configured=(wide, deep),
-        square=float(square),
+        square=float(half_x[half_y >= half_x - 1e-9].max(initial=0.0)),
         largest=largest,
         tilt=float(levels[0].tilt[inside].max(initial=-math.inf)),
         reached=most_y(wide) >= deep - 1e-9,
@@ -217,9 +245,9 @@ def _level_result(level: ReachLevel, seconds: float) -> GateResult:
 
 def _region_result(cfg: Config, region: ObjectRegion) -> GateResult:
     margin = cast(ReachabilityJobCfg, cfg.job).margin
-    wide, deep = region.configured
+    wide, deep = cfg.scene.random_xy
     x, y = region.largest
-    at = "({:.3f}, {:.3f})".format(*region.place)
+    at = "({:.3f}, {:.3f})".format(*cfg.scene.objects[region.name].xy)
     there = "reached" if region.reached else "not reached"
     reason = (
         f"at {at} m, scene.random_xy {wide:g} x {deep:g} m is {there} with {1e3 * margin:g} mm to"
@@ -243,17 +271,15 @@ def _region_result(cfg: Config, region: ObjectRegion) -> GateResult:
 
 
 def _write(
-    cfg: Config,
-    folder: Path,
+    context: RunContext,
     levels: list[ReachLevel],
     regions: list[ObjectRegion],
     results: list[GateResult],
     draw: bool = False,
-) -> str:
-    """Write table and picture as far as they are known; return why there is no picture."""
+) -> None:
+    """Write table and picture as far as they are known."""
+    cfg = context.cfg
     job = cast(ReachabilityJobCfg, cfg.job)
-    scene = cfg.scene
-    x, y = axes(cfg)
     title = f"{cfg.robot.title}, task {cfg.task.name}: what the arm reaches"
     notes = [
         (
@@ -273,20 +299,67 @@ def _write(
         "Reached does not mean grasped: how many worlds succeed, the gate success tells.",
     ]
 
-    def picture(path: Path) -> None:
-        table = (scene.table_center[:2], scene.table_half[:2])
-        colors = {name: thing.color for name, thing in scene.free.items()}
-        save_map(path, title, x, y, levels, regions, table, colors)
-
-    return write_tables(
-        folder,
+    write_tables(
+        context,
         "reachability",
         title,
-        [summarize(results)],
+        summarize(results),
         notes,
-        points_csv(x, y, levels),
-        picture if draw else None,
+        _points_csv(cfg, levels),
+        (lambda path: _save_map(path, title, cfg, levels, regions)) if draw else None,
     )
 
 
-JOB = Job(check_reachability, run_reachability_job)
+def _points_csv(cfg: Config, levels: Sequence[ReachLevel]) -> str:
+    """A row per point of the map; the tilt is ``nan`` where the arm does not get to."""
+    columns = dict(zip(("x_m", "y_m"), np.meshgrid(*axes(cfg)), strict=True))
+    for level in levels:
+        columns[f"{level.name}_reached"] = level.reached
+        columns[f"{level.name}_residual_m"] = level.residual
+        columns[f"{level.name}_tilt_deg"] = level.tilt
+    out = io.StringIO()
+    table = np.stack([column.ravel() for column in columns.values()], axis=1)
+    np.savetxt(out, table, "%.6g", ",", header=",".join(columns), comments="")
+    return out.getvalue()
+
+
+def _save_map(
+    path: Path,
+    title: str,
+    cfg: Config,
+    levels: Sequence[ReachLevel],
+    regions: Sequence[ObjectRegion],
+) -> None:
+    """Draw a panel per level: the tilt as colour, hatched where the arm does not get to, table,
+    objects and regions.
+    """
+    scene = cfg.scene
+    x, y = axes(cfg)
+    wide = x[-1] - x[0]
+    deep = y[-1] - y[0]
+    title += (
+        "\nhatched: not reached; squares: objects; solid: configured region; dotted: largest with"
+        " margin"
+    )
+    count = len(levels)
+    size = ((3.6 * max(0.6, wide / deep) + 1.0) * count + 1.2, 5.6)
+    with figure(path, title, count, figsize=size) as (drawn, panels):
+        top = np.nanmax([level.tilts[1] for level in levels] + [1.0])
+        for panel, level in zip(np.atleast_1d(panels), levels, strict=True):
+            panel.set_facecolor("0.92")
+            center = (x[len(x) // 2], y[len(y) // 2])
+            panel.add_patch(outline(center, (wide / 2, deep / 2), hatch="////", ec="0.6", lw=0))
+            image = panel.pcolormesh(x, y, level.tilt, vmin=0.0, vmax=top, shading="nearest")
+            panel.add_patch(outline(scene.table_center, scene.table_half, ec="k", lw=1.5))
+            for region in regions:
+                color = scene.objects[region.name].color
+                place = scene.objects[region.name].xy
+                panel.plot(*place, "s", color=color, markersize=7, markeredgecolor="w")
+                panel.add_patch(outline(place, scene.random_xy, ec=color, lw=1.8))
+                panel.add_patch(outline(place, region.largest, ec=color, lw=1.2, ls=":"))
+            label = f"{level.name}: {level.height:.3f} m above, {level.gripper}"
+            panel.set(title=label, xlabel="x [m]", ylabel="y [m]", aspect="equal")
+        drawn.colorbar(image, ax=panels, label="smallest tilt of the gripper from vertical [deg]")
+
+
+JOB = Job(check_reachability)

@@ -14,6 +14,7 @@ from rich.markup import escape
 
 from mjstack.config.schema import Backend, Config, SimCfg
 from mjstack.episodes.context import RunContext, judge_one, require_episode
+from mjstack.episodes.earlier_run import EarlierRun, archived_starts, copy_names
 from mjstack.episodes.failures import FailureMonitor, describe_sign
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.replay import ReplayedWorld, replay_world, start_of_world
@@ -21,11 +22,8 @@ from mjstack.errors import ConfigError, DeviceError, RunError
 from mjstack.files import write_atomic, write_npz
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
-from mjstack.jobs.earlier_run import EarlierRun, archived_starts, copy_names
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.job import Job, JobResult
-from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.runner import Record, check_showing, run_provenance, run_reported
+from mjstack.jobs.runner import CheckedJob, Job, check_showing, run_provenance
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import resolve_backend, resolve_device
 
@@ -62,35 +60,28 @@ class ReplayPlan:
     context: RunContext
 
 
-def check_replay(cfg: Config) -> ReplayPlan:
+def check_replay(cfg: Config) -> CheckedJob:
     """Raise for what cannot be replayed, before anything is written."""
     plan = _plan(cfg)
-    require_episode(plan.context.cfg)
-    check_task(plan.context)
-    check_showing(plan.context.cfg)
+    context = plan.context
+    require_episode(context.cfg)
+    check_task(context)
+    check_showing(context.cfg)
     _check_start(plan)
-    return plan
-
-
-def run_replay_job(plan: ReplayPlan, folder: Path, overrides: list[str]) -> JobResult:
-    """Play the world on its run's backend and, where that was MJWarp, on native MuJoCo too; see
-    `run_reported`.
-    """
-
-    def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
-        played = OmegaConf.structured(replace(context.cfg, seed=plan.seed))
-        write_atomic(folder / "replayed_config.yaml", OmegaConf.to_yaml(played))
-        changes = _changes(plan.run.provenance, run_provenance(context.cfg, context))
-        for line in changes:
-            bar.say(escape(line))
-        for number, (backend, _) in enumerate(plan.where):
-            name = f"replay_{backend.value}"
-            bar.start(name)
-            run_guarded(context, name, partial(_replay, plan, number, changes), record)
-
-    nworld = plan.context.cfg.nworld
+    nworld = context.cfg.nworld
     title = f"replay of world {plan.world} of {nworld}, seed {plan.seed}, of {plan.run.folder}"
-    return run_reported(plan.context, folder, overrides, title, work)
+    return CheckedJob(context=context, title=title, work=partial(_replay_all, plan))
+
+
+def _replay_all(plan: ReplayPlan, context: RunContext, folder: Path) -> None:
+    """Play the world on its run's backend and, where that was MJWarp, on native MuJoCo too."""
+    played = OmegaConf.structured(replace(context.cfg, seed=plan.seed))
+    write_atomic(folder / "replayed_config.yaml", OmegaConf.to_yaml(played))
+    changes = _changes(plan.run.provenance, run_provenance(context))
+    for line in changes:
+        context.say(escape(line))
+    for number, (backend, _) in enumerate(plan.where):
+        run_guarded(context, f"replay_{backend.value}", partial(_replay, plan, number, changes))
 
 
 def _plan(cfg: Config) -> ReplayPlan:
@@ -175,8 +166,10 @@ def _check_start(plan: ReplayPlan) -> None:
 
 def _changes(then: dict, now: dict) -> list[str]:
     """Facts that differ from the earlier run's and could change a result, or its last bits."""
-    before = {**then.get("versions", {}), **{name: then.get(key) for key, name in _PLACES.items()}}
-    here = {**now["versions"], **{name: now[key] for key, name in _PLACES.items()}}
+    before, here = (
+        one.get("versions", {}) | {name: one.get(key) for key, name in _PLACES.items()}
+        for one in (then, now)
+    )
     lines = [
         f"{name} was {before[name]} in that run and is {value} now"
         for name, value in here.items()
@@ -209,11 +202,9 @@ def _replay(
     if not kept:
         status = Status.failed
     if first:
-        context.artifacts.shown = done.recorder
-        shown = f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
-        context.artifacts.shown_by = shown
-    told = list(done.findings)
-    told += [_first_sign(monitor, done, context) for monitor in monitors]
+        title = f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
+        context.artifacts.shown = (title, done.recorder)
+    told = [*done.findings, *(_first_sign(monitor, done, context) for monitor in monitors)]
     for line in told:
         context.say(escape(f"  {line}"))
     name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
@@ -288,6 +279,4 @@ def _compare(
     return bool(reasons), f"{agrees} {ends}{why}"
 
 
-JOB = Job(
-    check_replay, run_replay_job, keys=("job", "run", "world", "sim", "view", "video"), shows=True
-)
+JOB = Job(check_replay, keys=("job", "run", "world", "sim", "view", "video"), shows=True)

@@ -1,13 +1,16 @@
-"""The runner of jobs that leave a report, which is written after each result."""
+"""Jobs: how they are checked and run, and the report that is written after each result."""
 
 import contextlib
+import hashlib
 import logging
 import os
+import re
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import mujoco
 import numpy as np
@@ -15,22 +18,21 @@ from omegaconf import OmegaConf
 from rich.console import Console
 from rich.markup import escape
 
+from mjstack.config.functions import find_object
 from mjstack.config.schema import Config
 from mjstack.episodes.context import Artifacts, RunContext
 from mjstack.episodes.observers import StepHook
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.jobs.job import JobResult
+from mjstack.files import write_atomic
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
 from mjstack.report.picture import require_video, save_scene, save_trajectories, save_video
 from mjstack.report.provenance import collect_provenance
-from mjstack.report.record import GateResult, Report, Status
+from mjstack.report.record import GateResult, Provenance, Report, Status
+from mjstack.report.table import Table, to_document
 from mjstack.report.write import safely_draw, summarize, write_report
 from mjstack.sim import Simulation, cuda_driver, cuda_name
 
 log = logging.getLogger(__name__)
-
-Record = Callable[[GateResult], None]
-Work = Callable[[RunContext, ProgressBar, Record], None]
 
 
 def check_showing(cfg: Config) -> None:
@@ -47,94 +49,189 @@ def check_showing(cfg: Config) -> None:
         require_video()
 
 
-def run_reported(
-    context: RunContext, folder: Path, overrides: list[str], title: str, work: Work
-) -> JobResult:
-    """Do some work and write its report after each result.
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One kind of job; ``conf/job/<name>.yaml`` names it.
+
+    Attributes:
+        check: Raises a `MjstackError` for what cannot be done here, before anything is written.
+            Returns the job ready to run, with the scene and the plan that the check built.
+        keys: Top-level keys and groups that its command line may set; None for all.
+        shows: Whether it can show a world (``view``, ``video``).
+    """
+
+    check: Callable[[Config], "CheckedJob"]
+    keys: tuple[str, ...] | None = None
+    shows: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CheckedJob:
+    """A job that has passed its checks.
+
+    Attributes:
+        context: The configuration, and what its check built.
+        title: The work in one line.
+        work: Does it in a folder, and hands each result to the context's ``record``.
+        folder: The default folder of a job that resumes; None for a folder of the hour.
+    """
+
+    context: RunContext
+    title: str
+    work: Callable[[RunContext, Path], None]
+    folder: Path | None = None
+
+    def run(self, folder: Path, overrides: Sequence[str] = ()) -> Report:
+        """Do the work and write its report after each result.
+
+        Args:
+            folder: Where report.json, report.md, pictures and logs go.
+            overrides: The command line.
+
+        Returns:
+            How it ended. Ctrl-C is an outcome, not an exception: the finished results are in the
+            report.
+        """
+        console = Console(highlight=False, soft_wrap=True)
+        errors = Console(stderr=True, soft_wrap=True, markup=False)
+        report = Report(folder=folder, overrides=list(overrides))
+        cfg = self.context.cfg
+
+        def record(result: GateResult) -> None:
+            report.gates.append(result)
+            write_report(report)
+            log.info("%s: %s %s", result.name, result.status.value, result.reason)
+            bar.finish(result)
+
+        # The work, and the pictures of its artifacts
+        try:
+            where = f"{escape(self.title)} -> {escape(str(folder))}"
+            console.print(f"[bold]{cfg.robot.title}[/], {where}")
+            report.provenance = run_provenance(self.context)
+            write_report(report)
+            with ProgressBar(console) as bar:
+                context = replace(
+                    self.context,
+                    folder=folder,
+                    overrides=overrides,
+                    say=bar.say,
+                    begin=bar.start,
+                    record=record,
+                    advance=bar.advance,
+                    on_step=_viewer(self.context) if cfg.view else None,
+                    artifacts=Artifacts(),
+                )
+                self.work(context, folder)
+            report.conclude()
+            write_report(report)
+            report.pictures = [*_draw(context, console), *context.artifacts.pictures]
+        # However it ends, the finished results are in the report.
+        except KeyboardInterrupt:
+            report.status = Status.interrupted
+            console.print("interrupted; the finished gates are in the report")
+        except OSError as error:
+            report.status = Status.failed
+            errors.print(
+                f"mjstack: {folder} cannot be written: {error.strerror}. Free space, or set"
+                " hydra.run.dir."
+            )
+        except MjstackError as error:
+            report.status = Status.failed
+            log.error("%s", error)
+            errors.print(f"mjstack: {error}")
+        with contextlib.suppress(OSError):
+            write_report(report)
+        _print_summary(console, report)
+        return report
+
+
+def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
+    """Raise for what this machine cannot do, before anything is written.
 
     Args:
-        context: The configuration, and what its check built.
-        folder: Where report.json, report.md, pictures and logs go.
-        overrides: The command line.
-        title: The work in one line.
-        work: Does it. Hands over each result as soon as there is one.
-
-    Returns:
-        How it ended. Ctrl-C is an outcome, not an exception: the finished results are in the
-        report.
+        cfg: The configuration.
+        overrides: Its command line, without Hydra's own keys.
     """
-    console = Console(highlight=False, soft_wrap=True)
-    errors = Console(stderr=True, soft_wrap=True, markup=False)
-    context = replace(context, folder=folder, artifacts=Artifacts())
-    cfg = context.cfg
-    report = Report(provenance={})
-
-    def record(result: GateResult) -> None:
-        report.gates.append(result)
-        write_report(report, folder)
-        log.info("%s: %s %s", result.name, result.status.value, result.reason)
-        bar.finish(result)
-
-    try:
-        console.print(f"[bold]{cfg.robot.title}[/], {escape(title)} -> {escape(str(folder))}")
-        report.provenance = run_provenance(cfg, context)
-        write_report(report, folder)
-        with ProgressBar(console) as bar:
-            viewer = _viewer(context) if cfg.view else None
-            context = replace(context, say=bar.say, advance=bar.advance, on_step=viewer)
-            work(context, bar, record)
-        report.conclude()
-        write_report(report, folder)
-        report.pictures = [*_draw(context, folder, console), *context.artifacts.pictures]
-        write_report(report, folder)
-    # However it ends, the finished results are in the report.
-    except KeyboardInterrupt:
-        report.status = Status.interrupted
-        console.print("interrupted; the finished gates are in the report")
-    except OSError as error:
-        report.status = Status.failed
-        errors.print(
-            f"mjstack: {folder} cannot be written: {error.strerror}. Free space, or set"
-            " hydra.run.dir."
-        )
-    except MjstackError as error:
-        report.status = Status.failed
-        log.error("%s", error)
-        errors.print(f"mjstack: {error}")
-    with contextlib.suppress(OSError):
-        write_report(report, folder)
-    _print_summary(console, report, folder)
-    return JobResult(status=report.status, folder=folder, overrides=overrides, gates=report.gates)
+    job = find_object("job.func", cfg.job.func)
+    if not isinstance(job, Job):
+        raise ConfigError("job.func", cfg.job.func, "a mjstack.jobs.Job")
+    for override in overrides:
+        key, _, value = override.lstrip("+~").partition("=")
+        if job.keys is not None and re.split(r"[.@/]", key)[0] not in job.keys:
+            expected = f"only {', '.join(job.keys[1:])} beside job={cfg.job.name}"
+            raise ConfigError(key, value, expected, "Leave it out")
+    for key in ("view", "video"):
+        if getattr(cfg, key) and not job.shows:
+            expected = f"false with job={cfg.job.name}, which shows no world"
+            raise ConfigError(key, "true", expected, "Leave it out")
+    return job.check(cfg)
 
 
-def run_provenance(cfg: Config, context: RunContext) -> dict:
-    """Versions, device, and hashes of configuration and model."""
+def write_tables(
+    context: RunContext,
+    name: str,
+    title: str,
+    table: Table,
+    notes: Sequence[str],
+    csv: str,
+    draw: Callable[[Path], object] | None = None,
+) -> None:
+    """Replace ``name.csv``, ``name.md`` and, where ``draw`` is given, ``name.png`` of a run.
+
+    Args:
+        context: The run. A picture that fails is said.
+        name: Of the files.
+        title: Heading of the text.
+        table: Of the text.
+        notes: Of the text, a line each.
+        csv: All rows.
+        draw: Draws the picture, which may fail.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
+    folder = cast(Path, context.folder)
+    picture = folder / f"{name}.png"
+    if draw is not None:
+        if problem := safely_draw(picture, draw):
+            context.say(escape(problem))
+        else:
+            context.artifacts.pictures.append(picture.name)
+    write_atomic(folder / f"{name}.csv", csv)
+    shown = [picture.name] if picture.exists() else []
+    write_atomic(folder / f"{name}.md", to_document(title, [table], notes, shown))
+
+
+def run_provenance(context: RunContext) -> Provenance:
+    """Versions, machine, device, and hashes of configuration and model."""
     backend, device = context.backend
     name = "Warp's CPU device"
     if device.startswith("cuda"):
         name = cuda_name(device)
     elif backend.value == "native":
         name = f"native MuJoCo on {os.cpu_count()} cores"
-    # The compiled model's numbers: what the physics sees, whatever file it came from
+    config = OmegaConf.to_yaml(OmegaConf.structured(context.cfg))
+    # The numbers of the compiled model: the physics sees these, not the files
     buffer = np.empty(mujoco.mj_sizeModel(context.model), np.uint8)
     mujoco.mj_saveModel(context.model, None, buffer)
-    return collect_provenance(
-        config_yaml=OmegaConf.to_yaml(OmegaConf.structured(cfg)),
-        model_text=buffer.tobytes().hex(),
-        device=f"{device}: {name}",
-        driver=cuda_driver() if device.startswith("cuda") else "no CUDA device",
-    )
+    return collect_provenance() | {
+        "device": f"{device}: {name}",
+        "driver": cuda_driver() if device.startswith("cuda") else "no CUDA device",
+        "config_sha256": hashlib.sha256(config.encode()).hexdigest(),
+        "model_sha256": hashlib.sha256(buffer.tobytes().hex().encode()).hexdigest(),
+    }
 
 
-def _draw(context: RunContext, folder: Path, console: Console) -> list[str]:
+def _draw(context: RunContext, console: Console) -> list[str]:
     """Draw the one-world episode, if there was one; return the pictures' file names."""
-    episode = context.artifacts.shown
-    cfg = context.cfg
-    if episode is None:
+    if context.artifacts.shown is None:
         return []
+    world, episode = context.artifacts.shown
+    cfg = context.cfg
+    folder = cast(Path, context.folder)
     objects = {name: (thing.half, thing.color) for name, thing in cfg.scene.free.items()}
     positions = np.stack([episode.qpos[:, a : a + 3] for a in context.index.object_qpos], axis=1)
-    title = f"{cfg.robot.title}, {cfg.task.name}: {context.artifacts.shown_by}"
+    title = f"{cfg.robot.title}, {cfg.task.name}: {world}"
     model = context.stage.visual_model
     drawn: dict[str, tuple[Callable[..., object], tuple]] = {
         "scene.png": (save_scene, (model, episode.qpos[-1])),
@@ -173,8 +270,8 @@ def _viewer(context: RunContext) -> StepHook:
     return show
 
 
-def _print_summary(console: Console, report: Report, folder: Path) -> None:
+def _print_summary(console: Console, report: Report) -> None:
     colors = {status.value: color for status, color in STATUS_COLOR.items()}
     console.print(summarize(report.gates).to_console(colors))
-    console.print(f"report: {escape(str(folder))}/report.md")
+    console.print(f"report: {escape(str(report.folder))}/report.md")
     console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status.value}[/]")

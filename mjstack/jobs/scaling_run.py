@@ -9,22 +9,24 @@ from pathlib import Path
 from typing import Any
 
 from mjstack.config.session import search_path_args
-from mjstack.errors import MjstackError, is_out_of_memory
+from mjstack.errors import is_out_of_memory
 from mjstack.files import write_atomic
-from mjstack.report.scaling import NOT_RUN, PASS, Row
 
+PASS = "pass"
+NOT_RUN = "not run"
 RESULT = "run.json"
 _START = "from mjstack.__main__ import main; main()"
 _GRACE = 20.0  # s, for a process that was asked to stop
 
-
-class OutOfTime(MjstackError):
-    """The job's time is over; the run counts as not run."""
+Row = dict[str, Any]
+"""One run of the job: ``nworld``, ``backend``, ``status`` (pass, fail, out of memory or not run),
+``reason``, ``seconds`` with the start of its process, ``hardware``, ``git_commit``, and every
+metric of its gates by name. A figure that was not measured, or is void, is missing."""
 
 
 def new_row(nworld: int, backend: str, **values: Any) -> Row:
     """A row that has not run, with some values."""
-    empty = {"status": NOT_RUN, "reason": "", "seconds": None, "hardware": "", "git_commit": ""}
+    empty = {"status": NOT_RUN, "reason": "", "hardware": "", "git_commit": ""}
     return {"nworld": nworld, "backend": backend} | empty | values
 
 
@@ -40,29 +42,22 @@ def read_run(folder: Path, nworld: int, backend: str) -> Row:
 
 
 def run_process(
-    folder: Path,
-    nworld: int,
-    backend: str,
-    overrides: Sequence[str],
-    *,
-    run_seconds: float,
-    job_seconds: float,
+    folder: Path, row: Row, overrides: Sequence[str], *, run_seconds: float, job_seconds: float
 ) -> Row:
     """Run the gates in a process and keep the row.
 
     Args:
         folder: The run's folder; its report, log and output go there.
-        nworld: Number of worlds.
-        backend: ``mjwarp`` or ``native``.
+        row: The row so far: number of worlds and backend count.
         overrides: The run's command line.
         run_seconds: After that it has failed.
         job_seconds: After that it is stopped; the next call of the job repeats it.
 
     Returns:
-        The row, also for a run that failed.
+        The row, also for a run that failed. One that the job had no time for has not run, with the
+        reason.
 
     Raises:
-        OutOfTime: The job's time is over.
         KeyboardInterrupt: Ctrl-C; the process has been stopped.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -85,8 +80,11 @@ def run_process(
         finally:
             _stop(process)
     seconds = time.monotonic() - began
+    nworld = row["nworld"]
+    backend = row["backend"]
     if code is None and job_seconds <= run_seconds:
-        raise OutOfTime(f"{backend}, {nworld} worlds: stopped after {seconds:.0f} s")
+        stopped = f"{backend}, {nworld} worlds: stopped after {seconds:.0f} s"
+        return new_row(nworld, backend, reason=stopped)
     if code == 130:
         raise KeyboardInterrupt
     row = read_report(folder, nworld, backend, code) | {"seconds": seconds}

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from rich.markup import escape
 
 from mjstack.bench.physics import HeldPhysics, play_to_phase
 from mjstack.bench.timing import describe_lost, steps_that_fit
@@ -22,14 +21,11 @@ from mjstack.errors import MjstackError
 from mjstack.files import to_csv
 from mjstack.gates.runner import describe_error
 from mjstack.jobs.gates import check_machine
-from mjstack.jobs.job import Job, JobResult
-from mjstack.jobs.progress import ProgressBar
-from mjstack.jobs.runner import Record, run_reported
+from mjstack.jobs.runner import CheckedJob, Job, write_tables
 from mjstack.managers.episode import required_fields
 from mjstack.report.picture import figure
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
-from mjstack.report.write import write_tables
 from mjstack.sim import Simulation, SolverLimit, make_simulation
 from mjstack.sim.sizes import resolve_measuring_sizes
 
@@ -46,56 +42,46 @@ median, ``ratio_min``, ``ratio_max``).
 """
 
 
-def check_study(cfg: Config) -> RunContext:
+def check_study(cfg: Config) -> CheckedJob:
     """Raise for what this machine cannot do, before anything is written."""
     require_episode(cfg)
-    return check_machine(cfg)
+    count = len(cast(StudyJobCfg, cfg.job).variants)
+    title = f"task {cfg.task.name}, {cfg.nworld} worlds, study of {count} variants of the solver"
+    return CheckedJob(context=check_machine(cfg), title=title, work=run_study)
 
 
-def run_study_job(context: RunContext, folder: Path, overrides: list[str]) -> JobResult:
-    """Measure every variant and leave study.csv, study.md, study.png and the report.
+def run_study(context: RunContext, folder: Path) -> None:
+    """Measure every variant and leave study.csv, study.md and study.png in the folder.
 
-    Args:
-        context: The configuration, and what its check built.
-        folder: Where they go.
-        overrides: The command line.
-
-    Returns:
-        How it ended: a pass if every variant was measured, whatever was found.
+    A variant passes if it was measured.
     """
     cfg = context.cfg
     job = cast(StudyJobCfg, cfg.job)
-
-    def work(context: RunContext, bar: ProgressBar, record: Record) -> None:
-        rows: list[Row] = []
-        bar.start("base")
-        try:
-            # The configured solver's worlds are kept beside every variant, so that the repetitions
-            # of both are interleaved and start from one state.
-            sim = _simulation(context)
-            state = play_to_phase(context, sim)
-            base = HeldPhysics(sim, state, cfg.timing.decimation)
-            steps = steps_that_fit(job.steps, job.max_seconds, base.warm_up())
-        except Exception as error:  # nothing can be compared with it
-            reason = f"the configured solver cannot be timed: {describe_error(error)}"
-            record(GateResult(name="base", status=Status.failed, reason=reason))
-            return
-        try:
-            for name, solver in job.variants.items():
-                bar.start(name)
-                began = time.perf_counter()
-                rows.append(_guarded(context, base, steps, name, solver))
-                _write(context, folder, rows)
-                record(_as_result(rows[-1], time.perf_counter() - began))
-            measured = any(row["status"] == "pass" for row in rows)
-            if measured and (problem := _write(context, folder, rows, draw=True)):
-                bar.say(escape(problem))
-        finally:
-            base.sim.close()
-
-    count = len(job.variants)
-    title = f"task {cfg.task.name}, {cfg.nworld} worlds, study of {count} variants of the solver"
-    return run_reported(context, folder, overrides, title, work)
+    rows: list[Row] = []
+    context.begin("base")
+    try:
+        # The configured solver's worlds are kept beside every variant, so that the repetitions
+        # of both are interleaved and start from one state.
+        sim = _simulation(context)
+        state = play_to_phase(context, sim)
+        base = HeldPhysics(sim, state, cfg.timing.decimation)
+        steps = steps_that_fit(job.steps, job.max_seconds, base.warm_up())
+    except Exception as error:  # nothing can be compared with it
+        reason = f"the configured solver cannot be timed: {describe_error(error)}"
+        context.record(GateResult(name="base", status=Status.failed, reason=reason))
+        return
+    try:
+        for name, solver in job.variants.items():
+            context.begin(name)
+            began = time.perf_counter()
+            rows.append(_guarded(context, base, steps, name, solver))
+            _write(context, rows)
+            context.record(_as_result(rows[-1], time.perf_counter() - began))
+        measured = any(row["status"] == "pass" for row in rows)
+        if measured:
+            _write(context, rows, draw=True)
+    finally:
+        base.sim.close()
 
 
 def _guarded(
@@ -206,8 +192,8 @@ def _as_result(row: Row, seconds: float) -> GateResult:
     )
 
 
-def _write(context: RunContext, folder: Path, rows: list[Row], draw: bool = False) -> str:
-    """Write the tables and the picture so far; return why there is no picture."""
+def _write(context: RunContext, rows: list[Row], draw: bool = False) -> None:
+    """Write the tables and the picture so far."""
     cfg = context.cfg
     backend, device = context.backend
     title = f"{cfg.robot.title}, task {cfg.task.name}: the solver's settings, {cfg.nworld} worlds"
@@ -224,8 +210,8 @@ def _write(context: RunContext, folder: Path, rows: list[Row], draw: bool = Fals
         notes.append("Native MuJoCo does not tell which worlds stopped at a limit of the solver.")
     done = [row for row in rows if row["status"] == "pass"]
     picture = (lambda path: _draw(path, done, title)) if draw else None
-    tables = [Table.of("", _SHOWN, rows)]
-    return write_tables(folder, "study", title, tables, notes, to_csv(rows), picture)
+    table = Table.of(_SHOWN, rows)
+    write_tables(context, "study", title, table, notes, to_csv(rows), picture)
 
 
 def _draw(path: Path, rows: Sequence[Row], title: str) -> None:
@@ -268,4 +254,4 @@ _SHOWN = {
     "notes": "reason",
 }
 
-JOB = Job(check_study, run_study_job)
+JOB = Job(check_study)

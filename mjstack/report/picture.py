@@ -134,7 +134,7 @@ def save_trajectories(
         path: The picture.
         positions: Of each object over the episode [m], shape ``(steps, objects, 3)``.
         objects: Half sizes [m] and color of each object, by name.
-        title: What is shown.
+        title: Above the panels.
     """
     with figure(path, title, 3, figsize=(13, 4)) as (_, (side, above, height)):
         for number, (name, (half, color)) in enumerate(objects.items()):
@@ -171,7 +171,7 @@ def save_places(
         places: x and y [m] of each object first, shape ``(n, objects, 2 or more)``.
         succeeded: Whether each episode was, shape ``(n,)``, bool.
         table: Centre and half size of the table in x and y [m].
-        title: What is shown.
+        title: Above the panels.
         colors: Red, green, blue and alpha of each object, by name.
     """
     centre, half = table

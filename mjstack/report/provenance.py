@@ -1,6 +1,5 @@
-"""Where a result comes from: versions, hardware, commit, and hashes of configuration and model."""
+"""Where a result comes from: versions, processor and commit."""
 
-import hashlib
 import os
 import platform
 import subprocess
@@ -13,17 +12,8 @@ from mjstack.report.record import Provenance
 PACKAGES = ("mjstack", "mujoco", "mujoco-warp", "warp-lang", "torch", "mink", "hydra-core", "numpy")
 
 
-def collect_provenance(
-    *, config_yaml: str, model_text: str, device: str, driver: str
-) -> Provenance:
-    """Collect what is needed to judge and to repeat a run.
-
-    Args:
-        config_yaml: The whole configuration as text.
-        model_text: The compiled model as text, whatever file it came from.
-        device: What the batch runs on, in words.
-        driver: CUDA driver version, or a word why there is none.
-    """
+def collect_provenance() -> Provenance:
+    """Date, versions, processor and commit."""
     versions: dict[str, str] = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -33,13 +23,9 @@ def collect_provenance(
     return {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
         "versions": versions,
-        "device": device,
-        "driver": driver,
         "cpu": _cpu_name(),
         "cpu_count": os.cpu_count(),
         "git_commit": _git_commit(),
-        "config_sha256": hashlib.sha256(config_yaml.encode()).hexdigest(),
-        "model_sha256": hashlib.sha256(model_text.encode()).hexdigest(),
     }
 
 
@@ -54,8 +40,8 @@ def _cpu_name() -> str:
 
 
 def _git_commit() -> str:
-    """The checkout's commit, marked where files differ from it; an installed wheel has none,
-    whatever repository it lies in.
+    """The checkout's commit, marked where files differ from it; an installed wheel has none, even
+    inside a repository.
     """
     root = Path(__file__).resolve().parents[2]
     mark = "--dirty= with changes"

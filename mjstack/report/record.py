@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 
 from mjstack.report.table import Table
 
@@ -26,8 +27,8 @@ class GateResult:
         status: pass, fail or skip.
         reason: Why, in one line; empty where a pass needs no word.
         seconds: Wall time.
-        thresholds: What was required, by name with unit.
-        metrics: What was measured, by name with unit; numbers alone.
+        thresholds: Required values, by name with unit.
+        metrics: Measured values, by name with unit; numbers alone.
         notes: Facts in words, by name: the backend, why something was not measured.
         details: Longer findings, a line each, for the report's text.
         tables: Tables for the report's text.
@@ -46,12 +47,28 @@ class GateResult:
 
 @dataclass(kw_only=True, slots=True)
 class Report:
-    """A whole run: its results so far, and where they come from."""
+    """A whole run: its results so far, and where they come from.
 
-    provenance: Provenance
+    Attributes:
+        folder: Where report.json, report.md, pictures and logs go.
+        overrides: The command line.
+        provenance: Versions, device, hashes.
+        status: How it ended.
+        gates: The results.
+        pictures: File names.
+    """
+
+    folder: Path
+    overrides: list[str] = field(default_factory=list)
+    provenance: Provenance = field(default_factory=dict)
     status: Status = Status.interrupted
     gates: list[GateResult] = field(default_factory=list)
     pictures: list[str] = field(default_factory=list)
+
+    @property
+    def exit_code(self) -> int:
+        """0 pass, 1 a gate failed, 130 interrupted."""
+        return {Status.passed: 0, Status.interrupted: 130}.get(self.status, 1)
 
     def conclude(self) -> Status:
         """pass: no gate that was asked for failed, and at least one passed."""

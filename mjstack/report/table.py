@@ -13,28 +13,28 @@ class Table:
     """A table for people, all text.
 
     Attributes:
-        title: Its heading.
         header: Names of the columns.
         rows: Cells, as many as there are columns.
+        title: Its heading; empty for none.
     """
 
-    title: str
     header: list[str]
     rows: list[list[str]]
+    title: str = ""
 
     @classmethod
     def of(
-        cls, title: str, columns: Mapping[str, str], rows: Iterable[Mapping[str, object]]
+        cls, columns: Mapping[str, str], rows: Iterable[Mapping[str, object]], title: str = ""
     ) -> "Table":
         """Make a table from records; "-" where a record has no value.
 
         Args:
-            title: Its heading.
             columns: By name of the column, the key of its values.
             rows: The records.
+            title: Its heading; empty for none.
         """
         cells = [[format_value(row.get(key, "-")) for key in columns.values()] for row in rows]
-        return cls(title=title, header=list(columns), rows=cells)
+        return cls(header=list(columns), rows=cells, title=title)
 
     def to_markdown(self) -> list[str]:
         """Lines of a Markdown table without its title."""
@@ -69,25 +69,30 @@ def format_value(value: object) -> str:
 
 
 def to_document(
-    title: str, tables: Sequence[Table], notes: Sequence[str] = (), picture: str = ""
+    title: str,
+    tables: Sequence[Table] = (),
+    notes: Sequence[str] = (),
+    pictures: Sequence[str] = (),
+    text: str = "",
+    level: int = 1,
 ) -> str:
-    """A Markdown file: title, tables, picture, and notes as a list.
+    """A Markdown file, or a section of one: heading, text, tables, pictures, and notes as a list.
 
     Args:
-        title: The file's heading.
+        title: The heading.
         tables: With a heading each, except those without a title.
         notes: A line each.
-        picture: File name; empty for none.
+        pictures: File names.
+        text: The first paragraph.
+        level: Of the heading.
     """
-    lines = [f"# {title}"]
+    parts = [f"{'#' * level} {title}", *filter(None, [text])]
     for table in tables:
-        lines += ["", f"## {table.title}"] if table.title else []
-        lines += ["", *table.to_markdown()]
-    if picture:
-        lines += ["", f"![{picture}]({picture})"]
-    if notes:
-        lines += ["", *(f"- {note}" for note in notes)]
-    return "\n".join(lines) + "\n"
+        parts += [f"{'#' * (level + 1)} {table.title}"] if table.title else []
+        parts.append("\n".join(table.to_markdown()))
+    parts += [f"![{picture}]({picture})" for picture in pictures]
+    parts += ["\n".join(f"- {note}" for note in notes)] if notes else []
+    return "\n\n".join(parts) + "\n"
 
 
 def _escape(cell: str) -> str:

@@ -1,14 +1,14 @@
-"""Write report.json and report.md, tables as files, and draw pictures that may fail."""
+"""Write report.json and report.md, and draw pictures that may fail."""
 
 import json
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
 from mjstack.files import write_atomic
-from mjstack.report.record import GateResult, Report, Status
+from mjstack.report.record import GateResult, Report
 from mjstack.report.table import Table, format_value, to_document
 
 log = logging.getLogger(__name__)
@@ -31,7 +31,7 @@ _UNITS = {
 _SPREAD = ("median", "min", "max")
 
 
-def write_report(report: Report, folder: Path) -> None:
+def write_report(report: Report) -> None:
     """Replace report.json and report.md, each in one step.
 
     Called after every result, so that nothing finished is lost.
@@ -47,8 +47,8 @@ def write_report(report: Report, folder: Path) -> None:
     # JSON has no NaN: a number that is not finite becomes its name.
     finite = json.loads(json.dumps(data), parse_constant=lambda name: str(float(name)))
     text = json.dumps(finite, indent=2) + "\n"
-    write_atomic(folder / "report.json", text)
-    write_atomic(folder / "report.md", to_markdown(report))
+    write_atomic(report.folder / "report.json", text)
+    write_atomic(report.folder / "report.md", to_markdown(report))
 
 
 def safely_draw(path: Path, draw: Callable[..., object], *args: object) -> str:
@@ -57,7 +57,7 @@ def safely_draw(path: Path, draw: Callable[..., object], *args: object) -> str:
     Args:
         path: The picture.
         draw: Called with the path and ``args``.
-        args: What is drawn.
+        args: The drawn values.
 
     Returns:
         Empty, or one line that says why there is no picture. run.log has the traceback.
@@ -72,58 +72,17 @@ def safely_draw(path: Path, draw: Callable[..., object], *args: object) -> str:
     return ""
 
 
-def write_tables(
-    folder: Path,
-    name: str,
-    title: str,
-    tables: Sequence[Table],
-    notes: Sequence[str],
-    csv: str,
-    draw: Callable[[Path], object] | None = None,
-) -> str:
-    """Replace ``name.csv``, ``name.md`` and, where ``draw`` is given, ``name.png``.
-
-    Args:
-        folder: Where they go.
-        name: Of the files.
-        title: Heading of the text.
-        tables: Of the text.
-        notes: Of the text, a line each.
-        csv: All rows.
-        draw: Draws the picture, which may fail.
-
-    Returns:
-        Empty, or one line that says why there is no picture.
-
-    Raises:
-        OSError: A file cannot be written.
-    """
-    picture = folder / f"{name}.png"
-    problem = "" if draw is None else safely_draw(picture, draw)
-    write_atomic(folder / f"{name}.csv", csv)
-    shown = picture.name if picture.exists() else ""
-    write_atomic(folder / f"{name}.md", to_document(title, tables, notes, shown))
-    return problem
-
-
 def to_markdown(report: Report) -> str:
     """Summary table, pictures, then every gate with its figures, and the provenance."""
-    lines = [f"# mjstack run: {report.status.value}", "", *summarize(report.gates).to_markdown()]
-    for picture in report.pictures:
-        lines += ["", f"![{picture}]({picture})"]
+    title = f"mjstack run: {report.status.value}"
+    parts = [to_document(title, [summarize(report.gates)], pictures=report.pictures)]
     for gate in report.gates:
-        lines += ["", f"## {gate.name}: {gate.status.value}"]
-        lines += ["", gate.reason] if gate.reason else []
-        for table in [*gate.tables, *_tables(gate)]:
-            lines += ["", f"### {table.title}", "", *table.to_markdown()]
-        lines += ["", *(f"- {line}" for line in gate.details)] if gate.details else []
+        title = f"{gate.name}: {gate.status.value}"
+        tables = [*gate.tables, *_tables(gate)]
+        parts.append(to_document(title, tables, gate.details, text=gate.reason, level=2))
     rows = [[key, _words(value)] for key, value in report.provenance.items()]
-    table = Table(title="Provenance", header=["fact", "value"], rows=rows)
-    lines += ["", f"## {table.title}", "", *table.to_markdown()]
-    skipped = [gate for gate in report.gates if gate.status is Status.skipped]
-    if skipped:
-        lines += ["", "Skipped:", ""] + [f"- {gate.name}: {gate.reason}" for gate in skipped]
-    return "\n".join(lines) + "\n"
+    facts = Table(header=["fact", "value"], rows=rows)
+    return "\n".join([*parts, to_document("Provenance", [facts], level=2)])
 
 
 def summarize(gates: Iterable[GateResult]) -> Table:
@@ -131,7 +90,7 @@ def summarize(gates: Iterable[GateResult]) -> Table:
     rows = [
         [gate.name, gate.status.value, f"{gate.seconds:.1f}", gate.reason or "ok"] for gate in gates
     ]
-    return Table(title="", header=["gate", "status", "seconds", "result"], rows=rows)
+    return Table(header=["gate", "status", "seconds", "result"], rows=rows)
 
 
 def format_percent(rate: float, unit: str = " %") -> str:

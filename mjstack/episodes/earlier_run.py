@@ -138,8 +138,7 @@ def _from_copies(cfg: Config, folder: Path, names: Mapping[str, str]) -> Config:
     def swap(reset: Mapping[str, TermCfg]) -> dict[str, TermCfg]:
         out = dict(reset)
         for key, term in reset.items():
-            name = names.get(term.params.get("path", ""))
-            if name is not None and reads_starts_file({"": term}):
+            if (name := names.get(term.params.get("path", ""))) is not None:
                 out[key] = replace(term, params=term.params | {"path": str(folder / name)})
         return out
 
