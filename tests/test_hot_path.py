@@ -105,13 +105,9 @@ PATHS: dict[str, list[str] | None] = {
         *("StackSuccess._stands", "StackSuccess.__call__"),
     ],
     "tasks/box.py": [
-        *(f"BoxCheck.{n}" for n in ("airborne", "resting", "placed")),
+        *(f"BoxCheck.{n}" for n in ("airborne", "resting", "outside", "over", "placed")),
         *(f"_{n}.update" for n in ("CarriedOver", "Drop", "Release", "Settled", "Order")),
-        "_Drop.held",
-    ],
-    "tasks/box_geometry.py": [
-        *(f"Inside.{n}" for n in ("beyond", "holds", "over")),
-        "corner_speed",
+        *("_Drop.held", "corner_speed"),
     ],
     "tasks/box_terms.py": [
         *(f"{n}.__call__" for n in ("ToSlot", "Place", "InBox", "ReachNext", "GraspNext")),

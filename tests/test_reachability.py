@@ -361,7 +361,7 @@ def test_a_wall_that_leaves_no_room_is_said() -> None:
         pose=cfg.robot.start,
     )
     with pytest.raises(ParameterError, match="found none in 20000 of 20000 trials"):
-        placement.require_room("xy", [0.05, 0.05], 16)
+        placement.require_room([0.05, 0.05], 16)
 
 
 @pytest.mark.full
@@ -377,7 +377,7 @@ def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
     model = build_model(cfg)
     index = SceneIndex(model, cfg.robot, cfg.scene)
     placement = Placement(cfg, model, index, region=(0.03, 0.03), gap=0.04, pose=cfg.robot.start)
-    placement.require_room("xy", [0.03, 0.03], 16)
+    placement.require_room([0.03, 0.03], 16)
     draws = (
         2.0
         * torch.rand(

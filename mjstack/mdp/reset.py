@@ -78,16 +78,16 @@ class JitterObjects:
         placement = Placement(
             env.cfg, env.sim.model, env.index, region=(xy, xy), gap=0.0, pose=env.cfg.robot.home
         )
-        placement.require_room("xy", xy, candidates=1)
+        placement.require_room(xy, candidates=1)
         self._xy = xy
         self._yaw = yaw
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Writes qpos."""
-        draw = random_uniform(env, self.label, 3 * len(env.index.objects))
+        draws = random_uniform(env, self.label, 3 * len(env.index.objects)).view(env.nworld, -1, 3)
         for number, name in enumerate(env.index.objects):
-            dx, dy, yaw = draw[:, 3 * number : 3 * number + 3].unbind(1)
-            _write_object(env, mask, name, self._xy * dx, self._xy * dy, self._yaw * yaw)
+            xy, yaw = draws[:, number].split((2, 1), dim=1)
+            _write_object(env, mask, name, self._xy * xy, self._yaw * yaw[:, 0])
 
 
 @offers(places_objects=True)
@@ -127,8 +127,9 @@ class RandomizeObjects:
             ParameterError: A value is out of range, the region leaves no free place, or the arm
                 does not reach all of it.
         """
-        if len(xy) != 2:
-            raise ParameterError("xy", list(xy), "two numbers [m]")
+        region = list(xy)
+        if len(region) != 2:
+            raise ParameterError("xy", region, "two numbers [m]")
         for name, value in (("xy", min(xy)), ("yaw", yaw), ("gap", gap)):
             require_positive(name, value, zero=True)
         require_positive("candidates", candidates)
@@ -143,13 +144,13 @@ class RandomizeObjects:
             env.cfg,
             env.sim.model,
             env.index,
-            region=(xy[0], xy[1]),
+            region=region,
             gap=gap,
             pose=named_pose(env, pose).tolist(),
             noise=sum(noise),
         )
-        self._placement.require_room("xy", list(xy), candidates)
-        require_reach(env, "xy", (xy[0], xy[1]))
+        self._placement.require_room(region, candidates)
+        require_reach(env, region)
         self._placement.to(env.device, env.sim.qpos.dtype)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
@@ -162,8 +163,7 @@ class RandomizeObjects:
             draws[..., 1:].reshape(env.nworld, count, self._candidates, 2)
         )
         for number, name in enumerate(env.index.objects):
-            dx, dy = offsets[:, number].unbind(1)
-            _write_object(env, mask, name, dx, dy, self._yaw * draws[:, number, 0])
+            _write_object(env, mask, name, offsets[:, number], self._yaw * draws[:, number, 0])
 
 
 class _Randomized:
@@ -212,18 +212,13 @@ class ActuatorGains(_Randomized):
         super().__init__(env, ServoGains(env), bounds("scale", scale))
 
 
-def _write_object(
-    env: EnvView,
-    mask: Tensor,
-    name: str,
-    dx: Tensor,
-    dy: Tensor,
-    yaw: Tensor,
-) -> None:
-    """Moves the masked worlds' object off the position where the simulation's reset has put it."""
+def _write_object(env: EnvView, mask: Tensor, name: str, offset: Tensor, yaw: Tensor) -> None:
+    """Moves the masked worlds' object off the position where the simulation's reset has put it, by
+    x and y [m], and turns it [rad].
+    """
     view = pose_w(env, name)
-    place = view[:, :3] + torch.stack((dx, dy, torch.zeros_like(dx)), dim=1)
     # Float64, because a float32 cosine need not be that of any angle, and a file of starts has the
     # angle.
-    pose = torch.cat((place, quat_from_yaw(yaw.double()).to(place.dtype)), dim=1)
+    turned = quat_from_yaw(yaw.double()).to(view.dtype)
+    pose = torch.cat((view[:, :2] + offset, view[:, 2:3], turned), dim=1)
     torch.where(mask[:, None], pose, view, out=view)

@@ -11,8 +11,7 @@ from mjstack.config.fields import spec
 from mjstack.errors import ConfigError, UnknownName
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import gripper_opening
-from mjstack.scene import lowest_height
-from mjstack.tasks.box_geometry import Inside, corner_speed, scene_box
+from mjstack.scene import lowest_height, table_top
 from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
 from mjstack.tasks.parts import (
     AtLeast,
@@ -82,11 +81,7 @@ class BoxCheck(EpisodeCheck):
         """See `EpisodeCheck`."""
         t = self.t
         self.objects = list(t.objects)
-        self.inside = Inside(self.cfg, t.inside)
-        if len(t.places) != len(t.objects):
-            raise ConfigError("task.check.places", t.places, "a place for each object")
-        self.slots = dict(zip(t.objects, t.places, strict=True))
-        self._check_places()
+        self._read_box()
         self.summaries = {
             "beyond_max_m": ("beyond_m", "max"),
             "corner_speed_max_m_per_s": ("corner_speed_m_per_s", "max"),
@@ -131,17 +126,28 @@ class BoxCheck(EpisodeCheck):
         order = _Order(self, release)
         return [grasp, lift, carry, drop, release, settled, order, inside, _JawClear(self)]
 
-    def _check_places(self) -> None:
-        """Raises unless every object fits into the box at its place."""
-        box = scene_box(self.cfg)
-        places = self.cfg.scene.places
+    def _read_box(self) -> None:
+        """Reads the scene's box, and raises unless every object fits into it at its place."""
+        scene = self.cfg.scene
+        box = scene.box
+        if box is None:
+            raise ConfigError("scene", scene.name, "a scene with a box", "Set scene=box")
+        top = table_top(scene)
+        self.box = box
+        self.rim = top + box.height
+        self._low = [*(box.center[i] - box.half[i] for i in (0, 1)), top + box.floor]
+        self._high = [*(box.center[i] + box.half[i] for i in (0, 1)), self.rim]
+        t = self.t
+        if len(t.places) != len(t.objects):
+            raise ConfigError("task.check.places", t.places, "a place for each object")
+        self.slots = dict(zip(t.objects, t.places, strict=True))
         for name, slot in self.slots.items():
-            if slot not in places:
-                raise UnknownName("task.check.places: place", slot, places)
-            if name not in self.cfg.scene.objects:
+            if slot not in scene.places:
+                raise UnknownName("task.check.places: place", slot, scene.places)
+            if name not in scene.objects:
                 continue  # the base class reports it
-            xy = places[slot].xy
-            half = self.cfg.scene.objects[name].half
+            xy = scene.places[slot].xy
+            half = scene.objects[name].half
             if not all(abs(xy[i] - box.center[i]) <= box.half[i] - half[i] for i in (0, 1)):
                 raise ConfigError(f"scene.places.{slot}.xy", xy, f"a place in the box for {name}")
 
@@ -161,17 +167,30 @@ class BoxCheck(EpisodeCheck):
         bool.
         """
         slow = corner_speed(step) < self.t.rest_speed
-        return step.untouched & self.inside.holds(step) & slow
+        return step.untouched & self.placed(step) & slow
+
+    @once_per_step
+    def outside(self, step: Step) -> Tensor:
+        """How far the outermost corner is beyond the inside of the box along each axis [m],
+        negative inside, shape ``(nworld, objects, 3)``.
+        """
+        low, high = step.bounds
+        constant = step.view.constant
+        return torch.maximum(constant(*self._low) - low, high - constant(*self._high))
+
+    def over(self, step: Step) -> Tensor:
+        """Whether each object is over the box or in it."""
+        return (self.outside(step)[..., :2] <= 0.0).all(-1)
 
     def placed(self, step: Step) -> Tensor:
         """Whether each object is in the box."""
-        return self.inside.holds(step)
+        return self.outside(step).amax(-1) <= self.t.inside
 
     def trace(self, step: Step) -> dict[str, Tensor]:
         """See `EpisodeCheck`."""
         return {
             **{f"slot_err_{each}_m": away(step, each, self.slots[each]) for each in self.objects},
-            "beyond_m": self.inside.beyond(step).amax(1),
+            "beyond_m": self.outside(step).amax((1, 2)),
             "corner_speed_m_per_s": corner_speed(step).amax(1),
         }
 
@@ -180,6 +199,19 @@ class BoxCheck(EpisodeCheck):
         off = [f"{each} {1e3 * values[f'slot_err_{each}_m']:.1f} mm" for each in self.objects]
         clearance = 1e3 * values["jaw_clearance_m"]
         return f"{', '.join(off)} off their places, jaws {clearance:.0f} mm above the rim"
+
+
+@once_per_step
+def corner_speed(step: Step) -> Tensor:
+    """Speed of the fastest corner [m/s], shape ``(nworld, objects)``."""
+    signs = step.view.constant(*itertools.chain(*itertools.product((-1.0, 1.0), repeat=3)))
+    arms = step.view.half[:, None] * signs.view(8, 3)
+    # A free joint's linear velocity is the world's, its angular velocity the body's: all of it in
+    # the body's frame.
+    linear = (step.turn * step.velocity[..., :3, None]).sum(-2)
+    spin = step.velocity[..., None, 3:].expand(-1, -1, 8, -1)
+    swept = torch.linalg.cross(spin, arms.expand_as(spin))
+    return torch.linalg.vector_norm(linear[..., None, :] + swept, dim=-1).amax(-1)
 
 
 class _CarriedOver(Carried):
@@ -207,7 +239,7 @@ class _CarriedOver(Carried):
     def update(self, step: Step) -> None:
         super().update(step)
         hold = step.judged(self._hold) if step.view.phased else step.in_hand
-        self.over.copy_(torch.where(hold, self._check.inside.over(step), self.over))
+        self.over.copy_(torch.where(hold, self._check.over(step), self.over))
 
     def judge(self, end: Step) -> Judgement:
         held, values = super().judge(end)
@@ -328,7 +360,7 @@ class _JawClear(Rule):
         sim = end.view.env.sim
         sim.kinematics()
         jaws = lowest_height(sim.model, self._check.cfg.robot.jaw_bodies, sim.xpos, sim.xquat)
-        clearance = jaws - self._check.inside.rim  # which is above the table
+        clearance = jaws - self._check.rim  # which is above the table
         return clearance >= self._check.t.jaw_clearance, {"jaw_clearance_m": clearance}
 
 

@@ -11,7 +11,6 @@ from mjstack.managers.view import EnvView, offers
 from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, nearness, place_xy, pose_w
 from mjstack.scene import table_top
 from mjstack.tasks.box import BoxCheck
-from mjstack.tasks.box_geometry import scene_box
 
 
 @offers(unit="m")
@@ -30,14 +29,14 @@ class ToSlot:
         Raises:
             MjstackError: There is no such object, or no box.
         """
-        box = scene_box(env.cfg)
-        slots = BoxCheck(env.cfg).slots
-        if object not in slots:
-            raise UnknownName("object", object, slots)
+        check = BoxCheck(env.cfg)
+        if object not in check.slots:
+            raise UnknownName("object", object, check.slots)
         self._object = object
-        self._place = slots[object]
+        self._place = check.slots[object]
         scene = env.cfg.scene
-        self._height = table_top(scene) + box.floor + scene.objects[object].half_height
+        self.floor = check.box.floor
+        self._height = table_top(scene) + self.floor + scene.objects[object].half_height
 
     def __call__(self, env: EnvView) -> Tensor:
         """The offset."""
@@ -66,7 +65,7 @@ class Place:
         self._to_slot = ToSlot(env, object=object)
         self._object = object
         self._scale = scale
-        self._off_table = 0.5 * scene_box(env.cfg).floor
+        self._off_table = 0.5 * self._to_slot.floor
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""

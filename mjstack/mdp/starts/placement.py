@@ -36,7 +36,7 @@ class Placement:
         model: mujoco.MjModel,
         index: SceneIndex,
         *,
-        region: tuple[float, float],
+        region: Sequence[float],
         gap: float,
         pose: Sequence[float],
         noise: float = 0.0,
@@ -91,8 +91,12 @@ class Placement:
         """Moves the constants to where worlds are placed."""
         self._tensors = [t.to(device, dtype) for t in self._tensors]
 
-    def require_room(self, name: str, value: object, candidates: int) -> None:
+    def require_room(self, xy: object, candidates: int) -> None:
         """Tries the region on many imaginary worlds.
+
+        Args:
+            xy: The region as the user wrote it, for the error.
+            candidates: Draws per object and world.
 
         Raises:
             ParameterError: In some of them no candidate fits.
@@ -110,8 +114,8 @@ class Placement:
         lacking = sum(int((~self.choose(share)[1]).sum()) for share in hard.split(_SHARE))
         if lacking:
             raise ParameterError(
-                name,
-                value,
+                "xy",
+                xy,
                 f"a region with a free position for every object; {candidates} draws found none in"
                 f" {lacking} of {_TRIALS} trials",
                 "Make the region smaller, the gap smaller, or move the objects"

@@ -1,6 +1,7 @@
 """Whether the arm reaches what its phases ask of an object, wherever the object may stand."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -8,51 +9,12 @@ from mjstack.errors import ParameterError
 from mjstack.kinematics.reach import PointReach
 from mjstack.managers.view import EnvView
 from mjstack.scene import table_top
-from mjstack.scene.phases import (
-    Phase,
-    Target,
-    nominal_xy,
-    object_targets,
-    source_names,
-    target_xy,
-)
+from mjstack.scene.phases import nominal_xy, object_targets, source_names, target_xy
 
 _GRID = 0.02  # [m] between the positions whose reach is tried
 
 
-def reach_distances(
-    env: EnvView, name: str, xy: np.ndarray
-) -> tuple[np.ndarray, list[tuple[Phase, Target]]]:
-    """How far the grasp point stays from where the phases bring it at an object.
-
-    Args:
-        env: The environment.
-        name: The object.
-        xy: Where it stands [m], shape ``(n, 2)``.
-
-    Returns:
-        Distance [m], shape ``(n, targets)``, and the phases with their targets.
-    """
-    robot = env.cfg.robot
-    targets = object_targets(env.cfg)[name]
-    sources = np.tile(nominal_xy(env.cfg.scene), (len(xy), 1, 1))
-    sources[:, source_names(env.cfg.scene).index(name)] = xy
-    distances = np.zeros((len(xy), len(targets)))
-    for gripper, command in robot.grips.items():
-        columns = [k for k, (phase, _) in enumerate(targets) if phase.spec.gripper == gripper]
-        if not columns:
-            continue
-        points = np.empty((len(xy), len(columns), 3))
-        for place, k in enumerate(columns):
-            _, target = targets[k]
-            points[:, place, :2] = target_xy(target, sources)
-            points[:, place, 2] = target.z
-        reach = PointReach(env.sim.model, robot, command)
-        distances[:, columns] = reach.solve(points.reshape(-1, 3)).distance.reshape(len(xy), -1)
-    return distances, targets
-
-
-def require_reach(env: EnvView, name: str, region: tuple[float, float]) -> None:
+def require_reach(env: EnvView, region: Sequence[float]) -> None:
     """Tries a grid over each object's region, as far as it is on the table.
 
     Raises:
@@ -74,9 +36,7 @@ def require_reach(env: EnvView, name: str, region: tuple[float, float]) -> None:
                 f"Make the region smaller, or move the object (scene.objects.{thing}.xy);"
                 " job=reachability draws a map"
             )
-            raise ParameterError(
-                name, list(region), f"a region that the arm reaches; {found[1]}", fix
-            )
+            raise ParameterError("xy", region, f"a region that the arm reaches; {found[1]}", fix)
 
 
 def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | None:
@@ -88,13 +48,29 @@ def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | N
         name: The object.
         xy: Where it may stand [m], shape ``(n, 2)``.
     """
-    distances, targets = reach_distances(env, name, xy)
+    # How far the grasp point stays from each target at each position
+    scene = env.cfg.scene
+    targets = object_targets(env.cfg)[name]
+    sources = np.tile(nominal_xy(scene), (len(xy), 1, 1))
+    sources[:, source_names(scene).index(name)] = xy
+    points = np.empty((len(xy), len(targets), 3))
+    for column, (_, target) in enumerate(targets):
+        points[:, column, :2] = target_xy(target, sources)
+        points[:, column, 2] = target.z
+    distances = np.zeros(points.shape[:2])
+    openings = np.array([phase.spec.gripper for phase, _ in targets])
+    for gripper in np.unique(openings):
+        reach = PointReach(env.sim.model, env.cfg.robot, env.cfg.robot.grips[gripper])
+        some = openings == gripper
+        found = reach.solve(points[:, some].reshape(-1, 3)).distance
+        distances[:, some] = found.reshape(len(xy), -1)
     if (distances <= env.cfg.controller.ik_tolerance).all():
         return None
+
+    # The farthest in words
     row, column = (int(k) for k in np.unravel_index(distances.argmax(), distances.shape))
     x, y = xy[row]
     phase, target = targets[column]
-    scene = env.cfg.scene
     height = target.z - table_top(scene) - scene.objects[name].half_height
     where = "at its centre" if abs(height) < 5e-4 else f"{1e3 * height:.0f} mm above its centre"
     return (

@@ -46,18 +46,23 @@ class StartsTable:
         lines: The line of each world in the file, ``(worlds,)``.
     """
 
-    def __init__(self, path: str, required: Sequence[str], optional: Sequence[str]) -> None:
+    def __init__(
+        self, path: str, key: str, required: Sequence[str], optional: Sequence[str]
+    ) -> None:
         """Reads a file and checks it cell by cell.
 
         Args:
             path: The file.
+            key: What names it, ``starts`` or a term's ``path``.
             required: Names of columns that every file has, beside ``world``.
             optional: Names of columns that a file may have.
 
         Raises:
-            ParameterError: The file cannot be read, or a column, a cell or a world is wrong.
+            ConfigError: The file cannot be read, or a column, a cell or a world is wrong.
         """
         self._path = path
+        self._error = ConfigError if key == "starts" else ParameterError
+        self._key = key
         required = ["world", *required]
         try:
             with Path(path).open(encoding="utf-8-sig", newline="") as file:
@@ -67,22 +72,22 @@ class StartsTable:
         except (OSError, UnicodeDecodeError, csv.Error) as error:
             expected = "a CSV file with a header and one row per world; it cannot be read"
             reason = getattr(error, "strerror", None) or error
-            raise self._wrong(f"{expected} ({reason})", "Name a file: starts=worlds.csv") from error
+            raise self.wrong(f"{expected} ({reason})", "Name a file: starts=worlds.csv") from error
 
         known = [*required, *optional]
         for name in header:
             if name not in known or header.count(name) > 1:
                 expected = f"columns separated by commas, each once; {reprlib.repr(name)} is wrong"
-                raise self._wrong(expected, suggest(name, known).rstrip("."), 1)
+                raise self.wrong(expected, suggest(name, known).rstrip("."), 1)
         if lacking := [name for name in required if name not in header]:
             expected = f"columns {', '.join(required)}; {', '.join(lacking)} missing"
-            raise self._wrong(expected, "Add the missing columns", 1)
+            raise self.wrong(expected, "Add the missing columns", 1)
 
         values = np.empty((len(rows), len(header)))
         for row, (line, cells) in enumerate(rows):
             if len(cells) != len(header):
                 expected = f"{len(header)} cells as in the header, it has {len(cells)}"
-                raise self._wrong(expected, "Correct it; the decimal mark is a point", line)
+                raise self.wrong(expected, "Correct it; the decimal mark is a point", line)
             for column, cell in enumerate(cells):
                 try:
                     values[row, column] = float(cell)
@@ -90,28 +95,28 @@ class StartsTable:
                     values[row, column] = math.nan
                 if not math.isfinite(values[row, column]):
                     expected = f"a finite number, {reprlib.repr(cell)} is none"
-                    raise self._wrong(expected, "Correct it", line, [header[column]])
+                    raise self.wrong(expected, "Correct it", line, [header[column]])
 
         table = dict(zip(header, values.T, strict=True))
         worlds = table.pop("world")
         if missing := set(range(max(1, len(rows)))).difference(worlds):
             expected = f"worlds numbered from 0, a row each; {min(missing)} is missing"
-            raise self._wrong(expected, "Number the rows anew", columns=["world"])
+            raise self.wrong(expected, "Number the rows anew", columns=["world"])
         order = np.argsort(worlds)
         self.columns = {name: column[order] for name, column in table.items()}
         self.lines = np.array([line for line, _ in rows])[order]
 
     def misfit(
         self, world: int, columns: Sequence[str], expected: str, fix: str = "Correct it"
-    ) -> ParameterError:
+    ) -> ConfigError:
         """The error that some cells of a world's line cannot be used."""
-        return self._wrong(expected, fix, self.lines[world], columns)
+        return self.wrong(expected, fix, self.lines[world], columns)
 
     def require_range(self, column: str, low: float, high: float, fix: str = "Correct it") -> None:
         """Refuse a value outside a range, if the file has the column.
 
         Raises:
-            ParameterError: There is one; names its line.
+            ConfigError: There is one; names its line.
         """
         values = self.columns.get(column, np.empty(0))
         slack = 1e-6 * max(abs(low), abs(high))  # float32 does not hold the ends exactly
@@ -119,13 +124,14 @@ class StartsTable:
             expected = f"{low:.6g} to {high:.6g}, it is {values[world]:.6g}"
             raise self.misfit(world, [column], expected, fix)
 
-    def _wrong(
+    def wrong(
         self, expected: str, fix: str, line: int | None = None, columns: Sequence[str] = ()
-    ) -> ParameterError:
+    ) -> ConfigError:
+        """The error that the file, or some columns of a line, cannot be used."""
         where = self._path if line is None else f"{self._path}, line {line}"
         if columns:
             where += f", column{'s' if len(columns) > 1 else ''} {', '.join(columns)}"
-        return ParameterError("path", where, expected, fix)
+        return self._error(self._key, where, expected, fix)
 
 
 @offers(reads_file=True)
@@ -166,6 +172,7 @@ class FromStartsFile:
         if path is None:
             expected = "a file with one row per world, which reset=starts_file reads"
             raise ConfigError("starts", "null", expected, "Set starts=worlds.csv")
+        # The table
         ranges = {"mass": mass, "friction": friction, "gain": gain}
         ends = {name: bounds(name, values) for name, values in ranges.items()}
         quantities: dict[str, Quantity] = {
@@ -173,35 +180,19 @@ class FromStartsFile:
             "friction": SlidingFriction(env, ends["friction"][0]),
             "gain": ServoGains(env),
         }
-        try:
-            self._read(env, path, pose, quantities, ends)
-        except ParameterError as error:
-            if error.key == "path" and path == env.cfg.starts:
-                raise error.at("starts") from error
-            raise
-
-    def _read(
-        self,
-        env: EnvView,
-        path: str,
-        pose: str,
-        quantities: dict[str, Quantity],
-        ends: dict[str, tuple[float, float]],
-    ) -> None:
-        # The table
         objects = list(env.index.objects)
         joints = [f"joint_{name}" for name in robot_joints(env)]
         drawn = {name: _xy(name) for name in _drawn_places(env)}
         columns = [column for held in quantities.values() for column in held.columns]
         required = [column for name in objects for column in (*_xy(name), f"{name}_yaw_rad")]
         optional = [*joints, *columns, *(column for pair in drawn.values() for column in pair)]
-        file = StartsTable(path, required, optional)
+        file = StartsTable(path, "starts" if path == env.cfg.starts else "path", required, optional)
         table = file.columns
         rows = len(file.lines)
         needed = max(env.nworld, env.cfg.nworld)
         if rows < needed:
             fix = f"Add rows, or set nworld={rows}"
-            raise ParameterError("path", path, f"at least {needed} worlds, it has {rows}", fix)
+            raise file.wrong(f"at least {needed} worlds, it has {rows}", fix)
 
         # Values within their ranges
         for name, held in quantities.items():
@@ -324,11 +315,11 @@ def _on(env: EnvView, values: np.ndarray) -> Tensor:
 
 def _varies(env: EnvView, names: Sequence[str]) -> bool:
     """Whether the value of a field differs from the model's in some world."""
-    for name in set(names) & set(env.sim.fields):
-        field = env.sim.fields[name]
-        if bool((field != torch.from_numpy(getattr(env.sim.model, name)).to(field)).any()):
-            return True
-    return False
+    return any(
+        bool((field != torch.from_numpy(getattr(env.sim.model, name)).to(field)).any())
+        for name, field in env.sim.fields.items()
+        if name in names
+    )
 
 
 def _yaw(w: np.ndarray, z: np.ndarray) -> np.ndarray:
