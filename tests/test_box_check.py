@@ -43,7 +43,7 @@ def planned() -> SimpleNamespace:
     def drop(env: Env, _: str) -> None:
         if (
             int(env.episode_step[-1])
-            == (context.phase_start("carry_red") + context.phase_start("hold_red")) // 2
+            == (context.phase("carry_red").start + context.phase("hold_red").start) // 2
         ):
             scene = context.cfg.scene
             x, y = scene.objects["red"].xy

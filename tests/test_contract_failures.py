@@ -31,7 +31,7 @@ from mjstack.tasks.check import make_check
 
 def teleport(context: RunContext, world: int) -> Callable[[int, Simulation], None]:
     """Moves red beside the stack, once, when it has been released."""
-    released = context.phase_start("retreat")
+    released = context.phase("retreat").start
 
     def hook(step: int, sim: Simulation) -> None:
         if step == released:
@@ -81,7 +81,7 @@ def test_mjwarp(stage: Callable[..., RunContext], make_sim: Callable[..., Simula
 
     def hook(step: int, sim: Simulation) -> None:
         push(step, sim)
-        if step == context.phase_start("above_blue"):
+        if step == context.phase("above_blue").start:
             sim.qvel[2, context.index.object_qvel[1]] = math.nan
 
     episode = context.play(sim, context.cfg.reset, [Hook(hook)])

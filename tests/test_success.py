@@ -537,7 +537,7 @@ def test_signs_in_real_episodes(new_context: Callable[..., RunContext]) -> None:
     base = new_context("sim=native", "nworld=6")
     context = base.with_config(success_config(base.cfg))
     red, _ = context.index.object_qpos
-    at = {name: context.phase_start(name) for name in PHASES}
+    at = {name: context.phase(name).start for name in PHASES}
 
     def interfere(step: int, sim: Simulation) -> None:
         if step == at["lift_red"] + 30:

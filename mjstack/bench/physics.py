@@ -146,7 +146,7 @@ def play_to_phase(context: RunContext, sim: Simulation) -> State:
     """The state of every world as the measured phase begins, played from the configured starts."""
     phase = context.cfg.gate.throughput.from_phase
     env = context.start(sim, context.cfg.reset)
-    steps = context.phase_start(phase)
+    steps = context.phase(phase).start
     label = f"steps to {phase}"
     rollout(env, context.driver(env), steps=steps, advance=context.advance, label=label)
     return snapshot(sim)
@@ -185,7 +185,7 @@ def measure_arrangements(
     # The trajectory
     sim = context.simulation(cfg.nworld, Backend.mjwarp, resolve_device(cfg.sim.device))
     assert isinstance(sim, MjwarpSimulation)
-    first = context.phase_start(cfg.gate.throughput.from_phase)
+    first = context.phase(cfg.gate.throughput.from_phase).start
     snapshots = Snapshots([first - 1])
     recorder = CommandRecorder()
     context.play(sim, cfg.reset, [snapshots, recorder])
@@ -231,6 +231,5 @@ def _in_hand(context: RunContext, sim: Simulation) -> int | None:
 
     None if the phase carries none.
     """
-    name = context.cfg.gate.throughput.from_phase
-    number = next(phase.carried for phase in context.planner.phases if phase.name == name)
+    number = context.phase(context.cfg.gate.throughput.from_phase).carried
     return None if number < 0 else int(objects_in_hand(context.index, sim)[:, number].sum())

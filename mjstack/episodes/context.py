@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import mujoco
-import numpy as np
 
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import Driver, OpenLoopDriver
@@ -36,6 +35,7 @@ from mjstack.managers.episode import required_fields
 from mjstack.mdp.geometry import source_xy
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import SceneIndex, build_model
+from mjstack.scene.phases import Phase
 from mjstack.sim import (
     BatchSizes,
     Simulation,
@@ -196,7 +196,7 @@ class RunContext:
         and parity.
         """
         sim = make_simulation(self.model, self.cfg, 1, backend=Backend.native)
-        steps = [self.phase_end(name) for name in self.cfg.gate.parity.states.values()]
+        steps = [self.phase(name).stop - 1 for name in self.cfg.gate.parity.states.values()]
         world = WorldRecorder()
         snapshots = Snapshots(steps)
         shown = [] if "parity" in self.cfg.gates else self.viewers
@@ -339,12 +339,11 @@ class RunContext:
         """Play the driven task once, in worlds of exactly these sizes; without, with room to
         spare.
         """
-
-        def play(sim: Simulation) -> np.ndarray:
-            return self.play(sim, reset).failed
-
         return play_workload(
-            self.cfg, lambda sizes: self.measuring_simulation(sizes, reset), play, sizes
+            self.cfg,
+            lambda sizes: self.measuring_simulation(sizes, reset),
+            lambda sim: self.play(sim, reset).failed,
+            sizes,
         )
 
     @property
@@ -359,13 +358,9 @@ class RunContext:
         """One MJWarp world."""
         return make_simulation(self.model, self.cfg, 1, backend=Backend.mjwarp)
 
-    def phase_start(self, name: str) -> int:
-        """First step of a phase."""
-        return next(phase.start for phase in self.planner.phases if phase.name == name)
-
-    def phase_end(self, name: str) -> int:
-        """Last step of a phase."""
-        return next(phase.stop for phase in self.planner.phases if phase.name == name) - 1
+    def phase(self, name: str) -> Phase:
+        """A phase by its name."""
+        return next(phase for phase in self.planner.phases if phase.name == name)
 
 
 def lacks_episode(cfg: Config) -> str:

@@ -28,20 +28,19 @@ class Sign(IntEnum):
     LEFT = 5
 
 
-_TEXT = {
-    Sign.NONE: "no sign before the result",
-    Sign.PHYSICS: "physics lost",
-    Sign.EMPTY: "grasp empty, and not tried again",
-    Sign.DROPPED: "held cube lost its load",
-    Sign.MISSED: "not in place when let go",
-    Sign.LEFT: "left its place",
-}
+_TEXTS = (  # of each sign
+    "no sign before the result",
+    "physics lost",
+    "grasp empty, and not tried again",
+    "held cube lost its load",
+    "not in place when let go",
+    "left its place",
+)
 
 
 def describe_sign(sign: int, phase: str) -> str:
     """A sign in words, with the phase's name if there is one."""
-    text = _TEXT[Sign(sign)]
-    return f"{phase}: {text}" if phase else text
+    return f"{phase}: {_TEXTS[sign]}" if phase else _TEXTS[sign]
 
 
 class FailureMonitor(Observer):

@@ -2,7 +2,7 @@
 people.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -56,11 +56,11 @@ class Circumstances:
     ) -> "Circumstances":
         """Copy the arrays to the host."""
         # Objects stand flat at a start, so that all of a rotation is about z.
-        poses = [episode.start[:, at : at + 7].astype(float) for at in index.object_qpos]
-        yaws = [2.0 * np.arctan2(pose[:, 6], pose[:, 3]) for pose in poses]
-        places = [np.column_stack((p[:, :2], yaw)) for p, yaw in zip(poses, yaws, strict=True)]
-        signs = torch.stack((monitor.sign, monitor.phase, monitor.step)).cpu().numpy()
-        sign, phase, step = signs
+        places = []
+        for at in index.object_qpos:
+            x, y, _, w, _, _, z = episode.start[:, at : at + 7].astype(float).T
+            places.append(np.column_stack((x, y, 2.0 * np.arctan2(z, w))))
+        sign, phase, step = torch.stack((monitor.sign, monitor.phase, monitor.step)).cpu().numpy()
         return cls(
             objects=list(index.objects),
             phase_names=list(cfg.controller.phases),
@@ -75,9 +75,9 @@ class Circumstances:
 
     def arrays(self) -> dict[str, Any]:
         """The arrays by their names in the file."""
-        names = [item.name for item in fields(self) if item.name != "objects"]
-        held = {name: getattr(self, name) for name in names}
-        return held | {"sign_names": [sign.name for sign in Sign]}
+        held = asdict(self) | {"sign_names": [sign.name for sign in Sign]}
+        del held["objects"]
+        return held
 
     def cells(self, world: int) -> dict[str, object]:
         """A world's cells of the table of failing episodes, by column."""

@@ -112,11 +112,12 @@ def find_regions(
         for chosen in (("x", "y"), ("yaw",), ("x", "y", "yaw")):
             keys = np.stack([axes[axis][0] for axis in chosen], axis=1)
             cells, which = np.unique(keys, axis=0, return_inverse=True)
-            counts = np.bincount(which.ravel())
-            good = np.bincount(which.ravel(), weights=succeeded).astype(int)
-            for key, n, k in zip(cells.tolist(), counts.tolist(), good.tolist(), strict=True):
+            for place, key in enumerate(cells.tolist()):
+                good = succeeded[which.ravel() == place]
+                n = len(good)
                 if n < episodes:
                     continue
+                k = int(good.sum())
                 bounds = {}
                 for axis, at in zip(chosen, key, strict=True):
                     _, width, unit, last = axes[axis]

@@ -13,8 +13,7 @@ from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Episode, WorldRecorder
 from mjstack.episodes.rollout import Observer
-from mjstack.sim import Simulation, describe_overflow, resolve_sizes
-from mjstack.sim.sizes import BatchSizes
+from mjstack.sim import BatchSizes, Simulation, describe_overflow, resolve_sizes
 from mjstack.tasks.check import make_check
 from mjstack.tasks.view import TaskView
 
@@ -72,8 +71,12 @@ def replay_world(
         steps = {name: np.stack(values) for name, values in trace.steps.items()}
         steps["time_s"] = np.arange(1, len(recorder.phase) + 1) * cfg.timing.step_dt
         steps["phase"] = names[recorder.phase]
-        facts = {"seed": seed, "world": world, "backend": sim.description}
-        facts["failed"] = int(episode.failed[0])
+        facts = {
+            "seed": seed,
+            "world": world,
+            "backend": sim.description,
+            "failed": int(episode.failed[0]),
+        }
         return ReplayedWorld(
             episode=episode,
             recorder=recorder,
@@ -127,8 +130,7 @@ def start_of_world(
 
 def _alone(context: RunContext, backend: Backend, device: str) -> Simulation:
     """A simulation for one world of the batch."""
-    cfg = context.cfg
-    sizes = _sizes_alone(resolve_sizes(cfg), cfg.nworld)
+    sizes = _sizes_alone(resolve_sizes(context.cfg), context.cfg.nworld)
     return context.simulation(1, backend, device, sizes=sizes)
 
 

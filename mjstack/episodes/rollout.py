@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -163,8 +163,7 @@ def reset_worlds(env: Env, seed: int, worlds: Sequence[int] | None = None) -> En
     return env
 
 
-@dataclass(slots=True)
-class State:
+class State(NamedTuple):
     """State of every world at a step end, on the host."""
 
     qpos: np.ndarray
@@ -174,7 +173,7 @@ class State:
 
 def snapshot(sim: Simulation) -> State:
     """Copy the state of every world to the host."""
-    return State(*(view.double().cpu().numpy().copy() for view in (sim.qpos, sim.qvel, sim.ctrl)))
+    return State(*(getattr(sim, name).double().cpu().numpy().copy() for name in State._fields))
 
 
 def restore(sim: Simulation, state: State) -> None:
@@ -182,6 +181,6 @@ def restore(sim: Simulation, state: State) -> None:
     current.
     """
     sim.reset()
-    for view, values in ((sim.qpos, state.qpos), (sim.qvel, state.qvel), (sim.ctrl, state.ctrl)):
-        view.copy_(torch.from_numpy(values))
+    for name, values in state._asdict().items():
+        getattr(sim, name).copy_(torch.from_numpy(values))
     sim.forward()

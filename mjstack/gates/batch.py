@@ -12,7 +12,7 @@ def run_batch(context: RunContext) -> list[GateResult]:
     cfg = context.cfg
     t = cfg.gate.batch
     # Throughput continues from the first seed.
-    carry = context.phase_start(cfg.gate.throughput.from_phase) - 1
+    carry = context.phase(cfg.gate.throughput.from_phase).start - 1
     snapshots = Snapshots([carry])
     tally = play_seeds(
         context,
