@@ -64,6 +64,7 @@ PATHS: dict[str, list[str] | None] = {
         "JointPosition.write_commands",
         "Gripper.write_commands",
         "EndEffectorDelta.write_commands",
+        "_Commands._write_bounded",
     ],
     "mdp/reset.py": [
         *("home", "_write_object"),

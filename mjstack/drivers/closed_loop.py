@@ -93,8 +93,6 @@ class ClosedLoopDriver:
             approach_gain=c.approach_gain,
             tolerance=c.ik_tolerance,
         )
-        self._uses_posture = c.posture_gain > 0.0
-        tensors = robot(env)
         self._n_arm = env.index.n_arm
         self._nominal = torch.as_tensor(nominal, dtype=torch.float32, device=device)
         # Where nothing is carried, the gripper points down as far as it can.
@@ -104,7 +102,7 @@ class ClosedLoopDriver:
             if c.approach_gain > 0.0 and carries
             else None
         )
-        self._home_grip = tensors.home[self._n_arm :].float()
+        self._home_grip = robot(env).home[self._n_arm :].float()
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros((n, *shape), dtype=dtype, device=device)
@@ -152,7 +150,7 @@ class ClosedLoopDriver:
             there = self._aim(self._tilt.place[self.phase])
             approach = self._tilt.desired_approach(start, self.phase, there, fresh)
         command, distance = self._ik.solve(
-            start, target, posture if self._uses_posture else None, approach
+            start, target, posture if self._cfg.controller.posture_gain > 0.0 else None, approach
         )
         self._command.copy_(command)
         last = self._time >= length - _DONE
@@ -222,8 +220,8 @@ class ClosedLoopDriver:
         again = self._retry_to[self.phase]
         time_left = (self.steps - self._rest - self._env.episode_step).clamp(min=1)
         rate = (self._needed[again] / time_left).clamp(min=1.0)
-        first = ~self._tried.gather(1, number)[:, 0] & self._can_retry[self.phase]
-        retry = empty & first & (rate <= self._speed_limit)
+        first = ~self._tried.gather(1, number)[:, 0] & (again >= 0)
+        retry = empty & first & (rate <= self._cfg.controller.speed_limit)
         self._tried |= retry[:, None] & (grasps[:, None] == self._numbers)
         return retry, rate
 
@@ -304,8 +302,7 @@ class ClosedLoopDriver:
                     float(target.toward >= 0),
                     phase.target is None,
                     phase.grasped,
-                    names.index(spec.retry or names[0]),
-                    spec.retry is not None,
+                    names.index(spec.retry) if spec.retry else -1,
                     spec.observe and spec.gripper == "open" and spec.anchor in things,
                     [spec.observe and name in (spec.anchor, spec.toward) for name in things],
                 )
@@ -321,12 +318,10 @@ class ClosedLoopDriver:
             self._holds,
             self._grasps,
             self._retry_to,
-            self._can_retry,
             self._aligns,
             self._observes,
         ) = (torch.tensor(column, device=device) for column in zip(*rows, strict=True))
         self._numbers = torch.arange(len(things), device=device)
-        self._speed_limit = cfg.controller.speed_limit
         window = 0 if cfg.task.check is None else make_check(cfg).settle_steps
         self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)
 

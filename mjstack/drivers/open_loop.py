@@ -159,12 +159,12 @@ class OpenLoopPlanner:
         """
         nominal = nominal_xy(self._cfg.scene)
         trajectory = self.plan(nominal[None])
+        targets = self._targets(nominal)
         worst = 0.0
-        for phase, (start, end) in zip(self.phases, self._targets(nominal), strict=True):
-            for step in range(phase.start, phase.stop):
-                s = smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
-                at = self.ik.grasp_point(trajectory.command(step)[0].numpy())
-                worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start))[:3])))
+        for step, (number, s) in enumerate(self._progress()):
+            start, end = targets[number]
+            at = self.ik.grasp_point(trajectory.command(step)[0].numpy())
+            worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start))[:3])))
         return worst
 
     def plan_world(self, world: int, xy: np.ndarray) -> tuple[np.ndarray, float]:
@@ -233,6 +233,13 @@ class OpenLoopPlanner:
             out.append((out[-1][1] if out else home, end))
         return out
 
+    def _progress(self) -> Iterator[tuple[int, float]]:
+        """Number of the phase, and the smoothstep parameter at the end, of every step."""
+        for number, phase in enumerate(self.phases):
+            steps = phase.stop - phase.start
+            for step in range(steps):
+                yield number, smoothstep((step + 1) / steps)
+
     def _step_weights(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Barycentric Lagrange weights of the Chebyshev points, and their numbers, for every
         step.
@@ -242,13 +249,11 @@ class OpenLoopPlanner:
         bary[[0, -1]] *= 0.5
         rows = []
         numbers = []
-        for i, phase in enumerate(self.phases):
-            for step in range(phase.start, phase.stop):
-                s = smoothstep((step + 1 - phase.start) / (phase.stop - phase.start))
-                gap = s - self._nodes
-                hit = np.abs(gap) < 1e-12
-                rows.append(hit.astype(float) if hit.any() else (bary / gap) / (bary / gap).sum())
-                numbers.append(range(i * n, i * n + n))
+        for number, s in self._progress():
+            gap = s - self._nodes
+            hit = np.abs(gap) < 1e-12
+            rows.append(hit.astype(float) if hit.any() else (bary / gap) / (bary / gap).sum())
+            numbers.append(range(number * n, number * n + n))
         return torch.from_numpy(np.array(rows)), torch.tensor(numbers)
 
 

@@ -5,7 +5,7 @@ Warp is not loaded, and the gripper's tilt matters too.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -23,8 +23,7 @@ _POINTING = 0.02  # [m/rad] weight of the approach axis against the position
 _STARTS = (0.0, -0.6, 0.6)
 
 
-@dataclass(frozen=True, slots=True)
-class Reached:
+class Reached(NamedTuple):
     """Solutions at the points.
 
     Attributes:
@@ -105,8 +104,8 @@ class PointReach:
             found = self._search(turned, goals)
             better = (found.distance <= tolerance) & (found.tilt < upright.tilt)
             upright = _choose(better, found, upright)
-        for name in ("q", "distance", "tilt"):
-            getattr(best, name)[reached] = getattr(upright, name)
+        for everywhere, there in zip(best, upright, strict=True):
+            everywhere[reached] = there
         return best
 
     def _start(self, points: np.ndarray, off: float) -> np.ndarray:

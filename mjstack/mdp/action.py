@@ -19,12 +19,18 @@ class _Commands(ActionTerm):
     """Commands of some of the robot's actuators, from actions of -1 to 1."""
 
     def _set_up(self, env: EnvView, chosen: Sequence[int], dim: int) -> None:
+        chosen = list(chosen)
         self._ctrl = env.sim.ctrl
         self._columns = Columns(env.index.ctrl[chosen], env.device)
+        self._low, self._high = robot(env).ctrl_range[chosen].unbind(1)
         self.actuators = self._columns.indices
         self.dim = dim
         self.high = torch.ones(dim, dtype=self._ctrl.dtype, device=env.device)
         self.low = -self.high
+
+    def _write_bounded(self, command: Tensor) -> None:
+        """Writes commands, kept within the actuators' ranges."""
+        self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))
 
 
 class JointPosition(_Commands):
@@ -76,7 +82,6 @@ class JointPosition(_Commands):
         self._mode = mode
         self._scale = scale
         self._pose = named_pose(env, pose)[chosen]
-        self._low, self._high = robot(env).ctrl_range[chosen].unbind(1)
         self.unit = "-1 to 1"
         if mode == "absolute":
             self.unit = "rad, m"
@@ -90,7 +95,7 @@ class JointPosition(_Commands):
             command = self._pose + self._scale * action.clamp(-1.0, 1.0)
         else:
             command = self._columns.read(self._ctrl) + self._scale * action.clamp(-1.0, 1.0)
-        self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))
+        self._write_bounded(command)
 
 
 class Gripper(_Commands):
@@ -138,7 +143,6 @@ class EndEffectorDelta(_Commands):
         self._n_arm = env.index.n_arm
         self._set_up(env, range(self._n_arm), dim=3)
         self._all = robot(env).ctrl
-        self._low, self._high = robot(env).ctrl_range[: self._n_arm].unbind(1)
         self._scale = scale
         self._ik = BatchedIk(
             env.sim.model, env.cfg.robot, env.nworld, env.device, iterations=iterations
@@ -149,5 +153,4 @@ class EndEffectorDelta(_Commands):
         last = self._all.read(self._ctrl)
         target = self._ik.forward(last)[0] + self._scale * action.clamp(-1.0, 1.0).float()
         command, _ = self._ik.solve(last, target)
-        command = command[:, : self._n_arm].to(self._ctrl.dtype)
-        self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))
+        self._write_bounded(command[:, : self._n_arm].to(self._ctrl.dtype))

@@ -75,7 +75,7 @@ def gripper_opening(env: EnvView) -> Tensor:
     n_gripper)``.
     """
     tensors = robot(env)
-    q = tensors.gripper_qpos.read(env.sim.qpos)
+    q = joint_positions(env)[:, env.index.n_arm :]
     return (q - tensors.gripper_closed) / (tensors.gripper_open - tensors.gripper_closed)
 
 

@@ -62,19 +62,17 @@ class RobotTensors:
         qpos: Columns of qpos.
         qvel: Columns of qvel.
         ctrl: Columns of ctrl.
-        gripper_qpos: Columns of qpos, the gripper's alone.
         range: Joint limits [rad, m], shape ``(n, 2)``.
         ctrl_range: Limits of the commands, shape ``(n, 2)``.
         home: Home command, shape ``(n,)``.
         start: Start of environments, clear of the table, shape ``(n,)``.
         gripper_open: Command of the open gripper, shape ``(n_gripper,)``.
-        gripper_closed: Likewise closed.
+        gripper_closed: Command of the closed gripper, shape ``(n_gripper,)``.
     """
 
     qpos: Columns
     qvel: Columns
     ctrl: Columns
-    gripper_qpos: Columns
     range: torch.Tensor
     ctrl_range: torch.Tensor
     home: torch.Tensor
@@ -153,15 +151,12 @@ class SceneIndex:
         """The robot's part on a device. Made once: a captured step may not copy from the host."""
         key = (device, dtype)
         if key not in self._tensors:
-            addresses = self.robot_qpos, self.robot_qvel, self.ctrl, self.robot_qpos[self.n_arm :]
-            columns = [Columns(a, device) for a in addresses]
+            columns = [Columns(a, device) for a in (self.robot_qpos, self.robot_qvel, self.ctrl)]
             r = self._robot
+            poses = (r.home, r.start, r.gripper_open, r.gripper_closed)
             numbers = [
                 torch.as_tensor(np.asarray(values, dtype=float), dtype=dtype, device=device)
-                for values in (
-                    *(self.robot_range, self.ctrl_range),
-                    *(r.home, r.start, r.gripper_open, r.gripper_closed),
-                )
+                for values in (self.robot_range, self.ctrl_range, *poses)
             ]
             self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]

@@ -323,19 +323,11 @@ class EpisodeCheck(ABC):
         """Report the values of the first world, and what is wanted, by the name of each of the
         task's rules.
         """
-        wanted = {
-            name: words
-            for rule in self._rules
-            for name, words in zip(rule.texts, rule.wanted, strict=True)
-        }
-        values = result.values
+        told = {name: f"{name} {float(value[0]):.4g}" for name, value in result.values.items()}
         return {
-            name: (
-                ", ".join(f"{each} {float(values[each][0]):.4g}" for each in names)
-                or "see the values",
-                wanted[name],
-            )
-            for name, names in result.shown.items()
+            name: (", ".join(told[each] for each in result.shown[name]) or "see the values", wanted)
+            for rule in self._rules
+            for name, wanted in zip(rule.texts, rule.wanted, strict=True)
         }
 
     def headline(self, values: Mapping[str, float]) -> str:
