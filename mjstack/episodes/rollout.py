@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -96,19 +96,20 @@ def rollout(
         observer.start(env, driver)
 
     def work() -> None:
-        env.action_manager.process(driver.command())
-        env.advance()
+        command = driver.command()
+        if physics is None:
+            env.action_manager.process(command)
+            env.advance()
+        else:
+            sim.ctrl.copy_(command)
+            physics()
         for observer in observers:
             observer.update()
-
-    def bare() -> None:
-        sim.ctrl.copy_(driver.command())
-        cast(Callable[[], None], physics)()
 
     if physics is None:
         play = env.captured(work, "a step of the episode")
     else:
-        play = StepGraph(bare, sim.device, GraphMode.off, name="the physics")
+        play = StepGraph(work, sim.device, GraphMode.off, name="the physics")
     # On Warp's CPU device physics alone is captured, once for all episodes.
     graph: StepGraph | None = play
     if sim.device.type != "cuda" and physics is None:

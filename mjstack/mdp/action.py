@@ -89,13 +89,10 @@ class JointPosition(_Commands):
 
     def write_commands(self, action: Tensor) -> None:
         """Writes the commands of its joints."""
-        if self._mode == "absolute":
-            command = action
-        elif self._mode == "relative":
-            command = self._pose + self._scale * action.clamp(-1.0, 1.0)
-        else:
-            command = self._columns.read(self._ctrl) + self._scale * action.clamp(-1.0, 1.0)
-        self._write_bounded(command)
+        if self._mode != "absolute":
+            base = self._pose if self._mode == "relative" else self._columns.read(self._ctrl)
+            action = base + self._scale * action.clamp(-1.0, 1.0)
+        self._write_bounded(action)
 
 
 class Gripper(_Commands):

@@ -237,11 +237,10 @@ class EpisodeCheck(ABC):
         """Length of the window at the episode's end in which everything has to be at rest."""
         return getattr(self.t, "window", 0)
 
-    def view(self, env: EnvView, steps: int = 0, phases: Sequence[Phase] = ()) -> TaskView:
-        """The task's objects in the worlds of an environment; arguments as of `start`."""
+    def view(self, env: EnvView, phases: Sequence[Phase] = (), stop: int = 0) -> TaskView:
+        """The task's objects in the worlds of an environment; arguments as of `TaskView`."""
         force = getattr(self.t, "force", LOADED)
-        window = self.settle_steps
-        return TaskView(env, self.objects, phases, steps=steps, window=window, force=force)
+        return TaskView(env, self.objects, phases, stop=stop, force=force)
 
     def start(self, env: EnvView, steps: int, phases: Sequence[Phase] = ()) -> None:
         """Allocates for an episode.
@@ -252,7 +251,8 @@ class EpisodeCheck(ABC):
             phases: Those of the driver, if it has any.
         """
         self._steps = steps
-        self._view = self.view(env, steps, phases)
+        # Without phases no rule but those on the settled window looks at it.
+        self._view = self.view(env, phases, steps if phases else steps - self.settle_steps)
         for rule in self._rules:
             rule.start(self._view)
         self._finite = torch.ones(env.nworld, dtype=torch.bool, device=env.device)

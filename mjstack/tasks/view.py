@@ -53,8 +53,7 @@ class TaskView:
         objects: Sequence[str],
         phases: Sequence[Phase] = (),
         *,
-        steps: int = 0,
-        window: int = 0,
+        stop: int = 0,
         force: float = LOADED,
     ) -> None:
         """Reads addresses and sizes.
@@ -63,8 +62,7 @@ class TaskView:
             env: The environment.
             objects: Names of objects of the scene.
             phases: Those of the driver.
-            steps: Length of the episode; those after it count for no rule.
-            window: The last steps, which count for no rule without phases.
+            stop: Steps from this one on count for no rule that names phases.
             force: A jaw or a support that presses with more touches an object [N].
         """
         self.env = env
@@ -73,7 +71,7 @@ class TaskView:
         self.force = force
         self.count = torch.zeros(1, dtype=torch.int64, device=env.device)
         self._phases = [phase.name for phase in phases]
-        self._stop = steps if phases else steps - window
+        self._stop = stop
         self._table = torch.zeros((len(phases), 0), dtype=torch.bool, device=env.device)
         self._blocks: list[tuple[Tensor, int]] = []
         self._columns: dict[tuple[str, ...], Columns] = {}

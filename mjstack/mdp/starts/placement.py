@@ -78,14 +78,13 @@ class Placement:
             away = np.abs(around[:, :2] - thing.xy) - around[:, 2:4] - region
             near = np.linalg.norm(np.maximum(away, 0.0), axis=1) < around[:, 4]
             rectangles.append(torch.from_numpy(around[near]))
-        half = torch.tensor(scene.table_half[:2]).double()
-        self._tensors = [
-            torch.tensor([thing.xy for thing in objects], dtype=torch.float64).reshape(-1, 2),
-            torch.tensor(region).double(),
-            torch.tensor(scene.table_center[:2]).double(),
-            torch.stack([half - radius for radius in radii]) if radii else half[None, :][:0],
-            *rectangles,
+        numbers = [
+            np.array([thing.xy for thing in objects]).reshape(-1, 2),
+            np.array(region, dtype=float),
+            np.array(scene.table_center[:2]),
+            np.array(scene.table_half[:2]) - np.reshape(radii, (-1, 1)),
         ]
+        self._tensors = [*map(torch.from_numpy, numbers), *rectangles]
 
     def to(self, device: torch.device, dtype: torch.dtype) -> None:
         """Moves the constants to where worlds are placed."""

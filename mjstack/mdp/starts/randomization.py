@@ -55,12 +55,9 @@ class ObjectMasses(Quantity):
         """Finds the bodies."""
         bodies = [env.index.bodies[name] for name in env.index.objects]
         dofs = [dof + i for _, dof in env.index.objects.values() for i in range(6)]
-        self._mass = _Elements(env, "body_mass", bodies)
-        self._scaled = [
-            _Elements(env, name, bodies) for name in ("body_inertia", "body_subtreemass")
-        ]
-        self._inverse = _Elements(env, "body_invweight0", bodies)
-        self._inverse_dofs = _Elements(env, "dof_invweight0", dofs)
+        self._mass, *self._scaled, self._inverse, self._inverse_dofs = (
+            _Elements(env, name, dofs if name.startswith("dof") else bodies) for name in self.fields
+        )
         self.columns = [f"{name}_mass_kg" for name in env.index.objects]
         self.nominal = self._mass.nominal
 
