@@ -11,7 +11,7 @@ import pytest
 
 from mjstack.files import write_atomic
 from mjstack.report.record import GateResult, Report, Status
-from mjstack.report.write import safely_draw, write_report
+from mjstack.report.write import safely_write, write_report
 
 
 def gate(status: Status, name: str = "g", **metrics: float) -> GateResult:
@@ -148,7 +148,7 @@ def test_a_failed_picture_is_a_line_and_leaves_no_part(tmp_path: Path) -> None:
         target.write_text(text)
         raise OSError(28, "No space left on device")
 
-    assert safely_draw(path, fail, "part") == "no picture a.png: No space left on device"
+    assert safely_write(path, fail, "part") == "a.png was not written: No space left on device"
     assert not path.exists()
-    assert safely_draw(path, Path.write_text, "all") == ""
+    assert safely_write(path, Path.write_text, "all") == ""
     assert path.read_text() == "all"

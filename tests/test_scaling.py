@@ -284,7 +284,7 @@ def test_failed_plot_takes_nothing_back(
 
     monkeypatch.setattr(scaling, "save_scaling_curves", fail)
     assert run([*TINY, "sim=native", "job.nworlds=[1]"]) == 0
-    assert "no picture scaling.png: no fonts" in capsys.readouterr().out
+    assert "scaling.png was not written: no fonts" in capsys.readouterr().out
     assert ("native", 1) in table(folder)
 
 

@@ -85,11 +85,11 @@ class OpenLoopDriver:
     the same phase.
     """
 
-    def __init__(
-        self, trajectory: JointTrajectory, phases: list[Phase], nworld: int, device: torch.device
-    ) -> None:
+    def __init__(self, trajectory: JointTrajectory, phases: list[Phase]) -> None:
         """Takes the trajectory, which must be on the device."""
         self._trajectory = trajectory
+        nworld = len(trajectory.knots)
+        device = trajectory.knots.device
         self.phases = phases
         self.steps = trajectory.steps
         numbers = [

@@ -245,8 +245,8 @@ class RunContext:
             return ClosedLoopDriver(env, self.planner.nominal)
         sources = source_xy(env).double().cpu().numpy()
         planned = partial(self.tell, "planning", total=sim.nworld)
-        tape = self.planner.plan(sources, planned).to(sim.device, sim.ctrl.dtype)
-        return OpenLoopDriver(tape, self.planner.phases, sim.nworld, sim.device)
+        trajectory = self.planner.plan(sources, planned).to(sim.device, sim.ctrl.dtype)
+        return OpenLoopDriver(trajectory, self.planner.phases)
 
     def play(
         self,

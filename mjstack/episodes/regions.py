@@ -2,7 +2,6 @@
 as a table, a file and a picture.
 """
 
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -17,9 +16,7 @@ from mjstack.files import to_csv, write_atomic
 from mjstack.math import wilson_interval
 from mjstack.report.picture import save_places
 from mjstack.report.table import Table
-from mjstack.report.write import safely_draw
-
-log = logging.getLogger(__name__)
+from mjstack.report.write import safely_write
 
 _EDGE = 1e-9  # cells: a place this close below a cell's edge is on it
 
@@ -168,20 +165,16 @@ def save_regions(
     folder = context.folder
     if folder is None:
         return []
-    lost = []
-    try:
-        rows = to_csv([asdict(region) for region in regions], [f.name for f in fields(Region)])
-        write_atomic(folder / REGIONS, rows)
-    except OSError as error:
-        log.exception("%s was not written", REGIONS)
-        lost.append(f"{REGIONS} could not be written ({error.strerror})")
+    rows = to_csv([asdict(region) for region in regions], [f.name for f in fields(Region)])
     scene = context.cfg.scene
     table = (scene.table_center[:2], scene.table_half[:2])
     title = f"{context.cfg.robot.title}: {tally.summary}"
     colors = {name: thing.color for name, thing in scene.free.items()}
-    succeeded = np.concatenate(tally.succeeded)
-    problem = safely_draw(folder / PICTURE, save_places, starts, succeeded, table, title, colors)
-    if problem:
-        return [*lost, problem]
-    context.artifacts.pictures.append(PICTURE)
-    return lost
+    drawn = (starts, np.concatenate(tally.succeeded), table, title, colors)
+    problems = [
+        safely_write(folder / REGIONS, write_atomic, rows),
+        safely_write(folder / PICTURE, save_places, *drawn),
+    ]
+    if not problems[-1]:
+        context.artifacts.pictures.append(PICTURE)
+    return [problem for problem in problems if problem]

@@ -29,7 +29,7 @@ from mjstack.report.picture import require_video, save_scene, save_trajectories,
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
 from mjstack.report.table import Table, to_document
-from mjstack.report.write import safely_draw, summarize, write_report
+from mjstack.report.write import safely_write, summarize, write_report
 from mjstack.sim import Simulation, cuda_driver, cuda_name
 
 log = logging.getLogger(__name__)
@@ -193,7 +193,7 @@ def write_tables(
     folder = cast(Path, context.folder)
     picture = folder / f"{name}.png"
     if draw is not None:
-        if problem := safely_draw(picture, draw):
+        if problem := safely_write(picture, draw):
             context.say(escape(problem))
         else:
             context.artifacts.pictures.append(picture.name)
@@ -240,7 +240,7 @@ def _draw(context: RunContext, console: Console) -> list[str]:
     if cfg.video:
         drawn["episode.mp4"] = (save_video, (model, episode.qpos, cfg.timing.step_dt))
     problems = {
-        name: safely_draw(folder / name, draw, *args) for name, (draw, args) in drawn.items()
+        name: safely_write(folder / name, draw, *args) for name, (draw, args) in drawn.items()
     }
     for name, problem in problems.items():
         if problem or name == "episode.mp4":

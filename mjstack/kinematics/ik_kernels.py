@@ -246,25 +246,24 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             anchors = Rows()
             axes = Rows()
             trunk = wp.transform(wp.vec3(), wp.quat_identity())
-            for i in range(TRUNK):
-                pose = wp.transform_multiply(trunk, chain.frame[i])
+            first_branch = trunk
+            second_branch = trunk
+            for i in range(END):
+                link = first_branch
+                if wp.static(i >= FORK):
+                    link = second_branch
+                pose = wp.transform_multiply(link, chain.frame[i])
                 anchors[i] = wp.transform_get_translation(pose)
                 axes[i] = wp.transform_vector(pose, chain.axis[i])
-                trunk = turn(pose, chain.axis[i], wp.static(shape.kinds[i]), q[i])
-            branch = trunk
-            for i in range(TRUNK, FORK):
-                pose = wp.transform_multiply(branch, chain.frame[i])
-                anchors[i] = wp.transform_get_translation(pose)
-                axes[i] = wp.transform_vector(pose, chain.axis[i])
-                branch = turn(pose, chain.axis[i], wp.static(shape.kinds[i]), q[i])
-            first = wp.transform_point(branch, first_site)
-            branch = trunk
-            for i in range(FORK, END):
-                pose = wp.transform_multiply(branch, chain.frame[i])
-                anchors[i] = wp.transform_get_translation(pose)
-                axes[i] = wp.transform_vector(pose, chain.axis[i])
-                branch = turn(pose, chain.axis[i], wp.static(shape.kinds[i]), q[i])
-            second = wp.transform_point(branch, second_site)
+                link = turn(pose, chain.axis[i], wp.static(shape.kinds[i]), q[i])
+                if wp.static(i < TRUNK):
+                    trunk = link
+                if wp.static(i < FORK):
+                    first_branch = link
+                if wp.static(i < TRUNK or i >= FORK):
+                    second_branch = link
+            first = wp.transform_point(first_branch, first_site)
+            second = wp.transform_point(second_branch, second_site)
             midpoint = wp.lerp(first, second, 0.5)
             error = goal - midpoint
             left = wp.length(error)

@@ -24,12 +24,6 @@ def robot_joints(env: EnvView) -> list[str]:
     return env.cfg.robot.joints
 
 
-def joint_limits(env: EnvView) -> tuple[Tensor, Tensor]:
-    """Lowest and highest position of each joint that is also a command, each ``(n,)``."""
-    both = torch.stack((robot(env).range, robot(env).ctrl_range))
-    return both[..., 0].amax(0), both[..., 1].amin(0)
-
-
 POSES = ("home", "start")
 LOADED = 1e-5  # N: a jaw that presses with more touches the object
 

@@ -13,7 +13,7 @@ from mjstack.errors import ParameterError
 from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
-from mjstack.mdp.geometry import joint_limits, named_pose, pose_w, robot, write_robot
+from mjstack.mdp.geometry import named_pose, pose_w, robot, robot_joints, write_robot
 from mjstack.mdp.starts.placement import Placement
 from mjstack.mdp.starts.randomization import (
     ObjectMasses,
@@ -23,6 +23,7 @@ from mjstack.mdp.starts.randomization import (
     bounds,
 )
 from mjstack.mdp.starts.reach import require_reach
+from mjstack.scene.index import joint_limits
 
 
 def home(env: EnvView, mask: Tensor, *, pose: str = "home") -> None:
@@ -51,7 +52,8 @@ class JointNoise:
         require_positive("gripper", gripper, zero=True)
         self._width = torch.full_like(robot(env).home, gripper)
         self._width[: env.index.n_arm] = arm
-        self._low, self._high = joint_limits(env)
+        limits = joint_limits(env.sim.model, robot_joints(env))
+        self._low, self._high = (torch.from_numpy(each).to(self._width) for each in limits)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Writes qpos and ctrl."""

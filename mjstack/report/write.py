@@ -51,24 +51,24 @@ def write_report(report: Report) -> None:
     write_atomic(report.folder / "report.md", to_markdown(report))
 
 
-def safely_draw(path: Path, draw: Callable[..., object], *args: object) -> str:
-    """Draw a picture; a failure takes no result back.
+def safely_write(path: Path, write: Callable[..., object], *args: object) -> str:
+    """Write a file beside the result; a failure takes no result back.
 
     Args:
-        path: The picture.
-        draw: Called with the path and ``args``.
-        args: The drawn values.
+        path: The file.
+        write: Called with the path and ``args``.
+        args: Its content.
 
     Returns:
-        Empty, or one line that says why there is no picture. run.log has the traceback.
+        Empty, or one line that says why there is no such file. run.log has the traceback.
     """
     try:
-        draw(path, *args)
+        write(path, *args)
     except Exception as error:
-        log.exception("%s was not drawn", path.name)
+        log.exception("%s was not written", path.name)
         path.unlink(missing_ok=True)  # it may be there in part
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        return f"no picture {path.name}: {reason}"
+        return f"{path.name} was not written: {reason}"
     return ""
 
 

@@ -81,11 +81,6 @@ class StackCheck(EpisodeCheck):
         """See `EpisodeCheck`."""
         t = self.t
         self.objects = [t.object, t.onto]
-        self.rest = {
-            "speed": t.rest_speed,
-            "position": t.rest_position,
-            "rotation_deg": t.rest_rotation_deg,
-        }
         moved = [t.object]
         up = airborne(t.object, height=t.airborne_height)
         self.stacked = on_top(t.object, t.onto, xy_err=t.xy_err, dz_min=t.dz_min, dz_max=t.dz_max)
@@ -119,7 +114,12 @@ class StackCheck(EpisodeCheck):
                 measure=self.trace,
             ),
             InWindow("SUPPORTED", f"{t.onto} not on the table", self.supported, t.window),
-            AtRest(t.window, **self.rest),
+            AtRest(
+                t.window,
+                speed=t.rest_speed,
+                position=t.rest_position,
+                rotation_deg=t.rest_rotation_deg,
+            ),
         ]
 
     def placed(self, step: Step) -> Tensor:
@@ -144,16 +144,15 @@ class RestWindow:
     takes its own along. Distances stay squared, and angles stay cosines, until they are judged.
     """
 
-    def __init__(
-        self, view: TaskView, window: int, *, speed: float, position: float, rotation_deg: float
-    ) -> None:
-        """Allocates the ring; arguments as of `AtRest`."""
+    def __init__(self, view: TaskView, t: StackCheck.Thresholds) -> None:
+        """Allocates the ring."""
         size = len(view.objects)
+        window = t.window
         self._window = window
         self._limits = (
-            speed**2,
-            position**2,
-            1.0 - math.cos(0.5 * math.radians(rotation_deg)),
+            t.rest_speed**2,
+            t.rest_position**2,
+            1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg)),
         )
         # Where the oldest step is, in every world.
         self._slot = torch.zeros(1, dtype=torch.int64, device=view.env.device)
@@ -202,7 +201,7 @@ class StackSuccess(ReleasedSuccess):
         check = StackCheck(env.cfg)
         super().__init__(env, check, self._stands, open_fraction)
         self._check = check
-        self._rest = RestWindow(check.view(env), check.t.window, **check.rest)
+        self._rest = RestWindow(check.view(env), check.t)
 
     def _stands(self, step: Step) -> Tensor:
         """Takes a step; `reset` may leave the ring alone: every slot is written anew before the

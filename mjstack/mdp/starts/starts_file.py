@@ -15,7 +15,6 @@ from mjstack.errors import ArgumentError, ConfigError, ParameterError, suggest
 from mjstack.files import to_csv, write_atomic
 from mjstack.managers.view import EnvView, offers, uses_fields
 from mjstack.mdp.geometry import (
-    joint_limits,
     joint_positions,
     named_pose,
     place_xy,
@@ -32,6 +31,7 @@ from mjstack.mdp.starts.randomization import (
     bounds,
 )
 from mjstack.mdp.starts.reach import out_of_reach
+from mjstack.scene.index import joint_limits
 
 # [m], and of a quaternion: how far off upright an object on the table may be
 _FLAT = 1e-5
@@ -106,9 +106,7 @@ class StartsTable:
         self.columns = {name: column[order] for name, column in table.items()}
         self.lines = np.array([line for line, _ in rows])[order]
 
-    def misfit(
-        self, world: int, columns: Sequence[str], expected: str, fix: str = "Correct it"
-    ) -> ConfigError:
+    def misfit(self, world: int, columns: Sequence[str], expected: str, fix: str) -> ConfigError:
         """The error that some cells of a world's line cannot be used."""
         return self.wrong(expected, fix, self.lines[world], columns)
 
@@ -200,8 +198,8 @@ class FromStartsFile:
             fix = f"Correct it, or widen reset.starts.params.{name}"
             for column, nominal in zip(held.columns, held.nominal.tolist(), strict=True):
                 file.require_range(column, nominal * low, nominal * high, fix)
-        limits = torch.stack(joint_limits(env), dim=1).tolist()
-        for column, (low, high) in zip(joints, limits, strict=True):
+        limits = joint_limits(env.sim.model, robot_joints(env))
+        for column, low, high in zip(joints, *limits, strict=True):
             file.require_range(column, low, high)
         for name, pair in drawn.items():
             if not table.keys() & set(pair):
