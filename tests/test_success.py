@@ -21,6 +21,7 @@ from compositions import load_config
 from environments import at_double_speed, configure, one_second_episode
 
 from mjstack.cli import run
+from mjstack.config.schema import Config
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor, Sign
@@ -31,7 +32,9 @@ from mjstack.gates.success import run_success, success_config
 from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
+from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation
+from mjstack.tasks.check import make_check
 
 RULES = rules_of("stack")
 
@@ -454,16 +457,16 @@ def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> Non
     overflow = (rng.random((total, n)) < 0.0005).cumsum(axis=0) > 0
     qpos = np.where(rng.random((total, n, 1)) < 0.0005, np.inf, 1.0) * np.ones((1, 1, 3))
 
-    watch = FailureMonitor(cfg)
+    watch = FailureMonitor()
     now = SimpleNamespace(step=0)
     device = torch.device("cpu")
     sim = SimpleNamespace(
         qpos=torch.zeros(n, 3), qvel=torch.zeros(n, 3), overflow=torch.zeros(n, dtype=torch.int32)
     )
     env = SimpleNamespace(nworld=n, device=device, sim=sim, index=None, cfg=cfg)
-    controller = SimpleNamespace(phase=torch.zeros(n, dtype=torch.int64), phases=None)
+    controller = SimpleNamespace(phase=torch.zeros(n, dtype=torch.int64), phases=build_phases(cfg))
     pretend(
-        watch,
+        cfg,
         monkeypatch,
         in_hand=lambda: torch.from_numpy(forces[now.step] > 0.0).all(2),
         placed=lambda: torch.from_numpy(placed[now.step]),
@@ -493,7 +496,7 @@ def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def pretend(
-    watch: FailureMonitor,
+    cfg: Config,
     monkeypatch: pytest.MonkeyPatch,
     *,
     in_hand: Callable[[], torch.Tensor],
@@ -501,8 +504,10 @@ def pretend(
 ) -> None:
     """Give the monitor a check that says what the test made up."""
     view = SimpleNamespace(step=lambda: SimpleNamespace(in_hand=in_hand()))
-    check = SimpleNamespace(view=lambda _: view, placed=lambda _: placed())
-    monkeypatch.setattr(watch, "_check", check)
+    check = SimpleNamespace(
+        objects=make_check(cfg).objects, view=lambda _: view, placed=lambda _: placed()
+    )
+    monkeypatch.setattr("mjstack.episodes.failures.make_check", lambda _: check)
 
 
 def recount(
@@ -551,7 +556,7 @@ def test_signs_in_real_episodes(new_context: Callable[..., RunContext]) -> None:
         if step == at["above_blue"]:
             sim.qvel[5] = torch.nan
 
-    watch = FailureMonitor(context.cfg)
+    watch = FailureMonitor()
     sim = context.batch_simulation(6)
     episode = context.play(sim, context.cfg.reset, [watch, Hook(interfere)])
     failed = episode.result.failed.tolist()
@@ -588,15 +593,15 @@ def test_each_cube_of_the_box_has_its_own_release(monkeypatch: pytest.MonkeyPatc
     placed[:, 3, 1] = False
     placed[at["done"] + 1 :, 4, 1] = False
 
-    watch = FailureMonitor(cfg)
+    watch = FailureMonitor()
     now = SimpleNamespace(step=0)
     sim = SimpleNamespace(
         qpos=torch.zeros(5, 3), qvel=torch.zeros(5, 3), overflow=torch.zeros(5, dtype=torch.int32)
     )
     env = SimpleNamespace(nworld=5, device=torch.device("cpu"), sim=sim, index=None, cfg=cfg)
-    controller = SimpleNamespace(phase=torch.zeros(5, dtype=torch.int64), phases=None)
+    controller = SimpleNamespace(phase=torch.zeros(5, dtype=torch.int64), phases=build_phases(cfg))
     pretend(
-        watch,
+        cfg,
         monkeypatch,
         in_hand=lambda: torch.ones(5, 2, dtype=torch.bool),
         placed=lambda: torch.from_numpy(placed[now.step]),
@@ -685,7 +690,7 @@ def test_steps_with_the_tracker_are_one_graph(
     base = new_context("sim=mjwarp", "sim.device=cuda:0", "nworld=64", "graph=require", robot=robot)
     context = base.with_config(success_config(base.cfg))
     sim = context.batch_simulation(64)
-    watch = FailureMonitor(context.cfg)
+    watch = FailureMonitor()
     episode = context.play(sim, context.cfg.reset, [watch])
     assert episode.timing.captured
     failed = episode.result.failed != 0

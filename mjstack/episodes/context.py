@@ -1,6 +1,5 @@
 """The context of a run: configuration, scene, plan, and the products of its gates."""
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -45,8 +44,6 @@ from mjstack.sim import (
 )
 from mjstack.sim.sizes import apply_configured
 from mjstack.tasks.check import EpisodeCheck, make_check
-
-log = logging.getLogger(__name__)
 
 Say = Callable[[str], None]
 AnyGate = TypeVar("AnyGate", bound=Callable)

@@ -5,12 +5,10 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.rollout import Observer
 from mjstack.math import not_finite
-from mjstack.scene.phases import build_phases
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.tasks.check import make_check
 
@@ -72,40 +70,32 @@ class FailureMonitor(Observer):
     phase: Tensor
     step: Tensor
 
-    def __init__(self, cfg: Config) -> None:
-        """Reads the phases, and what belongs where."""
-        self._check = make_check(cfg)
-        objects = self._check.objects
-        names = list(cfg.scene.objects)
-        column = {names.index(name): place for place, name in enumerate(objects)}
-        # Without phases there is one, in which nothing is grasped or carried.
-        phases = build_phases(cfg)
-        self._tables = tuple(
-            [column.get(number, -1) for number in table] or [-1]
-            for table in ([p.grasped for p in phases], [p.carried for p in phases])
-        )
+    def start(self, env: Env, driver: Driver) -> None:
+        """Read what belongs where, and allocate for the environment's worlds."""
+        super().start(env, driver)
+        device = env.device
+        self._check = make_check(env.cfg)
+        self._view = self._check.view(env)
+        # Objects are numbered as by the check. Without phases there is one, in which nothing is
+        # grasped or carried.
+        names = list(env.cfg.scene.objects)
+        column = {names.index(name): place for place, name in enumerate(self._check.objects)}
+        grasped = [column.get(phase.grasped, -1) for phase in driver.phases] or [-1]
+        carried = [column.get(phase.carried, -1) for phase in driver.phases] or [-1]
         # Number of the phase in which each object is let go for good; one that never comes for one
         # that is not carried.
-        last = {carried: number for number, carried in enumerate(self._tables[1])}
-        never = len(self._tables[1]) - 1
-        self._releases = [last.get(place, never) + 1 for place in range(len(objects))]
-
-    def start(self, env: Env, driver: Driver) -> None:
-        """Allocate for the environment's worlds."""
-        super().start(env, driver)
-        self._view = self._check.view(env)
-        device = env.device
-        self._grasped, self._carried = (
-            torch.tensor(table, device=device) for table in self._tables
-        )
-        self._release = torch.tensor(self._releases, device=device)
+        last = {place: number for number, place in enumerate(carried)}
+        released = [last.get(place, len(carried) - 1) + 1 for place in column.values()]
+        self._grasped = torch.tensor(grasped, device=device)
+        self._carried = torch.tensor(carried, device=device)
+        self._release = torch.tensor(released, device=device)
         self.sign = torch.zeros(env.nworld, dtype=torch.int64, device=device)
         self.phase = torch.full_like(self.sign, -1)
         self.step = torch.full_like(self.sign, -1)
         self._now = torch.zeros_like(self.sign[:1])
         self._at = torch.zeros_like(self.sign)
         self._gone = torch.zeros_like(self.sign)
-        self._loaded = self.sign.new_zeros((env.nworld, len(self._releases)), dtype=torch.bool)
+        self._loaded = self.sign.new_zeros((env.nworld, len(released)), dtype=torch.bool)
         self._placed = torch.zeros_like(self._loaded)
 
     def update(self) -> None:

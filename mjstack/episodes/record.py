@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from mjstack.config.schema import Config
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.observers import Episode
 from mjstack.errors import RunError
 from mjstack.files import write_npz
-from mjstack.scene import SceneIndex
 from mjstack.tasks.check import Rules
 
 STEMS = {"batch": "worlds", "success": "success"}
@@ -51,10 +49,10 @@ class Circumstances:
     sign_step: np.ndarray
 
     @classmethod
-    def of(
-        cls, episode: Episode, monitor: FailureMonitor, cfg: Config, index: SceneIndex
-    ) -> "Circumstances":
-        """Copy the arrays to the host."""
+    def of(cls, episode: Episode, monitor: FailureMonitor) -> "Circumstances":
+        """Copy the arrays of an episode that the monitor has seen to the host."""
+        cfg = monitor.env.cfg
+        index = monitor.env.index
         # Objects stand flat at a start, so that all of a rotation is about z.
         places = []
         for at in index.object_qpos:

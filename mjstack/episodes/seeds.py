@@ -59,7 +59,7 @@ def play_seeds(
     try:
         for seed in range(cfg.seed, last + 1):
             try:
-                monitors = [FailureMonitor(cfg)] if circumstances else []
+                monitors = [FailureMonitor()] if circumstances else []
                 looking = [*monitors, *observers(seed)]
                 episode = context.play(sim, cfg.reset, looking, seed=seed)
                 record = EpisodeRecord(
@@ -72,8 +72,7 @@ def play_seeds(
                     start=episode.start,
                 )
                 for monitor in monitors:
-                    found = Circumstances.of(episode, monitor, cfg, context.index)
-                    record.circumstances = found
+                    record.circumstances = Circumstances.of(episode, monitor)
                 tally.add(record, episode, sim)
             except Exception as error:
                 if seed == cfg.seed:

@@ -186,7 +186,7 @@ def _replay(
     """Play the world on one backend, and compare the result with the recorded one."""
     first = number == 0
     backend, device = plan.where[number]
-    monitors = [FailureMonitor(context.cfg)] if plan.gate == "success" else []
+    monitors = [FailureMonitor()] if plan.gate == "success" else []
     done = replay_world(
         context,
         seed=plan.seed,
