@@ -318,7 +318,7 @@ def test_what_is_promised_of_another_end(
     )
     plan = SimpleNamespace(record=record, world=1, gate="batch")
     episode = SimpleNamespace(failed=np.zeros(1, dtype=np.int32))
-    done = SimpleNamespace(episode=episode, qpos_end=ours)
+    done = SimpleNamespace(episode=episode, recorder=SimpleNamespace(qpos=ours[None]))
     found = _compare(plan, done, Backend.mjwarp, device, changes, context)
     assert found[0] is kept
     assert says in found[1]

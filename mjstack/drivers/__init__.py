@@ -1,1 +1,1 @@
-"""Controllers: what writes the commands."""
+"""Drivers: they give the joint targets of every step."""

@@ -283,7 +283,7 @@ class ClosedLoopDriver:
             self._seen[:, number, :2] = place_xy(self._env, name).float()
 
     def _build_tables(self, cfg: Config, device: torch.device) -> None:
-        """What each phase says, as tensors: a row per phase."""
+        """Makes tensors of all that the phases say, a row per phase."""
         names = [phase.name for phase in self.phases]
         things = list(cfg.scene.objects)
         rows = []

@@ -195,11 +195,8 @@ class OpenLoopPlanner:
                     way = start + s * (end - start)
                     command, distance = self.ik.solve(way[:3], way[3:], guess)
                     if not distance <= self.ik.tolerance:
-                        anchor = phase.spec.anchor
-                        at = way[:3].tolist()
-                        raise Unreachable(
-                            world, phase.name, anchor, at, distance, self.ik.tolerance
-                        )
+                        facts = (phase.spec.anchor, way[:3].tolist(), distance, self.ik.tolerance)
+                        raise Unreachable(world, phase.name, *facts)
                     worst = max(worst, distance)
                 knots[k] = command
         return knots, worst
@@ -260,7 +257,7 @@ class OpenLoopPlanner:
 def plan_in_parallel(
     cfg: Config, worlds: Sequence[int], sources_xy: np.ndarray, processes: int
 ) -> Generator[Plan]:
-    """Plans worlds in processes, which are gone when this has ended, in whatever way it ends.
+    """Plans worlds in processes, which are gone when this has ended in any way.
 
     Args:
         cfg: From which a process builds its planner.

@@ -74,7 +74,8 @@ class CarryTilt:
         """Desired approach axis of the next step. Fixed shapes, no host read.
 
         Args:
-            command: What the arm starts from [rad, m], shape ``(nworld, nu)``, float32.
+            command: Joint positions at which the arm starts [rad, m], shape ``(nworld, nu)``,
+                float32.
             phase: Number of each world's phase, shape ``(nworld,)``, int64.
             there: Target of the phase ``place[phase]``, where the next object or the held one is
                 released [m], shape ``(nworld, 3)``.

@@ -82,8 +82,8 @@ class FailureMonitor(Observer):
         column = {names.index(name): place for place, name in enumerate(self._check.objects)}
         grasped = [column.get(phase.grasped, -1) for phase in driver.phases] or [-1]
         carried = [column.get(phase.carried, -1) for phase in driver.phases] or [-1]
-        # Number of the phase in which each object is let go for good; one that never comes for one
-        # that is not carried.
+        # Number of the phase in which each object is let go for the last time; one that never comes
+        # for one that is not carried.
         last = {place: number for number, place in enumerate(carried)}
         released = [last.get(place, len(carried) - 1) + 1 for place in column.values()]
         self._grasped = torch.tensor(grasped, device=device)

@@ -96,7 +96,7 @@ class Circumstances:
 
 @dataclass(eq=False, kw_only=True, slots=True)
 class EpisodeRecord:
-    """All worlds of one seed after their episode. Some 500 bytes a world, whatever the episode's
+    """All worlds of one seed after their episode. Some 500 bytes a world, for an episode of any
     length.
 
     Attributes:

@@ -29,14 +29,12 @@ class ReplayedWorld:
         recorder: Its positions and phases.
         arrays: Its start, and its state and the check's values at step ends, for an npz file.
         findings: A line for each rule.
-        qpos_end: Final positions in the backend's precision, shape ``(nq,)``.
     """
 
     episode: Episode
     recorder: WorldRecorder
     arrays: dict[str, Any]
     findings: list[str]
-    qpos_end: np.ndarray
 
 
 def replay_world(
@@ -82,7 +80,6 @@ def replay_world(
             recorder=recorder,
             arrays=facts | trace.start_arrays | steps,
             findings=_explain(episode, steps, sim, context),
-            qpos_end=sim.qpos[0].cpu().numpy().copy(),
         )
 
 

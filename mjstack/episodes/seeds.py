@@ -31,7 +31,7 @@ def play_seeds(
         context: The run.
         gate: The gate, which names the files.
         count: Number of seeds, from the configured one on.
-        noun: What is counted, such as ``worlds``.
+        noun: The things that are counted, such as ``worlds``.
         circumstances: Whether starts and signs of failure are recorded too.
         observers: More observers, by seed.
     """

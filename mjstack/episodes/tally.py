@@ -29,7 +29,7 @@ class EpisodeTally:
 
     Attributes:
         gate: Whose episodes.
-        noun: What is counted, such as ``worlds``.
+        noun: The things that are counted, such as ``worlds``.
         several: Whether there are several seeds; then an episode's name has its seed.
         check: The task's.
         path: The file of failing episodes; None where nothing is written.
@@ -47,7 +47,7 @@ class EpisodeTally:
         steps: Physics steps of all worlds.
         first: The first seed's episode.
         notes: Backend and buffer sizes in words.
-        problems: Why the gate fails, whatever the rate.
+        problems: Why the gate fails at any rate of success.
         details: Remarks.
     """
 

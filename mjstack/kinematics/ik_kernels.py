@@ -46,8 +46,8 @@ class Chain:
 
 @dataclass(frozen=True)
 class Shape:
-    """What a solve kernel is compiled for, so that its loops unroll and its working memory is
-    registers.
+    """The chain that a solve kernel is compiled for, so that its loops unroll and its working
+    memory is registers.
     """
 
     kinds: tuple[int, ...]  # HINGE or SLIDE, of each link
@@ -129,11 +129,8 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
     # Links that an iteration follows: these up to TRUNK carry both sites, and so on as in Chain.
     TRUNK = shape.trunk if forked else max((i + 1 for i in range(n) if shape.moved[i]), default=0)
     FORK, END = (shape.fork, n) if forked else (TRUNK, TRUNK)
-    # Links after them, from the trunk's, to the first site and to the second.
-    TRUNK_REST = (TRUNK, shape.trunk)
-    FIRST_REST, SECOND_REST = (
-        ((0, 0), (0, 0)) if forked else ((shape.trunk, shape.fork), (shape.fork, n))
-    )
+    # The first links after them on the way to the first site and to the second
+    FIRST_REST, SECOND_REST = (shape.fork, n) if forked else (shape.trunk, shape.fork)
     Values = wp.types.vector(length=max(END, 1), dtype=float)
     Rows = wp.types.matrix(shape=(max(END, 1), 3), dtype=float)  # a vector per link
 
@@ -221,20 +218,9 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             unreachable[w] = True
             return
         # Links behind the moved ones
-        rest = follow(
-            chain,
-            given,
-            w,
-            wp.static(TRUNK_REST[0]),
-            wp.static(TRUNK_REST[1]),
-            wp.transform_identity(),
-        )
-        first_end = follow(
-            chain, given, w, wp.static(FIRST_REST[0]), wp.static(FIRST_REST[1]), rest
-        )
-        second_end = follow(
-            chain, given, w, wp.static(SECOND_REST[0]), wp.static(SECOND_REST[1]), rest
-        )
+        rest = follow(chain, given, w, TRUNK, wp.static(shape.trunk), wp.transform_identity())
+        first_end = follow(chain, given, w, FIRST_REST, wp.static(shape.fork), rest)
+        second_end = follow(chain, given, w, SECOND_REST, wp.static(n), rest)
         first_site = wp.transform_point(first_end, chain.first_site)
         second_site = wp.transform_point(second_end, chain.second_site)
         approach = wp.transform_vector(rest, chain.approach)

@@ -116,7 +116,7 @@ class EndEffectorDelta(_Commands):
     inverse kinematics.
 
     It starts from the last command, not from the measured joints, so that the arm does not sag by
-    its servo error at every step; and it keeps no target of its own, so that nothing winds up at
+    its servo error at every step; and it keeps no target itself, so that nothing winds up at
     the edge of the reach. The gripper's last command counts too: where a jaw swings, as SO-101's
     does, closing it moves the grasp point, by up to 16 mm there.
     """

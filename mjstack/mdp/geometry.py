@@ -83,11 +83,12 @@ def pose_w(env: EnvView, name: str) -> Tensor:
     return env.sim.qpos[:, address : address + 7]
 
 
-def grasp_point_to_object(env: EnvView, name: str, height: float = 0.0) -> Tensor:
-    """From the grasp point to a point above an object's centre [m], shape ``(nworld, 3)``."""
-    offset = pose_w(env, name)[:, :3] - grasp_point(env)
-    offset[:, 2] += height
-    return offset
+def write_object(env: EnvView, mask: Tensor, name: str, xy: Tensor, quat: Tensor) -> None:
+    """Put the masked worlds' object at x and y [m], turned by a quaternion (wxyz); its height
+    stays.
+    """
+    view = pose_w(env, name)
+    torch.where(mask[:, None], torch.cat((xy, view[:, 2:3], quat), dim=1), view, out=view)
 
 
 def nearness(offset: Tensor, scale: float) -> Tensor:
@@ -131,9 +132,9 @@ def place_xy(env: EnvView, name: str) -> Tensor:
         return env.index.constant(place.xy, env.sim.qpos).expand(env.nworld, -1)
 
     def compute() -> Tensor:
-        dx, dy = episode_draw(env, name, 2).unbind(1)
-        wide, deep = place.random_xy
-        return torch.stack((place.xy[0] + wide * dx, place.xy[1] + deep * dy), dim=1)
+        draw = episode_draw(env, name, 2)
+        constant = env.index.constant
+        return constant(place.xy, draw) + constant(place.random_xy, draw) * draw
 
     return shared((id(env), place_xy, name), compute)
 

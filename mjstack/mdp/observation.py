@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from mjstack.managers.view import EnvView, offers
-from mjstack.mdp import geometry
 from mjstack.mdp.geometry import (
     grasp_point,
     jaw_forces,
@@ -50,7 +49,9 @@ def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> 
         object: Scene object.
         height: How far above [m].
     """
-    return geometry.grasp_point_to_object(env, object, height)
+    offset = pose_w(env, object)[:, :3] - grasp_point(env)
+    offset[:, 2] += height
+    return offset
 
 
 @offers(unit="m")

@@ -13,7 +13,14 @@ from mjstack.errors import ParameterError
 from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
-from mjstack.mdp.geometry import named_pose, pose_w, robot, robot_joints, write_robot
+from mjstack.mdp.geometry import (
+    named_pose,
+    pose_w,
+    robot,
+    robot_joints,
+    write_object,
+    write_robot,
+)
 from mjstack.mdp.starts.placement import Placement
 from mjstack.mdp.starts.randomization import (
     ObjectMasses,
@@ -218,9 +225,7 @@ def _write_object(env: EnvView, mask: Tensor, name: str, offset: Tensor, yaw: Te
     """Moves the masked worlds' object off the position where the simulation's reset has put it, by
     x and y [m], and turns it [rad].
     """
-    view = pose_w(env, name)
     # Float64, because a float32 cosine need not be that of any angle, and a file of starts has the
     # angle.
-    turned = quat_from_yaw(yaw.double()).to(view.dtype)
-    pose = torch.cat((view[:, :2] + offset, view[:, 2:3], turned), dim=1)
-    torch.where(mask[:, None], pose, view, out=view)
+    turned = quat_from_yaw(yaw.double()).to(offset.dtype)
+    write_object(env, mask, name, pose_w(env, name)[:, :2] + offset, turned)

@@ -7,13 +7,13 @@ from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import (
     above_table,
-    grasp_point_to_object,
     jaw_forces,
     joint_velocities,
     nearness,
     place_xy,
     pose_w,
 )
+from mjstack.mdp.observation import grasp_point_to_object
 
 
 def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> Tensor:
@@ -25,7 +25,7 @@ def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> Te
         scale: Distance over which the reward falls [m].
         height: How far above the object's centre the point is [m].
     """
-    return nearness(grasp_point_to_object(env, object, height), scale)
+    return nearness(grasp_point_to_object(env, object=object, height=height), scale)
 
 
 def grasp(env: EnvView, *, object: str, force: float = 0.05) -> Tensor:

@@ -140,7 +140,7 @@ class GraspNext(_ByObject):
 
         Args:
             env: The environment.
-            force: What each jaw must exceed [N].
+            force: Force that each jaw must exceed [N].
 
         Raises:
             MjstackError: There is no box, or the force is out of range.

@@ -24,7 +24,7 @@ Example:
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -59,14 +59,14 @@ values by name with unit, each ``(nworld,)``."""
 class Rules(dict[str, int]):
     """A task's rules: the bit of each by its name, in order. A world passes with none set.
 
-    FINITE, STEPS and OVERFLOW come first, whatever the task.
+    FINITE, STEPS and OVERFLOW come first, for every task.
     """
 
     def __init__(self, texts: Mapping[str, str]) -> None:
         """Numbers the rules.
 
         Args:
-            texts: What went wrong if a rule of the task is broken, by the rule's name.
+            texts: The failure in words if a rule of the task is broken, by the rule's name.
         """
         self.texts = {**_EVERY_TASK, **texts}
         super().__init__((name, 1 << number) for number, name in enumerate(self.texts))
@@ -76,7 +76,7 @@ class Rules(dict[str, int]):
         return [name for name, bit in self.items() if bits & bit]
 
     def describe(self, bits: int) -> str:
-        """What went wrong, in words."""
+        """The broken rules of a bit set, in words."""
         return ", ".join(self.texts[name] for name in self.broken(bits))
 
     def failing(self, failed: np.ndarray) -> dict[str, list[int]]:
@@ -101,7 +101,7 @@ class CheckResult:
 
     failed: Tensor
     values: dict[str, Tensor]
-    shown: dict[str, list[str]] = field(default_factory=dict)
+    shown: dict[str, list[str]]
 
 
 class Rule(ABC):
@@ -110,9 +110,9 @@ class Rule(ABC):
     It is data until `start` allocates for every world. `update` may be captured into a CUDA graph.
 
     Attributes:
-        texts: What went wrong if it is broken, by name; one entry, or one for each object.
+        texts: The failure in words if it is broken, by name; one entry, or one for each object.
         suffixes: Part of the names of the measured values that tell about each of them.
-        wanted: What the rule wants of those values, in words.
+        wanted: The values that the rule wants, in words.
         phases: For each object, the phases in which it counts.
         at_end: Whether it can only hold at the end of a whole episode.
     """
@@ -132,9 +132,9 @@ class Rule(ABC):
 
         Args:
             name: In capital letters. The rule of one of several objects is ``NAME_OBJECT``.
-            text: What went wrong if it is broken; ``{object}`` is the object's name.
+            text: The failure in words if it is broken; ``{object}`` is the object's name.
             objects: The objects that it judges one by one.
-            wanted: What the rule wants of its measured values, in words.
+            wanted: The measured values that the rule wants, in words.
         """
         self.objects = list(objects)
         self.suffixes = [f"_{each}" for each in objects] if len(objects) > 1 else [""]

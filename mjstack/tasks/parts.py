@@ -119,7 +119,7 @@ class AtLeast(Rule):
 
         Args:
             name: Of the rule.
-            text: What went wrong.
+            text: The failure in words.
             objects: The objects.
             value: Name of the number, with ``{}`` for the suffix of the object.
             least: The threshold.
@@ -166,7 +166,7 @@ class Streak(AtLeast):
 
         Args:
             name: Of the rule.
-            text: What went wrong.
+            text: The failure in words.
             objects: The objects.
             condition: With a column for each.
             steps: How many in a row.
@@ -246,7 +246,7 @@ class InWindow(Rule):
 
         Args:
             name: Of the rule.
-            text: What went wrong.
+            text: The failure in words.
             condition: If it has several columns, all have to hold.
             window: How many steps.
             measure: Values at the end of the episode, by name with unit.

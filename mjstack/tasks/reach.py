@@ -5,7 +5,7 @@ from torch import Tensor
 
 from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView
-from mjstack.mdp.geometry import grasp_point_to_object
+from mjstack.mdp.observation import grasp_point_to_object
 from mjstack.tasks.parts import HeldSuccess
 
 
@@ -21,7 +21,7 @@ class ReachSuccess(HeldSuccess):
             env: The environment.
             object: The cube.
             height: How far above its centre the point is [m].
-            distance: What counts as near [m].
+            distance: Largest distance that counts as near [m].
             steps: How many steps in a row.
 
         Raises:
@@ -30,7 +30,7 @@ class ReachSuccess(HeldSuccess):
         require_positive("distance", distance)
 
         def near() -> Tensor:
-            offset = grasp_point_to_object(env, object, height)
+            offset = grasp_point_to_object(env, object=object, height=height)
             return torch.linalg.vector_norm(offset, dim=1) <= distance
 
         super().__init__(env, near, steps)

@@ -24,11 +24,10 @@ def require_reach(env: EnvView, region: Sequence[float]) -> None:
     center = np.array(scene.table_center[:2])
     for thing, spec in scene.free.items():
         room = np.array(scene.table_half[:2]) - spec.footprint  # as `Placement` has it, for any yaw
-        lows = np.clip(np.subtract(spec.xy, region), center - room, center + room)
-        highs = np.clip(np.add(spec.xy, region), center - room, center + room)
+        ends = np.array(spec.xy) + np.outer((-1.0, 1.0), region)
         axes = [
             np.unique(np.linspace(low, high, max(5, 1 + math.ceil((high - low) / _GRID))))
-            for low, high in zip(lows, highs, strict=True)
+            for low, high in np.clip(ends, center - room, center + room).T
         ]
         xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
         if found := out_of_reach(env, thing, xy):

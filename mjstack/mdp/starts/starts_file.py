@@ -20,6 +20,7 @@ from mjstack.mdp.geometry import (
     place_xy,
     pose_w,
     robot_joints,
+    write_object,
     write_robot,
 )
 from mjstack.mdp.starts.placement import world_boxes
@@ -53,7 +54,7 @@ class StartsTable:
 
         Args:
             path: The file.
-            key: What names it, ``starts`` or a term's ``path``.
+            key: The configuration key that names it: ``starts``, or ``path`` of a term.
             required: Names of columns that every file has, beside ``world``.
             optional: Names of columns that a file may have.
 
@@ -242,10 +243,8 @@ class FromStartsFile:
         write_robot(env, mask, self._command.index_select(0, env.world))
         poses = self._poses.index_select(0, env.world)
         for number, name in enumerate(env.index.objects):
-            view = pose_w(env, name)
-            at = poses[:, number]
-            pose = torch.cat((at[:, :2], view[:, 2:3], at[:, 2:]), dim=1)
-            torch.where(mask[:, None], pose, view, out=view)
+            xy, quat = poses[:, number].split((2, 4), dim=1)
+            write_object(env, mask, name, xy, quat)
         for held, table in self._given:
             values = table.index_select(0, env.world)
             held.write(mask, torch.where(values.isnan(), held.read().double(), values))
