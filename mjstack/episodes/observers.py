@@ -133,7 +133,7 @@ class Snapshots(Observer):
 
     def __init__(self, steps: Collection[int]) -> None:
         """``steps`` after which the state is kept."""
-        self._steps = frozenset(steps)
+        self._steps = steps
         self.states: dict[int, State] = {}
 
     def after_step(self, step: int) -> None:

@@ -21,7 +21,7 @@ from mjstack.tasks.parts import (
     on_table,
     on_top,
 )
-from mjstack.tasks.view import Step, TaskView
+from mjstack.tasks.view import Step
 
 
 class StackCheck(EpisodeCheck):
@@ -136,64 +136,17 @@ class StackCheck(EpisodeCheck):
         return f"xy_err {1e3 * values['xy_err_m']:.1f} mm, dz {1e3 * values['dz_m']:.1f} mm"
 
 
-class RestWindow:
-    """Whether objects have been at rest for the last steps, asked in every step; see `AtRest`.
+class StackSuccess(ReleasedSuccess):
+    """Achieved while an object has stood at rest on another one through the whole window, and the
+    gripper is open: rules 4 and 5 of the check, whose thresholds it shares.
 
     For the largest distance between any two steps of the window, each step keeps its largest
     distance to the later ones: a new step updates all of them at once, and the one that leaves
     takes its own along. Distances stay squared, and angles stay cosines, until they are judged.
     """
 
-    def __init__(self, view: TaskView, t: StackCheck.Thresholds) -> None:
-        """Allocates the ring."""
-        size = len(view.objects)
-        window = t.window
-        self._window = window
-        self._limits = (
-            t.rest_speed**2,
-            t.rest_position**2,
-            1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg)),
-        )
-        # Where the oldest step is, in every world.
-        self._slot = torch.zeros(1, dtype=torch.int64, device=view.env.device)
-        self._pos = view.zeros(window, size, 3)
-        self._quat = view.zeros(window, size, 4)
-        self._apart = torch.zeros_like(self._pos)
-        self._product = torch.zeros_like(self._quat)
-        self._energy = view.zeros(window, size)  # squared speed
-        self._far = view.zeros(window, size)  # squared distance to later steps
-        self._turned = view.zeros(window, size)  # 1 - |cosine of half the angle| to them
-
-    def append(self, step: Step) -> None:
-        """Takes a step in place of the oldest one."""
-        pos, quat = step.pose[:, None].split((3, 4), dim=-1)
-        self._slot.add_(1).remainder_(self._window)
-        self._pos.index_copy_(1, self._slot, pos)
-        self._quat.index_copy_(1, self._slot, quat)
-        self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
-        for ring in (self._far, self._turned):
-            ring.index_fill_(1, self._slot, 0.0)
-
-    def compare(self, step: Step) -> Tensor:
-        """Holds the step appended last against the others; shape ``(nworld,)``, bool."""
-        pos, quat = step.pose[:, None].split((3, 4), dim=-1)
-        torch.sub(self._pos, pos, out=self._apart).square_()
-        torch.maximum(self._far, self._apart.sum(-1), out=self._far)
-        torch.mul(self._quat, quat, out=self._product)
-        torch.maximum(self._turned, 1.0 - self._product.sum(-1).abs(), out=self._turned)
-        speed, position, rotation = self._limits
-        rest = (self._energy.mean(1) <= speed).all(1)
-        rest &= self._far.amax((1, 2)) <= position
-        return rest & (self._turned.amax((1, 2)) <= rotation)
-
-
-class StackSuccess(ReleasedSuccess):
-    """Achieved while an object has stood at rest on another one through the whole window, and the
-    gripper is open: rules 4 and 5 of the check, whose thresholds it shares.
-    """
-
     def __init__(self, env: EnvView, *, open_fraction: float) -> None:
-        """Allocates the ring; see `ReleasedSuccess`.
+        """Allocates a ring of the last steps; see `ReleasedSuccess`.
 
         Raises:
             MjstackError: The fraction is out of range, or the task has another check.
@@ -201,14 +154,27 @@ class StackSuccess(ReleasedSuccess):
         check = StackCheck(env.cfg)
         super().__init__(env, check, self._stands, open_fraction)
         self._check = check
-        self._rest = RestWindow(check.view(env), check.t)
+        view = check.view(env)
+        ring = (check.t.window, len(view.objects))
+        # Where the oldest step is, in every world.
+        self._slot = torch.zeros(1, dtype=torch.int64, device=env.device)
+        self._pose = view.zeros(*ring, 7)
+        self._apart = view.zeros(*ring, 3)
+        self._product = view.zeros(*ring, 4)
+        self._energy = view.zeros(*ring)  # squared speed
+        self._far = view.zeros(*ring)  # squared distance to later steps
+        self._turned = view.zeros(*ring)  # 1 - |cosine of half the angle| to them
 
     def _stands(self, step: Step) -> Tensor:
-        """Takes a step; `reset` may leave the ring alone: every slot is written anew before the
-        streak can reach the window.
+        """Takes a step in place of the oldest one. `reset` may leave the ring alone: every slot is
+        written anew before the streak can reach the window.
         """
         self._step = step
-        self._rest.append(step)
+        self._slot.add_(1).remainder_(self._steps)
+        self._pose.index_copy_(1, self._slot, step.pose[:, None])
+        self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
+        for ring in (self._far, self._turned):
+            ring.index_fill_(1, self._slot, 0.0)
         return self._check.placed(step).all(1)
 
     def __call__(self, env: EnvView) -> Tensor:
@@ -216,4 +182,16 @@ class StackSuccess(ReleasedSuccess):
         achieved = super().__call__(env)
         if not achieved.is_cuda and not bool(self._length.any()):
             return achieved  # no window that holds this step can pass, in any world
-        return achieved & self._rest.compare(self._step)
+
+        # The newest step against the others
+        pos, quat = self._step.pose[:, None].split((3, 4), dim=-1)
+        torch.sub(self._pose[..., :3], pos, out=self._apart).square_()
+        torch.maximum(self._far, self._apart.sum(-1), out=self._far)
+        torch.mul(self._pose[..., 3:], quat, out=self._product)
+        torch.maximum(self._turned, 1.0 - self._product.sum(-1).abs(), out=self._turned)
+
+        t = self._check.t
+        rotation = 1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg))
+        achieved &= (self._energy.mean(1) <= t.rest_speed**2).all(1)
+        achieved &= self._far.amax((1, 2)) <= t.rest_position**2
+        return achieved & (self._turned.amax((1, 2)) <= rotation)

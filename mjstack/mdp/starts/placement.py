@@ -78,13 +78,14 @@ class Placement:
             away = np.abs(around[:, :2] - thing.xy) - around[:, 2:4] - region
             near = np.linalg.norm(np.maximum(away, 0.0), axis=1) < around[:, 4]
             rectangles.append(torch.from_numpy(around[near]))
-        numbers = [
-            np.array([thing.xy for thing in objects]).reshape(-1, 2),
-            np.array(region, dtype=float),
-            np.array(scene.table_center[:2]),
-            np.array(scene.table_half[:2]) - np.reshape(radii, (-1, 1)),
+        half = torch.tensor(scene.table_half[:2]).double()
+        self._tensors = [
+            torch.tensor([thing.xy for thing in objects], dtype=torch.float64).reshape(-1, 2),
+            torch.tensor(region).double(),  # rounded to float32, which every start depends on
+            torch.tensor(scene.table_center[:2]).double(),
+            half - torch.tensor(radii, dtype=torch.float64)[:, None],
+            *rectangles,
         ]
-        self._tensors = [*map(torch.from_numpy, numbers), *rectangles]
 
     def to(self, device: torch.device, dtype: torch.dtype) -> None:
         """Moves the constants to where worlds are placed."""
