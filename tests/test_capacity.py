@@ -561,7 +561,7 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([0, int(Overflow.NEFC)])))
     monkeypatch.setattr(RunContext, "play_task", lambda *_: workload())
 
-    def play_random(context: RunContext, **sizes: BatchSizes) -> Workload:
+    def play_random(context: RunContext, *sizes: BatchSizes) -> Workload:
         assert not sizes, "tried sizes that are not known"
         return lost
 

@@ -169,7 +169,7 @@ def _measure(
     exact = not context.backend[1].startswith("cuda")
     for name, first in reversed(runs.items()):
         if first.sizes is not None and not group.lost:
-            problem = _compare(name, first, plays[name](sizes=wanted), result, exact=exact)
+            problem = _compare(name, first, plays[name](wanted), result, exact=exact)
             group.broken += [problem] if problem else []
     return group
 
