@@ -75,12 +75,12 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
         result.notes["gpu_power_and_memory"] = "not measured: no GPU"
 
     # Whether they count
-    episode = found.get("episode")
-    if episode is not None and episode.facts.get("succeeded", cfg.nworld) < cfg.nworld:
+    episode = found.get("episode", Measurement(name="episode"))
+    if episode.facts.get("succeeded", cfg.nworld) < cfg.nworld:
         for one in found.values():
             one.problem = one.problem or f"the episode failed, and {_UNVERIFIED}"
     verified = batch is not None and batch.status is Status.passed
-    verified |= episode is not None and bool(episode.samples) and not episode.problem
+    verified |= bool(episode.samples) and not episode.problem
     result.reason = "; ".join(f"{key}: {_describe(one, on_cuda)}" for key, one in found.items())
     if not verified:
         result.reason += " (the task was not verified in this run: add batch to gates)"

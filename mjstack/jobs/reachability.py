@@ -194,8 +194,9 @@ def find_region(cfg: Config, levels: list[ReachLevel], name: str) -> ObjectRegio
         - job.step
         - job.margin
     )
-    ends = [min(place[k] - axis[0], axis[-1] - place[k]) for k, axis in enumerate((x, y))]
-    edge = [end - job.margin for end in ends]
+    edge = [
+        min(place[k] - axis[0], axis[-1] - place[k]) - job.margin for k, axis in enumerate((x, y))
+    ]
 
     def most_y(half_x: float) -> float:
         """How far a region of this half-width goes in y; negative where there is none."""
@@ -209,16 +210,14 @@ def find_region(cfg: Config, levels: list[ReachLevel], name: str) -> ObjectRegio
     half_x = np.arange(0.0, max(room[0], 0.0) + 1e-9, _FINE)
     half_y = np.minimum(room[1], [most_y(one) for one in half_x])
     half_y = _FINE * np.floor(half_y / _FINE + 1e-9)
-    area = half_x * half_y.clip(0.0)
-    best = area.argmax()
-    largest = (float(half_x[best]), float(half_y[best])) if area[best] > 0.0 else (0.0, 0.0)
+    best = (half_x * half_y).argmax()
     wide, deep = scene.random_xy
     inside = np.ix_(np.abs(y - place[1]) <= deep + 1e-9, np.abs(x - place[0]) <= wide + 1e-9)
     return ObjectRegion(
         name=name,
-        square=float(half_x[half_y >= half_x - 1e-9].max(initial=0.0)),
-        largest=largest,
-        tilt=float(levels[0].tilt[inside].max(initial=-math.inf)),
+        square=half_x[half_y >= half_x - 1e-9].max(initial=0.0),
+        largest=(half_x[best], max(half_y[best], 0.0)),
+        tilt=levels[0].tilt[inside].max(initial=-math.inf),
         reached=most_y(wide) >= deep - 1e-9,
     )
 
