@@ -9,8 +9,6 @@ from functools import partial
 import torch
 
 from mjstack.config.schema import Config, GraphMode
-from mjstack.drivers.driver import Driver
-from mjstack.envs import Env
 from mjstack.episodes.rollout import Observer, RolloutTiming
 from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS, Simulation, cuda_uuid, device_memory
@@ -100,14 +98,10 @@ class EnergyObserver(Observer):
         """``meter`` adds it up."""
         self._meter = meter
 
-    def start(self, env: Env, driver: Driver) -> None:
-        """See `Observer`."""
-        self._sim = env.sim
-
     def after_step(self, step: int) -> None:
         """See `Observer`."""
         if step == _EAGER - 1:
-            self._sim.synchronize()
+            self.env.sim.synchronize()
             reading = time.perf_counter()
             self._meter.start()
             self.aside = time.perf_counter() - reading

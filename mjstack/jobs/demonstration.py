@@ -20,7 +20,6 @@ from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import play_episode
 from mjstack.episodes.rollout import Observer, reset_worlds
 from mjstack.errors import ConfigError
-from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation, resolve_backend
 
 STATE = "observation.state"
@@ -61,19 +60,15 @@ class StepRecorder(Observer):
     values: torch.Tensor
     layout: dict[str, int]
 
-    def __init__(self, steps: int) -> None:
-        """``steps`` is the length of an episode."""
-        self._steps = steps
-
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
+        super().start(env, driver)
         joints = len(env.index.ctrl)
         dims = env.observation_manager.group_dims
         groups = {f"observation.{name}": dim for name, dim in dims.items()}
         self.layout = {STATE: joints, **groups, ACTION: joints, REWARD: 1}
-        shape = (self._steps, env.nworld, sum(self.layout.values()))
+        shape = (driver.steps, env.nworld, sum(self.layout.values()))
         self.values = torch.zeros(shape, device=env.device)
-        self._env = env
         self._robot = env.index.on(env.device, env.sim.qpos.dtype)
         seen = joints + sum(dims.values())
         self._seen = torch.zeros((env.nworld, seen), device=env.device)
@@ -82,7 +77,7 @@ class StepRecorder(Observer):
 
     def update(self) -> None:
         """See `Observer`."""
-        env = self._env
+        env = self.env
         command = self._robot.ctrl.read(env.sim.ctrl).float()
         step = torch.cat((self._seen, command, env.reward_manager.reward[:, None]), dim=1)
         self.values.index_copy_(0, self._next, step[None])
@@ -91,9 +86,9 @@ class StepRecorder(Observer):
 
     def _observe(self) -> None:
         """Keep the state that the next action is for."""
-        groups = self._env.observation_manager.groups.values()
+        groups = self.env.observation_manager.groups.values()
         torch.cat(
-            [self._robot.qpos.read(self._env.sim.qpos).float(), *groups], dim=1, out=self._seen
+            [self._robot.qpos.read(self.env.sim.qpos).float(), *groups], dim=1, out=self._seen
         )
 
 
@@ -142,7 +137,7 @@ def play_demonstrations(context: RunContext, sim: Simulation, seed: int) -> Play
     cfg = demonstration_config(replace(context.cfg, seed=seed))
     env = Env(sim, context.index, cfg, check_faults=False)  # the check names lost worlds
     reset_worlds(env, seed)
-    recorder = StepRecorder(build_phases(cfg)[-1].stop)
+    recorder = StepRecorder()
     episode = play_episode(
         env,
         context.driver(env),

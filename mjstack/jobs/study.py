@@ -22,11 +22,10 @@ from mjstack.files import to_csv
 from mjstack.gates.runner import describe_error
 from mjstack.jobs.gates import check_machine
 from mjstack.jobs.runner import CheckedJob, Job, write_tables
-from mjstack.managers.episode import required_fields
 from mjstack.report.picture import figure
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
-from mjstack.sim import Simulation, SolverLimit, make_simulation
+from mjstack.sim import Simulation, SolverLimit
 from mjstack.sim.sizes import resolve_measuring_sizes
 
 Row = dict[str, Any]
@@ -159,12 +158,8 @@ def _measure(context: RunContext, base: HeldPhysics, steps: int) -> Row:
 
 def _simulation(context: RunContext) -> Simulation:
     """Worlds with room to spare: buffer sizes are not what is studied."""
-    cfg, (backend, device) = context.cfg, context.backend
-    fields = required_fields(cfg.reset)
-    sizes = resolve_measuring_sizes(cfg)
-    return make_simulation(
-        context.model, cfg, cfg.nworld, backend=backend, device=device, fields=fields, sizes=sizes
-    )
+    sizes = resolve_measuring_sizes(context.cfg)
+    return context.simulation(context.cfg.nworld, *context.backend, sizes=sizes)
 
 
 def _text(settings: dict[str, object]) -> str:
