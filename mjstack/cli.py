@@ -142,9 +142,8 @@ def _print_help(hydra: Hydra, args: list[str]) -> None:
     try:
         print("\n".join(texts), flush=True)
     except BrokenPipeError:
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # Python writes there once more at its end
+        # Python writes there once more at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def run_job(cfg: DictConfig) -> Report:
@@ -165,9 +164,8 @@ def run_job(cfg: DictConfig) -> Report:
 
 def _check(cfg: DictConfig, overrides: list[str]) -> "CheckedJob":
     """Types and checks a composed job, and keeps what that built for its run."""
-    from mjstack.jobs import (
-        check_job,
-    )  # loads torch and Warp, for which a misspelt key need not wait
+    # It loads torch and Warp, for which a misspelt key need not wait.
+    from mjstack.jobs import check_job
 
     own = own_overrides(overrides)
     checked = check_job(to_config(cfg), own)

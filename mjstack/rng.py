@@ -35,9 +35,8 @@ def philox(counter: torch.Tensor, key: tuple[int, int]) -> torch.Tensor:
     multiplied = counter[..., ::2]
     mixed = counter[..., 1::2]
     for round_ in range(10):
-        product = (
-            multiplied * multipliers
-        )  # int64 wraps, and the mask after the shift drops the sign
+        # int64 wraps, and the mask after the shift drops the sign.
+        product = multiplied * multipliers
         high = (product >> 32).bitwise_and_(_MASK)
         multiplied = high.flip(-1).bitwise_xor_(mixed).bitwise_xor_(keys[round_])
         mixed = product.bitwise_and_(_MASK).flip(-1)

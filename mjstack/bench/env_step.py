@@ -29,7 +29,7 @@ from mjstack.bench.timing import (
     steps_that_fit,
     timed,
 )
-from mjstack.config.functions import resolve_func
+from mjstack.config.functions import offered
 from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
 from mjstack.episodes.rollout import State, restore, snapshot
@@ -213,7 +213,7 @@ class _Parts:
 
     def _find_losses(self, counted: dict[str, float]) -> None:
         terms = self._env.cfg.termination.items()
-        losses = [n for n, term in terms if hasattr(resolve_func(n, term.func), "ends_on")]
+        losses = [n for n, term in terms if offered(term.func, "ends_on")]
         ended = [name for name in losses if counted.get(f"termination/{name}", 0.0) > 0.0]
         if ended:
             self.problem = (

@@ -88,8 +88,8 @@ class Env:
         self.cfg = cfg
         self.nworld = sim.nworld
         self.device = sim.device
-        self.key = torch.zeros(1, dtype=torch.int64, device=sim.device)
         self.seed = cfg.seed
+        self.key = torch.full((1,), cfg.seed, dtype=torch.int64, device=sim.device)
         self.world = torch.arange(sim.nworld, device=sim.device)
         self.episode = torch.full_like(self.world, -1)
         self.episode_step = torch.zeros_like(self.world)
@@ -133,16 +133,6 @@ class Env:
         self.graph = self.captured(self.advance, "env.step")
 
     @property
-    def seed(self) -> int:
-        """Seed of every random number."""
-        return self._seed
-
-    @seed.setter
-    def seed(self, value: int) -> None:
-        self._seed = value
-        self.key.fill_(value)
-
-    @property
     def max_episode_steps(self) -> int:
         """Steps after which an episode times out: the time-out term's, or the task's where there is
         none.
@@ -180,6 +170,7 @@ class Env:
                 raise ArgumentError("mask", "a part of the worlds", expected, "Call env.reset()")
         if seed is not None:
             self.seed = check_seed(seed, masked=mask is not None)
+            self.key.fill_(self.seed)
             self.episode.fill_(-1)
         everywhere = mask is None
         mask = self._all_worlds if mask is None else mask

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.config.functions import resolve_func
+from mjstack.config.functions import offered
 from mjstack.config.schema import TerminationTermCfg
 from mjstack.errors import FaultError, name_worlds
 from mjstack.managers.action import ActionManager
@@ -47,8 +47,7 @@ class FaultLatch:
         self._faults = torch.zeros((sim.nworld, len(_FIXES)), dtype=torch.bool, device=sim.device)
         self._overflow = torch.zeros(sim.nworld, dtype=torch.int32, device=sim.device)
         self._none = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
-        funcs = [resolve_func(f"termination.{n}", cfg.func) for n, cfg in termination.items()]
-        ends_on = {getattr(func, "ends_on", None) for func in funcs}
+        ends_on = {offered(term.func, "ends_on") for term in termination.values()}
         # A world's own overflow may end its episode; that of the shared pool voids the whole batch.
         self._lost = POOL if "overflow" in ends_on else LOST_PHYSICS
         self._state_ends = "non_finite" in ends_on

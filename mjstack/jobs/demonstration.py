@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from mjstack.config.fingerprint import config_content, config_hash
-from mjstack.config.functions import resolve_func
+from mjstack.config.functions import offered
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
 from mjstack.datasets import DatasetSpec, Feature
 from mjstack.drivers.driver import Driver
@@ -258,7 +258,9 @@ def _group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
 
 
 def _term_units(func: str, width: int, joints: tuple[str, ...]) -> Sequence[str]:
-    unit = getattr(resolve_func("observation", func), "unit", "unknown")
+    unit = offered(func, "unit")
+    if unit is None:
+        unit = "unknown"
     if unit == "joint":
         return joints
     if unit == "joint/s":

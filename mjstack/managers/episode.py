@@ -3,10 +3,11 @@ worlds, reward terms are summed, termination terms say which worlds end.
 """
 
 from collections.abc import Mapping
+from itertools import chain
 
 import torch
 
-from mjstack.config.functions import resolve_func
+from mjstack.config.functions import offered
 from mjstack.config.schema import RewardTermCfg, TermCfg, TerminationTermCfg
 from mjstack.managers.term import Term, blamed, first_value, render_table
 from mjstack.managers.view import EnvView
@@ -41,12 +42,8 @@ class ResetManager:
 
 def required_fields(cfg: Mapping[str, TermCfg]) -> tuple[str, ...]:
     """Per-world model fields that some reset terms write, for the simulation's constructor."""
-    names: dict[str, None] = {}
-    for name, term in cfg.items():
-        names |= dict.fromkeys(
-            getattr(resolve_func(f"reset.{name}", term.func), "model_fields", ())
-        )
-    return tuple(names)
+    fields = [offered(term.func, "model_fields") or () for term in cfg.values()]
+    return tuple(dict.fromkeys(chain.from_iterable(fields)))
 
 
 class _ValueManager:

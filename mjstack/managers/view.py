@@ -103,9 +103,8 @@ def random_uniform(
     """
     stream = zlib.crc32(name.encode())
     if env.device.type == "cuda":
-        from mjstack.sim.draws import (
-            draw_uniform,
-        )  # one kernel; loads Warp, which native runs do not need
+        # One kernel; it loads Warp, which native runs do not need.
+        from mjstack.sim.draws import draw_uniform
 
         return draw_uniform(
             key=env.key,

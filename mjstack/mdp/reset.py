@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mjstack.config.functions import resolve_func
+from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
 from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields
@@ -147,7 +147,7 @@ class RandomizeObjects:
         noise = [
             term.params.get("arm", 0.0)
             for term in env.cfg.reset.values()
-            if getattr(resolve_func("reset", term.func), "joint_noise", False)
+            if offered(term.func, "joint_noise")
         ]
         self._placement = Placement(
             env.cfg,
