@@ -172,8 +172,8 @@ class CaptureError(MjstackError):
 
         Args:
             name: What was to be captured.
-            culprit: What was current_term, if that is known.
-            error: What the capture says.
+            culprit: The current term, if that is known.
+            error: The error of the capture.
         """
         where = f" because of {culprit}" if culprit else ""
         super().__init__(

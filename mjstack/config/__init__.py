@@ -1,4 +1,4 @@
-"""Typed configuration: `schema` has the dataclasses, `store` composes them, `validate` checks their
+"""Typed configuration: `schema` has the dataclasses, `load` composes them, `check` checks their
 values.
 """
 

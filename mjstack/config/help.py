@@ -36,7 +36,7 @@ _EXAMPLES = (
     ),
     ("job=collect job.episodes=20", "demonstrations of the scripted expert, as a dataset; resumes"),
     ("job=scaling robot=so101", "throughput from 1 to 32,768 worlds; resumes"),
-    ("job=study nworld=8", "what the solver's limits cost, and who is still succeeded"),
+    ("job=study nworld=8", "what the solver's limits cost, and which worlds still succeed"),
     (
         "job=reachability robot=rebot",
         "what the arm reaches, and how far cubes may stand from their places",

@@ -42,7 +42,7 @@ Advance = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Peaks:
-    """The most that worlds used over all decimation of a run, and what they lost.
+    """The most that worlds used over all physics steps of a run, and what they lost.
 
     Worlds that start anew in between are counted on: the simulation keeps what a masked reset
     erases (``most_contacts``, ``most_constraints``, ``overflow_ever``). So nothing is read while

@@ -87,7 +87,7 @@ def random_uniform(
     high: float = 1.0,
     step: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Random numbers of every world's current episode, the same whatever nworld is and whichever
+    """Random numbers of every world's current episode, which depend neither on nworld nor on which
     worlds reset.
 
     Args:

@@ -25,7 +25,7 @@ _ALIGNMENT = 512  # bytes
 log = logging.getLogger(__name__)
 
 _nesting = 0
-# The rest of a broken capture is kept: torch counts its memory as in use for ever.
+# The rest of a broken capture is kept: torch counts its memory as in use until the process ends.
 _abandoned: list[tuple[torch.cuda.CUDAGraph, torch.cuda.MemPool]] = []
 _capture_streams: dict[str, torch.cuda.Stream] = {}
 _side_streams: dict[str, list[torch.cuda.Stream]] = {}
@@ -84,7 +84,7 @@ class StepGraph:
                 capture fails; ``require`` raises there.
             name: What it is called in messages.
             version: A number that changes when the graph has to be captured anew.
-            culprit: Names what was current_term, for the message of a failed capture.
+            culprit: Names the current term, for the message of a failed capture.
             scratch: Whether Warp's temporaries come from a `Scratch`.
         """
         self._work = work
@@ -172,7 +172,7 @@ class StepGraph:
 
         torch_device = wp.device_to_torch(device)
         # A stream of torch's own making: newer torch refuses to capture on a blocking one. The same
-        # for ever, because a second Warp object for it would unregister it when freed.
+        # in every capture, because a second Warp object for it would unregister it when freed.
         if torch_device not in _capture_streams:
             _capture_streams[torch_device] = torch.cuda.Stream(torch_device)
         stream = _capture_streams[torch_device]

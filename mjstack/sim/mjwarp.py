@@ -27,8 +27,8 @@ class MjwarpSimulation(Simulation):
     """`Simulation` on MuJoCo Warp, float32.
 
     Box against box uses the primitive collider, as native MuJoCo does: with MJWarp's convex one the
-    kept contacts of a resting stack can alternate, and it never comes to rest. The decimation of
-    one `step(n)` are captured into a graph, unless they are a part of a larger one.
+    kept contacts of a resting stack can alternate, and it never comes to rest. The physics
+    steps of one `step(n)` are captured into a graph, unless they are a part of a larger one.
 
     Attributes:
         arrangement: How a captured step is arranged.

@@ -55,8 +55,8 @@ class NativeSimulation(Simulation):
     """`Simulation` on native MuJoCo, float64 on the CPU.
 
     A world's whole state, warm start included (``qacc_warmstart``), is one row that goes into a
-    thread's MjData before its decimation and comes back after them; so do its model fields into the
-    thread's MjModel, if there are any. MuJoCo's automatic reset of a diverged world is switched
+    thread's MjData before its physics steps and comes back after them; so do its model fields into
+    the thread's MjModel, if there are any. MuJoCo's automatic reset of a diverged world is switched
     off, because it would hide the divergence; a world whose state is not finite is not stepped any
     more, and its derived arrays are NaN.
     """

@@ -97,8 +97,8 @@ class Simulation(ABC):
         step_count: Physics steps since the world's last reset, shape ``(nworld,)``, int64.
         overflow: Bits of `Overflow` raised by `step`, sticky until the world is reset, shape
             ``(nworld,)``, int32. `forward` alone raises none on MJWarp.
-        peak_contacts: Largest contact_count over all decimation since the world's last reset, shape
-            ``(nworld,)``, int32.
+        peak_contacts: Largest contact_count of all physics steps since the world's last reset,
+            shape ``(nworld,)``, int32.
         peak_constraints: Largest constraint_count over the same time, shape ``(nworld,)``, int32.
         most_contacts: Largest contact_count since the last full reset (one without a mask), shape
             ``(nworld,)``, int32. Masked resets leave it alone, so it is the peak of a run in which

@@ -8,8 +8,8 @@ import mujoco_warp as mjw  # noqa: E402  (the first use of Warp)
 
 __all__ = ["mjw", "torch_stream_scope", "wp"]
 
-# One object per torch stream, for ever: a second one for the same stream would unregister it when
-# freed.
+# One object per torch stream, until the process ends: a second one for the same stream would
+# unregister it when freed.
 _STREAMS: dict[tuple[str, int], wp.Stream] = {}
 
 
