@@ -29,7 +29,7 @@ import mjstack
 from mjstack.config.explain import own_overrides, parse
 from mjstack.config.help import help_text, key_help
 from mjstack.config.load import compose, extended_search_path, to_config
-from mjstack.config.session import CONFIG_NAME, PROVIDER, hydra_session, search_path
+from mjstack.config.session import CONFIG_NAME, hydra_session, lacking_folders, search_path
 from mjstack.errors import CompositionError, MjstackError, first_line, suggest
 from mjstack.report.record import Report, Status
 from mjstack.report.table import Table
@@ -37,12 +37,8 @@ from mjstack.report.table import Table
 if TYPE_CHECKING:
     from mjstack.jobs import CheckedJob
 
-_OTHER_CONFIG = {  # mjstack runs its own configuration
-    "--config-name",
-    "-cn",
-    "--config-path",
-    "-cp",
-}
+# mjstack runs its own configuration.
+_OTHER_CONFIG = {"--config-name", "-cn", "--config-path", "-cp"}
 
 _checked: dict[tuple[str, ...], "CheckedJob"] = {}  # by their overrides, until Hydra runs them
 _results: list[Report] = []  # of the jobs that ran in this process
@@ -152,8 +148,7 @@ def run_job(cfg: DictConfig) -> Report:
     """
     own = HydraConfig.get()
     overrides = list(own.overrides.task)
-    sources = [s for s in own.runtime.config_sources if s.provider == PROVIDER]
-    with search_path([f"{source.schema}://{source.path}" for source in sources]):
+    with search_path(lacking_folders(own.runtime.config_sources)):
         checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
         result = checked.run(Path(own.runtime.output_dir), overrides)
     _results.append(result)

@@ -9,12 +9,13 @@ import copy
 import os
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.hydra import Hydra
@@ -83,10 +84,14 @@ def add_folder(saved: Path) -> str:
     """
     file = saved.with_name("hydra.yaml")
     sources = OmegaConf.load(file).hydra.runtime.config_sources if file.is_file() else []
-    used = [Path(source.path) for source in sources if source.provider == PROVIDER]
-    lacking = [folder for folder in used if folder not in config_folders()]
-    flag = shlex.join(search_path_args(lacking)) or "--config-dir DIR"
+    flag = shlex.join(search_path_args(lacking_folders(sources))) or "--config-dir DIR"
     return f"If you trust the folder that the run had used, add {flag}."
+
+
+def lacking_folders(sources: Iterable[Any]) -> list[Path]:
+    """Added folders among Hydra's sources of a composition that the current search path lacks."""
+    used = [Path(source.path) for source in sources if source.provider == PROVIDER]
+    return [folder for folder in used if folder not in config_folders()]
 
 
 def config_folders() -> list[Path]:
