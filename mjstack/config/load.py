@@ -122,16 +122,14 @@ def _drop_inherited(hydra: Hydra, cfg: DictConfig, overrides: Sequence[str]) -> 
             continue
         term = key.removesuffix(".func")
         section = term if term == "task.check" else f"{term}.params"
-        given = {"func"}
+        given = OmegaConf.create()
         for override, name in zip(overrides, keys, strict=True):
-            if name == section:
-                value = parse(override).value()
-                given.update(map(str, value) if isinstance(value, dict) else ())
-            elif name.startswith(f"{section}."):
-                given.add(name.removeprefix(f"{section}.").partition(".")[0])
+            if f"{name}.".startswith(f"{section}."):
+                OmegaConf.update(given, name, parse(override).value())
+        kept = {"func", *(OmegaConf.select(given, section) or ())}
         node = OmegaConf.select(cfg, section) or {}
         with open_dict(cfg):
-            for name in [name for name in node if name not in given]:
+            for name in [name for name in node if name not in kept]:
                 del node[name]
 
 
