@@ -77,18 +77,16 @@ def _env_step(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
         if result.problem:
             raise MjstackError(f"{title}: no figure: {result.problem}.")
         results[title] = result
-    figures = list(dict.fromkeys(name for r in results.values() for name in r.samples))
-    table = Table(
+    figures = [
+        [name.replace("_", " "), *(_spread(found.samples[name]) for found in results.values())]
+        for name in result.samples
+    ]
+    ended = [str(found.facts["episodes_ended"]) for found in results.values()]
+    return Table(
         title=f"env.step: {cfg.task.name}, {cfg.robot.title}, random actions, with resets",
         header=["median (smallest to largest)", *results],
-        rows=[
-            [name.replace("_", " "), *(_spread(r.samples.get(name)) for r in results.values())]
-            for name in figures
-        ],
+        rows=[*figures, ["episodes that ended and were reset", *ended]],
     )
-    ended = [str(r.facts["episodes_ended"]) for r in results.values()]
-    table.rows.append(["episodes that ended and were reset", *ended])
-    return table
 
 
 def _physics(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
