@@ -251,7 +251,7 @@ class EpisodeCheck(ABC):
             phases: Those of the driver, if it has any.
         """
         self._steps = steps
-        # Without phases no rule but those on the settled window looks at it.
+        # Without phases, rules count before the settled window.
         self._view = self.view(env, phases, steps if phases else steps - self.settle_steps)
         for rule in self._rules:
             rule.start(self._view)
