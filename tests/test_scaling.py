@@ -321,7 +321,7 @@ def alive(marker: str) -> list[str]:
 @pytest.mark.full
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="no /proc here")
 def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
-    marker = f"MJSTACK_TEST={folder.name}"
+    marker = f"MJSTACK_TEST={folder}"
     process = subprocess.Popen(
         [
             sys.executable,
@@ -335,7 +335,7 @@ def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"MJSTACK_TEST": folder.name},
+        env=os.environ | {"MJSTACK_TEST": str(folder)},
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
