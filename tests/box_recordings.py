@@ -207,7 +207,7 @@ class World:
 
     @property
     def outcome(self) -> BoxOutcome:
-        """What the plain checker says."""
+        """The verdict of the plain checker."""
         return check_box_world(self.recording, self.context.cfg, self.context.model)
 
 

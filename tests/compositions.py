@@ -21,7 +21,7 @@ def _composed(overrides: tuple[str, ...]) -> Config:
 
 
 def load_config(overrides: Sequence[str] = ()) -> Config:
-    """What `mjstack.load_config` returns, as a copy of the caller's own."""
+    """A copy of the result of `mjstack.load_config`."""
     return copy.deepcopy(
         _composed(tuple(o for o in overrides if o not in ("robot=so101", "task=stack")))
     )
@@ -34,7 +34,7 @@ def make_env(
     seed: int | None = None,
     device: str | None = None,
 ) -> Env:
-    """What `mjstack.make_env` returns."""
+    """The result of `mjstack.make_env`."""
     given = {"nworld": nworld, "seed": seed, "sim.device": device}
     return build_env(
         load_config([*overrides, *(f"{k}={v}" for k, v in given.items() if v is not None)])

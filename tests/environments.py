@@ -133,7 +133,7 @@ def mask_of(env: Env, *worlds: int) -> torch.Tensor:
 
 
 def returned(step: tuple[Any, ...]) -> dict[str, torch.Tensor]:
-    """What `step` or `reset` returned, flat; the tensors themselves."""
+    """The tensors that `step` or `reset` returned, in one list."""
     obs = step[0]
     extras = step[-1]
     out = {f"obs.{name}": value for name, value in obs.items()}

@@ -32,7 +32,7 @@ def fake_demonstrations(
     *,
     noise: bool = False,
 ) -> Callable[..., Played]:
-    """What stands in for `play_demonstrations`.
+    """Stands in for `play_demonstrations`.
 
     Args:
         fails: Whether a world of a seed breaks a rule.

@@ -195,7 +195,7 @@ def test_random_actions_from_every_start(robot: str, reset: str) -> None:
     env.close()
 
 
-# What a policy is paid for
+# Rewards
 
 
 def put(env: Env, name: str, place: list[float] | np.ndarray, worlds: list[int]) -> None:

@@ -57,7 +57,7 @@ def start(sim: Simulation, context: RunContext) -> None:
     context.start(sim, context.cfg.reset)
 
 
-# What the simulations keep
+# Counters of the simulations
 
 
 @pytest.mark.full

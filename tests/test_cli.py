@@ -47,7 +47,7 @@ def the_report(folder: Path) -> dict:
     return json.loads(path.read_text())
 
 
-# What composing alone refuses is in test_config.py.
+# Refusals of the composition itself are in test_config.py.
 BAD = [
     ["nworld=0"],
     ["sim=mjwarp", "sim.device=cuda:77"],

@@ -470,7 +470,7 @@ def test_seeds_go_on_until_the_episodes_are_there(
     )
     assert collect("nworld=4", "job.episodes=7", "seed=5") == 0
     found = pairs(folder / "dataset")
-    # What is missing decides how many worlds: 7, then 4, then 1 and one to spare.
+    # The missing episodes decide how many worlds play: 7, then 4, then 1 and one to spare.
     assert found == [(5, 0), (5, 2), (5, 3), (6, 0), (6, 2), (6, 3), (7, 0)]
     batches = json.loads((folder / FILE).read_text())
     assert [(batch["worlds"], batch["succeeded"], batch["kept"]) for batch in batches] == [

@@ -1,4 +1,4 @@
-"""What an environment promises on every backend, for both tasks and both robots."""
+"""The promises of an environment on every backend, for both tasks and both robots."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What only a GPU can show of the environment."""
+"""Tests of the environment that need a GPU."""
 
 from __future__ import annotations
 

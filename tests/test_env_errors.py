@@ -1,4 +1,4 @@
-"""What a user can do wrong with an environment: one line each, that names the term or argument and
+"""Mistakes that a user can make with an environment: one line each, that names the term or argument and
 says what to do.
 """
 

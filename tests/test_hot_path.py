@@ -1,4 +1,4 @@
-"""What a captured step runs reads nothing back to the host and copies nothing from it: the source
+"""The code of a captured step reads nothing back to the host and copies nothing from it: the source
 is checked.
 """
 
@@ -15,7 +15,7 @@ ROOT = Path(mjstack.__file__).parent
 READS = {"item", "tolist", "cpu", "numpy", "nonzero", "synchronize", "all_gather_object"}
 COPIES = {"tensor", "as_tensor", "from_numpy", "masked_select", "unique", "argwhere"}
 CASTS = {"bool", "int", "float"}
-# What runs within a step, by file: qualified names, or every function of a file.
+# The code that runs within a step, by file: qualified names, or every function of a file.
 PATHS: dict[str, list[str] | None] = {
     "envs/env.py": [
         f"Env.{n}"
