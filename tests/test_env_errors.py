@@ -1,5 +1,5 @@
-"""Mistakes that a user can make with an environment: one line each, that names the term or argument and
-says what to do.
+"""Mistakes that a user can make with an environment: one line each, that names the term or argument
+and says what to do.
 """
 
 from __future__ import annotations
