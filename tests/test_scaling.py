@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import math
@@ -336,6 +337,7 @@ def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ | {"MJSTACK_TEST": str(folder)},
+        start_new_session=True,  # so that a failing test can end the run too
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
@@ -350,7 +352,8 @@ def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
         )  # this process alone: a terminal would tell its child too
         out, err = process.communicate(timeout=60)
     finally:
-        process.kill()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == 130
     assert "Traceback" not in err
     assert "interrupted; the finished gates are in the report" in out
