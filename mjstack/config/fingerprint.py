@@ -5,10 +5,10 @@ wherever they are.
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, cast
-
-from omegaconf import OmegaConf
+from typing import Any
 
 from mjstack.config.check import reads_starts_file
 from mjstack.config.schema import Config
@@ -24,9 +24,7 @@ def config_content(cfg: Config) -> dict[str, Any]:
     Raises:
         ConfigError: One of these files cannot be read.
     """
-    config = cast(
-        dict[str, Any], OmegaConf.to_container(OmegaConf.structured(cfg), enum_to_str=True)
-    )
+    config: dict[str, Any] = json.loads(json.dumps(asdict(cfg), default=attrgetter("name")))
     if cfg.robot.file is not None:
         config["robot"]["file"] = _content("robot.file", cfg.robot.file)
     for name, term in cfg.reset.items():
@@ -38,7 +36,7 @@ def config_content(cfg: Config) -> dict[str, Any]:
                 config["starts"] = _content("starts", path)
             else:
                 params["path"] = _content(f"reset.{name}.params.path", path)
-    return cast(dict[str, Any], json.loads(json.dumps(config)))
+    return config
 
 
 def config_hash(config: Mapping[str, Any]) -> str:

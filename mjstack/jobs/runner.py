@@ -14,10 +14,10 @@ from typing import cast
 
 import mujoco
 import numpy as np
-from omegaconf import OmegaConf
 from rich.console import Console
 from rich.markup import escape
 
+from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Config
 from mjstack.episodes.context import Artifacts, RunContext
@@ -210,14 +210,13 @@ def run_provenance(context: RunContext) -> Provenance:
         name = cuda_name(device)
     elif backend.value == "native":
         name = f"native MuJoCo on {os.cpu_count()} cores"
-    config = OmegaConf.to_yaml(OmegaConf.structured(context.cfg))
     # The numbers of the compiled model: the physics sees these, not the files
     buffer = np.empty(mujoco.mj_sizeModel(context.model), np.uint8)
     mujoco.mj_saveModel(context.model, None, buffer)
     return collect_provenance() | {
         "device": f"{device}: {name}",
         "driver": cuda_driver() if device.startswith("cuda") else "no CUDA device",
-        "config_sha256": hashlib.sha256(config.encode()).hexdigest(),
+        "config_sha256": config_hash(config_content(context.cfg)),
         "model_sha256": hashlib.sha256(buffer.tobytes().hex().encode()).hexdigest(),
     }
 
