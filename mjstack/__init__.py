@@ -28,7 +28,7 @@ _HOMES = {
 if not TYPE_CHECKING:  # a type checker would take any name for one of these
 
     def __getattr__(name: str) -> Any:
-        """Loads what takes seconds, torch and Warp, when it is asked for: the command line has
+        """Load what takes seconds, torch and Warp, when it is asked for: the command line has
         things to do before.
         """
         if name in _HOMES:

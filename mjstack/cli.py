@@ -45,7 +45,7 @@ _results: list[Report] = []  # of the jobs that ran in this process
 
 
 def run(args: list[str]) -> int:
-    """Runs a command line and returns its exit status."""
+    """Run a command line and return its exit status."""
     errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
     _checked.clear()
     _results.clear()
@@ -68,14 +68,15 @@ def run(args: list[str]) -> int:
 
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
-    """Does what the flags ask for, on the current search path."""
+    """Do what the flags ask for, on the current search path."""
     with hydra_session() as hydra:
         if flags.help:
             _print_help(hydra, overrides)
         elif flags.hydra_help:
             hydra.hydra_help(CONFIG_NAME, args_parser=get_args_parser(), args=flags)
         elif flags.info is not None:
-            hydra.show_info(flags.info, CONFIG_NAME, overrides)
+            compose(hydra, overrides)
+            run_and_report(lambda: hydra.show_info(flags.info, CONFIG_NAME, overrides))
         elif flags.shell_completion:
             run_and_report(lambda: hydra.shell_completion(CONFIG_NAME, overrides))
         elif flags.cfg:
@@ -88,7 +89,7 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
 
 
 def _show(hydra: Hydra, flags: Namespace, overrides: list[str]) -> None:
-    """Checks the values of a configuration and prints it."""
+    """Check the values of a configuration and print it."""
     if flags.multirun:
         raise CompositionError("--cfg shows one configuration, and -m makes several. Leave -m out.")
     to_config(compose(hydra, overrides))
@@ -98,7 +99,7 @@ def _show(hydra: Hydra, flags: Namespace, overrides: list[str]) -> None:
 
 
 def _run_one(hydra: Hydra, overrides: list[str]) -> int:
-    """Composes, checks and runs one job."""
+    """Compose, check and run one job."""
     cfg = compose(hydra, overrides)
     checked = _check(cfg, overrides)
     if checked.folder is not None and not any(o.startswith("hydra.run.dir=") for o in overrides):
@@ -109,7 +110,7 @@ def _run_one(hydra: Hydra, overrides: list[str]) -> int:
 
 
 def _sweep(hydra: Hydra, overrides: list[str]) -> int:
-    """Composes and checks every job of a sweep, then runs them.
+    """Compose and check every job of a sweep, then run them.
 
     Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
     """
@@ -127,7 +128,7 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
 
 
 def _print_help(hydra: Hydra, args: list[str]) -> None:
-    """Prints the help, or the keys below the ones among the arguments, as the overrides have them.
+    """Print the help, or the keys below the ones among the arguments, as the overrides have them.
 
     The reader may not want all of it, such as ``| head``.
     """
@@ -143,7 +144,7 @@ def _print_help(hydra: Hydra, args: list[str]) -> None:
 
 
 def run_job(cfg: DictConfig) -> Report:
-    """Runs a job in the folder that Hydra made. A launcher may call it in another process, where
+    """Run a job in the folder that Hydra made. A launcher may call it in another process, where
     nothing has been checked yet.
     """
     own = HydraConfig.get()
@@ -158,7 +159,7 @@ def run_job(cfg: DictConfig) -> Report:
 
 
 def _check(cfg: DictConfig, overrides: list[str]) -> "CheckedJob":
-    """Types and checks a composed job, and keeps what that built for its run."""
+    """Type and check a composed job, and keep what that built for its run."""
     # It loads torch and Warp, for which a misspelt key need not wait.
     from mjstack.jobs import check_job
 

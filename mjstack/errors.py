@@ -27,13 +27,14 @@ class MjstackError(Exception):
     exit_code = 1
 
     def __init__(self, problem: str, fix: str = "") -> None:
-        """Builds the message.
+        """Build the message.
 
         Args:
             problem: A value or an event, and what was expected; with or without its full stop.
             fix: What to do about it, a sentence without its full stop.
         """
-        super().__init__(f"{problem.removesuffix('.')}.{f' {fix}.' if fix else ''}")
+        stop = "" if problem.endswith((".", "?")) else "."
+        super().__init__(f"{problem}{stop}{f' {fix}.' if fix else ''}")
 
 
 class InputError(MjstackError):
@@ -46,7 +47,7 @@ class ConfigError(InputError):
     """A value in the configuration cannot be used."""
 
     def __init__(self, key: str, value: object, expected: str, fix: str = "") -> None:
-        """Builds the message.
+        """Build the message.
 
         Args:
             key: Dotted configuration key, such as ``timing.decimation``.
@@ -94,7 +95,7 @@ class TermError(InputError):
     """A term of a manager that cannot be found, built or used."""
 
     def __init__(self, label: str, problem: str) -> None:
-        """Builds the message from the term's dotted configuration key and what is wrong with it."""
+        """Build the message from the term's dotted configuration key and what is wrong with it."""
         super().__init__(f"{label}: {problem}")
 
 
@@ -153,7 +154,7 @@ class RebindError(MjstackError):
     """A view of a simulation was assigned to instead of written into."""
 
     def __init__(self, view: str) -> None:
-        """Builds the message.
+        """Build the message.
 
         Args:
             view: The view as the user writes it, such as ``sim.qpos``.
@@ -168,7 +169,7 @@ class CaptureError(MjstackError):
     """Work that cannot be captured into a graph."""
 
     def __init__(self, name: str, culprit: str, error: Exception) -> None:
-        """Builds the message.
+        """Build the message.
 
         Args:
             name: What was to be captured.
@@ -186,7 +187,7 @@ class ArgumentError(InputError):
     """An argument of a function cannot be used."""
 
     def __init__(self, name: str, found: object, expected: str, fix: str = "") -> None:
-        """Builds the message.
+        """Build the message.
 
         Args:
             name: The argument.
@@ -207,7 +208,7 @@ class UnwrittenError(MjstackError):
     """A dataset that could not be written any further, such as on a full disk."""
 
     def __init__(self, folder: str, error: OSError, kept: int) -> None:
-        """Builds the message.
+        """Build the message.
 
         Args:
             folder: The dataset.
@@ -236,7 +237,7 @@ def first_line(error: BaseException) -> str:
 
 
 def suggest(name: str, available: Iterable[str]) -> str:
-    """Lists the available names, the nearest match first if there is one."""
+    """List the available names, the nearest match first if there is one."""
     names = sorted(available)
     nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     hint = f"Did you mean '{nearest[0]}'? " if nearest else ""
@@ -246,7 +247,7 @@ def suggest(name: str, available: Iterable[str]) -> str:
 def name_worlds(
     worlds: Sequence[int | str], nworld: int, limit: int = 8, what: str = "worlds"
 ) -> str:
-    """Says how many worlds and names the first ones: ``17 of 4096 worlds (first: 3, 41, 96)``."""
+    """Say how many worlds and name the first ones: ``17 of 4096 worlds (first: 3, 41, 96)``."""
     shown = ", ".join(str(w) for w in worlds[:limit])
     label = "first: " if len(worlds) > limit else ""
     return f"{len(worlds)} of {nworld} {what} ({label}{shown})"

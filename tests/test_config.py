@@ -233,6 +233,8 @@ def test_a_bad_value_is_one_line(override: str, says: str) -> None:
 
 
 BAD = [
+    (["gate.seeds=3"], "'seeds'"),
+    (["hydra.searchpath=[pkg://mine.conf]"], "expected a folder, such as file://DIR"),
     (["job=collect", "job.episode=3"], "Did you mean 'job.episodes'?"),
     (["job=scaling", "job.retri=true"], "Did you mean 'job.retry'?"),
     (
@@ -315,6 +317,10 @@ def test_a_swapped_function_does_not_inherit_parameters() -> None:
     assert load_config([swap, "reward.reach.weight=3.0"]).reward["reach"].params == {}
     given = load_config([swap, "+reward.reach.params.mine=2", "reward.reach.params={scale: 1}"])
     assert given.reward["reach"].params == {"mine": 2, "scale": 1}
+    term = "{func: mjstack.mdp.reward.action_rate, params: {mine: 3}}"
+    assert load_config([f"+reward.reach={term}"]).reward["reach"].params == {"mine": 3}
+    home = "gate.success.reset.joint_noise.func=mjstack.mdp.reset.home"
+    assert load_config([home]).gate.success.reset["joint_noise"].params == {}
     check = load_config(["task.check.func=mine.Check", "task.check.window=7"]).task.check
     assert check == {"func": "mine.Check", "window": 7}
 

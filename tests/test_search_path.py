@@ -144,7 +144,8 @@ def test_a_sweep_and_a_replay(
 ) -> None:
     flags = ["--config-dir", str(lean), "-m", "task=stack", "gates=[baseline]"]
     reward = "+reward.height={func: lean.height, weight: 1.0}"
-    assert run([*flags, reward, "seed=1,2"]) == 0
+    swapped = "reward.reach.func=mjstack.mdp.reward.action_rate"  # without the other's parameters
+    assert run([*flags, reward, swapped, "seed=1,2"]) == 0
     first, _ = sorted(tmp_path.rglob("report.json"))
     assert json.loads(first.read_text())["status"] == "pass"
     saved = first.parent / ".hydra" / "config.yaml"

@@ -43,7 +43,7 @@ class GymnasiumVectorEnv(VectorEnv):
     """
 
     def __init__(self, env: Env, *, group: str | None = "policy") -> None:
-        """Takes over an environment, and closes it when it is closed.
+        """Take over an environment, and close it when it is closed.
 
         Args:
             env: The environment.
@@ -73,7 +73,7 @@ class GymnasiumVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts new episodes.
+        """Start new episodes.
 
         Args:
             seed: Starts every world anew under this seed. Without one, the worlds go on to their
@@ -101,7 +101,7 @@ class GymnasiumVectorEnv(VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advances every world by one control interval.
+        """Advance every world by one control interval.
 
         Args:
             actions: Shape ``(num_envs, action_dim)``, float32.
@@ -113,7 +113,7 @@ class GymnasiumVectorEnv(VectorEnv):
         Raises:
             MjstackError: The actions cannot be used, or something went wrong in the worlds.
         """
-        action = torch.tensor(np.asarray(actions, np.float32), device=self.inner.device)
+        action = torch.tensor(_array(actions, self.action_space), device=self.inner.device)
         obs, reward, terminated, truncated, extras = self.inner.step(action)
         success = extras["success"].cpu().numpy()
         infos = {"success": success, "_success": np.ones(self.num_envs, dtype=np.bool_)}
@@ -136,7 +136,7 @@ class GymnasiumVectorEnv(VectorEnv):
         )
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Gives the simulation's threads and buffers back."""
+        """Give the simulation's threads and buffers back."""
         self.inner.close()
 
 
@@ -151,7 +151,7 @@ class GymnasiumEnv(gymnasium.Env):
     """
 
     def __init__(self, env: Env, *, group: str | None = "policy") -> None:
-        """Takes over an environment of one world, and closes it when it is closed.
+        """Take over an environment of one world, and close it when it is closed.
 
         Args:
             env: The environment.
@@ -181,7 +181,7 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts a new episode.
+        """Start a new episode.
 
         Args:
             seed: Starts with the first episode of this seed. Without one, the next episode under
@@ -204,7 +204,7 @@ class GymnasiumEnv(gymnasium.Env):
         return _row(first, 0), {}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Advances the world by one control interval.
+        """Advance the world by one control interval.
 
         Args:
             action: Shape ``(action_dim,)``, float32.
@@ -221,7 +221,7 @@ class GymnasiumEnv(gymnasium.Env):
             raise ArgumentError(
                 "env", "step() after the end of an episode", "reset() first", "Call env.reset()"
             )
-        actions = np.asarray(action, np.float32)[None]
+        actions = _array(action, self.action_space)[None]
         obs, reward, terminated, truncated, infos = self._worlds.step(actions)
         info = {"success": bool(infos["success"])}
         ended = bool(terminated), bool(truncated)
@@ -231,7 +231,7 @@ class GymnasiumEnv(gymnasium.Env):
         return _row(obs, 0), float(reward[0]), *ended, info
 
     def close(self) -> None:
-        """Gives the simulation's threads and buffers back."""
+        """Give the simulation's threads and buffers back."""
         self.inner.close()
 
 
@@ -244,3 +244,14 @@ def _row(obs: Observation, world: int) -> Observation:
     if isinstance(obs, dict):
         return {name: value[world] for name, value in obs.items()}
     return obs[world]
+
+
+def _array(action: Any, space: spaces.Space) -> np.ndarray:
+    expected = f"a float32 array of shape {space.shape}"
+    try:
+        array = np.asarray(action, np.float32)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError("action", type(action).__name__, expected) from error
+    if array.shape != space.shape:
+        raise ArgumentError("action", f"shape {array.shape}", expected)
+    return array

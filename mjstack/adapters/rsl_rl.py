@@ -33,7 +33,7 @@ class RslRlVecEnv(VecEnv):
     """
 
     def __init__(self, env: Env, *, log_interval: int = 24) -> None:
-        """Takes over an environment and starts its first episodes.
+        """Take over an environment and start its first episodes.
 
         Args:
             env: The environment.
@@ -57,7 +57,7 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Steps since each world's last reset, shape ``(num_envs,)``, int64.
+        """Step since each world's last reset, shape ``(num_envs,)``, int64.
 
         Assigning copies into the environment: runners start worlds at random times of an episode so
         that not all end at once.
@@ -81,7 +81,7 @@ class RslRlVecEnv(VecEnv):
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advances every world by one control interval; worlds that end are reset in the same step.
+        """Advance every world by one control interval; worlds that end are reset in the same step.
 
         Args:
             actions: Shape ``(num_envs, num_actions)``, float32.
@@ -91,8 +91,8 @@ class RslRlVecEnv(VecEnv):
             ``rewards``: shape ``(num_envs,)``, float32.
             ``dones``: whether the episode ended for any reason, shape ``(num_envs,)``, int64.
             ``extras``: ``time_outs``, ended by the clock alone, shape ``(num_envs,)``, bool; and
-                every ``log_interval``
-            steps ``log``, means over the episodes that ended since the last one.
+                ``log`` every ``log_interval`` steps, means over the episodes that ended since the
+                last one.
 
         Raises:
             MjstackError: The actions cannot be used, or something went wrong in the worlds.
@@ -111,7 +111,7 @@ class RslRlVecEnv(VecEnv):
         return self._tensordict(obs), rewards, (terminated | truncated).long(), extras
 
     def close(self) -> None:
-        """Gives the simulation's threads and buffers back."""
+        """Give the simulation's threads and buffers back."""
         self.env.close()
 
     def _tensordict(self, obs: dict[str, torch.Tensor]) -> TensorDict:

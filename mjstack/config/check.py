@@ -168,7 +168,7 @@ def _box(scene: SceneCfg, box: BoxCfg) -> None:
     for name, thing in scene.objects.items():
         away = (abs(thing.xy[i] - box.center[i]) - outer[i] for i in (0, 1))
         _refuse(
-            max(away) < thing.size[0],
+            all(a < half for a, half in zip(away, thing.half, strict=False)),
             f"scene.objects.{name}.xy",
             thing.xy,
             "a position beside the box",

@@ -8,7 +8,7 @@ from mjstack.errors import TermError, first_line, suggest
 
 
 def resolve_func(label: str, path: str, base: type | None = None) -> Callable[..., Any]:
-    """Finds a function or class by its dotted name.
+    """Find a function or class by its dotted name.
 
     Args:
         label: Dotted configuration key, for errors.
@@ -28,7 +28,7 @@ def resolve_func(label: str, path: str, base: type | None = None) -> Callable[..
 
 
 def find_object(label: str, path: str) -> Any:
-    """Finds anything in a module by its dotted name.
+    """Find anything in a module by its dotted name.
 
     Raises:
         TermError: There is no such module, or nothing of that name in it.

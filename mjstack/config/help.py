@@ -39,7 +39,7 @@ _EXAMPLES = (
     ("job=study nworld=8", "what the solver's limits cost, and which worlds still succeed"),
     (
         "job=reachability robot=rebot",
-        "what the arm reaches, and how far cubes may stand from their places",
+        "what the arm reaches, and how far objects may stand from their places",
     ),
 )
 _FLAGS = (
@@ -172,8 +172,8 @@ def help_text(cfg: Config, width: int) -> str:
     keys = [(name, words) for name, words in keys if name not in {g for g, _ in groups}]
     parts = [
         [
-            "mjstack: two cubes and one simulated arm, from native MuJoCo to thousands of MuJoCo"
-            " Warp worlds, verified in gates."
+            "mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp worlds,"
+            " verified in gates."
         ],
         [
             "Usage: mjstack [group=choice ...] [key=value ...] [flags]",

@@ -1,6 +1,7 @@
 """Composes `conf/` into the dataclasses of `schema`."""
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,7 +29,6 @@ from mjstack.config.session import (
 )
 from mjstack.errors import CompositionError, ConfigError
 
-_KEEPING = ("job.", "gate.")  # their other keys are no parameters of the function
 _schema = OmegaConf.structured(Config)
 _schema.gate._set_flag("struct", False)  # gates of the search path are added to it
 ConfigStore.instance().store(name="mjstack_schema", node=_schema, provider="mjstack")
@@ -98,7 +98,8 @@ def compose(
             cfg = hydra.compose_config(CONFIG_NAME, list(overrides), run_mode, from_shell=False)
         else:
             cfg = hydra.config_loader.load_sweep_config(sweep, list(overrides))
-        _drop_inherited(hydra, cfg, overrides)
+        if run_mode is RunMode.RUN:
+            _drop_inherited(hydra, cfg, overrides)
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error
     except YAMLError as error:
@@ -110,21 +111,29 @@ def _drop_inherited(hydra: Hydra, cfg: DictConfig, overrides: Sequence[str]) -> 
     """Leave a term whose ``func`` an override swaps with the parameters that overrides give it:
     those of the other function are not its own.
     """
-    keys = [override.lstrip("+").partition("=")[0] for override in overrides]
-    swapped = [key for key in keys if key.endswith(".func") and not key.startswith(_KEEPING)]
+    swapped = {}
+    for override in overrides:
+        key, _, value = override.lstrip("+").partition("=")
+        # Other keys of a job or a gate are no parameters of its function.
+        if "func" not in override or re.match(r"job\.|gate\.(?!.*\.reset\.)", key):
+            continue
+        if key.endswith(".func"):
+            swapped[override] = key.removesuffix(".func")
+        elif value.startswith("{") and "func" in cast(dict, parse(override).value()):
+            swapped[override] = key
     if not swapped:
         return
-    others = [o for o, key in zip(overrides, keys, strict=True) if key not in swapped]
+    others = [override for override in overrides if override not in swapped]
     before = hydra.compose_config(CONFIG_NAME, others, RunMode.RUN, from_shell=False)
-    for key in swapped:
-        old = OmegaConf.select(before, key)
-        if old is None or old == OmegaConf.select(cfg, key):
+    for term in swapped.values():
+        old = OmegaConf.select(before, f"{term}.func")
+        if old is None or old == OmegaConf.select(cfg, f"{term}.func"):
             continue
-        term = key.removesuffix(".func")
         section = term if term == "task.check" else f"{term}.params"
         given = OmegaConf.create()
-        for override, name in zip(overrides, keys, strict=True):
-            if f"{name}.".startswith(f"{section}."):
+        for override in overrides:
+            name = override.lstrip("+").partition("=")[0]
+            if f"{name}.".startswith(f"{term}."):
                 OmegaConf.update(given, name, parse(override).value())
         kept = {"func", *(OmegaConf.select(given, section) or ())}
         node = OmegaConf.select(cfg, section) or {}

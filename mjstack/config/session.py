@@ -114,7 +114,10 @@ def is_trusted(dotted: str) -> bool:
     package = dotted.partition(".")[0]
     if package in {"mjstack", *(name.partition(".")[0] for name in _registered())}:
         return True
-    found = find_spec(package)
+    try:
+        found = find_spec(package)
+    except ValueError:  # no name of a module, or __main__
+        return False
     places = [*(found.submodule_search_locations or ()), found.origin or ""] if found else []
     parents = [folder.parent for folder in _added.get()]
     # The origin of a module of Python's own is a word, such as frozen.
@@ -213,10 +216,9 @@ class _Loader(ConfigLoaderImpl):
         key = (config_name, *overrides, run_mode)
         if key not in self._composed:
             # All gates of the search path are composed, as mjstack's are.
-            names = {
-                path.stem for folder in config_folders() for path in folder.glob("gate/*.yaml")
-            }
-            gates = [f"+gate@gate.{name}={name}" for name in sorted(names)]
+            own = {path.stem for path in CONFIG_FOLDER.glob("gate/*.yaml")}
+            names = {p.stem for folder in config_folders() for p in folder.glob("gate/*.yaml")}
+            gates = [f"+gate@gate.{name}={name}" for name in sorted(names - own)]
             cfg = super().load_configuration(
                 config_name, [*gates, *overrides], run_mode, from_shell, validate_sweep_overrides
             )
@@ -229,6 +231,11 @@ class _Loader(ConfigLoaderImpl):
 def _checked_folder(text: str) -> Path:
     """A folder with configuration files, absolute."""
     folder = Path(text.removeprefix(_FILE)).absolute()
+    if text.startswith("pkg://"):
+        raise CompositionError(
+            f"hydra.searchpath: found {text}, expected a folder, such as file://DIR. An installed"
+            f" package registers its folder as an entry point of {ENTRY_POINTS}."
+        )
     if not folder.is_dir():
         raise CompositionError(
             f"configuration folder {folder}: there is no such folder, expected one with YAML files"

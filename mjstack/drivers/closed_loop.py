@@ -52,7 +52,7 @@ class ClosedLoopDriver:
     """
 
     def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
-        """Allocates for the environment's worlds.
+        """Allocate for the environment's worlds.
 
         Args:
             env: The environment; its action terms must take absolute joint commands.
@@ -226,7 +226,7 @@ class ClosedLoopDriver:
         return retry, rate
 
     def _turn(self, command: torch.Tensor, fresh: torch.Tensor) -> None:
-        """Rolls the open jaws towards a face of the object that a phase observes, by a little per
+        """Roll the open jaws towards a face of the object that a phase observes, by a little per
         step.
 
         A box has a face every quarter turn. A roll about the approach axis turns the closing
@@ -268,7 +268,7 @@ class ClosedLoopDriver:
         return column, math.copysign(1.0, float(x0 * y1 - y0 * x1))
 
     def _observe(self, entering: torch.Tensor, fresh: torch.Tensor) -> None:
-        """Measures the objects that the phases which begin observe; everything where an episode
+        """Measure the objects that the phases which begin observe; everything where an episode
         begins.
         """
         wanted = self._observes[self.phase]
@@ -283,7 +283,7 @@ class ClosedLoopDriver:
             self._seen[:, number, :2] = place_xy(self._env, name).float()
 
     def _build_tables(self, cfg: Config, device: torch.device) -> None:
-        """Makes tensors of all that the phases say, a row per phase."""
+        """Make tensors of all that the phases say, a row per phase."""
         names = [phase.name for phase in self.phases]
         things = list(cfg.scene.objects)
         rows = []
@@ -327,7 +327,7 @@ class ClosedLoopDriver:
 
 
 def _put(buffer: torch.Tensor, mask: torch.Tensor, values: torch.Tensor) -> None:
-    """Writes the rows of a ``(nworld,)`` bool mask; the buffer keeps its address."""
+    """Write the rows of a ``(nworld,)`` bool mask; the buffer keeps its address."""
     rows = mask if buffer.dim() == 1 else mask[:, None]
     buffer.copy_(torch.where(rows, values, buffer))
 

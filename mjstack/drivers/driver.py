@@ -40,7 +40,7 @@ class Recorded:
     """
 
     def __init__(self, source: Driver, nu: int) -> None:
-        """Allocates for the worlds and steps of a driver; NaN until it is written.
+        """Allocate for the worlds and steps of a driver; NaN until it is written.
 
         Args:
             source: The driver.
@@ -60,7 +60,7 @@ class Recorded:
         self._next = torch.zeros(1, dtype=torch.int64, device=device)
 
     def append(self, command: torch.Tensor, phase: torch.Tensor) -> None:
-        """Takes the next step's command, ``(nworld, nu)``, and phase, ``(nworld,)``. No
+        """Take the next step's command, ``(nworld, nu)``, and phase, ``(nworld,)``. No
         host read.
         """
         self._commands.index_copy_(0, self._next, command[None].float())
@@ -86,7 +86,7 @@ class OpenLoopDriver:
     """
 
     def __init__(self, trajectory: JointTrajectory, phases: list[Phase]) -> None:
-        """Takes the trajectory, which must be on the device."""
+        """Take the trajectory, which must be on the device."""
         self._trajectory = trajectory
         nworld = len(trajectory.knots)
         device = trajectory.knots.device

@@ -90,7 +90,7 @@ class OpenLoopPlanner:
     """Plans joint trajectories for objects and places at given positions, with mink."""
 
     def __init__(self, cfg: Config) -> None:
-        """Plans the nominal start, from which every other plan starts.
+        """Plan the nominal start, from which every other plan starts.
 
         Raises:
             Unreachable: A nominal target is out of reach.
@@ -112,7 +112,7 @@ class OpenLoopPlanner:
     def plan(
         self, sources_xy: np.ndarray, progress: Callable[[int], None] | None = None
     ) -> JointTrajectory:
-        """Plans one trajectory per world; worlds that start alike share the work.
+        """Plan one trajectory per world; worlds that start alike share the work.
 
         Args:
             sources_xy: Position of each object and place at the start [m], shape ``(nworld,
@@ -168,7 +168,7 @@ class OpenLoopPlanner:
         return worst
 
     def plan_world(self, world: int, xy: np.ndarray) -> tuple[np.ndarray, float]:
-        """Plans one world, starting from the nominal plan, so that its neighbours do not matter.
+        """Plan one world, starting from the nominal plan, so that its neighbours do not matter.
 
         Args:
             world: Its number, for the error.
@@ -257,7 +257,7 @@ class OpenLoopPlanner:
 def plan_in_parallel(
     cfg: Config, worlds: Sequence[int], sources_xy: np.ndarray, processes: int
 ) -> Generator[Plan]:
-    """Plans worlds in processes, which are gone when this has ended in any way.
+    """Plan worlds in processes, which are gone when this has ended in any way.
 
     Args:
         cfg: From which a process builds its planner.
@@ -310,7 +310,7 @@ def _as_programs() -> Iterator[None]:
 
 
 def _start_process(cfg: Config) -> None:
-    """Makes the planner of a process, which ends when the one that started it does."""
+    """Make the planner of a process, which ends when the one that started it does."""
     global _planner
     Thread(target=_end_with_parent, daemon=True).start()
     _planner = OpenLoopPlanner(cfg)

@@ -35,7 +35,7 @@ class CarryTilt:
         ik: BatchedIk,
         nominal: torch.Tensor,
     ) -> None:
-        """Allocates for the worlds of the solver.
+        """Allocate for the worlds of the solver.
 
         Args:
             model: The compiled scene.

@@ -152,7 +152,7 @@ def play_workload(
     play: Callable[[Simulation], np.ndarray],
     sizes: BatchSizes | None = None,
 ) -> Workload:
-    """Plays something in worlds of these sizes; without, with room to spare, and with twice the
+    """Play something in worlds of these sizes; without, with room to spare, and with twice the
     room wherever even that was too little.
 
     Peaks of a run that lost physics are those of another motion. Where the last run has lost some
@@ -207,7 +207,7 @@ def describe_lost(run: Workload) -> tuple[str, str]:
 
 
 def require_physics(what: str, run: Workload) -> None:
-    """Refuses to size anything from motion that lost physics.
+    """Refuse to size anything from motion that lost physics.
 
     Args:
         what: What was run, such as ``the scripted task``.
@@ -222,7 +222,7 @@ def require_physics(what: str, run: Workload) -> None:
 
 
 def play_random_actions(env: Env, steps: int, advance: Advance | None = None) -> None:
-    """Steps worlds that have started with actions drawn evenly from the action range; worlds that
+    """Step worlds that have started with actions drawn evenly from the action range; worlds that
     end start anew.
 
     Args:

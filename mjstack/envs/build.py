@@ -9,7 +9,7 @@ import mujoco
 import torch
 
 from mjstack.config import load_config
-from mjstack.config.schema import Backend, Config
+from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.envs.buffers import probe_env_sizes
 from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError
@@ -27,7 +27,7 @@ def make_env(
     device: str | None = None,
     config_dir: str | os.PathLike | None = None,
 ) -> Env:
-    """Builds an environment as the command line would configure it.
+    """Build an environment as the command line would configure it.
 
     Args:
         overrides: Such as ``["task=reach", "robot=rebot", "action=ee_delta"]``.
@@ -64,7 +64,7 @@ def build_env(
     device: str | None = None,
     sizes: BatchSizes | None = None,
 ) -> Env:
-    """Builds an environment with its simulation. Gates, whose simulation is shared, build `Env` on
+    """Build an environment with its simulation. Gates, whose simulation is shared, build `Env` on
     that.
 
     Args:
@@ -90,12 +90,11 @@ def build_env(
     return Env(sim, SceneIndex(model, cfg.robot, cfg.scene), cfg)
 
 
-def driven_config(cfg: Config, **changes: object) -> Config:
-    """The configuration of an environment that the scripted controller drives through one whole
-    episode.
+def driven_config(cfg: Config, reset: dict[str, TermCfg] | None = None) -> Config:
+    """The configuration of an environment in which a driver plays one whole episode.
 
-    The controller's action terms take the place of the configured ones. Nothing ends an episode
-    early or rewards it: the acceptance judges it as a whole.
+    The driver's action terms take the place of the configured ones, and ``reset`` that of the
+    configured reset terms. Nothing ends an episode early or rewards it: the check judges the whole.
     """
     return replace(
         cfg,
@@ -104,7 +103,7 @@ def driven_config(cfg: Config, **changes: object) -> Config:
         termination={},
         reward={},
         task=replace(cfg.task, success=None),
-        **changes,  # type: ignore[arg-type]
+        reset=cfg.reset if reset is None else reset,
     )
 
 

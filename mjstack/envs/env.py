@@ -69,7 +69,7 @@ class Env:
     def __init__(
         self, sim: Simulation, index: SceneIndex, cfg: Config, *, check_faults: bool = True
     ) -> None:
-        """Builds the managers on a simulation, and checks every term once.
+        """Build the managers on a simulation, and check every term once.
 
         Args:
             sim: The worlds, with the model fields that the reset terms write
@@ -134,7 +134,7 @@ class Env:
 
     @property
     def max_episode_steps(self) -> int:
-        """Steps after which an episode times out: the time-out term's, or the task's where there is
+        """Step after which an episode times out: the time-out term's, or the task's where there is
         none.
         """
         limits = [
@@ -147,7 +147,7 @@ class Env:
     def reset(
         self, *, seed: int | None = None, mask: Tensor | None = None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Starts new episodes.
+        """Start new episodes.
 
         Args:
             seed: Starts every world's episode 0 under this seed. Without it, each reset world goes
@@ -187,7 +187,7 @@ class Env:
     def step(
         self, action: Tensor
     ) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Advances every world by one control interval; see the class for the order.
+        """Advance every world by one control interval; see the class for the order.
 
         Args:
             action: Shape ``(nworld, action_dim)``, float32.
@@ -246,9 +246,7 @@ class Env:
         )
 
     def recapture(self) -> None:
-        """Has every graph of this environment captured anew: for a change of something that a graph
-        has baked in.
-        """
+        """Have every graph captured anew, after a change of something that a graph has baked in."""
         self._version += 1
 
     def halves(self) -> tuple[StepGraph, StepGraph]:
@@ -271,7 +269,7 @@ class Env:
         return self.statistics.read()
 
     def raise_faults(self) -> None:
-        """Looks at what went wrong on the device. Waits for it.
+        """Look at what went wrong on the device. Waits for it.
 
         Raises:
             FaultError: Something did; names the worlds and what to do.
@@ -279,7 +277,7 @@ class Env:
         self._faults.raise_first()
 
     def close(self) -> None:
-        """Gives the simulation's threads and buffers back. Nothing can be stepped afterwards."""
+        """Give the simulation's threads and buffers back. Nothing can be stepped afterwards."""
         self._started = False
         self._closed = True
         self.sim.synchronize()

@@ -10,7 +10,7 @@ class EpisodeStatistics:
     def __init__(
         self, reward_names: list[str], termination_names: list[str], device: torch.device
     ) -> None:
-        """Allocates the sums."""
+        """Allocate the sums."""
         self._names = [
             *("steps", "success", "return"),
             *(f"reward/{name}" for name in reward_names),
@@ -28,7 +28,7 @@ class EpisodeStatistics:
         rewards: Tensor,
         terminations: Tensor,
     ) -> None:
-        """Adds the episodes that end in this step.
+        """Add the episodes that end in this step.
 
         Args:
             done: Which end, shape ``(nworld,)``, bool.
@@ -48,7 +48,7 @@ class EpisodeStatistics:
         self._sums += torch.where(done[:, None], row, 0.0).sum(0, dtype=torch.float64)
 
     def read(self) -> dict[str, float]:
-        """Means over the episodes that ended since the last read, and starts anew. Waits for the
+        """Means over the episodes that ended since the last read, which starts anew. Waits for the
         device.
 
         Returns:

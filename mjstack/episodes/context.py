@@ -201,7 +201,7 @@ class RunContext:
         return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)
 
     def tell(self, what: str, done: int, total: int) -> None:
-        """Reports progress, if anyone listens."""
+        """Report progress, if anyone listens."""
         if self.advance is not None:
             self.advance(what, done, total)
 
@@ -228,7 +228,7 @@ class RunContext:
             worlds: Their numbers, which random numbers depend on: ``[17]`` starts one world as
                 world 17 of any batch starts.
         """
-        cfg = driven_config(self.cfg, reset=reset)
+        cfg = driven_config(self.cfg, reset)
         env = Env(sim, self.index, cfg, check_faults=False)
         return reset_worlds(env, cfg.seed if seed is None else seed, worlds)
 

@@ -6,7 +6,7 @@ from mjstack.report.record import GateResult
 
 @needs_episode
 def run_baseline(context: RunContext) -> list[GateResult]:
-    """Runs the nominal episode on native MuJoCo and judges it."""
+    """Run the nominal episode on native MuJoCo and judge it."""
     cfg = context.cfg
     nominal = context.nominal
     sim = nominal.sim

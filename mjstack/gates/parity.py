@@ -64,7 +64,7 @@ def run_parity(context: RunContext) -> list[GateResult]:
 
 
 def _compare_states(context: RunContext, mjwarp: Simulation, result: GateResult) -> list[str]:
-    """Steps of both backends from the same states of the reference episode; returns the
+    """Step both backends from the same states of the reference episode; return the
     problems.
     """
     limits = context.cfg.gate.parity

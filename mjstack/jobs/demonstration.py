@@ -190,7 +190,7 @@ def _flat(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSpec:
-    """Describes the dataset of an environment's demonstrations.
+    """Describe the dataset of an environment's demonstrations.
 
     Args:
         env: An environment of `demonstration_config`, with any number of worlds.

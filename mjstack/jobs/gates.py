@@ -37,7 +37,7 @@ def check_machine(cfg: Config) -> RunContext:
 
 
 def _check_success(context: RunContext) -> None:
-    """Raises if worlds cannot start as the success gate has them, by the key that says so."""
+    """Raise if worlds cannot start as the success gate has them, by the key that says so."""
     cfg = context.cfg
     try:
         check_env(context, success_config(cfg))
@@ -51,7 +51,7 @@ def _check_success(context: RunContext) -> None:
 
 
 def check_task(context: RunContext) -> None:
-    """Raises if the task cannot be played as configured, on this machine."""
+    """Raise if the task cannot be played as configured, on this machine."""
     cfg = context.cfg
     resolve_backend(cfg)
     if cfg.task.check is not None:

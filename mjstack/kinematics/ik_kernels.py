@@ -108,7 +108,7 @@ def forward_kernel(
 
 @wp.func
 def within(value: float, low: float, high: float) -> float:
-    """Clamps, and lets NaN through, which ``wp.clamp`` would turn into a limit."""
+    """Clamp, and let NaN through, which ``wp.clamp`` would turn into a limit."""
     bounded = value
     if value < low:
         bounded = low

@@ -23,7 +23,7 @@ class GraspPointTask(mink.Task):
     """
 
     def __init__(self, sites: list[int], nv: int) -> None:
-        """Stores the two site indices; the target is set before each solve."""
+        """Store the two site indices; the target is set before each solve."""
         super().__init__(cost=np.ones(3))
         self.target = np.zeros(3)
         self._sites = sites

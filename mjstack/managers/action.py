@@ -1,4 +1,4 @@
-"""The action manager: slices of the policy's action, each turned into actuator commands
+"""The action manager: slices of the policy's action, each turned into joint targets
 by a term.
 """
 
@@ -15,7 +15,7 @@ from mjstack.math import describe_tensor
 
 
 class ActionTerm(ABC):
-    """Turns a slice of the action into commands. A subclass takes the environment and keyword
+    """Turns a slice of the action into joint targets. A subclass takes the environment and keyword
     parameters.
 
     Attributes:
@@ -34,7 +34,7 @@ class ActionTerm(ABC):
 
     @abstractmethod
     def write_commands(self, action: torch.Tensor) -> None:
-        """Writes ``sim.ctrl`` for an action of shape ``(nworld, dim)``."""
+        """Write ``sim.ctrl`` for an action of shape ``(nworld, dim)``."""
 
 
 class ActionManager:
@@ -52,7 +52,7 @@ class ActionManager:
     """
 
     def __init__(self, env: EnvView, cfg: Mapping[str, TermCfg]) -> None:
-        """Builds the terms.
+        """Build the terms.
 
         Raises:
             TermError: A term cannot be found, built, or is no `ActionTerm`.
@@ -120,7 +120,7 @@ class ActionManager:
             term.write_commands(part)
 
     def check(self, action: torch.Tensor) -> None:
-        """Raises an `ArgumentError` for an action of wrong type, shape, dtype or device."""
+        """Raise an `ArgumentError` for an action of wrong type, shape, dtype or device."""
         if (
             not isinstance(action, torch.Tensor)
             or action.shape != self.action.shape

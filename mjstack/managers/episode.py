@@ -17,11 +17,10 @@ class ResetManager:
     """Puts the masked worlds back and runs every term over them, in their order."""
 
     def __init__(self, env: EnvView, cfg: Mapping[str, TermCfg]) -> None:
-        """Builds the terms.
+        """Build the terms.
 
         Raises:
-            TermError: A term cannot be found, a parameter is wrong, or the simulation was made
-                without a model field that it writes.
+            TermError: A term cannot be found, or a parameter is wrong.
         """
         self._env = env
         self._terms = {
@@ -29,7 +28,7 @@ class ResetManager:
         }
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Resets the worlds of a ``(nworld,)`` bool mask: qpos0 first, then every term."""
+        """Reset the worlds of a ``(nworld,)`` bool mask: qpos0 first, then every term."""
         self._env.sim.reset(mask)
         for term in self._terms.values():
             with blamed(term.label):
@@ -78,7 +77,7 @@ class RewardManager(_ValueManager):
     """
 
     def __init__(self, env: EnvView, cfg: Mapping[str, RewardTermCfg]) -> None:
-        """Builds the terms and calls each once.
+        """Build the terms and call each once.
 
         Raises:
             TermError: A term cannot be found, does not return ``(nworld,)`` numbers, or has a
@@ -95,7 +94,7 @@ class RewardManager(_ValueManager):
         self.episode_sums = torch.zeros_like(self.values)
 
     def compute(self, void: torch.Tensor | None = None) -> torch.Tensor:
-        """Writes `values` and `reward`, and returns `reward`.
+        """Write `values` and `reward`, and return `reward`.
 
         Args:
             void: Worlds whose state is not finite, shape ``(nworld,)``, bool: they get no reward
@@ -113,7 +112,7 @@ class RewardManager(_ValueManager):
         return torch.sum(self.values, dim=1, out=self.reward)
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Starts the sums of the masked worlds anew."""
+        """Start the sums of the masked worlds anew."""
         super().reset(mask)
         self.episode_sums.masked_fill_(mask[:, None], 0.0)
 
@@ -133,7 +132,7 @@ class TerminationManager(_ValueManager):
     """
 
     def __init__(self, env: EnvView, cfg: Mapping[str, TerminationTermCfg]) -> None:
-        """Builds the terms and calls each once.
+        """Build the terms and call each once.
 
         Raises:
             TermError: A term cannot be found, or does not return ``(nworld,)`` bool.
@@ -150,7 +149,7 @@ class TerminationManager(_ValueManager):
         )
 
     def compute(self) -> None:
-        """Writes `terminated`, `truncated` and `values`."""
+        """Write `terminated`, `truncated` and `values`."""
         if not self._terms:
             return
         torch.stack([term(self._env) for term in self._terms.values()], dim=1, out=self.values)

@@ -107,7 +107,7 @@ class _Group:
         return step.mul_(self._scale) if self._scales else step
 
     def append(self, out: torch.Tensor) -> None:
-        """Takes in a new step of every world, and forgets the oldest."""
+        """Take in a new step of every world, and forget the oldest."""
         step = self.compute()
         if not self._has_history:
             out.copy_(step)
@@ -137,7 +137,7 @@ class ObservationManager:
     """
 
     def __init__(self, env: EnvView, cfg: Mapping[str, ObservationGroupCfg]) -> None:
-        """Builds the terms and calls each once.
+        """Build the terms and call each once.
 
         Raises:
             TermError: A term cannot be found, or returns what a group cannot hold.
@@ -154,13 +154,13 @@ class ObservationManager:
         }
 
     def compute(self) -> dict[str, torch.Tensor]:
-        """Takes in a new step of every world, and returns `groups`."""
+        """Take in a new step of every world, and return `groups`."""
         for name, group in self._groups.items():
             group.append(self.groups[name])
         return self.groups
 
     def refresh(self, mask: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Computes the masked worlds anew after their reset; their whole history becomes the first
+        """Compute the masked worlds anew after their reset; their whole history becomes the first
         step.
         """
         for name, group in self._groups.items():

@@ -39,7 +39,7 @@ _WORDS = {
 def check_params(
     label: str, func: Callable[..., Any], params: dict[str, Any], leading: int
 ) -> None:
-    """Holds the parameters against a signature whose first ``leading`` arguments the manager gives.
+    """Hold the parameters against a signature whose first ``leading`` arguments the manager gives.
 
     Raises:
         TermError: A parameter is unknown or missing.
@@ -143,7 +143,7 @@ def step_cache() -> Iterator[None]:
 
 
 def require_positive(name: str, value: float, *, zero: bool = False) -> None:
-    """Refuses a parameter that is not a positive number, or zero where that will do.
+    """Refuse a parameter that is not a positive number, or zero where that will do.
 
     Raises:
         ParameterError: It is not.
@@ -188,7 +188,7 @@ class Term:
         masked: bool = False,
         base: type | None = None,
     ) -> None:
-        """Finds the function or class and checks its parameters.
+        """Find the function or class and check its parameters.
 
         Args:
             label: Dotted configuration key, for errors.
@@ -222,7 +222,7 @@ class Term:
         self._shared_by = None if is_class or masked else (func, repr(sorted(self.params.items())))
 
     def __call__(self, *args: Any) -> Any:
-        """Calls the term with the environment, and a mask if it takes one."""
+        """Call the term with the environment, and a mask if it takes one."""
         current_term.label = self.label
         if self._shared_by is None:
             return self.call(*args, **self._call_params)
@@ -231,7 +231,7 @@ class Term:
         )
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Lets a term with a memory forget the masked worlds."""
+        """Let a term with a memory forget the masked worlds."""
         if self._reset is not None:
             self._reset(mask)
 

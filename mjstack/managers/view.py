@@ -51,7 +51,7 @@ class EnvView(Protocol):
 
 
 def offers(**attributes: Any) -> Callable[[Any], Any]:
-    """Marks a term with what others may ask of it.
+    """Mark a term with what others may ask of it.
 
     Known attributes: ``unit`` of an observation (one, or one per number; ``joint`` and ``joint/s``
     are those of the robot's joints); ``ends_on`` of a termination, ``overflow`` or ``non_finite``,
@@ -73,7 +73,7 @@ def offers(**attributes: Any) -> Callable[[Any], Any]:
 
 
 def uses_fields(*names: str) -> Callable[[Any], Any]:
-    """Marks a reset term that writes per-world model fields, so that the simulation is built with
+    """Mark a reset term that writes per-world model fields, so that the simulation is built with
     them.
     """
     return offers(model_fields=names)

@@ -29,7 +29,7 @@ class _Commands(ActionTerm):
         self.low = -self.high
 
     def _write_bounded(self, command: Tensor) -> None:
-        """Writes commands, kept within the actuators' ranges."""
+        """Write commands, kept within the actuators' ranges."""
         self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))
 
 
@@ -50,7 +50,7 @@ class JointPosition(_Commands):
         scale: float = 1.0,
         pose: str = "home",
     ) -> None:
-        """Chooses joints.
+        """Choose joints.
 
         Args:
             env: The environment.
@@ -88,7 +88,7 @@ class JointPosition(_Commands):
             self.low, self.high = self._low, self._high
 
     def write_commands(self, action: Tensor) -> None:
-        """Writes the commands of its joints."""
+        """Write the commands of its joints."""
         if self._mode != "absolute":
             base = self._pose if self._mode == "relative" else self._columns.read(self._ctrl)
             action = base + self._scale * action.clamp(-1.0, 1.0)
@@ -99,13 +99,13 @@ class Gripper(_Commands):
     """One number for all fingers: -1 is closed, 1 is open, as the robot's profile has them."""
 
     def __init__(self, env: EnvView) -> None:
-        """Reads the profile."""
+        """Read the profile."""
         self._set_up(env, range(env.index.n_arm, len(env.index.ctrl)), dim=1)
         self._closed = robot(env).gripper_closed
         self._opening = robot(env).gripper_open - self._closed
 
     def write_commands(self, action: Tensor) -> None:
-        """Writes the fingers' commands."""
+        """Write the fingers' commands."""
         self._columns.write(
             self._ctrl, self._closed + 0.5 * (action.clamp(-1.0, 1.0) + 1.0) * self._opening
         )
@@ -122,7 +122,7 @@ class EndEffectorDelta(_Commands):
     """
 
     def __init__(self, env: EnvView, *, scale: float, iterations: int = 8) -> None:
-        """Builds the solver.
+        """Build the solver.
 
         Args:
             env: The environment.
@@ -146,7 +146,7 @@ class EndEffectorDelta(_Commands):
         )
 
     def write_commands(self, action: Tensor) -> None:
-        """Writes the arm's commands."""
+        """Write the arm's commands."""
         last = self._all.read(self._ctrl)
         target = self._ik.forward(last)[0] + self._scale * action.clamp(-1.0, 1.0).float()
         command, _ = self._ik.solve(last, target)

@@ -34,21 +34,21 @@ from mjstack.scene.index import joint_limits
 
 
 def home(env: EnvView, mask: Tensor, *, pose: str = "home") -> None:
-    """Puts the robot at its home command, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
+    """Put the robot at its home, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
     write_robot(env, mask, named_pose(env, pose).expand(env.nworld, -1))
     env.sim.qvel.masked_fill_(mask[:, None], 0.0)
 
 
 @offers(joint_noise=True)
 class JointNoise:
-    """Adds uniform noise to the robot's joint positions and commands, within the joints' ranges."""
+    """Adds uniform noise to the robot's joint positions and targets, within the joints' ranges."""
 
     label = (  # the manager sets the term's own, so that two of them draw different numbers
         "reset.joints"
     )
 
     def __init__(self, env: EnvView, *, arm: float, gripper: float = 0.0) -> None:
-        """Takes the half-widths.
+        """Take the half-widths.
 
         Args:
             env: The environment.
@@ -63,7 +63,7 @@ class JointNoise:
         self._low, self._high = (torch.from_numpy(each).to(self._width) for each in limits)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
-        """Writes qpos and ctrl."""
+        """Write qpos and ctrl."""
         noise = random_uniform(env, self.label, self._width.shape[0])
         command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
         write_robot(env, mask, torch.clamp(command, self._low, self._high))
@@ -75,7 +75,7 @@ class JitterObjects:
     label = "reset.cubes"
 
     def __init__(self, env: EnvView, *, xy: float, yaw: float) -> None:
-        """Takes the half-widths.
+        """Take the half-widths.
 
         Args:
             env: The environment.
@@ -92,7 +92,7 @@ class JitterObjects:
         self._yaw = yaw
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
-        """Writes qpos."""
+        """Write qpos."""
         draws = random_uniform(env, self.label, 3 * len(env.index.objects)).view(env.nworld, -1, 3)
         for number, name in enumerate(env.index.objects):
             xy, yaw = draws[:, number].split((2, 1), dim=1)
@@ -122,7 +122,7 @@ class RandomizeObjects:
         candidates: int = 16,
         pose: str = "start",
     ) -> None:
-        """Checks that the region has room.
+        """Check that the region has room.
 
         Args:
             env: The environment.
@@ -163,7 +163,7 @@ class RandomizeObjects:
         self._placement.to(env.device, env.sim.qpos.dtype)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
-        """Writes qpos."""
+        """Write qpos."""
         count = len(env.index.objects)
         draws = random_uniform(env, self.label, count * (2 * self._candidates + 1)).view(
             env.nworld, count, -1
@@ -186,7 +186,7 @@ class _Randomized:
         self._ends = ends
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
-        """Writes the model fields."""
+        """Write the model fields."""
         factors = random_uniform(env, self.label, len(self._nominal), *self._ends)
         self._quantity.write(mask, self._nominal * factors)
 
@@ -196,7 +196,7 @@ class ObjectMass(_Randomized):
     """Scales each object's mass and inertia."""
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
-        """Takes the smallest and largest factor."""
+        """Take the smallest and largest factor."""
         super().__init__(env, ObjectMasses(env), bounds("scale", scale))
 
 
@@ -205,7 +205,7 @@ class ObjectFriction(_Randomized):
     """Draws the sliding friction of each object, and of the grip; see `SlidingFriction`."""
 
     def __init__(self, env: EnvView, *, sliding: Sequence[float]) -> None:
-        """Takes the smallest and largest coefficient."""
+        """Take the smallest and largest coefficient."""
         ends = bounds("sliding", sliding)
         super().__init__(env, SlidingFriction(env, ends[0]), ends)
 
@@ -217,12 +217,12 @@ class ActuatorGains(_Randomized):
     """
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
-        """Takes the smallest and largest factor."""
+        """Take the smallest and largest factor."""
         super().__init__(env, ServoGains(env), bounds("scale", scale))
 
 
 def _write_object(env: EnvView, mask: Tensor, name: str, offset: Tensor, yaw: Tensor) -> None:
-    """Moves the masked worlds' object off the position where the simulation's reset has put it, by
+    """Move the masked worlds' object off the position where the simulation's reset has put it, by
     x and y [m], and turns it [rad].
     """
     # Float64, because a float32 cosine need not be that of any angle, and a file of starts has the

@@ -26,7 +26,7 @@ class ObjectOffTable:
     """When an object's centre is beside the table or below its top."""
 
     def __init__(self, env: EnvView) -> None:
-        """Reads the table's place."""
+        """Read the table's place."""
         scene = env.cfg.scene
         self._center = env.index.constant(scene.table_center[:2], env.sim.qpos)
         self._half = env.index.constant(scene.table_half[:2], env.sim.qpos)
@@ -47,7 +47,7 @@ class JointLimit:
     """
 
     def __init__(self, env: EnvView, *, margin: float) -> None:
-        """Reads the ranges.
+        """Read the ranges.
 
         Args:
             env: The environment.

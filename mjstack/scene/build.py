@@ -39,7 +39,7 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
 
 
 def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
-    """Adds the scene to a robot and compiles it.
+    """Add the scene to a robot and compile it.
 
     Args:
         spec: The robot; it is changed in place.
@@ -118,7 +118,7 @@ def force_sensor(first: str, second: str) -> str:
 
 
 def _add_object(world: mujoco.MjsBody, name: str, thing: ObjectCfg, top: float) -> None:
-    """Adds an object that stands on a surface at height top [m]. Its body, joint and geom have its
+    """Add an object that stands on a surface at height top [m]. Its body, joint and geom have its
     name.
     """
     body = world.add_body(name=name, pos=[*thing.xy, top + thing.half_height])
@@ -138,7 +138,7 @@ def _add_object(world: mujoco.MjsBody, name: str, thing: ObjectCfg, top: float) 
 
 
 def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
-    """Adds a box to the world, its floor and walls on a surface at height top [m]. Every geom's
+    """Add a box to the world, its floor and walls on a surface at height top [m]. Every geom's
     name begins with ``box_``.
     """
     x, y = box.center

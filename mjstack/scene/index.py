@@ -20,7 +20,7 @@ class Columns:
     """
 
     def __init__(self, indices: Sequence[int] | np.ndarray, device: torch.device) -> None:
-        """Takes the columns, in the order in which values are given."""
+        """Take the columns, in the order in which values are given."""
         self.indices = tuple(int(i) for i in indices)
         first = self.indices[0] if self.indices else 0
         stop = first + len(self.indices)
@@ -40,11 +40,11 @@ class Columns:
         return view.index_select(1, self._at)
 
     def write(self, view: torch.Tensor, value: torch.Tensor) -> None:
-        """Writes all worlds."""
+        """Write all worlds."""
         view[:, self._at] = value
 
     def write_masked(self, view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor) -> None:
-        """Writes the worlds of a ``(nworld,)`` bool mask."""
+        """Write the worlds of a ``(nworld,)`` bool mask."""
         rows = mask.view(-1, *[1] * (view.dim() - 1))
         part = self.read(view)
         value = value.to(view.dtype)
@@ -63,8 +63,8 @@ class RobotTensors:
         qvel: Columns of qvel.
         ctrl: Columns of ctrl.
         range: Joint limits [rad, m], shape ``(n, 2)``.
-        ctrl_range: Limits of the commands, shape ``(n, 2)``.
-        home: Home command, shape ``(n,)``.
+        ctrl_range: Limits of the joint targets, shape ``(n, 2)``.
+        home: Joint values at home, shape ``(n,)``.
         start: Start of environments, clear of the table, shape ``(n,)``.
         gripper_open: Command of the open gripper, shape ``(n_gripper,)``.
         gripper_closed: Command of the closed gripper, shape ``(n_gripper,)``.
@@ -89,7 +89,7 @@ class SceneIndex:
         robot_qvel: qvel addresses in the same order.
         robot_range: Joint limits in the same order [rad, m], shape ``(n, 2)``.
         ctrl: Actuator indices in the same order.
-        ctrl_range: Limits of the commands in the same order, shape ``(n, 2)``.
+        ctrl_range: Limits of the joint targets in the same order, shape ``(n, 2)``.
         n_arm: How many of them are the arm's.
         grasp_sites: The two site indices whose midpoint is the grasp point.
         object_qpos: First qpos address of every object that moves, in the scene's order.

@@ -35,7 +35,7 @@ def resolve_device(requested: str) -> str:
 def resolve_backend(
     cfg: Config, backend: Backend | None = None, device: str | None = None
 ) -> tuple[Backend, str]:
-    """Backend (never auto) and device of the batch and throughput gates.
+    """Backend (never auto) and device of a simulation.
 
     Args:
         cfg: The configuration.

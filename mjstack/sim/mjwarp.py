@@ -46,7 +46,7 @@ class MjwarpSimulation(Simulation):
         *,
         fields: Sequence[str] = (),
     ) -> None:
-        """Upload the model and allocates nworld worlds at qpos0.
+        """Upload the model and allocate nworld worlds at qpos0.
 
         Args:
             model: The compiled model.
@@ -137,7 +137,7 @@ class MjwarpSimulation(Simulation):
             self._pose()
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Put the masked worlds back to qpos0, at rest, and clears their counters and overflow
+        """Put the masked worlds back to qpos0, at rest, and clear their counters and overflow
         bits.
         """
         self.check_mask(mask)
@@ -278,7 +278,7 @@ class MjwarpSimulation(Simulation):
         )
 
     def _warm_up(self) -> None:
-        """Compile and loads every kernel, then leaves the worlds as new."""
+        """Compile and load every kernel, then leave the worlds as new."""
         with torch_stream_scope(self._device):
             self._decimation(1, kinematics=True)
         self.synchronize()

@@ -262,7 +262,7 @@ class NativeSimulation(Simulation):
         mujoco.mj_setState(worker.model, worker.data, self._state[w], _SPEC)
 
     def _step(self, worker: _Worker, worlds: Iterable[int], *, n: int, kinematics: bool) -> None:
-        """Steps some worlds on one thread, n=0 meaning forward.
+        """Step some worlds on one thread, n=0 meaning forward.
 
         MuJoCo's functions release the interpreter lock; the rest is a few microseconds a world.
         """

@@ -155,17 +155,17 @@ class Simulation(ABC):
 
     @property
     def most_contacts(self) -> torch.Tensor:
-        """See above."""
+        """Most contacts since the last full reset, shape ``(nworld,)``."""
         return torch.maximum(self._erased[0], self.peak_contacts)
 
     @property
     def most_constraints(self) -> torch.Tensor:
-        """See above."""
+        """Most constraint rows since the last full reset, shape ``(nworld,)``."""
         return torch.maximum(self._erased[1], self.peak_constraints)
 
     @property
     def overflow_ever(self) -> torch.Tensor:
-        """See above."""
+        """Bits of `Overflow` since the last full reset, shape ``(nworld,)``."""
         return self._erased[2] | self.overflow
 
     @abstractmethod

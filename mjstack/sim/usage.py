@@ -150,7 +150,7 @@ def record_usage(
     limits: wp.array[int],
     steps: wp.array[wp.int64],
 ) -> None:
-    """Count each world's contacts, and keeps the largest counters and every overflow bit seen so
+    """Count each world's contacts, and keep the largest counters and every overflow bit seen so
     far.
 
     ``contacts`` is zero before. The packed list may claim more contacts than it holds after an

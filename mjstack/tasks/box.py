@@ -127,7 +127,7 @@ class BoxCheck(EpisodeCheck):
         return [grasp, lift, carry, drop, release, settled, order, inside, _JawClear(self)]
 
     def _read_box(self) -> None:
-        """Reads the scene's box, and raises unless every object fits into it at its place."""
+        """Read the scene's box, and raise unless every object fits into it at its place."""
         scene = self.cfg.scene
         box = scene.box
         if box is None:
@@ -370,7 +370,7 @@ class BoxSuccess(ReleasedSuccess):
     """
 
     def __init__(self, env: EnvView, *, open_fraction: float) -> None:
-        """Allocates the streak; see `ReleasedSuccess`.
+        """Allocate the streak; see `ReleasedSuccess`.
 
         Raises:
             MjstackError: The fraction is out of range, or the task has another check.

@@ -20,7 +20,7 @@ class ToSlot:
     """
 
     def __init__(self, env: EnvView, *, object: str) -> None:
-        """Finds the place.
+        """Find the place.
 
         Args:
             env: The environment.
@@ -52,7 +52,7 @@ class Place:
     """
 
     def __init__(self, env: EnvView, *, object: str, scale: float) -> None:
-        """Finds the place.
+        """Find the place.
 
         Args:
             env: The environment.
@@ -111,7 +111,7 @@ class ReachNext(_ByObject):
     """
 
     def __init__(self, env: EnvView, *, scale: float) -> None:
-        """Reads the box's place.
+        """Read the box's place.
 
         Args:
             env: The environment.
@@ -136,7 +136,7 @@ class GraspNext(_ByObject):
     """
 
     def __init__(self, env: EnvView, *, force: float = 0.05) -> None:
-        """Reads the box's place.
+        """Read the box's place.
 
         Args:
             env: The environment.

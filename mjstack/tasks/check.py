@@ -128,7 +128,7 @@ class Rule(ABC):
         *,
         wanted: str = "see the thresholds",
     ) -> None:
-        """Names the rule.
+        """Name the rule.
 
         Args:
             name: In capital letters. The rule of one of several objects is ``NAME_OBJECT``.
@@ -146,14 +146,14 @@ class Rule(ABC):
         self.wanted = [wanted] * len(self.suffixes)
 
     def start(self, view: TaskView) -> None:  # noqa: B027
-        """Allocates for the worlds of a view."""
+        """Allocate for the worlds of a view."""
 
     def update(self, step: Step) -> None:  # noqa: B027
-        """Processes the state at the end of a step. Fixed shapes, no host read."""
+        """Process the state at the end of a step. Fixed shapes, no host read."""
 
     @abstractmethod
     def judge(self, end: Step) -> Judgement:
-        """Judges the episode.
+        """Judge the episode.
 
         Args:
             end: The state at its end.
@@ -195,7 +195,7 @@ class EpisodeCheck(ABC):
     summaries: Mapping[str, tuple[str, str]] = {}
 
     def __init__(self, cfg: Config) -> None:
-        """Reads the thresholds and builds the rules.
+        """Read the thresholds and build the rules.
 
         Raises:
             MjstackError: A threshold is missing, unknown, of the wrong type or out of range.
@@ -243,7 +243,7 @@ class EpisodeCheck(ABC):
         return TaskView(env, self.objects, phases, stop=stop, force=force)
 
     def start(self, env: EnvView, steps: int, phases: Sequence[Phase] = ()) -> None:
-        """Allocates for an episode.
+        """Allocate for an episode.
 
         Args:
             env: The worlds, at their start.
@@ -258,7 +258,7 @@ class EpisodeCheck(ABC):
         self._finite = torch.ones(env.nworld, dtype=torch.bool, device=env.device)
 
     def update(self, phase: Tensor | None = None) -> None:
-        """Processes the state at the end of a step. Fixed shapes, no host read.
+        """Process the state at the end of a step. Fixed shapes, no host read.
 
         Args:
             phase: Number of the phase that each world's command belonged to, shape ``(nworld,)``,
@@ -272,7 +272,7 @@ class EpisodeCheck(ABC):
         self._view.count += 1
 
     def result(self) -> CheckResult:
-        """Judges the episode; every rule that was not shown to hold has failed."""
+        """Judge the episode; every rule that was not shown to hold has failed."""
         sim = self._view.env.sim
         complete = int(self._view.count) == self._steps
         wanted = self._steps * self.cfg.timing.decimation

@@ -115,7 +115,7 @@ class AtLeast(Rule):
         *,
         phases: PhaseNames,
     ) -> None:
-        """Describes the rule; see `Rule`.
+        """Describe the rule; see `Rule`.
 
         Args:
             name: Of the rule.
@@ -133,7 +133,7 @@ class AtLeast(Rule):
         self.phases = phases
 
     def start(self, view: TaskView) -> None:
-        """Allocates the numbers."""
+        """Allocate the numbers."""
         self.key = view.during(self.phases)
         self.best = view.counter(len(self.objects))
 
@@ -162,7 +162,7 @@ class Streak(AtLeast):
         anew: PhaseNames = (),
         distance: float | None = None,
     ) -> None:
-        """Describes the rule; see `Rule`.
+        """Describe the rule; see `Rule`.
 
         Args:
             name: Of the rule.
@@ -184,13 +184,13 @@ class Streak(AtLeast):
         self._anew = anew
 
     def start(self, view: TaskView) -> None:
-        """Allocates the streaks."""
+        """Allocate the streaks."""
         super().start(view)
         self.length = view.counter(len(self.objects))  # of the current streak
         self._clears = view.during(self._anew)
 
     def update(self, step: Step) -> None:
-        """Extends or ends the streaks."""
+        """Extend or end the streaks."""
         if self._anew and step.view.phased:
             step.view.forget(step.judged(self._clears))
         self.length.add_(1.0).mul_(self._counts(step))
@@ -209,14 +209,14 @@ class Carried(Streak):
     """
 
     def start(self, view: TaskView) -> None:
-        """Allocates the streaks."""
+        """Allocate the streaks."""
         super().start(view)
         size = len(self.objects)
         self._from = view.zeros(size, 2)  # where the streak began
         self._far = view.counter(size)  # farthest from there
 
     def update(self, step: Step) -> None:
-        """Extends or ends the streaks."""
+        """Extend or end the streaks."""
         counts = self._counts(step)
         xy = step.view.columns(self.objects).read(step.pos)[..., :2]
         begins = counts & (self.length == 0.0)
@@ -242,7 +242,7 @@ class InWindow(Rule):
         *,
         measure: Callable[[Step], dict[str, Tensor]] = lambda end: {},
     ) -> None:
-        """Describes the rule; see `Rule`.
+        """Describe the rule; see `Rule`.
 
         Args:
             name: Of the rule.
@@ -258,11 +258,11 @@ class InWindow(Rule):
         self._measure = measure
 
     def start(self, view: TaskView) -> None:
-        """Allocates the streak that lasts to the end."""
+        """Allocate the streak that lasts to the end."""
         self.length = view.zeros()
 
     def update(self, step: Step) -> None:
-        """Extends or ends the streak."""
+        """Extend or end the streak."""
         holds = self._condition(step)
         self.length.add_(1.0).mul_(holds if holds.dim() == 1 else holds.all(1))
 
@@ -279,7 +279,7 @@ class AtRest(Rule):
     """
 
     def __init__(self, window: int, *, speed: float, position: float, rotation_deg: float) -> None:
-        """Describes the rules.
+        """Describe the rules.
 
         Args:
             window: How many steps.
@@ -301,14 +301,14 @@ class AtRest(Rule):
         self._rotation = math.radians(rotation_deg)
 
     def start(self, view: TaskView) -> None:
-        """Allocates a ring of the last steps."""
+        """Allocate a ring of the last steps."""
         size = len(view.objects)
         # A ring that is not filled fails: NaN compares false with everything.
         self._poses = view.zeros(self._window, size, 7, fill=math.nan)
         self._speeds = view.zeros(self._window, size, fill=math.nan)
 
     def update(self, step: Step) -> None:
-        """Keeps the step in place of the oldest one."""
+        """Keep the step in place of the oldest one."""
         slot = step.view.count.remainder(self._window)
         self._poses.index_copy_(1, slot, step.pose[:, None])
         self._speeds.index_copy_(1, slot, step.speed[:, None])
@@ -342,7 +342,7 @@ class HeldSuccess:
     """Achieved while a condition has held for some steps in a row."""
 
     def __init__(self, env: EnvView, condition: Callable[[], Tensor], steps: int) -> None:
-        """Allocates the streaks.
+        """Allocate the streaks.
 
         Args:
             env: The environment.
@@ -358,12 +358,12 @@ class HeldSuccess:
         self._length = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
 
     def __call__(self, env: EnvView) -> Tensor:
-        """Processes a step; shape ``(nworld,)``, bool."""
+        """Process a step; shape ``(nworld,)``, bool."""
         self._length.add_(1).mul_(self._condition())
         return self._length >= self._steps
 
     def reset(self, mask: Tensor) -> None:
-        """Forgets the masked worlds."""
+        """Forget the masked worlds."""
         self._length.masked_fill_(mask, 0)
 
 
@@ -373,7 +373,7 @@ class ReleasedSuccess(HeldSuccess):
     def __init__(
         self, env: EnvView, check: EpisodeCheck, condition: Condition, open_fraction: float
     ) -> None:
-        """Allocates the streaks.
+        """Allocate the streaks.
 
         Args:
             env: The environment.
@@ -392,5 +392,5 @@ class ReleasedSuccess(HeldSuccess):
         self._open = open_fraction
 
     def __call__(self, env: EnvView) -> Tensor:
-        """Processes a step; shape ``(nworld,)``, bool."""
+        """Process a step; shape ``(nworld,)``, bool."""
         return super().__call__(env) & (gripper_opening(env) >= self._open).all(1)

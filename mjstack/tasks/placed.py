@@ -11,7 +11,7 @@ class Placed(HeldSuccess):
     """
 
     def __init__(self, env: EnvView, *, steps: int = 1) -> None:
-        """Allocates the streaks.
+        """Allocate the streaks.
 
         Args:
             env: The environment, its task with a check.

@@ -15,7 +15,7 @@ class ReachSuccess(HeldSuccess):
     def __init__(
         self, env: EnvView, *, object: str, height: float, distance: float, steps: int
     ) -> None:
-        """Takes the thresholds.
+        """Take the thresholds.
 
         Args:
             env: The environment.

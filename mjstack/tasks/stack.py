@@ -146,7 +146,7 @@ class StackSuccess(ReleasedSuccess):
     """
 
     def __init__(self, env: EnvView, *, open_fraction: float) -> None:
-        """Allocates a ring of the last steps; see `ReleasedSuccess`.
+        """Allocate a ring of the last steps; see `ReleasedSuccess`.
 
         Raises:
             MjstackError: The fraction is out of range, or the task has another check.
@@ -166,7 +166,7 @@ class StackSuccess(ReleasedSuccess):
         self._turned = view.zeros(*ring)  # 1 - |cosine of half the angle| to them
 
     def _stands(self, step: Step) -> Tensor:
-        """Takes a step in place of the oldest one. `reset` may leave the ring alone: every slot is
+        """Take a step in place of the oldest one. `reset` may leave the ring alone: every slot is
         written anew before the streak can reach the window.
         """
         self._step = step
@@ -178,7 +178,7 @@ class StackSuccess(ReleasedSuccess):
         return self._check.placed(step).all(1)
 
     def __call__(self, env: EnvView) -> Tensor:
-        """Processes a step; shape ``(nworld,)``, bool."""
+        """Process a step; shape ``(nworld,)``, bool."""
         achieved = super().__call__(env)
         if not achieved.is_cuda and not bool(self._length.any()):
             return achieved  # no window that holds this step can pass, in any world

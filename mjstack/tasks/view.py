@@ -56,7 +56,7 @@ class TaskView:
         stop: int = 0,
         force: float = LOADED,
     ) -> None:
-        """Reads addresses and sizes.
+        """Read addresses and sizes.
 
         Args:
             env: The environment.
@@ -145,7 +145,7 @@ class TaskView:
         return self.counter(size)
 
     def forget(self, mask: Tensor) -> None:
-        """Clears all counters of the masked columns, shape ``(nworld, size)``."""
+        """Clear all counters of the masked columns, shape ``(nworld, size)``."""
         for block, _ in self._blocks:
             if block.shape[2] == mask.shape[1]:
                 # Not by a product: an earlier attempt may have left NaN.
@@ -163,7 +163,7 @@ class Step:
     """
 
     def __init__(self, view: TaskView, phase: Tensor | None) -> None:
-        """Takes the view, and the phase of every world."""
+        """Take the view, and the phase of every world."""
         self.view = view
         self.known: dict[tuple, Tensor] = {}  # see `once_per_step`
         self._phase = phase

@@ -41,7 +41,7 @@ class TimingCfg:
 
     @property
     def step_dt(self) -> float:
-        """Time between two commands [s]."""
+        """Time of a control step [s]."""
         return self.physics_dt * self.decimation
 
 
@@ -227,7 +227,7 @@ class GateCfg:
         return {
             name: gate.func if isinstance(gate, GateFuncCfg) else gate["func"]
             for name, gate in gates.items()
-            if isinstance(gate, GateFuncCfg) or "func" in gate
+            if isinstance(gate, GateFuncCfg) or (isinstance(gate, dict) and "func" in gate)
         }
 
 

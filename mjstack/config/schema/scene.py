@@ -170,7 +170,7 @@ class PlacementsCfg:
     grasp_offset: float = spec(0.0, unit="m")
     """How far above an object's centre it is held."""
     home: list[float] | None = spec(None, unit="rad, m")
-    """Home command of a scene in whose way the usual one is."""
+    """Joint values at which this scene's task begins, where ``robot.home`` would collide."""
     nconmax: int = spec(128, ge=1)
     """Contacts per world while a driver does the task."""
     njmax: int = spec(300, ge=1)

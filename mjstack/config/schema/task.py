@@ -113,7 +113,7 @@ class PhaseCfg:
 
 @dataclass(slots=True)
 class ControllerCfg:
-    """The scripted motion. Its commands go through the action terms of ``action``."""
+    """The phases of the expert. Its joint targets go through the action terms of ``action``."""
 
     name: str = spec()
     """open_loop or closed_loop."""

@@ -41,7 +41,7 @@ class Placement:
         pose: Sequence[float],
         noise: float = 0.0,
     ) -> None:
-        """Finds what could be in the way.
+        """Find what could be in the way.
 
         Args:
             cfg: The configuration.
@@ -88,11 +88,11 @@ class Placement:
         ]
 
     def to(self, device: torch.device, dtype: torch.dtype) -> None:
-        """Moves the constants to where worlds are placed."""
+        """Move the constants to where worlds are placed."""
         self._tensors = [t.to(device, dtype) for t in self._tensors]
 
     def require_room(self, xy: object, candidates: int) -> None:
-        """Tries the region on many imaginary worlds.
+        """Try the region on many imaginary worlds.
 
         Args:
             xy: The region as the user wrote it, for the error.

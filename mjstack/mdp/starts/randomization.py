@@ -33,13 +33,13 @@ class Quantity(Protocol):
     nominal: Tensor
 
     def __init__(self, env: EnvView) -> None:
-        """Finds the elements of the fields."""
+        """Find the elements of the fields."""
 
     def read(self) -> Tensor:
         """The numbers of every world, shape ``(nworld, n)``."""
 
     def write(self, mask: Tensor, values: Tensor) -> None:
-        """Writes numbers ``(nworld, n)``, and what follows from them, into the masked worlds."""
+        """Write numbers ``(nworld, n)``, and what follows from them, into the masked worlds."""
 
 
 class ObjectMasses(Quantity):
@@ -52,7 +52,7 @@ class ObjectMasses(Quantity):
     fields = ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")
 
     def __init__(self, env: EnvView) -> None:
-        """Finds the bodies."""
+        """Find the bodies."""
         bodies = [env.index.bodies[name] for name in env.index.objects]
         dofs = [dof + i for _, dof in env.index.objects.values() for i in range(6)]
         self._mass, *self._scaled, self._inverse, self._inverse_dofs = (
@@ -89,7 +89,7 @@ class SlidingFriction(Quantity):
     fields = ("geom_friction",)
 
     def __init__(self, env: EnvView, least: float = 0.0) -> None:
-        """Finds the geoms. ``least`` is the smallest coefficient that is ever drawn."""
+        """Find the geoms. ``least`` is the smallest coefficient that is ever drawn."""
         model = env.sim.model
         bodies = [model.body(name).id for name in env.cfg.robot.jaw_bodies]
         jaws = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies]
@@ -125,7 +125,7 @@ class ServoGains(Quantity):
     fields = ("actuator_gainprm", "actuator_biasprm")
 
     def __init__(self, env: EnvView) -> None:
-        """Finds the servos."""
+        """Find the servos."""
         servos = env.index.ctrl.tolist()
         # A position servo's gain is kp and its bias (0, -kp, -kv): scaling all of them scales both.
         self._gain, self._bias = (_Elements(env, name, servos) for name in self.fields)
@@ -173,5 +173,5 @@ class _Elements:
         self._columns.write_masked(self._view, mask, value)
 
     def scale(self, mask: Tensor, factor: Tensor) -> None:
-        """Writes nominal times factor, ``(nworld, elements)``, into the masked worlds."""
+        """Write nominal times factor, ``(nworld, elements)``, into the masked worlds."""
         self.write(mask, self.nominal * factor.view(*factor.shape, *[1] * (self.nominal.dim() - 1)))

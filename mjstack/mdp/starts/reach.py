@@ -15,7 +15,7 @@ _GRID = 0.02  # [m] between the positions whose reach is tried
 
 
 def require_reach(env: EnvView, region: Sequence[float]) -> None:
-    """Tries a grid over each object's region, as far as it is on the table.
+    """Try a grid over each object's region, as far as it is on the table.
 
     Raises:
         ParameterError: The arm cannot follow a phase at an object somewhere there.

@@ -50,7 +50,7 @@ class StartsTable:
     def __init__(
         self, path: str, key: str, required: Sequence[str], optional: Sequence[str]
     ) -> None:
-        """Reads a file and checks it cell by cell.
+        """Read a file and check it cell by cell.
 
         Args:
             path: The file.
@@ -152,7 +152,7 @@ class FromStartsFile:
         friction: Sequence[float] = (0.8, 1.4),
         gain: Sequence[float] = (0.9, 1.1),
     ) -> None:
-        """Reads the file and checks every world in it.
+        """Read the file and check every world in it.
 
         Args:
             env: The environment.
@@ -239,7 +239,7 @@ class FromStartsFile:
                 self._given.append((held, torch.from_numpy(values).to(env.device)))
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
-        """Writes qpos, ctrl and the model fields that the file has columns for."""
+        """Write qpos, ctrl and the model fields that the file has columns for."""
         write_robot(env, mask, self._command.index_select(0, env.world))
         poses = self._poses.index_select(0, env.world)
         for number, name in enumerate(env.index.objects):
@@ -251,7 +251,7 @@ class FromStartsFile:
 
 
 def write_starts(env: EnvView, path: str | Path) -> None:
-    """Writes how the worlds of an environment have just started, for ``reset=starts_file``.
+    """Write how the worlds of an environment have just started, for ``reset=starts_file``.
 
     Masses, friction and gains have columns if they differ from the model's in some world.
 
