@@ -57,7 +57,7 @@ def fake_demonstrations(
             after(seed, values)
         return Played(
             seed=seed,
-            steps=cast(StepRecorder, SimpleNamespace(values=values, layout=LAYOUT)),
+            steps=cast(StepRecorder, SimpleNamespace(values=values, schema=LAYOUT)),
             failed=failed,
             retries=np.array([world % 3 for world in range(worlds)], dtype=np.int32),
         )

@@ -73,7 +73,7 @@ def two_seeds(
     folder = tmp_path_factory.mktemp("batch")
     context = new_context("sim=native", "nworld=7", "gate.batch.seeds=2", TIGHT)
     lines: list[str] = []
-    context.say = lines.append
+    context.print_line = lines.append
     return folder, play(context, folder), lines
 
 

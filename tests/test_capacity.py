@@ -221,10 +221,10 @@ def test_nothing_is_sized_from_motion_that_lost_physics(bits: Overflow, fix: str
     lost = peaks(overflow=np.array([0, int(bits), 0, int(bits)]))
     with pytest.raises(FaultError) as caught:
         require_physics(
-            "the scripted task", workload(peaks=lost, sizes=BatchSizes(nconmax=128, njmax=768))
+            "the driven task", workload(peaks=lost, sizes=BatchSizes(nconmax=128, njmax=768))
         )
     says = str(caught.value)
-    assert says.startswith("batch=auto: what the scripted task needs cannot be measured: ")
+    assert says.startswith("batch=auto: what the driven task needs cannot be measured: ")
     assert "overflow in 2 of 4 worlds (1, 3) even with batch.nconmax=128 batch.njmax=768. " in says
     assert says.endswith(fix)
     assert "\n" not in says
@@ -318,7 +318,7 @@ def too_small(new_context: NewContext) -> tuple[RunContext, GateResult, list[str
     said: list[str] = []
     few = ("nworld=2", "gate.capacity.random_steps=20", *at_double_speed())
     context = new_context("sim=mjwarp", "sim.device=cpu", "batch.njmax=100", *few)
-    context.say = said.append
+    context.print_line = said.append
     (result,) = run_capacity(context)
     return context, result, said
 
@@ -330,8 +330,8 @@ def test_too_small_is_found_and_the_printed_override_cures_it(
     context, result, said = too_small
     assert result.status is Status.failed
     assert result.reason.startswith("njmax overflow in 2 of 2 worlds (0, 1); room for 100")
-    task = next(line for line in said if line.startswith("scripted task: "))
-    overrides = task.removeprefix("scripted task: ").split()
+    task = next(line for line in said if line.startswith("driven task: "))
+    overrides = task.removeprefix("driven task: ").split()
     assert f"batch.njmax={result.metrics['recommended.njmax']}" in overrides
     cured = new_context(
         "sim=mjwarp",
@@ -434,7 +434,7 @@ def test_native_says_what_it_cannot_know(new_context: NewContext) -> None:
     context = new_context(
         "sim=native", "nworld=2", "gate.capacity.random_steps=5", *at_double_speed()
     )
-    context.say = said.append
+    context.print_line = said.append
     (result,) = run_capacity(context)
     assert result.status is Status.passed
     assert "native MuJoCo has no fixed buffers" in result.notes["rerun"]
@@ -557,7 +557,7 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
 ) -> None:
     said: list[str] = []
     context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
-    context.say = said.append
+    context.print_line = said.append
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([0, int(Overflow.NEFC)])))
     monkeypatch.setattr(RunContext, "play_task", lambda *_: workload())
 
@@ -659,7 +659,7 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
     context = new_context("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
     with pytest.raises(
         FaultError,
-        match="what the scripted task needs cannot be measured: NEFC overflow in 1 of 2 worlds",
+        match="what the driven task needs cannot be measured: NEFC overflow in 1 of 2 worlds",
     ):
         context.sizes  # noqa: B018
     assert context.artifacts.sizes is None
@@ -699,12 +699,12 @@ def test_batch_measures_where_capacity_does_not_run(new_context: NewContext) -> 
         "gates=[batch]",
         *at_double_speed(),
     )
-    context.say = said.append
+    context.print_line = said.append
     (result,) = run_batch(context)
     assert result.status is Status.passed, result.reason
     assert (
         result.notes["sizes"]
-        == "batch.nconmax=40 batch.njmax=184 batch.nccdmax=8 (batch=auto: the scripted task in 1"
+        == "batch.nconmax=40 batch.njmax=184 batch.nccdmax=8 (batch=auto: the driven task in 1"
         " worlds, times 1.25)"
     )
     assert said == [result.notes["sizes"]]

@@ -1,4 +1,4 @@
-"""Demonstrations of the scripted expert: what a step holds, which episodes count, and that nothing
+"""Demonstrations of the expert: what a step holds, which episodes count, and that nothing
 is lost or there twice.
 """
 
@@ -668,6 +668,35 @@ def test_a_full_disk_is_one_line(
 
 
 @pytest.mark.full
+def test_a_full_device_is_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise RuntimeError("CUDA out of memory. Tried to allocate 9 GiB")
+
+    monkeypatch.setattr(collection, "play_demonstrations", full)
+    assert collect("nworld=2", "job.episodes=2") == 1
+    err = capsys.readouterr().err.strip()
+    assert err.startswith("mjstack: out of memory (")
+    assert len(err.splitlines()) == 1
+    assert report_of(folder)["status"] == "fail"
+
+
+@pytest.mark.full
+def test_brackets_in_names_are_printed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(
+        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
+    )
+    own = ("robot.title='Arm [/b]'", "job.folder='outputs/[b]'")
+    assert collect("nworld=2", "job.episodes=2", *own) == 0
+    out = capsys.readouterr().out
+    assert "Arm [/b], " in out
+    assert "dataset: outputs/[b]/dataset, described in " in out
+
+
+@pytest.mark.full
 def test_a_kill_in_the_middle_of_a_batch(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Killed when the batch's first data file is committed and an episode of the second one is on
     the disk.
@@ -765,7 +794,7 @@ def test_the_buffer_bounds_the_worlds() -> None:
 
 def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     values = torch.randn(5, 7, 4)
-    steps = cast(StepRecorder, SimpleNamespace(values=values, layout={"a": 3, "b": 1}))
+    steps = cast(StepRecorder, SimpleNamespace(values=values, schema={"a": 3, "b": 1}))
     none = np.zeros(7, dtype=np.int32)
     played = Played(seed=0, steps=steps, failed=none, retries=none)
     for size in (1, 2 * 5 * 4 * 4, 10**6):  # one world, two and all at once

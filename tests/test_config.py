@@ -266,6 +266,10 @@ BAD = [
     (["view=perhaps"], "view"),
     (["reward.lift.wait=1"], "wait"),
     (
+        ["scene.objects.red.fixed=true", "scene.objects.blue.fixed=true"],
+        "expected at least one object that is not fixed",
+    ),
+    (
         ["controller=closed_loop", "controller.phases.above_blue.observe=false"],
         "above_blue.observe=false",
     ),

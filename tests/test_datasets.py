@@ -246,6 +246,14 @@ def test_what_is_read_is_what_was_added(tmp_path: Path) -> None:
         stored.frames("acton")
 
 
+@pytest.mark.full
+def test_a_dataset_without_an_episode_has_no_frames(tmp_path: Path) -> None:
+    write(tmp_path, range(0))
+    stored = read_dataset(tmp_path)
+    assert stored.frames("action").shape == (0, 2)
+    assert stored.frames("next.done").dtype == bool
+
+
 def test_statistics_are_those_of_all_frames(tmp_path: Path) -> None:
     """Episodes of unequal length, over several commits and a resumed writer; a column far from zero
     that hardly moves.

@@ -85,7 +85,7 @@ PATHS: dict[str, list[str] | None] = {
     "mdp/starts/placement.py": ["Placement.choose"],
     "tasks/check.py": ["EpisodeCheck.update"],
     "tasks/view.py": [
-        *(f"TaskView.{n}" for n in ("step", "judged", "forget")),
+        *(f"TaskView.{n}" for n in ("step", "judged", "clear")),
         *(
             f"Step.{n}"
             for n in (

@@ -431,6 +431,14 @@ def test_regions_stay_inside_what_is_reached() -> None:
 
 
 @pytest.mark.full
+def test_a_region_without_a_point_of_the_map_has_no_tilt() -> None:
+    region = "scene.random_xy=[0.001,0.001]"
+    cfg = mjstack.load_config(["job=reachability", "job.step=0.07", region])
+    everywhere = level(cfg, lambda x, y: x < 9.0)
+    assert math.isnan(find_region(cfg, [everywhere], "red").tilt)
+
+
+@pytest.mark.full
 def test_levels_are_the_controllers(robot: str) -> None:
     cfg = mjstack.load_config([f"robot={robot}", "job=reachability"])
     h = cfg.robot.approach_height + 0.022

@@ -171,8 +171,8 @@ def test_trajectory_holds_the_episode(
         v = context.index.object_qvel[0]
         speed = np.linalg.norm(held["qvel"][:, v : v + 3], axis=1)
         speed += np.sqrt(3.0) * 0.022 * np.linalg.norm(held["qvel"][:, v + 3 : v + 6], axis=1)
-        assert held["cube_speed_m_per_s"][:, 0] == pytest.approx(speed, rel=1e-5, abs=1e-6)
-        low = held["cube_height_m"]
+        assert held["object_speed_m_per_s"][:, 0] == pytest.approx(speed, rel=1e-5, abs=1e-6)
+        low = held["object_height_m"]
         assert abs(low[-1, 1]) < 0.001  # blue on the table,
         assert low[-1, 0] == pytest.approx(0.044, abs=0.001)  # red one cube above it
     sim.close()
@@ -210,7 +210,7 @@ def test_another_verdict_is_said(
     record.write(folder)
     status, report = replay(folder, "world=3")
     (gate,) = report["gates"]
-    differs = "NOT as recorded (red not carried): its cubes end 2 mm from where they did, "
+    differs = "NOT as recorded (red not carried): its objects end 2 mm from where they did, "
     assert gate["reason"].startswith("succeeded, ")
     assert gate["reason"].endswith(f"{differs}expected bit for bit there")
     assert gate["notes"]["recorded"] == "red not carried"
@@ -238,7 +238,7 @@ def test_another_verdict_is_said(
             [],
             False,
             (
-                "NOT as recorded (the same result): its cubes end 1e-06 mm from where they did,"
+                "NOT as recorded (the same result): its objects end 1e-06 mm from where they did,"
                 " expected"
             ),
         ),
@@ -248,7 +248,7 @@ def test_another_verdict_is_said(
             "cpu",
             ["mujoco"],
             True,
-            "as recorded, but its cubes end 1e-06 mm from where they did, and not all is as",
+            "as recorded, but its objects end 1e-06 mm from where they did, and not all is as",
         ),
         (
             0,
@@ -256,7 +256,7 @@ def test_another_verdict_is_said(
             "cuda:0",
             [],
             True,
-            "as recorded, but its cubes end 1e-06 mm from where they did, and runs on CUDA agree",
+            "as recorded, but its objects end 1e-06 mm from where they did, and runs on CUDA agree",
         ),
         (
             RULES["CARRY"],
@@ -272,7 +272,7 @@ def test_another_verdict_is_said(
             "cpu",
             [],
             False,
-            "NOT as recorded (red not carried): its cubes end 2 mm from where they did",
+            "NOT as recorded (red not carried): its objects end 2 mm from where they did",
         ),
         (
             RULES["CARRY"],
@@ -280,7 +280,7 @@ def test_another_verdict_is_said(
             "cuda:0",
             [],
             True,
-            "NOT as recorded (red not carried): its cubes end 2 mm",
+            "NOT as recorded (red not carried): its objects end 2 mm",
         ),
         (
             RULES["OVERFLOW"],
@@ -441,7 +441,7 @@ def test_what_the_start_does_not_show_is_found_at_the_end(
     folder = copy_of(from_file, tmp_path)
     _replace(folder / "starts_played.csv", "0.09", "0.1")
     status, report = replay(folder, "world=batch:1")
-    assert "; NOT as recorded (the same result): its cubes end " in report["gates"][0]["reason"]
+    assert "; NOT as recorded (the same result): its objects end " in report["gates"][0]["reason"]
     assert status == 1
 
 
@@ -545,7 +545,7 @@ def test_mjwarp_world_is_played_on_both_engines(
     ):
         assert "Warp" in str(ours["backend"])
         assert np.abs(ours["start_qpos"] - theirs["start_qpos"]).max() < 1e-6
-        assert np.abs(ours["cube_pos_m"][-1] - theirs["cube_pos_m"][-1]).max() < 0.002
+        assert np.abs(ours["object_pos_m"][-1] - theirs["object_pos_m"][-1]).max() < 0.002
 
 
 @pytest.mark.gpu

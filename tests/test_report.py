@@ -7,6 +7,7 @@ import math
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mjstack.files import write_atomic
@@ -152,3 +153,13 @@ def test_a_failed_picture_is_a_line_and_leaves_no_part(tmp_path: Path) -> None:
     assert not path.exists()
     assert safely_write(path, Path.write_text, "all") == ""
     assert path.read_text() == "all"
+
+
+@pytest.mark.full
+def test_a_gate_may_return_numpy_scalars_and_a_median_alone(tmp_path: Path) -> None:
+    own = gate(Status.passed, small=np.float32(0.5), count=np.int64(3), good=np.bool_(True))
+    own.metrics["gap_m.median"] = 0.25
+    write_report(Report(folder=tmp_path, gates=[own]))
+    (held,) = strict_json(tmp_path / "report.json")["gates"]
+    assert held["metrics"] == {"small": 0.5, "count": 3, "good": True, "gap_m.median": 0.25}
+    assert "| gap m: median | 0.25 |" in (tmp_path / "report.md").read_text()

@@ -8,15 +8,19 @@ import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from mjstack import load_config
 from mjstack.config.fingerprint import config_content
-from mjstack.config.schema import Config
+from mjstack.config.schema import Backend, Config
 from mjstack.drivers.open_loop import OpenLoopPlanner
+from mjstack.episodes.context import RunContext
+from mjstack.episodes.rollout import rollout
 from mjstack.errors import ConfigError, MjstackError, SourceError, UnknownName
 from mjstack.kinematics.reach import PointReach
 from mjstack.robots import robot_spec
@@ -201,3 +205,23 @@ def test_mink_plans_an_arm_with_a_slide() -> None:
             distance, abs=1e-9
         )
         assert abs(values["roll"]) < 1e-12
+
+
+@pytest.mark.full
+def test_bare_steps_command_the_robots_own_actuators(tmp_path: Path) -> None:
+    """The file has them in another order, and one more that is not the robot's."""
+    block = MJCF.partition("<actuator>")[2].partition("</actuator>")[0].strip()
+    lines = ['<motor name="fan" site="left_grasp"/>', *reversed(block.splitlines())]
+    context = RunContext(changed(tmp_path, block, "\n".join(lines)))
+    sim = context.simulation(1, Backend.native, "cpu")
+    env = context.start(sim, context.cfg.reset)
+    command = torch.arange(1.0, 7.0, dtype=sim.ctrl.dtype)
+    driver = SimpleNamespace(steps=1, command=lambda: command[None])
+    rollout(env, driver, physics=lambda: None)  # type: ignore[arg-type]
+    sim.close()
+    names = [context.model.actuator(i).name for i in range(context.model.nu)]
+    joints = context.cfg.robot.joints
+    assert dict(zip(names, sim.ctrl[0].tolist(), strict=True)) == {
+        "fan": 0.0,
+        **dict(zip(joints, command.tolist(), strict=True)),
+    }

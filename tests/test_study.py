@@ -8,6 +8,7 @@ import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -124,6 +125,15 @@ def test_without_a_base_there_is_a_report(tmp_path: Path, monkeypatch: pytest.Mo
     (only,) = report(tmp_path)["gates"]
     says = "the configured solver cannot be timed: RuntimeError: no room (test_study.py:"
     assert only["reason"].startswith(says)
+
+
+@pytest.mark.full
+def test_a_base_that_breaks_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = []
+    sim = SimpleNamespace(close=lambda: closed.append(True))
+    monkeypatch.setattr(study, "_simulation", lambda context: sim)
+    assert run_study(configure(keep=("base",)), tmp_path).exit_code == 1
+    assert closed == [True]
 
 
 @pytest.mark.full

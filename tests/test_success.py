@@ -212,7 +212,7 @@ def test_seeds_add_up_and_the_rate_decides(
     """The threshold is on the rate itself; what fails is named all the same."""
     context = hasty("gates=[batch,success]", "gate.success.seeds=2", "gate.success.cell_episodes=2")
     lines: list[str] = []
-    context.say = lines.append
+    context.print_line = lines.append
     result = play(context, tmp_path)
     assert result.status is Status.failed
     failing = "4 of 4 episodes (0:0, 0:1, 1:0, 1:1) failed: "

@@ -340,6 +340,16 @@ def test_broken_episode_does_not_verify_the_task(
 
 
 @pytest.mark.full
+def test_a_task_without_a_check_is_not_asked_for_batch(
+    new_context: Callable[..., RunContext],
+) -> None:
+    result, _ = run_throughput(new_context("task=reach", "sim=native", "nworld=1", *SHORT))
+    assert result.status is Status.passed
+    assert "episode: not measured: task reach has no check" in result.reason
+    assert "verified" not in result.reason
+
+
+@pytest.mark.full
 def test_no_time_for_an_episode_is_said(new_context: Callable[..., RunContext]) -> None:
     result, _ = run_throughput(
         new_context("sim=native", "nworld=2", *SHORT, "gate.throughput.cpu_max_seconds=1e-4")
@@ -385,14 +395,14 @@ def test_worlds_with_an_empty_grasp_are_counted(new_context: Callable[..., RunCo
     state.qpos[[1, 4], red + 1] -= 0.1
     context.artifacts.carry_start = state
     result, _ = run_throughput(context)
-    assert result.metrics["physics.worlds_with_cube_in_hand"] == 3
+    assert result.metrics["physics.worlds_with_object_in_hand"] == 3
     assert speeds(result, "physics")
     assert "(2 of them with an empty grasp)" in result.reason
     state.qpos[0, red + 1] -= 0.1
     result, _ = run_throughput(context)
     assert result.status is Status.failed
     assert (
-        "physics: no figure: only 2 of 5 worlds have the cube in hand as lift_red begins"
+        "physics: no figure: only 2 of 5 worlds have the object in hand as lift_red begins"
         in result.reason
     )
     assert speeds(result, "physics") == []

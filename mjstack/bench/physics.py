@@ -24,7 +24,7 @@ from mjstack.errors import MjstackError
 from mjstack.mdp.geometry import objects_in_hand
 from mjstack.sim import Simulation, resolve_device
 
-BARE = "mujoco_warp.step as it is"
+BARE = "bare mujoco_warp.step"
 
 
 class HeldPhysics:
@@ -91,10 +91,10 @@ def measure_physics(
     held = HeldPhysics(sim, carry_start(context, sim), context.cfg.timing.decimation)
     full = _in_hand(context, sim)
     if full is not None:
-        out.facts["worlds_with_cube_in_hand"] = full
+        out.facts["worlds_with_object_in_hand"] = full
         if 2 * full < sim.nworld:
             where = f"as {t.from_phase} begins (gate.throughput.from_phase)"
-            out.problem = f"only {full} of {sim.nworld} worlds have the cube in hand {where}"
+            out.problem = f"only {full} of {sim.nworld} worlds have the object in hand {where}"
             return out
 
     # The repetitions
@@ -103,7 +103,7 @@ def measure_physics(
     times = []
     for repetition in range(repetitions):
         times.append(held.play(steps, meter))
-        context.tell("physics, repetitions", repetition + 1, repetitions)
+        context.report_progress("physics, repetitions", repetition + 1, repetitions)
 
     # The result
     graph = sim.graph_of(held.decimation)
@@ -221,7 +221,7 @@ def measure_arrangements(
                 raise MjstackError(
                     f"{name}: physics was lost, and a figure would be void. Run gates=[capacity]."
                 )
-        context.tell("repetitions", repetition, repetitions)
+        context.report_progress("repetitions", repetition, repetitions)
     sim.close()
     return times
 

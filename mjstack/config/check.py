@@ -39,6 +39,13 @@ def validate(cfg: Config) -> None:
         )
     _replay(cfg)
     _robot(cfg)
+    needs_free = cfg.task.check is not None or any(map(places_objects, cfg.reset.values()))
+    _refuse(
+        needs_free and not cfg.scene.free,
+        "scene.objects",
+        list(cfg.scene.objects),
+        "at least one object that is not fixed, for the check and for random starts",
+    )
     _scene(cfg.scene)
     _phases(cfg)
     _gates(cfg)
@@ -185,6 +192,8 @@ def _phases(cfg: Config) -> None:
         controller.step_iterations,
         "at least 4 with a posture_gain or an approach_gain",
     )
+
+    # Each phase
     phases = controller.phases
     names = list(phases)
     closed_loop = controller.name == "closed_loop" or "success" in cfg.gates
@@ -233,6 +242,8 @@ def _phases(cfg: Config) -> None:
             phase.seconds,
             f"a multiple of the step, {cfg.timing.step_dt:g} s",
         )
+
+    # The first one
     for name in names[:1]:
         _refuse(
             phases[name].anchor is None, "controller.phases", name, "a first phase with an anchor"

@@ -49,7 +49,7 @@ class StoredDataset:
         features = self.info["features"]
         if name not in features:
             raise UnknownName("feature", name, features)
-        parts = []
+        parts = [np.empty(0, features[name]["dtype"])]
         for shard in range(self.info["mjstack"]["shards"]):
             column = _read_table(lerobot.shard_path(self.folder, lerobot.DATA, shard), [name])[name]
             values = column.combine_chunks()

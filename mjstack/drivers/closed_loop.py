@@ -65,6 +65,8 @@ class ClosedLoopDriver:
         cfg = env.cfg
         device = env.device
         n = env.nworld
+
+        # The environment
         if list(cfg.action.values()) != list(cfg.controller.action.values()):
             expected = "absolute joint commands, which the expert gives"
             raise ArgumentError(
@@ -77,6 +79,8 @@ class ClosedLoopDriver:
                 "worlds at their start",
                 "Call env.reset() before",
             )
+
+        # Plan and inverse kinematics
         self._env = env
         self._cfg = cfg
         self.phases = build_phases(cfg)
@@ -104,6 +108,7 @@ class ClosedLoopDriver:
         )
         self._home_grip = robot(env).home[self._n_arm :].float()
 
+        # Buffers
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros((n, *shape), dtype=dtype, device=device)
 

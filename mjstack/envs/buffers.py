@@ -196,7 +196,7 @@ def play_workload(
     return done
 
 
-def describe_lost(run: Workload) -> tuple[str, str]:
+def describe_run_loss(run: Workload) -> tuple[str, str]:
     """The physics that a run lost although there was room to spare, and what to do; both empty if
     it lost none.
     """
@@ -210,13 +210,13 @@ def require_physics(what: str, run: Workload) -> None:
     """Refuse to size anything from motion that lost physics.
 
     Args:
-        what: What was run, such as ``the scripted task``.
+        what: What was run, such as ``the driven task``.
         run: The run.
 
     Raises:
         FaultError: A world lost physics; names the worlds and what to do.
     """
-    loss, fix = describe_lost(run)
+    loss, fix = describe_run_loss(run)
     if loss:
         raise FaultError(f"batch=auto: what {what} needs cannot be measured: {loss}", fix)
 

@@ -45,7 +45,7 @@ from mjstack.sim import (
 from mjstack.sim.sizes import apply_configured
 from mjstack.tasks.check import EpisodeCheck, make_check
 
-Say = Callable[[str], None]
+TextHook = Callable[[str], None]
 AnyGate = TypeVar("AnyGate", bound=Callable)
 
 
@@ -133,7 +133,7 @@ class RunContext:
         stage: Scene and plan; by default those of the configuration.
         folder: Where the run's files go, or None for none.
         overrides: The command line of the run.
-        say: Prints a line.
+        print_line: Prints a line.
         begin: Told the name of each part of the run as it begins.
         record: Gets each result as soon as there is one.
         advance: Told about progress.
@@ -145,8 +145,8 @@ class RunContext:
     stage: Stage = None  # type: ignore[assignment]
     folder: Path | None = None
     overrides: Sequence[str] = ()
-    say: Say = lambda line: None
-    begin: Say = lambda name: None
+    print_line: TextHook = lambda line: None
+    begin: TextHook = lambda name: None
     record: Callable[[GateResult], None] = lambda result: None
     advance: Advance | None = None
     on_step: StepHook | None = None
@@ -200,7 +200,7 @@ class RunContext:
         episode = self.play(sim, NOMINAL, [*shown, world, snapshots])
         return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)
 
-    def tell(self, what: str, done: int, total: int) -> None:
+    def report_progress(self, what: str, done: int, total: int) -> None:
         """Report progress, if anyone listens."""
         if self.advance is not None:
             self.advance(what, done, total)
@@ -241,7 +241,7 @@ class RunContext:
 
             return ClosedLoopDriver(env, self.planner.nominal)
         sources = source_xy(env).double().cpu().numpy()
-        planned = partial(self.tell, "planning", total=sim.nworld)
+        planned = partial(self.report_progress, "planning", total=sim.nworld)
         trajectory = self.planner.plan(sources, planned).to(sim.device, sim.ctrl.dtype)
         return OpenLoopDriver(trajectory, self.planner.phases)
 
@@ -311,14 +311,14 @@ class RunContext:
         found = self.artifacts.sizes
         if found is None:
             task = self.play_task(self.cfg.reset)
-            require_physics("the scripted task", task)
+            require_physics("the driven task", task)
             margin = self.cfg.gate.capacity.margin
             source = (
-                f"batch=auto: the scripted task in {self.measuring_nworld} worlds, times {margin:g}"
+                f"batch=auto: the driven task in {self.measuring_nworld} worlds, times {margin:g}"
             )
             found = self.artifacts.sizes = recommend_sizes(task.peaks, margin, source)
             sizes = apply_configured(self.cfg, found)
-            self.say(f"{sizes.as_overrides()} ({found.source})")
+            self.print_line(f"{sizes.as_overrides()} ({found.source})")
         return apply_configured(self.cfg, found)
 
     @property

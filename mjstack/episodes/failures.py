@@ -30,7 +30,7 @@ _TEXTS = (  # of each sign
     "no sign before the result",
     "physics lost",
     "grasp empty, and not tried again",
-    "held cube lost its load",
+    "held object lost its load",
     "not in place when let go",
     "left its place",
 )
@@ -47,17 +47,17 @@ class FailureMonitor(Observer):
     These are signs:
 
     - PHYSICS: the state is not finite, or a buffer overflowed.
-    - EMPTY: a phase that grasps is over, both jaws did not press on its cube in its last step, and
-      the world goes on.
+    - EMPTY: a phase that grasps is over, both jaws did not press on its object in its last step,
+      and the world goes on.
     - DROPPED: between that phase and the next opening of the gripper, both jaws have not pressed on
-      the cube for three steps.
-    - MISSED: a cube's release, the first phase after the last one that carries it, is over, and the
-      cube is not where it belongs. Cubes that no phase carries have none.
-    - LEFT: later, a cube that was where it belongs is so no more. That may be in a phase of the
-      other cube.
+      the object for three steps.
+    - MISSED: an object's release, the first phase after the last one that carries it, is over, and
+      the object is not where it belongs. Objects that no phase carries have none.
+    - LEFT: later, an object that was where it belongs is so no more. That may be in a phase of
+      another object.
 
     A grasp that is tried again is no sign. A sign need not lead to failure, nor has every failure
-    one: cubes that are in place but move break their rule alone.
+    one: objects that are in place but move break their rule alone.
 
     Attributes:
         sign: Number of the `Sign`, shape ``(nworld,)``, int64.
@@ -137,6 +137,6 @@ class FailureMonitor(Observer):
         self._now += 1
 
 
-def _of(table: Tensor, cube: Tensor) -> Tensor:
+def _of(table: Tensor, column: Tensor) -> Tensor:
     """Each world's column, shape ``(nworld,)``; the first one where there is none (-1)."""
-    return table.gather(1, cube.clamp(min=0)[:, None])[:, 0]
+    return table.gather(1, column.clamp(min=0)[:, None])[:, 0]

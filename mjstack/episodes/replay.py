@@ -107,9 +107,9 @@ class _Trace(Observer):
             "qpos": sim.qpos.double(),
             "qvel": sim.qvel.double(),
             "ctrl": sim.ctrl.double(),
-            "cube_pos_m": objects.pos,
-            "cube_speed_m_per_s": objects.speed,
-            "cube_height_m": objects.height,
+            "object_pos_m": objects.pos,
+            "object_speed_m_per_s": objects.speed,
+            "object_height_m": objects.height,
             **self._check.trace(self._task.step()),
         }
         for name, value in values.items():

@@ -87,21 +87,23 @@ def rollout(
         steps: Number of control steps; the driver's if None.
         advance: Told about progress.
         label: Name of the steps in the progress.
-        physics: Replaces the environment's step: the driver's command goes to the actuators as it
-            is, and this advances the physics by one control step. It is not captured here.
+        physics: Replaces the environment's step: the driver's command goes to the actuators
+            unchanged, and this advances the physics by one control step. It is not captured here.
     """
     sim = env.sim
+    columns = env.index.on(sim.device, sim.ctrl.dtype).ctrl
     steps = driver.steps if steps is None else steps
     for observer in observers:
         observer.start(env, driver)
 
+    # A step, and its graph
     def work() -> None:
         command = driver.command()
         if physics is None:
             env.action_manager.process(command)
             env.advance()
         else:
-            sim.ctrl.copy_(command)
+            columns.write(sim.ctrl, command)
             physics()
         for observer in observers:
             observer.update()
@@ -121,6 +123,7 @@ def rollout(
 
     before = graph_seconds()
 
+    # The episode
     sim.synchronize()
     began = time.perf_counter()
     for step in range(steps):
@@ -136,6 +139,7 @@ def rollout(
     for observer in reversed(observers):  # an energy meter, say, before the check computes
         observer.finish()
 
+    # Its time
     warm_up, capture = (
         now if now != then else 0.0 for now, then in zip(graph_seconds(), before, strict=True)
     )

@@ -35,6 +35,7 @@ def play_seeds(
         circumstances: Whether starts and signs of failure are recorded too.
         observers: More observers, by seed.
     """
+    # The tally, and the worlds
     cfg = context.cfg
     folder = context.folder
     name = SUCCESS_FAILING if gate != "batch" and "batch" in cfg.gates else FAILING
@@ -55,6 +56,8 @@ def play_seeds(
             else "native MuJoCo has no fixed buffers"
         ),
     }
+
+    # Seed after seed
     last = cfg.seed + count - 1
     try:
         for seed in range(cfg.seed, last + 1):
@@ -84,7 +87,7 @@ def play_seeds(
                 break
             _write(record, tally)
             if count > 1:
-                context.say(
+                context.print_line(
                     f"{gate}, seed {seed}: {int(record.succeeded.sum())} of {cfg.nworld} worlds"
                     f" succeeded, {tally.good} of {tally.episodes} so far"
                 )

@@ -1,4 +1,4 @@
-"""Gate *baseline*: one native world stacks the cubes."""
+"""Gate *baseline*: one native world does the task."""
 
 from mjstack.episodes.context import RunContext, judge_one, needs_episode
 from mjstack.report.record import GateResult
@@ -14,7 +14,7 @@ def run_baseline(context: RunContext) -> list[GateResult]:
     timing = episode.timing
     status, reason, metrics = judge_one(context, episode)
     headline = context.check.headline(metrics)
-    context.say(f"{cfg.task.name} check: {headline}")
+    context.print_line(f"{cfg.task.name} check: {headline}")
     metrics |= {
         "episode_s": timing.seconds,
         "world_steps_per_s": timing.steps * cfg.timing.decimation / timing.seconds,

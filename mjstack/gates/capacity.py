@@ -12,7 +12,7 @@ from mjstack.config.schema import Config
 from mjstack.envs.buffers import (
     Peaks,
     Workload,
-    describe_lost,
+    describe_run_loss,
     join_peaks,
     play_workload,
     random_actions,
@@ -77,7 +77,7 @@ def run_capacity(context: RunContext) -> list[GateResult]:
     task = _measure(
         context,
         result,
-        title="scripted task",
+        title="driven task",
         prefix="recommended",
         configured=resolve_sizes(cfg),
         task=partial(context.play_task, cfg.reset),
@@ -156,7 +156,7 @@ def _measure(
     peaks = reduce(join_peaks, (run.peaks for run in runs.values()))
     how = f"batch=auto: gate capacity, {context.measuring_nworld} worlds, times {margin:g}"
     wanted = recommend_sizes(peaks, margin, how if cfg.batch.auto else "gate capacity")
-    losses = [describe_lost(run) for run in runs.values() if run.sizes]
+    losses = [describe_run_loss(run) for run in runs.values() if run.sizes]
     group = _Group(
         title=title,
         prefix=prefix,
@@ -251,7 +251,7 @@ def _report(context: RunContext, group: _Group, result: GateResult) -> None:
             " (contacts alone: native MuJoCo does not count the collision pairs that share their"
             " pool)"
         )
-    context.say(line)
+    context.print_line(line)
     result.details.append(line)
     if group.lost:
         return

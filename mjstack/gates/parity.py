@@ -1,6 +1,7 @@
 """Gate *parity*: MJWarp against native MuJoCo, one world."""
 
 import math
+from contextlib import closing
 
 import torch
 
@@ -17,8 +18,13 @@ from mjstack.sim import Simulation, describe_overflow
 @needs_episode
 def run_parity(context: RunContext) -> list[GateResult]:
     """Compare steps from equal states, the options of each backend, and the whole task."""
+    with closing(context.parity_simulation()) as mjwarp:
+        return [_compare(context, mjwarp)]
+
+
+def _compare(context: RunContext, mjwarp: Simulation) -> GateResult:
+    """The result of the gate, measured in one MJWarp world."""
     cfg = context.cfg
-    mjwarp = context.parity_simulation()
     result = GateResult(
         name="parity",
         status=Status.passed,
@@ -52,15 +58,14 @@ def run_parity(context: RunContext) -> list[GateResult]:
     problems += _compare_ends(context, world, result)
 
     headline = context.check.headline(judged)
-    context.say(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
+    context.print_line(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
     context.artifacts.shown = ("parity world", world)
-    mjwarp.close()
     ends = [f"final.{name}.position_m" for name in context.index.objects]
     apart = max((result.metrics[end] for end in ends), default=0.0)
     good = f"{headline}; objects end at most {1e3 * apart:.2f} mm from native's"
     result.reason = "; ".join(problems) or good
     result.status = Status.failed if problems else Status.passed
-    return [result]
+    return result
 
 
 def _compare_states(context: RunContext, mjwarp: Simulation, result: GateResult) -> list[str]:

@@ -82,7 +82,7 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
     verified = batch is not None and batch.status is Status.passed
     verified |= bool(episode.samples) and not episode.problem
     result.reason = "; ".join(f"{key}: {_describe(one, on_cuda)}" for key, one in found.items())
-    if not verified:
+    if not verified and not lacks_episode(cfg):
         result.reason += " (the task was not verified in this run: add batch to gates)"
     for one in found.values():
         result.metrics |= one.metrics()

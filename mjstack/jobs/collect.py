@@ -1,5 +1,5 @@
-"""Job *collect*: demonstrations of the scripted expert as a dataset, batch by batch, until as many
-as asked for are there.
+"""Job *collect*: demonstrations of the expert as a dataset, batch by batch, until as many as
+asked for are there.
 """
 
 import json
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import cast
 
 import torch
+from rich.markup import escape
 
 from mjstack.config.fingerprint import config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
@@ -89,7 +90,8 @@ def run_collect(plan: CollectPlan, context: RunContext, folder: Path) -> None:
         result = collection.result(status, problem, time.perf_counter() - began)
         if collection.committed:
             _write_table(context.cfg, plan, folder, result)
-            context.say(f"dataset: {collection.path}, described in {folder / 'dataset.md'}")
+            line = f"dataset: {collection.path}, described in {folder}/dataset.md"
+            context.print_line(escape(line))
         context.record(result)
 
     try:

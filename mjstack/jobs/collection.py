@@ -135,8 +135,8 @@ class Collection:
     in later calls too. So a pair of seed and world is one episode for any nworld.
 
     A batch's record is written beside the dataset before its first episode is added. If a call is
-    stopped in between, the next one plays the whole batch again and adds the missing episodes. What
-    was committed stays as it is. On CUDA two plays of a world agree only nearly: the first play
+    stopped in between, the next one plays the whole batch again and adds the missing episodes.
+    Committed ones do not change. On CUDA two plays of a world agree only nearly: the first play
     counts in the success rate, and every episode has the result of the play that recorded it.
 
     Attributes:
@@ -217,7 +217,7 @@ class Collection:
                 batch.keep = min(batch.keep, batch.kept + len(usable))
             self._add(played, usable[: min(batch.keep - batch.kept, wanted)])
             del played.steps.values  # the device's memory, before the next batch takes as much
-            self._context.say(
+            self._context.print_line(
                 f"collect, seed {seed}: {batch.succeeded} of {worlds} worlds succeeded,"
                 f" {len(committed)} of {self._job.episodes} episodes there"
             )
@@ -251,7 +251,7 @@ class Collection:
         """Commit the episodes of some worlds, and record it."""
         for count, (world, arrays) in enumerate(played.episodes(worlds), 1):
             self._writer.add([self._episode(played, world, arrays)])
-            self._context.tell(f"episodes of seed {played.seed}", count, len(worlds))
+            self._context.report_progress(f"episodes of seed {played.seed}", count, len(worlds))
         self._writer.flush()
         self._record()
 

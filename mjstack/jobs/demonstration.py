@@ -1,5 +1,5 @@
-"""Demonstrations: one batch of scripted episodes with what was seen, done and earned in every step,
-and what a dataset of them holds.
+"""Demonstrations: one batch of the expert's episodes with what was seen, done and earned in every
+step, and what a dataset of them holds.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -54,11 +54,11 @@ class StepRecorder(Observer):
 
     Attributes:
         values: The steps, shape ``(steps, nworld, dim)``, float32.
-        layout: How many numbers of each kind there are, in order.
+        schema: How many numbers of each kind there are, in order.
     """
 
     values: torch.Tensor
-    layout: dict[str, int]
+    schema: dict[str, int]
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
@@ -66,8 +66,8 @@ class StepRecorder(Observer):
         joints = len(env.index.ctrl)
         dims = env.observation_manager.group_dims
         groups = {f"observation.{name}": dim for name, dim in dims.items()}
-        self.layout = {STATE: joints, **groups, ACTION: joints, REWARD: 1}
-        shape = (driver.steps, env.nworld, sum(self.layout.values()))
+        self.schema = {STATE: joints, **groups, ACTION: joints, REWARD: 1}
+        shape = (driver.steps, env.nworld, sum(self.schema.values()))
         self.values = torch.zeros(shape, device=env.device)
         self._robot = env.index.on(env.device, env.sim.qpos.dtype)
         seen = joints + sum(dims.values())
@@ -116,12 +116,12 @@ class Played:
         """Some worlds' steps on the host, by kind, each ``(steps, dim)``; copied in chunks."""
         values = self.steps.values
         size = max(1, _CHUNK_BYTES // (values[:, 0].numel() * values.element_size()))
-        ends = np.cumsum(list(self.steps.layout.values()))[:-1]
+        ends = np.cumsum(list(self.steps.schema.values()))[:-1]
         for first in range(0, len(worlds), size):
             chunk = torch.tensor(worlds[first : first + size], device=values.device)
             rows = values.index_select(1, chunk).transpose(0, 1).contiguous().cpu().numpy()
             for world, row in zip(worlds[first:], rows, strict=False):
-                yield world, dict(zip(self.steps.layout, np.split(row, ends, axis=1), strict=True))
+                yield world, dict(zip(self.steps.schema, np.split(row, ends, axis=1), strict=True))
 
 
 def play_demonstrations(context: RunContext, sim: Simulation, seed: int) -> Played:
@@ -154,11 +154,11 @@ def play_demonstrations(context: RunContext, sim: Simulation, seed: int) -> Play
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:
-    """Everything that episodes depend on, in JSON's types. A layout file counts by its content,
+    """Everything that episodes depend on, in JSON's types. A starts file counts by its content,
     wherever it is.
 
     Raises:
-        ConfigError: The layout file cannot be read.
+        ConfigError: The starts file cannot be read.
     """
     config = config_content(cfg)
     for key in _NO_MATTER:

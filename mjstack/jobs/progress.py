@@ -49,7 +49,7 @@ class ProgressBar:
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
-    def say(self, line: str) -> None:
+    def print_line(self, line: str) -> None:
         """Print a line above the bar."""
         self._progress.console.print(line, soft_wrap=True)
 
@@ -72,13 +72,13 @@ class ProgressBar:
         if self._progress.disable and done > 1 and now - self._spoke > 15.0:
             self._spoke = now
             left = (total - done) * (now - self._began) / done
-            self.say(f"{self._gate}: {unit} {done}/{total}, {rate}, {left:.0f} s left")
+            self.print_line(f"{self._gate}: {unit} {done}/{total}, {rate}, {left:.0f} s left")
 
     def finish(self, result: GateResult) -> None:
         """Print a gate's result."""
         self._progress.update(self._task, visible=False)
         color = STATUS_COLOR[result.status]
-        self.say(
+        self.print_line(
             f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s):"
             f" {escape(result.reason or 'ok')}"
         )

@@ -86,7 +86,7 @@ def check_reachability(cfg: Config) -> CheckedJob:
     find_levels(cfg)
     step = cast(ReachabilityJobCfg, cfg.job).step
     half = cfg.scene.table_half
-    points = math.prod(2 * int(half[k] / step) + 1 for k in (0, 1))
+    points = math.prod(2 * n + 1 for n in _counts(cfg))
     if points > _MOST_POINTS or step > min(half[:2]):
         least = math.sqrt(4.0 * half[0] * half[1] / _MOST_POINTS)
         expected = f"{least:.4f} to {min(half[:2]):g} m; this table would have {points} points"
@@ -145,9 +145,14 @@ def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
 def axes(cfg: Config) -> list[np.ndarray]:
     """The map's columns and rows: x and y [m] of points on the table, one in its middle."""
     step = cast(ReachabilityJobCfg, cfg.job).step
-    center, half = cfg.scene.table_center, cfg.scene.table_half
-    counts = [int(half[k] / step + 1e-9) for k in (0, 1)]
-    return [center[k] + step * np.arange(-n, n + 1) for k, n in enumerate(counts)]
+    center = cfg.scene.table_center
+    return [center[k] + step * np.arange(-n, n + 1) for k, n in enumerate(_counts(cfg))]
+
+
+def _counts(cfg: Config) -> list[int]:
+    """Points of the map on either side of the middle one, in x and y."""
+    step = cast(ReachabilityJobCfg, cfg.job).step
+    return [int(half / step + 1e-9) for half in cfg.scene.table_half[:2]]
 
 
 def map_level(context: RunContext, name: str, height: float, gripper: str) -> ReachLevel:
@@ -166,7 +171,7 @@ def map_level(context: RunContext, name: str, height: float, gripper: str) -> Re
         found = reach.solve_upright(points[part], tolerance)
         residual[part] = found.distance
         tilt[part] = np.where(found.distance <= tolerance, np.degrees(found.tilt), np.nan)
-        context.tell("points", min(first + _SHARE, len(points)), len(points))
+        context.report_progress("points", min(first + _SHARE, len(points)), len(points))
     return ReachLevel(
         name=name,
         height=height,
@@ -213,11 +218,12 @@ def find_region(cfg: Config, levels: list[ReachLevel], name: str) -> ObjectRegio
     best = (half_x * half_y).argmax()
     wide, deep = scene.random_xy
     inside = np.ix_(np.abs(y - place[1]) <= deep + 1e-9, np.abs(x - place[0]) <= wide + 1e-9)
+    tilts = levels[0].tilt[inside]
     return ObjectRegion(
         name=name,
         square=half_x[half_y >= half_x - 1e-9].max(initial=0.0),
         largest=(half_x[best], max(half_y[best], 0.0)),
-        tilt=levels[0].tilt[inside].max(initial=-math.inf),
+        tilt=tilts.max() if tilts.size else math.nan,
         reached=most_y(wide) >= deep - 1e-9,
     )
 

@@ -79,7 +79,7 @@ def _replay_all(plan: ReplayPlan, context: RunContext, folder: Path) -> None:
     write_atomic(folder / "replayed_config.yaml", OmegaConf.to_yaml(played))
     changes = _changes(plan.run.provenance, run_provenance(context))
     for line in changes:
-        context.say(escape(line))
+        context.print_line(escape(line))
     for number, (backend, _) in enumerate(plan.where):
         run_guarded(context, f"replay_{backend.value}", partial(_replay, plan, number, changes))
 
@@ -206,7 +206,7 @@ def _replay(
         context.artifacts.shown = (title, done.recorder)
     told = [*done.findings, *(_first_sign(monitor, done, context) for monitor in monitors)]
     for line in told:
-        context.say(escape(f"  {line}"))
+        context.print_line(escape(f"  {line}"))
     name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
     assert context.folder is not None
     write_npz(context.folder / name, done.arrays)
@@ -271,7 +271,7 @@ def _compare(
     if not exact:
         objects = [slice(a, a + 3) for a in context.index.object_qpos]
         apart = max(float(np.linalg.norm(ours[at] - theirs[at])) for at in objects)
-        ends = f"its cubes end {1e3 * apart:.3g} mm from where they did"
+        ends = f"its objects end {1e3 * apart:.3g} mm from where they did"
         if not reasons:
             ends += ", expected bit for bit there"
     why = "".join(f", and {reason}" for reason in reasons)

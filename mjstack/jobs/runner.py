@@ -22,8 +22,9 @@ from mjstack.config.functions import find_object
 from mjstack.config.schema import Config
 from mjstack.episodes.context import Artifacts, RunContext
 from mjstack.episodes.observers import StepHook
-from mjstack.errors import ConfigError, MjstackError
+from mjstack.errors import ConfigError
 from mjstack.files import write_atomic
+from mjstack.gates.runner import describe_error
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
 from mjstack.report.picture import require_video, save_scene, save_trajectories, save_video
 from mjstack.report.provenance import collect_provenance
@@ -106,7 +107,7 @@ class CheckedJob:
         # The work, and the pictures of its artifacts
         try:
             where = f"{escape(self.title)} -> {escape(str(folder))}"
-            console.print(f"[bold]{cfg.robot.title}[/], {where}")
+            console.print(f"[bold]{escape(cfg.robot.title)}[/], {where}")
             report.provenance = run_provenance(self.context)
             write_report(report)
             with ProgressBar(console) as bar:
@@ -114,7 +115,7 @@ class CheckedJob:
                     self.context,
                     folder=folder,
                     overrides=overrides,
-                    say=bar.say,
+                    print_line=bar.print_line,
                     begin=bar.start,
                     record=record,
                     advance=bar.advance,
@@ -135,10 +136,11 @@ class CheckedJob:
                 f"mjstack: {folder} cannot be written: {error.strerror}. Free space, or set"
                 " hydra.run.dir."
             )
-        except MjstackError as error:
+        except Exception as error:
             report.status = Status.failed
-            log.error("%s", error)
-            errors.print(f"mjstack: {error}")
+            problem = describe_error(error)
+            log.error("%s", problem)
+            errors.print(f"mjstack: {problem}")
         with contextlib.suppress(OSError):
             write_report(report)
         _print_summary(console, report)
@@ -179,7 +181,7 @@ def write_tables(
     """Replace ``name.csv``, ``name.md`` and, where ``draw`` is given, ``name.png`` of a run.
 
     Args:
-        context: The run. A picture that fails is said.
+        context: The run. A picture that fails is reported.
         name: Of the files.
         title: Heading of the text.
         table: Of the text.
@@ -194,7 +196,7 @@ def write_tables(
     picture = folder / f"{name}.png"
     if draw is not None:
         if problem := safely_write(picture, draw):
-            context.say(escape(problem))
+            context.print_line(escape(problem))
         else:
             context.artifacts.pictures.append(picture.name)
     write_atomic(folder / f"{name}.csv", csv)

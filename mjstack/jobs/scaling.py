@@ -72,7 +72,7 @@ def run_scaling(context: RunContext, folder: Path) -> None:
     ]
     for override in context.overrides:
         if override.lstrip("+~").partition("=")[0] in _UNUSED:
-            context.say(f"{escape(override)} is not used: each run of job=scaling sets it")
+            context.print_line(f"{escape(override)} is not used: each run of job=scaling sets it")
     _write(context, rows)
     left = _run_all(context, folder, rows)
 
@@ -81,12 +81,12 @@ def run_scaling(context: RunContext, folder: Path) -> None:
     for row in missing:
         context.record(_as_gate(row, left))
     if any(row["status"] not in (PASS, NOT_RUN) for row in rows):
-        context.say("job.retry=true repeats the runs that failed")
+        context.print_line("job.retry=true repeats the runs that failed")
     if missing:
         counts = f"{len(missing)} of {len(rows)} runs have not run ({escape(left)})"
-        context.say(f"incomplete: {counts}. The same command goes on with them.")
+        context.print_line(f"incomplete: {counts}. The same command goes on with them.")
     _write(context, rows, draw=True)
-    context.say(describe_crossover(rows))
+    context.print_line(describe_crossover(rows))
 
 
 def run_overrides(cfg: Config, overrides: Sequence[str], nworld: int, backend: str) -> list[str]:

@@ -6,6 +6,7 @@ It informs, and gates nothing.
 import statistics
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from enum import Enum
 from pathlib import Path
@@ -58,18 +59,19 @@ def run_study(context: RunContext, folder: Path) -> None:
     job = cast(StudyJobCfg, cfg.job)
     rows: list[Row] = []
     context.begin("base")
-    try:
-        # The configured solver's worlds are kept beside every variant, so that the repetitions
-        # of both are interleaved and start from one state.
-        sim = _simulation(context)
-        state = play_to_phase(context, sim)
-        base = HeldPhysics(sim, state, cfg.timing.decimation)
-        steps = steps_that_fit(job.steps, job.max_seconds, base.warm_up())
-    except Exception as error:  # nothing can be compared with it
-        reason = f"the configured solver cannot be timed: {describe_error(error)}"
-        context.record(GateResult(name="base", status=Status.failed, reason=reason))
-        return
-    try:
+    with ExitStack() as worlds:
+        try:
+            # The configured solver's worlds are kept beside every variant, so that the repetitions
+            # of both are interleaved and start from one state.
+            sim = _simulation(context)
+            worlds.callback(sim.close)
+            state = play_to_phase(context, sim)
+            base = HeldPhysics(sim, state, cfg.timing.decimation)
+            steps = steps_that_fit(job.steps, job.max_seconds, base.warm_up())
+        except Exception as error:  # nothing can be compared with it
+            reason = f"the configured solver cannot be timed: {describe_error(error)}"
+            context.record(GateResult(name="base", status=Status.failed, reason=reason))
+            return
         for name, solver in job.variants.items():
             context.begin(name)
             began = time.perf_counter()
@@ -79,8 +81,6 @@ def run_study(context: RunContext, folder: Path) -> None:
         measured = any(row["status"] == "pass" for row in rows)
         if measured:
             _write(context, rows, draw=True)
-    finally:
-        base.sim.close()
 
 
 def _guarded(
@@ -142,7 +142,7 @@ def _measure(context: RunContext, base: HeldPhysics, steps: int) -> Row:
                 times[one].append(1e3 * one.play(steps) / (steps * base.decimation))
                 if problem := describe_lost(one.lost):
                     raise MjstackError(f"no time: {problem} (of {sim.nworld}).")
-            context.tell("repetitions", repetition + 1, job.repetitions)
+            context.report_progress("repetitions", repetition + 1, job.repetitions)
     finally:
         sim.close()
     ratios = [a / b for a, b in zip(times[ours], times[base], strict=True)]

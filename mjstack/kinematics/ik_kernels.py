@@ -19,8 +19,8 @@ NAN = wp.constant(float("nan"))
 
 @wp.struct
 class Chain:
-    """The moving links from the world to the two sites. What does not move is folded into the
-    links' frames.
+    """The moving links from the world to the two sites. Parts that do not move are folded
+    into the links' frames.
 
     Links up to ``trunk`` carry both sites, from there to ``fork`` only the first one, from there to
     ``end`` only the second.

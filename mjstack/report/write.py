@@ -44,8 +44,10 @@ def write_report(report: Report) -> None:
         "gates": gates,
         "pictures": report.pictures,
     }
-    # JSON has no NaN: a number that is not finite becomes its name.
-    finite = json.loads(json.dumps(data), parse_constant=lambda name: str(float(name)))
+    # A gate may return NumPy scalars. JSON has no NaN: a number that is not finite becomes its
+    # name.
+    text = json.dumps(data, default=lambda value: value.item())
+    finite = json.loads(text, parse_constant=lambda name: str(float(name)))
     text = json.dumps(finite, indent=2) + "\n"
     write_atomic(report.folder / "report.json", text)
     write_atomic(report.folder / "report.md", to_markdown(report))
@@ -111,7 +113,8 @@ def _tables(gate: GateResult) -> list[Table]:
     metrics = dict(gate.metrics)
     thresholds = dict(gate.thresholds)
     tables = []
-    repeated = [name[:-7] for name in metrics if name.endswith(".median")]
+    groups = [name[:-7] for name in metrics if name.endswith(".median")]
+    repeated = [name for name in groups if all(f"{name}.{end}" in metrics for end in _SPREAD)]
     if repeated:
         rows = []
         for name in repeated:

@@ -53,6 +53,8 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
     scene = cfg.scene
     solver = cfg.solver
     jaw_bodies = cfg.robot.jaw_bodies
+
+    # Options and jaws
     option = spec.option
     option.timestep = cfg.timing.physics_dt
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -64,6 +66,8 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         for jaw in jaw_bodies:
             for geom in spec.body(jaw).geoms:
                 geom.condim = solver.gripper_condim
+
+    # Bodies
     world = spec.worldbody
     world.add_geom(
         name="floor",
@@ -85,6 +89,8 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         _add_box(spec, scene.box, table_top(scene))
     for name, thing in scene.objects.items():
         _add_object(world, name, thing, table_top(scene))
+
+    # Sensors
     pairs = [(jaw, name) for name in scene.objects for jaw in jaw_bodies]
     if scene.support_sensors:
         pairs += [(WORLD, name) for name in scene.objects]
@@ -99,6 +105,8 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
             refname=second,
             intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NETFORCE, 1],
         )
+
+    # Visuals
     if visuals:
         world.add_light(pos=[0.2, -0.6, 1.6], dir=[0.1, 0.4, -1.0], diffuse=[0.6, 0.6, 0.6])
         spec.visual.headlight.ambient = [0.35, 0.35, 0.35]

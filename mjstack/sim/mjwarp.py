@@ -72,6 +72,8 @@ class MjwarpSimulation(Simulation):
         self._placing = not PLACING_FIELDS.isdisjoint(names)
         name = self._device.name if self._device.is_cuda else "Warp's CPU device"
         self.description = f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}"
+
+        # The model and its data on the device
         with wp.ScopedDevice(self._device):
             try:
                 with warnings.catch_warnings():
@@ -87,6 +89,8 @@ class MjwarpSimulation(Simulation):
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
             self._can_rearrange = can_rearrange(model, self._m)
             self._usage = usage = Usage(model, nworld, self.device)
+
+        # Views of state, fields and counters
         for name in (
             *("qpos", "qvel", "act", "ctrl", "xpos", "xquat", "site_xpos", "geom_xpos"),
             *("qfrc_actuator", "sensordata"),

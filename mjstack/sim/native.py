@@ -92,6 +92,7 @@ class NativeSimulation(Simulation):
         )
         self._pool = ThreadPoolExecutor(nthread) if nthread > 1 else None
 
+        # The state
         # mj_getState's order: time, qpos, qvel, act, warm start, ctrl.
         m = self.model
         self._state = np.zeros((nworld, mujoco.mj_stateSize(m, _SPEC)))
@@ -102,6 +103,7 @@ class NativeSimulation(Simulation):
         self._initial = self._state[0].copy()
         mujoco.mj_getState(m, mujoco.MjData(m), self._initial, _SPEC)
 
+        # Derived arrays and counters
         self._poses = {
             "xpos": np.zeros((nworld, m.nbody, 3)),
             "xquat": np.zeros((nworld, m.nbody, 4)),
@@ -126,6 +128,8 @@ class NativeSimulation(Simulation):
         self._erased = torch.zeros((3, nworld), dtype=torch.int32).unbind(0)
         self._steps = np.zeros(nworld, dtype=np.int64)
         self.step_count = torch.from_numpy(self._steps)
+
+        # Model fields, and the threads
         self._fields = {
             name: np.repeat(np.asarray(getattr(m, name), dtype=float)[None], nworld, axis=0)
             for name in check_fields(fields)
@@ -220,7 +224,7 @@ class NativeSimulation(Simulation):
     ) -> list[int]:
         """The masked worlds that can be computed; the others' derived arrays become NaN.
 
-        A diverged world stays as it is: MuJoCo would spend every solver iteration on its NaN, and
+        A diverged world is left alone: MuJoCo would spend every solver iteration on its NaN, and
         gain nothing.
         """
         rows = self._rows(mask)

@@ -192,7 +192,7 @@ class Streak(AtLeast):
     def update(self, step: Step) -> None:
         """Extend or end the streaks."""
         if self._anew and step.view.phased:
-            step.view.forget(step.judged(self._clears))
+            step.view.clear(step.judged(self._clears))
         self.length.add_(1.0).mul_(self._counts(step))
         torch.maximum(self.best, self.length, out=self.best)
 

@@ -135,7 +135,7 @@ class TaskView:
         return torch.full(size, fill, dtype=torch.float32, device=self.env.device)
 
     def counter(self, size: int) -> Tensor:
-        """A buffer that `forget` clears, shape ``(nworld, size)``, float32."""
+        """A buffer that `clear` clears, shape ``(nworld, size)``, float32."""
         for place, (block, used) in enumerate(self._blocks):
             if block.shape[2] == size and used < _ROWS:
                 self._blocks[place] = (block, used + 1)
@@ -144,7 +144,7 @@ class TaskView:
         self._blocks.append((torch.zeros(shape, dtype=torch.float32, device=self.env.device), 0))
         return self.counter(size)
 
-    def forget(self, mask: Tensor) -> None:
+    def clear(self, mask: Tensor) -> None:
         """Clear all counters of the masked columns, shape ``(nworld, size)``."""
         for block, _ in self._blocks:
             if block.shape[2] == mask.shape[1]:

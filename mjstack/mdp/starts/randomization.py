@@ -1,9 +1,9 @@
 """Domain randomisation of the model: masses, friction and servo gains, with all that follows from
 each.
 
-Each class writes values into the model fields and reads them back. What follows from a value is
-computed in float64 from the value as the field holds it, so that writing what was read changes
-nothing.
+Each class writes values into the model fields and reads them back. Everything that follows from a
+value is computed in float64 from the value that the field holds, so that writing what was read
+changes nothing.
 """
 
 import math
