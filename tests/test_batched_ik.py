@@ -26,6 +26,7 @@ from mjstack.sim.warp_setup import torch_stream_scope
 
 Stage = Callable[[str], RunContext]
 
+MINK = 300  # targets that mink solves, one after the other
 TOLERANCE = 0.0005  # m, as the scripted controller's
 
 
@@ -113,11 +114,11 @@ def test_eight_iterations_reach_almost_every_target_from_home(
 
 @dataclass
 class Compared:
-    """What mink makes of 1,000 targets, from home and drawn there.
+    """What mink makes of some targets, from home and drawn there.
 
     Attributes:
-        targets: Where the grasp point goes [m], shape ``(1000, 3)``.
-        commands: Where mink ended, gripper open, shape ``(1000, nu)``.
+        targets: Where the grasp point goes [m], shape ``(MINK, 3)``.
+        commands: Where mink ended, gripper open, shape ``(MINK, nu)``.
         reached: Whether within the tolerance.
     """
 
@@ -146,12 +147,12 @@ def by_mink(
             arm = get_arm(robot)
             top = context.cfg.scene.table_center[2] + context.cfg.scene.table_half[2]
             anywhere = arm.grasp_point(arm.anywhere(3000, 25))
-            anywhere = anywhere[anywhere[:, 2] > top][:1000]
-            assert len(anywhere) == 1000
+            anywhere = anywhere[anywhere[:, 2] > top][:MINK]
+            assert len(anywhere) == MINK
             mink = GraspIk(arm.robot, context.cfg.model, tolerance=TOLERANCE, iterations=60)
             made[robot] = {}
             for where, targets in (
-                ("on and above the table", workspace(robot)[1]),
+                ("on and above the table", workspace(robot)[1][:MINK]),
                 ("wherever it reaches", anywhere),
             ):
                 pairs = [
@@ -185,19 +186,19 @@ def test_reaches_what_mink_reaches(
     ends at the joints' limits, either one ends short at times where the other arrives; with the
     base turned as mink turned it, nothing is missed at all."""
     ik = arm.solver(
-        1000,
+        MINK,
         iterations=40,
         **(shipped(stage(robot)) if gains == "shipped" else {"posture_gain": 0.3}),
     )
     for where, mink in by_mink(robot).items():
         theirs = mink.reached
         front = mink.front
-        command, distance = results(ik, arm.at_home(1000), mink.targets)
+        command, distance = results(ik, arm.at_home(MINK), mink.targets)
         ours = distance <= TOLERANCE
         missed = theirs & ~ours
         with capsys.disabled():
             print(
-                f"\n{robot}, {gains}, {where}: of 1000 mink reaches {theirs.sum()}, batched"
+                f"\n{robot}, {gains}, {where}: of {MINK} mink reaches {theirs.sum()}, batched"
                 f" {ours.sum()}, only mink {missed.sum()} (in front of the base"
                 f" {(missed & front).sum()}), only batched {(ours & ~theirs).sum()}"
             )
@@ -205,12 +206,12 @@ def test_reaches_what_mink_reaches(
                 print(f"  only mink: {target.round(3)} m, batched ends {1e3 * left:.1f} mm off")
         assert theirs.mean() > 0.8
         assert not (missed & front).any()
-        assert missed.sum() <= 10
+        assert missed.mean() <= 0.01
         to_limit = np.minimum(command - arm.low, arm.high - command)[:, arm.moved].min(1)
         assert (to_limit[missed] < 0.001).all()
         assert ours.sum() > theirs.sum()
         assert (distance[ours & front] <= 0.0001).mean() >= 0.998
-        turned = arm.at_home(1000)
+        turned = arm.at_home(MINK)
         turned[:, 0] = mink.commands[:, 0]
         assert (results(ik, turned, mink.targets)[1][theirs] <= TOLERANCE).all()
         np.testing.assert_allclose(
@@ -223,9 +224,9 @@ def test_drawn_home_it_ends_where_mink_does(
     robot: str, arm: Arm, by_mink: Callable, capsys: pytest.CaptureFixture
 ) -> None:
     """Both draw the arm home, so most solutions are the same one."""
-    ik = arm.solver(1000, iterations=40, posture_gain=0.3)
+    ik = arm.solver(MINK, iterations=40, posture_gain=0.3)
     for where, mink in by_mink(robot).items():
-        command, distance = results(ik, arm.at_home(1000), mink.targets)
+        command, distance = results(ik, arm.at_home(MINK), mink.targets)
         both = mink.reached & (distance <= TOLERANCE)
         apart = np.abs(command - mink.commands)[both].max(1)
         away, mink_away = (
@@ -252,7 +253,7 @@ def test_an_approach_gain_leans_less_than_mink(
     arm = get_arm("so101")
     mink = by_mink("so101")["on and above the table"]
     command, _ = results(
-        arm.solver(1000, iterations=40, **shipped(stage("so101"))), arm.at_home(1000), mink.targets
+        arm.solver(MINK, iterations=40, **shipped(stage("so101"))), arm.at_home(MINK), mink.targets
     )
     tilt, mink_tilt = (
         np.degrees(np.arccos(np.clip(-arm.directions(c[mink.reached])[1][:, 2], -1.0, 1.0)))
@@ -278,14 +279,14 @@ def test_follows_minks_way_as_shipped(
     mujoco.mj_kinematics(arm.model, data)
     axis = data.joint(arm.names[0]).xanchor[:2]
     ik = arm.solver(
-        1000, iterations=stage(robot).cfg.controller.step_iterations, **shipped(stage(robot))
+        MINK, iterations=stage(robot).cfg.controller.step_iterations, **shipped(stage(robot))
     )
     for where, mink in by_mink(robot).items():
         goal = mink.commands.copy()
         goal[:, len(arm.robot.arm_joints) :] = arm.robot.gripper_open
-        command = torch.as_tensor(arm.at_home(1000))
-        worst = np.zeros(1000)
-        radius = np.full(1000, np.inf)
+        command = torch.as_tensor(arm.at_home(MINK))
+        worst = np.zeros(MINK)
+        radius = np.full(MINK, np.inf)
         for u in np.arange(1, steps + 1) / steps:
             way = torch.as_tensor(arm.home + u * u * (3.0 - 2.0 * u) * (goal - arm.home))
             target = ik.forward(way)[0].clone()

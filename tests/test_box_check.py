@@ -154,7 +154,6 @@ ON_CUDA = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here"),
 ]
 PLAYED = [
-    ("so101", "closed_loop", "cpu"),
     ("rebot", "open_loop", "cpu"),
     *(
         pytest.param(r, c, "cuda:0", marks=ON_CUDA)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from check_cases import limits
 from compositions import load_config, make_env
+from environments import at_double_speed
 
 from mjstack.drivers.closed_loop import ClosedLoopDriver, make_expert
 from mjstack.drivers.tilt import _keeps, _places
@@ -86,7 +87,9 @@ def test_jaws_turn_to_a_face(stage: Stage) -> None:
     """
     off = {}
     for align in (0.0, 1.0):
-        env, controller = driven(stage("so101"), f"controller.yaw_alignment={align}", nworld=4)
+        env, controller = driven(
+            stage("so101"), f"controller.yaw_alignment={align}", *at_double_speed(), nworld=4
+        )
         address = env.index.object_qpos[0]
         yaw = torch.tensor([0.3, -0.6, 1.1, 2.0], dtype=torch.float64)
         env.sim.qpos[:, address + 3] = torch.cos(yaw / 2)
@@ -103,11 +106,11 @@ def test_jaws_turn_to_a_face(stage: Stage) -> None:
 
 
 @pytest.mark.full
-def test_an_empty_grasp_is_tried_once_more_in_time(robot: str, stage: Stage) -> None:
+def test_an_empty_grasp_is_tried_once_more_in_time(stage: Stage) -> None:
     """World 1 loses its cube to the side as the jaws close. It goes back, looks again, hurries, and
     stacks all the same.
     """
-    env, controller = driven(stage(robot), nworld=2)
+    env, controller = driven(stage("so101"), nworld=2)
     names = [phase.name for phase in controller.phases]
     grasp = names.index("grasp_red")
     address = env.index.object_qpos[0]
@@ -119,7 +122,7 @@ def test_an_empty_grasp_is_tried_once_more_in_time(robot: str, stage: Stage) -> 
         if step == controller.phases[grasp].stop - 1:
             # Where the open jaws do not reach it, and from where they can take it.
             env.sim.qpos[1, address : address + 7] = place
-            env.sim.qpos[1, address + 1] -= 0.10 if robot == "rebot" else 0.08
+            env.sim.qpos[1, address + 1] -= 0.08
             env.sim.qvel[1, velocity : velocity + 6] = 0.0
         env.step(controller.command())
         visited.append(int(controller.phase[1]))
@@ -208,10 +211,12 @@ def test_worlds_start_over_by_themselves() -> None:
     """A world that ends in the middle of a phase is in its first phase in the step after, the
     others go on.
     """
-    env = make_env(["task=stack", "action=joint_absolute", "sim=native", "reset=jitter"], nworld=3)
+    overrides = ["task=stack", "action=joint_absolute", "sim=native", "reset=jitter"]
+    overrides += at_double_speed()
+    env = make_env(overrides, nworld=3)
     env.reset(seed=3)
     expert = make_expert(env)
-    for _ in range(150):
+    for _ in range(75):
         env.step(expert.command())
     first = expert.command().clone()
     env.step(first)
@@ -219,9 +224,7 @@ def test_worlds_start_over_by_themselves() -> None:
     command = expert.command()
     assert expert.phase.tolist() == [2, 0, 2]
     assert (command[1] - first[1]).abs().max() > 0.05
-    again = make_env(
-        ["task=stack", "action=joint_absolute", "sim=native", "reset=jitter"], nworld=3
-    )
+    again = make_env(overrides, nworld=3)
     again.reset(seed=3)
     again.reset()  # episode 1 of every world
     np.testing.assert_allclose(
@@ -236,9 +239,9 @@ def test_a_world_does_not_depend_on_its_neighbours(stage: Stage) -> None:
     context = stage("so101")
     runs = []
     for nworld in (1, 4):
-        env, controller = driven(context, nworld=nworld)
+        env, controller = driven(context, *at_double_speed(), nworld=nworld)
         commands = []
-        for _ in range(140):
+        for _ in range(70):
             commands.append(controller.command()[0].clone())
             env.step(commands[-1].expand(nworld, -1) if nworld == 1 else controller._command)
         runs.append(torch.stack(commands))

@@ -694,7 +694,7 @@ def test_statistics_are_those_of_the_episodes_that_ended(backend: str) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("kind", "nworld", "steps"), [("native", 16, 300), ("mjwarp", 4, 60)])
+@pytest.mark.parametrize(("kind", "nworld", "steps"), [("native", 8, 120), ("mjwarp", 2, 45)])
 def test_random_actions_for_a_while(kind: str, nworld: int, steps: int) -> None:
     """`python tests/env_soak.py` makes it long."""
     found = soak(kind, nworld, steps, episode_steps=40)

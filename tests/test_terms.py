@@ -389,18 +389,18 @@ def jaw_forces(env: Env, world: int) -> list[float]:
 
 @pytest.mark.full
 def test_success_ends_a_scripted_episode(
-    robot: str, stage: Stage, scripted: Callable[[str], SimpleNamespace]
+    stage: Stage, scripted: Callable[[str], SimpleNamespace]
 ) -> None:
     """In the step in which it is first achieved, and not before the cubes have rested for a whole
     window.
     """
-    rec = scripted(robot)
+    rec = scripted("so101")
     first = rec.success.int().argmax(0).tolist()
     window = limits(rec.cfg).window
     placed = next(p for p in rec.phases if p.name == "place_stack").stop
     assert all(step >= placed + window // 2 for step in first)
     assert rec.success[-1].all()
-    cfg = configure("task=stack", "action=joint_absolute", "reset=jitter", robot=robot)
+    cfg = configure("task=stack", "action=joint_absolute", "reset=jitter")
     env = on_shared_sim("native", 3, cfg)
     run = record(env, stage, max(first) + 1)
     for k, step in enumerate(first):
@@ -616,12 +616,12 @@ def assert_success(
 
 @pytest.mark.full
 def test_stack_success_is_rules_four_and_five(
-    robot: str, scripted: Callable[[str], SimpleNamespace]
+    scripted: Callable[[str], SimpleNamespace],
 ) -> None:
     """Step by step, over the recorded episodes and altered ends of the first, some of whose worlds
     start anew in between.
     """
-    rec = scripted(robot)
+    rec = scripted("rebot")
     closed, opened = (
         np.array(v) for v in (rec.cfg.robot.gripper_closed, rec.cfg.robot.gripper_open)
     )
