@@ -27,7 +27,7 @@ from mjstack.sim.warp_setup import torch_stream_scope
 Stage = Callable[[str], RunContext]
 
 MINK = 300  # targets that mink solves, one after the other
-TOLERANCE = 0.0005  # m, as the scripted controller's
+TOLERANCE = 0.0005  # m, as the driver's
 
 
 @pytest.fixture(params=DEVICES)

@@ -1,4 +1,4 @@
-"""The scripted controller: phases, looks, turns, retries and restarts of every world by itself."""
+"""The closed-loop driver: phases, looks, turns, retries and restarts of every world by itself."""
 
 from __future__ import annotations
 

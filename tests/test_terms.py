@@ -199,7 +199,7 @@ def test_observation_groups_hold_what_mujoco_says(backend: str, task: str, robot
             assert start == len(values)
 
 
-# A scripted episode, through the environment
+# A driven episode, through the environment
 
 
 def record(env: Env, stage: Stage, steps: int = 600) -> SimpleNamespace:

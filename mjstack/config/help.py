@@ -34,7 +34,7 @@ _EXAMPLES = (
         "job=replay run=outputs/DATE/TIME world=17",
         "one world of an earlier run again: why did it fail?",
     ),
-    ("job=collect job.episodes=20", "demonstrations of the scripted expert, as a dataset; resumes"),
+    ("job=collect job.episodes=20", "demonstrations of the expert, as a dataset; resumes"),
     ("job=scaling robot=so101", "throughput from 1 to 32,768 worlds; resumes"),
     ("job=study nworld=8", "what the solver's limits cost, and which worlds still succeed"),
     (

@@ -213,7 +213,7 @@ class RobotCfg:
     grasp_parts: dict[str, list[str]] = field(default_factory=dict)
     """Where a grasp site goes that the file lacks: the mean of these geoms or bodies of one jaw."""
     home: list[float] = spec(unit="rad, m")
-    """Joint values at which the scripted task begins."""
+    """Joint values at which a driven episode begins."""
     start: list[float] = spec(factory=list, unit="rad, m")
     """Joint values at which environments begin, clear of the table. Empty: ``home``."""
     gripper_open: list[float] = spec(unit="rad, m")
