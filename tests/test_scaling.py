@@ -13,7 +13,8 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, TextIO
 
 import pytest
 from compositions import load_config, put
@@ -21,9 +22,10 @@ from environments import one_second_episode
 from matplotlib.axes import Axes
 
 from mjstack.cli import run
+from mjstack.config.check import validate
 from mjstack.config.schema import Backend
 from mjstack.errors import ConfigError
-from mjstack.jobs import scaling
+from mjstack.jobs import check_job, scaling, scaling_run
 from mjstack.jobs.scaling import (
     RATE,
     SHOWN,
@@ -33,7 +35,7 @@ from mjstack.jobs.scaling import (
     save_scaling_curves,
     scaling_folder,
 )
-from mjstack.jobs.scaling_run import NOT_RUN, PASS, Row, new_row, read_report, read_run
+from mjstack.jobs.scaling_run import NOT_RUN, PASS, RESULT, Row, new_row, read_report, read_run
 from mjstack.report.table import Table
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
@@ -62,28 +64,51 @@ def table(folder: Path) -> dict[tuple[str, int], dict[str, str]]:
         return {(row["backend"], int(row["nworld"])): row for row in csv.DictReader(file)}
 
 
+class OwnProcess:
+    """Stands in for `subprocess.Popen`: the command line runs in this process, which has imported
+    everything. The test of Ctrl-C starts real processes.
+    """
+
+    def __init__(self, command: list[str], *, stdout: TextIO, **_: object) -> None:
+        assert command[1] == "-c"
+        *overrides, target = command[3:]
+        folder = Path(target.removeprefix("hydra.run.dir=").strip("'"))
+        with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stdout):
+            self.code = check_job(load_config(overrides), overrides).run(folder).exit_code
+
+    def wait(self, _: float) -> int:
+        return self.code
+
+
+def run_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = SimpleNamespace(**{**vars(subprocess), "Popen": OwnProcess})
+    monkeypatch.setattr(scaling_run, "subprocess", fake)
+
+
 def stamps(folder: Path) -> dict[str, int]:
     return {path.parent.name: path.stat().st_mtime_ns for path in home(folder).rglob("run.json")}
 
 
 @pytest.mark.full
 def test_runs_resume_and_leave_table_and_plot(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert run([*TINY, "sim=native", "job.nworlds=[1]"]) == 0
+    run_in_this_process(monkeypatch)
+    # More worlds than there is memory for; the run after it starts all the same.
+    assert run([*TINY, "sim=native", "job.nworlds=[1,2000000000]"]) == 1
     first = table(folder)
     before = stamps(folder)
-    assert set(first) == {("native", 1)}
+    assert set(first) == {("native", 1), ("native", 2000000000)}
+    assert "job.retry=true" in capsys.readouterr().out
 
-    capsys.readouterr()
-    # More worlds than there is memory for; the next run starts all the same.
-    assert run([*TINY, "sim=native", "job.nworlds=[1,2000000000,2]", "nworld=7"]) == 1
+    args = [*TINY, "sim=native", "job.nworlds=[1,2000000000,2]"]
+    assert run([*args, "nworld=7"]) == 1
     out = capsys.readouterr().out
     after = stamps(folder)
     both = table(folder)
     assert {name: after[name] for name in before} == before
-    assert set(after) - set(before) == {"native-2", "native-2000000000"}
-    assert out.count("(done before)") == 2  # in the line of its result, and in the table
+    assert set(after) - set(before) == {"native-2"}
+    assert out.count("(done before)") == 4  # in the line of each result, and in the table
     assert "nworld=7 is not used" in out
     assert both["native", 1].items() >= first["native", 1].items()
     assert set(both) == {("native", 1), ("native", 2), ("native", 2000000000)}
@@ -117,11 +142,7 @@ def test_runs_resume_and_leave_table_and_plot(
     assert [path.name for path in folder.iterdir()] == ["outputs"]
 
     # What failed runs again if asked.
-    before = stamps(folder)
-    args = [*TINY, "sim=native", "job.nworlds=[1,2000000000,2]"]
-    assert run(args) == 1
-    assert stamps(folder) == before
-    assert "job.retry=true" in capsys.readouterr().out
+    before = after
     assert run([*args, "job.retry=true"]) == 1
     after = stamps(folder)
     again = {name for name in after if after[name] > before[name]}
@@ -129,7 +150,8 @@ def test_runs_resume_and_leave_table_and_plot(
 
 
 @pytest.mark.full
-def test_failing_run_is_a_gap(folder: Path) -> None:
+def test_failing_run_is_a_gap(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_in_this_process(monkeypatch)
     args = [
         *TINY,
         *one_second_episode(),
@@ -322,15 +344,17 @@ def alive(marker: str) -> list[str]:
 @pytest.mark.full
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="no /proc here")
 def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
+    args = [*TINY, "sim=native", "job.native_steps=20000"]
+    done = scaling_folder(load_config(args)) / "runs" / "native-1" / RESULT
+    done.parent.mkdir(parents=True)
+    done.write_text(json.dumps(new_row(1, "native", status=PASS, seconds=1.0)))
     marker = f"MJSTACK_TEST={folder}"
     process = subprocess.Popen(
         [
             sys.executable,
             SCRIPT,
-            *TINY,
-            "sim=native",
-            "job.nworlds=[1,3000]",
-            "job.native_steps=200",
+            *args,
+            "job.nworlds=[1,64]",
         ],
         cwd=folder,
         stdout=subprocess.PIPE,
@@ -342,7 +366,7 @@ def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
     )
     try:
         until = time.monotonic() + 120
-        while not list(folder.glob("outputs/scaling/*/runs/native-3000/report.json")):
+        while not list(folder.glob("outputs/scaling/*/runs/native-64/report.json")):
             assert process.poll() is None
             assert time.monotonic() < until
             time.sleep(0.1)
@@ -358,7 +382,7 @@ def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
     assert "Traceback" not in err
     assert "interrupted; the finished gates are in the report" in out
     rows = table(folder)
-    assert (rows["native", 1]["status"], rows["native", 3000]["status"]) == ("pass", "not run")
+    assert (rows["native", 1]["status"], rows["native", 64]["status"]) == ("pass", "not run")
     assert json.loads((home(folder) / "report.json").read_text())["status"] == "interrupted"
     assert alive(marker) == []
 
@@ -429,12 +453,7 @@ BAD = [
     ["job.nworlds=many"],
     ["job.nworld=[2]"],
     ["job.backends=[cuda]"],
-    ["job.repetitions=0"],
-    ["job.run_minutes=0"],
-    ["job.max_minutes=-1"],
-    ["job.retry=perhaps"],
     ["view=true"],
-    ["video=true"],
     ["task=reach"],
     ["gate.throughput.measurements=[physic]"],
     ["job.backends=[mjwarp]", "sim.device=cuda:77"],
@@ -454,6 +473,12 @@ def test_bad_input_is_one_line_and_writes_nothing(
     assert err.startswith("mjstack: ")
     assert len(err.strip().splitlines()) == 1
     assert [path.name for path in folder.rglob("*")] == ["afile"]
+
+
+@pytest.mark.parametrize("value", ["repetitions=0", "run_minutes=0", "max_minutes=-1"])
+def test_range_of_a_number(value: str) -> None:
+    with pytest.raises(ConfigError, match=rf"job\.{value}: expected"):
+        validate(put(load_config(["job=scaling"]), f"job.{value}"))
 
 
 def rows(rates: dict[str, dict[int, float | None]]) -> list[Row]:
