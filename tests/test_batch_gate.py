@@ -32,7 +32,8 @@ from mjstack.report.record import GateResult, Status
 
 RULES = rules_of("stack")
 
-TIGHT = "task.check.xy_err=0.0015"  # some worlds end farther off than this
+# At double speed some worlds end farther off than this.
+TIGHT = ("task.check.xy_err=0.00134", *at_double_speed())
 
 
 @pytest.mark.parametrize(
@@ -71,7 +72,7 @@ def two_seeds(
     it said.
     """
     folder = tmp_path_factory.mktemp("batch")
-    context = new_context("sim=native", "nworld=7", "gate.batch.seeds=2", TIGHT)
+    context = new_context("sim=native", "nworld=7", "gate.batch.seeds=2", *TIGHT)
     lines: list[str] = []
     context.print_line = lines.append
     return folder, play(context, folder), lines
@@ -120,7 +121,7 @@ def test_failing_worlds_are_a_table(two_seeds: tuple[Path, GateResult, list[str]
         assert record is not None
         assert record.failed[int(row["world"])] == RULES["STACKED"]
         assert row["rules"] == "STACKED"
-        assert float(row["xy_err_m"]) > 0.0015
+        assert float(row["xy_err_m"]) > 0.00134
         for name, values in record.values.items():
             assert float(row[name]) == pytest.approx(values[int(row["world"])], rel=1e-5)
 
@@ -134,7 +135,7 @@ def test_second_seed_is_what_it_is_alone(
     """Worlds are started anew: nothing of seed 0 is left in them. Fewer of them, too, because
     nworld does not matter.
     """
-    result = play(new_context("sim=native", "nworld=3", "seed=1", TIGHT), tmp_path)
+    result = play(new_context("sim=native", "nworld=3", "seed=1", *TIGHT), tmp_path)
     alone = EpisodeRecord.read(tmp_path, 1)
     after = EpisodeRecord.read(two_seeds[0], 1)
     assert alone is not None
@@ -187,7 +188,13 @@ def test_what_stops_the_second_seed_keeps_the_first(
         return play_episode(*args, **kwargs)
 
     monkeypatch.setattr(gate_module, "play_episode", stops)
-    context = new_context("sim=native", "nworld=2", "gate.batch.seeds=3", "task.check.xy_err=1e-6")
+    context = new_context(
+        "sim=native",
+        "nworld=2",
+        "gate.batch.seeds=3",
+        "task.check.xy_err=1e-6",
+        *at_double_speed(),
+    )
     if isinstance(error, KeyboardInterrupt):
         with pytest.raises(KeyboardInterrupt):
             play(context, tmp_path)
@@ -211,13 +218,13 @@ def test_full_disk_takes_no_verdict_back(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", full)
-    result = play(new_context("sim=native", "nworld=2"), tmp_path)
+    result = play(new_context("sim=native", "nworld=2", *at_double_speed()), tmp_path)
     assert result.status is Status.passed
     assert (
         "2 of 2 worlds succeeded (100 %, 95 % interval 34.24 to 100 %), 2 distinct" in result.reason
     )
     assert result.metrics["world_steps_per_s"] == pytest.approx(
-        2 * 6000 / result.metrics["episode_s"]
+        2 * 3000 / result.metrics["episode_s"]
     )
     assert any("No space left on device" in line for line in result.details)
     assert list(tmp_path.iterdir()) == []
@@ -253,11 +260,11 @@ def test_damaged_record_is_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.full
 def test_a_few_failures_may_be_allowed(new_context: Callable[..., RunContext]) -> None:
-    """nworld=5 of seed 0 has world 4 off; allowed, it is still named."""
-    result = play(new_context("sim=native", "nworld=5", "gate.batch.failed_worlds=1", TIGHT), None)
+    """nworld=2 of seed 0 has world 1 off; allowed, it is still named."""
+    result = play(new_context("sim=native", "nworld=2", "gate.batch.failed_worlds=1", *TIGHT), None)
     assert result.status is Status.passed
-    assert "4 of 5 worlds succeeded (80 %," in result.reason
-    assert "1 of 5 worlds (4) failed: not stacked in 1" in result.reason
+    assert "1 of 2 worlds succeeded (50 %," in result.reason
+    assert "1 of 2 worlds (1) failed: not stacked in 1" in result.reason
     assert not {"episode_s", "world_steps_per_s"} & set(
         result.metrics
     )  # allowed, and void nonetheless
