@@ -12,7 +12,7 @@ import pytest
 import torch
 from check_cases import rules_of
 from comparison import assert_same_run
-from environments import at_double_speed
+from environments import at_double_speed, one_second_episode
 
 from mjstack.config import Config
 from mjstack.drivers.driver import Driver
@@ -45,11 +45,9 @@ def rules(bits: torch.Tensor) -> list[set[str]]:
 
 
 @pytest.mark.full
-def test_native(
-    robot: str, stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]
-) -> None:
-    context = stage(robot)
-    sim = make_sim("native", 6, robot=robot)
+def test_native(stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]) -> None:
+    context = stage("so101")
+    sim = make_sim("native", 6)
     push = teleport(context, 1)
     kept = {}
 
@@ -148,12 +146,12 @@ def test_overflow_in_exactly_the_crowded_world(
     assert sim.overflow.tolist() == [0, 0, 0]
 
 
-FEW = ("sim=native", "nworld=2", "gate.capacity.random_steps=20", *at_double_speed())
+FEW = ("sim=native", "nworld=2", "gate.capacity.random_steps=20")
 
 
 @pytest.mark.full
 def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., RunContext]) -> None:
-    context = new_context(*FEW, "batch.njmax=100")
+    context = new_context(*FEW, "batch.njmax=100", *one_second_episode())
     (result,) = run_capacity(context)
     assert result.status is Status.failed
     assert "njmax overflow in 2 of 2 worlds (0, 1)" in result.reason
@@ -166,7 +164,9 @@ def test_capacity_gate_names_worlds_and_the_fix(new_context: Callable[..., RunCo
 def test_capacity_gate_passes_with_what_it_recommends(
     new_context: Callable[..., RunContext],
 ) -> None:
-    (result,) = run_capacity(new_context(*FEW, "batch.njmax=184", "batch.nconmax=40"))
+    (result,) = run_capacity(
+        new_context(*FEW, "batch.njmax=184", "batch.nconmax=40", *at_double_speed())
+    )
     assert result.status is Status.passed, result.reason
     assert int(result.metrics["recommended.njmax"]) <= 184
     assert int(result.metrics["recommended.nconmax"]) <= 40
@@ -174,7 +174,7 @@ def test_capacity_gate_passes_with_what_it_recommends(
 
 @pytest.mark.full
 def test_capacity_gate_sizes_the_contact_pool(new_context: Callable[..., RunContext]) -> None:
-    (result,) = run_capacity(new_context(*FEW, "batch.nconmax=8"))
+    (result,) = run_capacity(new_context(*FEW, "batch.nconmax=8", *one_second_episode()))
     assert result.status is Status.failed
     assert "contact pool overflow in 2 of 2 worlds (0, 1)" in result.reason
     assert "batch.nconmax=" in result.reason
@@ -227,7 +227,7 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
 
 
 def test_batch_gate_refuses_identical_worlds(new_context: Callable[..., RunContext]) -> None:
-    (batch,) = run_batch(new_context("sim=native", "nworld=2", "reset=nominal"))
+    (batch,) = run_batch(new_context("sim=native", "nworld=2", "reset=nominal", *at_double_speed()))
     assert batch.status is Status.failed
     assert batch.metrics["distinct_final_states"] == 1
     assert "reset=jitter" in batch.reason

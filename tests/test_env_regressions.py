@@ -10,7 +10,7 @@ from collections.abc import Callable
 import mujoco
 import pytest
 import torch
-from compositions import make_env
+from compositions import load_config, make_env, put
 
 import mjstack
 from mjstack.config.schema import ObservationTermCfg, TermCfg
@@ -222,8 +222,10 @@ def test_episode_length_is_the_time_out_terms() -> None:
     ],
 )
 def test_parameter_values_are_checked(overrides: list[str], words: str) -> None:
+    *groups, value = overrides
+    cfg = put(load_config(["sim=native", *groups]), value)
     with pytest.raises(ConfigError) as caught:
-        native(*overrides)
+        build_env(cfg, nworld=1)
     assert words in str(caught.value)
 
 

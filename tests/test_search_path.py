@@ -142,7 +142,7 @@ def test_a_file_that_does_not_fit_is_named(
 def test_a_sweep_and_a_replay(
     lean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flags = ["--config-dir", str(lean), "-m", "task=stack", "gates=[baseline]"]
+    flags = ["--config-dir", str(lean), "-m", "task=stack", "gates=[upright]"]
     reward = "+reward.height={func: lean.height, weight: 1.0}"
     swapped = "reward.reach.func=mjstack.mdp.reward.action_rate"  # without the other's parameters
     assert run([*flags, reward, swapped, "seed=1,2"]) == 0
