@@ -14,10 +14,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from compositions import load_config, make_env, put
 from environments import configure, on_shared_sim
 
 import mjstack
 from mjstack.cli import run
+from mjstack.config.check import validate
 from mjstack.config.schema import Config
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, ParameterError
@@ -71,7 +73,7 @@ def test_the_tilt_is_that_of_the_gripper_and_the_smallest(stage: Stage, robot: s
     cfg = stage(robot).cfg
     model = stage(robot).model
     reach = PointReach(model, cfg.robot, cfg.robot.gripper_open)
-    points = points_over(cfg, 6)
+    points = points_over(cfg, 4)
     upright = reach.solve_upright(points, 5e-4)
     any_ = reach.solve(points)
     assert (upright.tilt <= any_.tilt + 1e-9).all()
@@ -126,7 +128,6 @@ def test_joints_stay_within_both_ranges(stage: Stage, robot: str) -> None:
 
 REGIONS = [
     ("so101", "[0.12,0.05]", "red at (0.450, -0.180) m the point"),
-    ("so101", "[0.05,0.3]", "red at"),
     ("rebot", "[0.3,0.0]", None),  # the whole depth of its table is within reach
     ("so101", "[0.03,0.03]", None),
 ]
@@ -138,10 +139,10 @@ def test_a_region_beyond_the_arm_is_refused(robot: str, xy: str, says: str | Non
     overrides = [f"robot={robot}", "sim=native", "reset=randomized", f"reset.cubes.params.xy={xy}"]
     overrides.append("+reset.cubes.params.candidates=64")
     if says is None:
-        mjstack.make_env(overrides, nworld=1)
+        make_env(overrides, nworld=1)
         return
     with pytest.raises(ConfigError) as caught:
-        mjstack.make_env(overrides, nworld=1)
+        make_env(overrides, nworld=1)
     message = str(caught.value)
     assert message.startswith("reset.cubes.params.xy=[")
     assert says in message
@@ -152,16 +153,16 @@ def test_a_region_beyond_the_arm_is_refused(robot: str, xy: str, says: str | Non
 
 @pytest.mark.full
 def test_randomized_takes_the_layouts_region_and_the_command_line_another() -> None:
-    cfg = mjstack.load_config(["reset=randomized", "robot.placements.stack.random_xy=[0.02,0.04]"])
+    cfg = load_config(["reset=randomized", "robot.placements.stack.random_xy=[0.02,0.04]"])
     assert cfg.reset["cubes"].params["xy"] == [0.02, 0.04]
-    cfg = mjstack.load_config(["reset=randomized", "reset.cubes.params.xy=[0.03,0.03]"])
+    cfg = load_config(["reset=randomized", "reset.cubes.params.xy=[0.03,0.03]"])
     assert cfg.reset["cubes"].params["xy"] == [0.03, 0.03]
     for robot in ("so101", "rebot"):
-        cfg = mjstack.load_config(["reset=randomized", f"robot={robot}"])
+        cfg = load_config(["reset=randomized", f"robot={robot}"])
         assert min(cfg.reset["cubes"].params["xy"]) >= 0.05
         assert cfg.reset["cubes"].params["gap"] == cfg.robot.finger_room
     with pytest.raises(ConfigError, match=r"scene\.random_xy"):
-        mjstack.load_config(["scene.random_xy=[0.05,-0.01]"])
+        load_config(["scene.random_xy=[0.05,-0.01]"])
 
 
 def test_finger_room_is_what_the_open_jaws_need(stage: Stage, robot: str) -> None:
@@ -404,7 +405,7 @@ def level(cfg: Config, reached: Callable[[np.ndarray, np.ndarray], np.ndarray]) 
 
 @pytest.mark.full
 def test_regions_stay_inside_what_is_reached() -> None:
-    cfg = mjstack.load_config(["job=reachability", "job.step=0.005", "job.margin=0.01"])
+    cfg = load_config(["job=reachability", "job.step=0.005", "job.margin=0.01"])
     x0, y0 = cfg.scene.objects["red"].xy
     half_plane = level(cfg, lambda x, y: (x <= x0 + 0.08) & (y >= y0 - 0.09))
     region = find_region(cfg, [half_plane], "red")
@@ -433,14 +434,14 @@ def test_regions_stay_inside_what_is_reached() -> None:
 @pytest.mark.full
 def test_a_region_without_a_point_of_the_map_has_no_tilt() -> None:
     region = "scene.random_xy=[0.001,0.001]"
-    cfg = mjstack.load_config(["job=reachability", "job.step=0.07", region])
+    cfg = load_config(["job=reachability", "job.step=0.07", region])
     everywhere = level(cfg, lambda x, y: x < 9.0)
     assert math.isnan(find_region(cfg, [everywhere], "red").tilt)
 
 
 @pytest.mark.full
 def test_levels_are_the_controllers(robot: str) -> None:
-    cfg = mjstack.load_config([f"robot={robot}", "job=reachability"])
+    cfg = load_config([f"robot={robot}", "job=reachability"])
     h = cfg.robot.approach_height + 0.022
     levels = find_levels(cfg)
     assert levels == {
@@ -449,7 +450,7 @@ def test_levels_are_the_controllers(robot: str) -> None:
         "carry": levels["carry"],
     }
     assert levels["carry"] == (pytest.approx(h + 0.09), "open")
-    cfg = mjstack.load_config(["job=reachability", "controller.phases.lift_red.offset=[0,0,0.2]"])
+    cfg = load_config(["job=reachability", "controller.phases.lift_red.offset=[0,0,0.2]"])
     assert find_levels(cfg)["carry"] == (pytest.approx(0.312), "closed")
 
 
@@ -466,7 +467,7 @@ def test_the_job_leaves_a_map(
     assert status == (0 if report["status"] == "pass" else 1)
     with (tmp_path / "reachability.csv").open() as file:
         rows = list(csv.DictReader(file))
-    cfg = mjstack.load_config([f"robot={robot}"])
+    cfg = load_config([f"robot={robot}"])
     reach = PointReach(build_model(cfg), cfg.robot, cfg.robot.gripper_open)
     for row in rows[:: len(rows) // 7]:
         point = np.array(
@@ -498,7 +499,7 @@ def test_a_region_that_is_not_reached_fails_the_job(
 ) -> None:
     args = [
         "job=reachability",
-        "job.step=0.02",
+        "job.step=0.04",
         "scene.random_xy=[0.12,0.05]",
         f"hydra.run.dir={tmp_path}",
     ]
@@ -531,21 +532,24 @@ def test_an_interrupted_job_keeps_its_levels(
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("overrides", "says"),
+    ("value", "says"),
     [
-        (["job.step=0"], "job.step=0"),
-        (["job.step=-0.01"], "job.step=-0.01"),
-        (["job.step=0.0001"], "job.step=0.0001: expected 0.00"),
-        (["job.step=1.0"], "job.step=1.0"),
-        (["job.margin=-0.01"], "job.margin=-0.01"),
-        (["job.margin=nan"], "job.margin=nan"),
-        (["view=true"], "view=true"),
-        (["job.stepp=0.01"], "job.step"),
+        ("job.step=0", "job.step=0"),
+        ("job.step=0.0001", "job.step=0.0001: expected 0.00"),
+        ("job.step=1.0", "job.step=1.0"),
+        ("job.margin=-0.01", "job.margin=-0.01"),
+        ("job.margin=nan", "job.margin=nan"),
     ],
 )
-def test_bad_settings_are_refused_in_one_line(overrides: list[str], says: str) -> None:
+def test_bad_settings_are_refused_in_one_line(value: str, says: str) -> None:
+    cfg = put(load_config(["job=reachability"]), value)
+
+    def check() -> None:
+        validate(cfg)
+        check_job(cfg)
+
     with pytest.raises(mjstack.MjstackError) as caught:
-        check_job(mjstack.load_config(["job=reachability", *overrides]))
+        check()
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
     assert caught.value.exit_code == 2
