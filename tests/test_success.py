@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from check_cases import rules_of
-from compositions import checked, load_config
+from compositions import checked, load_config, put
 from environments import at_double_speed, configure, one_second_episode
 
 from mjstack.cli import run
@@ -30,6 +30,7 @@ from mjstack.episodes.record import FAILING, PICTURE, REGIONS, EpisodeRecord, cl
 from mjstack.episodes.regions import Region, find_regions, radial_yaw_deg, regions_table
 from mjstack.errors import ConfigError
 from mjstack.gates.success import run_success, success_config
+from mjstack.jobs import check_job
 from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
@@ -290,18 +291,11 @@ def test_replay_plays_the_gates_world(passed: Path, tmp_path: Path) -> None:
         ("6", "a world from 0 to 5"),
     ],
 )
-def test_replay_refuses_worlds_that_were_not(
-    world: str,
-    says: str,
-    passed: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run(["job=replay", f"run={passed}", f"world={world}"]) == 2
-    assert says in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
+def test_replay_refuses_worlds_that_were_not(world: str, says: str, passed: Path) -> None:
+    cfg = put(load_config(["job=replay"]), f"run={passed}")
+    cfg.world = world
+    with pytest.raises(ConfigError, match=says):
+        check_job(cfg)
 
 
 BAD = [

@@ -266,7 +266,7 @@ def test_overflow_voids_the_figure(new_context: Callable[..., RunContext], name:
         new_context(
             "sim=mjwarp",
             "sim.device=cpu",
-            "nworld=2",
+            "nworld=1",
             *SHORT,
             f"gate.throughput.measurements=[{name}]",
             "gate.throughput.env_steps=20",
