@@ -448,6 +448,12 @@ def test_many_differences_are_one_line(
     assert len(err.splitlines()) == 1
 
 
+def all_succeed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every world of every batch succeed, without playing it."""
+    played = fake_demonstrations(lambda seed, world: False)
+    monkeypatch.setattr(collection, "play_demonstrations", played)
+
+
 def collect(*overrides: str) -> int:
     """Runs the job as the command line does once it has checked everything, and returns its exit
     status.
@@ -507,9 +513,7 @@ FROM_LAYOUT = [
 def test_a_layout_counts_by_its_content(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(
-        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
-    )
+    all_succeed(monkeypatch)
     first = Path("worlds.csv")
     moved = Path("elsewhere.csv")
     first.write_text(LAYOUT)
@@ -588,9 +592,7 @@ def test_an_expert_that_never_succeeds_is_given_up(
     assert gate["reason"].startswith(
         "3 seeds in a row brought no episode, the last because of: red not lifted in 2 of 2 worlds"
     )
-    monkeypatch.setattr(
-        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
-    )
+    all_succeed(monkeypatch)
     assert collect(*args) == 0
     assert pairs(folder / "dataset") == [(3, 0), (3, 1), (4, 0)]
     assert report_of(folder)["gates"][0]["metrics"]["success_rate"] == pytest.approx(4 / 10)
@@ -631,9 +633,7 @@ def test_ctrl_c_keeps_finished_batches(folder: Path, monkeypatch: pytest.MonkeyP
     found = report_of(folder)
     assert found["status"] == "interrupted"
     assert found["gates"][0]["reason"].startswith("interrupted; 2 episodes, 5 asked for")
-    monkeypatch.setattr(
-        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
-    )
+    all_succeed(monkeypatch)
     assert collect(*args) == 0
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
 
@@ -650,9 +650,7 @@ def test_a_full_disk_is_one_line(
         add(self, *args)  # type: ignore[arg-type]
 
     args = ["nworld=2", "job.episodes=5"]
-    monkeypatch.setattr(
-        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
-    )
+    all_succeed(monkeypatch)
     monkeypatch.setattr(DatasetWriter, "_write", full)
     assert collect(*args) == 1
     err = capsys.readouterr().err.strip()
@@ -685,9 +683,7 @@ def test_a_full_device_is_one_line(
 def test_brackets_in_names_are_printed(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(
-        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
-    )
+    all_succeed(monkeypatch)
     own = ("robot.title='Arm [/b]'", "job.folder='outputs/[b]'")
     assert collect("nworld=2", "job.episodes=2", *own) == 0
     out = capsys.readouterr().out
@@ -764,9 +760,7 @@ run(ARGS)
 def test_damaged_notes_are_one_line(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(
-        collection, "play_demonstrations", fake_demonstrations(lambda seed, world: False)
-    )
+    all_succeed(monkeypatch)
     assert collect("nworld=2", "job.episodes=1") == 0
     (folder / FILE).write_text("[{]")
     capsys.readouterr()
