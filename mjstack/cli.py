@@ -1,5 +1,5 @@
 """The command line: composes, validates before anything is written, runs, and maps errors to exit
-codes.
+codes. Any exception becomes one line here, with its traceback if MJSTACK_DEBUG is set.
 
 Hydra exits with 1 on its own configuration errors, ignores what the main function returns, and
 makes the run folder before calling it. So every job is composed, checked and built here, once, and
@@ -10,18 +10,19 @@ import os
 import shutil
 import sys
 import tempfile
-from argparse import ArgumentError, Namespace
+import traceback
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.hydra import Hydra
-from hydra._internal.utils import get_args_parser, run_and_report
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
@@ -29,8 +30,20 @@ import mjstack
 from mjstack.config.explain import own_overrides, parse
 from mjstack.config.help import help_text, key_help
 from mjstack.config.load import compose, extended_search_path, to_config
-from mjstack.config.session import CONFIG_NAME, hydra_session, lacking_folders, search_path
-from mjstack.errors import CompositionError, MjstackError, first_line, suggest
+from mjstack.config.session import (
+    CONFIG_NAME,
+    hydra_session,
+    lacking_folders,
+    list_items,
+    search_path,
+)
+from mjstack.errors import (
+    CompositionError,
+    UnknownName,
+    describe_error,
+    first_line,
+    suggest,
+)
 from mjstack.report.record import Report, Status
 from mjstack.report.table import Table
 
@@ -56,15 +69,20 @@ def run(args: list[str]) -> int:
         flags = _parse(args)
         with extended_search_path(flags.overrides, flags.config_dir) as overrides:
             return _dispatch(flags, overrides)
-    except MjstackError as error:
-        errors.print(f"mjstack: {error}")
-        return error.exit_code
-    except SystemExit as stop:
-        return stop.code if isinstance(stop.code, int) else 1
     except KeyboardInterrupt:
         if not _results:
             errors.print("mjstack: interrupted before anything ran")
         return 130
+    except BrokenPipeError:
+        # The reader may not want all of it, such as ``| head``. Python writes once more at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return max((result.exit_code for result in _results), default=0)
+    except (Exception, SystemExit) as error:
+        if os.environ.get("MJSTACK_DEBUG"):
+            traceback.print_exception(error)
+        problem = describe_error(error, "MJSTACK_DEBUG=1 shows the traceback")
+        errors.print(f"mjstack: {problem}")
+        return getattr(error, "exit_code", 1 if _results else 2)
 
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
@@ -76,9 +94,9 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
             hydra.hydra_help(CONFIG_NAME, args_parser=get_args_parser(), args=flags)
         elif flags.info is not None:
             compose(hydra, overrides)
-            run_and_report(lambda: hydra.show_info(flags.info, CONFIG_NAME, overrides))
+            hydra.show_info(flags.info, CONFIG_NAME, overrides)
         elif flags.shell_completion:
-            run_and_report(lambda: hydra.shell_completion(CONFIG_NAME, overrides))
+            hydra.shell_completion(CONFIG_NAME, overrides)
         elif flags.cfg:
             _show(hydra, flags, overrides)
         elif flags.multirun:
@@ -92,10 +110,11 @@ def _show(hydra: Hydra, flags: Namespace, overrides: list[str]) -> None:
     """Check the values of a configuration and print it."""
     if flags.multirun:
         raise CompositionError("--cfg shows one configuration, and -m makes several. Leave -m out.")
-    to_config(compose(hydra, overrides))
-    run_and_report(
-        lambda: hydra.show_cfg(CONFIG_NAME, overrides, flags.cfg, flags.package, flags.resolve)
-    )
+    cfg = compose(hydra, overrides)
+    to_config(cfg)
+    if flags.package and OmegaConf.select(cfg, flags.package) is None:
+        raise UnknownName("package", flags.package, [key for key, _ in list_items(cfg)])
+    hydra.show_cfg(CONFIG_NAME, overrides, flags.cfg, flags.package, flags.resolve)
 
 
 def _run_one(hydra: Hydra, overrides: list[str]) -> int:
@@ -105,7 +124,7 @@ def _run_one(hydra: Hydra, overrides: list[str]) -> int:
     if checked.folder is not None and not any(o.startswith("hydra.run.dir=") for o in overrides):
         cfg.hydra.run.dir = str(checked.folder)
     _check_writable(cfg, "run")
-    run_and_report(lambda: hydra.run(CONFIG_NAME, run_job, overrides))
+    hydra.run(CONFIG_NAME, run_job, overrides)
     return max(result.exit_code for result in _results)
 
 
@@ -120,7 +139,7 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     for job in jobs:
         _check(compose(hydra, job, sweep=master), job)
     _check_writable(master, "sweep")
-    returned = run_and_report(lambda: hydra.multirun(CONFIG_NAME, run_job, overrides))
+    returned = hydra.multirun(CONFIG_NAME, run_job, overrides)
     batches = returned if isinstance(returned, list) else []  # a launcher's own processes return
     results = _results or [job.return_value for batch in batches for job in batch]
     _print_sweep(results)
@@ -128,19 +147,14 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
 
 
 def _print_help(hydra: Hydra, args: list[str]) -> None:
-    """Print the help, or the keys below the ones among the arguments, as the overrides have them.
-
-    The reader may not want all of it, such as ``| head``.
+    """Print the help, or the keys below the ones among the arguments, as the overrides have
+    them.
     """
     width = min(max(shutil.get_terminal_size((120, 24)).columns, 60), 120)
     keys = [arg for arg in args if "=" not in arg and not arg.startswith("~")]
     cfg = to_config(compose(hydra, [arg for arg in args if arg not in keys]))
     texts = [key_help(cfg, key, width) for key in keys] or [help_text(cfg, width)]
-    try:
-        print("\n".join(texts), flush=True)
-    except BrokenPipeError:
-        # Python writes there once more at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    print("\n".join(texts), flush=True)
 
 
 def run_job(cfg: DictConfig) -> Report:
@@ -171,8 +185,12 @@ def _check(cfg: DictConfig, overrides: list[str]) -> "CheckedJob":
 
 def _parse(args: list[str]) -> Namespace:
     """Hydra's reading of the flags, or a `CompositionError`."""
+
+    def refuse(message: str) -> NoReturn:
+        raise CompositionError(message)
+
     parser = get_args_parser()
-    parser.exit_on_error = False
+    parser.error = refuse  # type: ignore[method-assign]
     known = set(parser._option_string_actions) - _OTHER_CONFIG
     for arg in args:
         if arg.startswith("-") and arg.partition("=")[0] not in known:
@@ -180,10 +198,7 @@ def _parse(args: list[str]) -> Namespace:
                 f"flag '{arg}' does not exist. {suggest(arg, known)} Keys are set without dashes:"
                 " nworld=64."
             )
-    try:
-        return parser.parse_intermixed_args(args)
-    except ArgumentError as error:
-        raise CompositionError(str(error)) from error
+    return parser.parse_intermixed_args(args)
 
 
 def _expand(overrides: Sequence[str]) -> list[list[str]]:

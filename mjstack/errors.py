@@ -6,13 +6,21 @@ command line returns for it.
 
 import difflib
 import re
+import sysconfig
+import traceback
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 # As Python, C++, NumPy, torch, Warp and CUDA put it, each with another exception.
 _OUT_OF_MEMORY = re.compile(
     r"out of memory|OutOfMemory|MemoryError|bad_alloc|failed to allocate|unable to allocate"
     r"|can't allocate memory|not enough memory",
     re.IGNORECASE,
+)
+_LIBRARIES = (  # whose frames tell a user nothing
+    *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")),
+    str(Path(__file__).parent),
+    "<",
 )
 
 
@@ -229,6 +237,22 @@ class MissingExtra(InputError):
         super().__init__(
             f"{what} needs {package}, which is not installed: run pip install 'mjstack[{extra}]'."
         )
+
+
+def describe_error(error: BaseException, traceback_at: str) -> str:
+    """An error in one line: kind, text, the line of the user's own code, where the traceback is."""
+    if isinstance(error, MjstackError):
+        return str(error)
+    first = first_line(error)
+    if is_out_of_memory(f"{type(error).__name__}: {error}"):
+        smaller = "Run fewer worlds, or with smaller buffers (batch.nconmax, batch.njmax)"
+        return f"out of memory ({first}). {smaller}"
+    frames = [
+        f"{Path(frame.filename).name}:{frame.lineno}; "
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith(_LIBRARIES)
+    ]
+    return f"{type(error).__name__}: {first} ({''.join(frames[-1:])}{traceback_at})"
 
 
 def first_line(error: BaseException) -> str:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,9 +17,13 @@ import pytest
 from environments import has_gl
 
 import mjstack
+from mjstack import cli
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.session import CONFIG_FOLDER
+from mjstack.episodes.context import RunContext
+from mjstack.errors import CompositionError
+from mjstack.jobs import CheckedJob
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
 PROVENANCE = {
@@ -91,6 +96,67 @@ def test_bad_input_exits_2_in_one_line_and_writes_nothing(
     assert len(err.strip().splitlines()) == 1
     assert "Traceback" not in out + err
     assert everything(folder) == before
+
+
+FLAGS = ["--cfg nope", "-c", "--package", "--info x", "--version=1", "-m --cfg job", "-sc"]
+
+
+@pytest.mark.parametrize("flags", [*FLAGS, "nworld=2 -m gates=[nope]", "--cfg job -p gate.nope"])
+def test_flags_that_cannot_be_used_are_a_line(
+    flags: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(flags.split()) == 2
+    assert re.fullmatch("mjstack: .+\n", capsys.readouterr().err)
+    assert everything(folder) == []
+
+
+UNEXPECTED = (
+    ValueError("one\ntwo"),
+    MemoryError("5 GiB"),
+    RecursionError("deep"),
+    SystemExit(0),
+    CompositionError("a wrong value"),
+)
+
+
+@pytest.mark.parametrize("error", UNEXPECTED, ids=repr)
+def test_any_error_of_the_check_is_a_line(
+    error: BaseException,
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(cli, "_dispatch", fail)
+    assert run([]) == 2
+    said = capsys.readouterr().err
+    assert re.fullmatch("mjstack: .+\n", said)
+    monkeypatch.setenv("MJSTACK_DEBUG", "1")
+    assert run([]) == 2
+    debugged = capsys.readouterr().err
+    assert debugged.startswith("Traceback")
+    assert debugged.endswith(said)
+    assert everything(folder) == []
+
+
+@pytest.mark.parametrize("error", [*UNEXPECTED[:3], SystemExit(0)], ids=repr)
+def test_any_error_of_the_run_is_a_line(
+    error: BaseException,
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    stage: Callable[..., RunContext],
+) -> None:
+    def work(*_: object) -> None:
+        raise error
+
+    job = CheckedJob(context=stage("so101"), title="[/]", work=work)
+    assert job.run(folder, ["[/]"]).exit_code == 1
+    assert re.fullmatch("mjstack: .+\n", capsys.readouterr().err)
+    assert "Traceback" in caplog.text
+    assert the_report(folder)["status"] == "fail"
 
 
 @pytest.mark.parametrize("args", [["robot=so100"], ["nworld=many"]], ids=" ".join)

@@ -1,26 +1,18 @@
 """Runs the chosen gates in their order and keeps the report current."""
 
 import logging
-import sysconfig
 import time
-import traceback
 from collections.abc import Callable
-from pathlib import Path
 
 from mjstack.config.complete import typed
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
 from mjstack.episodes.context import RunContext, lacks_episode
-from mjstack.errors import MjstackError, first_line, is_out_of_memory
+from mjstack.errors import MjstackError, describe_error
 from mjstack.report.record import GateResult, Status
 
 log = logging.getLogger(__name__)
 
-_LIBRARIES = (  # whose frames tell a user nothing
-    *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")),
-    str(Path(__file__).parents[1]),
-    "<",
-)
 Gate = Callable[[RunContext], list[GateResult]]
 
 
@@ -63,8 +55,8 @@ def run_guarded(context: RunContext, name: str, run: Gate) -> None:
         lack = lacks_episode(context.cfg) if getattr(run, "needs_episode", False) else ""
         skipped = [GateResult(name=name, status=Status.skipped, reason=lack)]
         results = skipped if lack else run(context)
-    except Exception as error:
-        results = [GateResult(name=name, status=Status.failed, reason=describe_error(error))]
+    except (Exception, SystemExit) as error:
+        results = [GateResult(name=name, status=Status.failed, reason=log_error(error))]
     seconds = time.perf_counter() - began
     for result in results:
         if result.status is not Status.skipped and not result.seconds:
@@ -73,19 +65,8 @@ def run_guarded(context: RunContext, name: str, run: Gate) -> None:
         context.record(result)
 
 
-def describe_error(error: Exception) -> str:
+def log_error(error: BaseException) -> str:
     """An error in one line. The traceback of an unexpected one goes to run.log."""
-    if isinstance(error, MjstackError):
-        return str(error)
-    log.error("unexpected error", exc_info=error)
-    first = first_line(error)
-    if is_out_of_memory(f"{type(error).__name__}: {error}"):
-        smaller = "Run fewer worlds, or with smaller buffers (batch.nconmax, batch.njmax)"
-        return f"out of memory ({first}). {smaller}"
-    frames = [
-        f"{Path(frame.filename).name}:{frame.lineno}; "
-        for frame in traceback.extract_tb(error.__traceback__)
-        if not frame.filename.startswith(_LIBRARIES)
-    ]
-    where = "".join(frames[-1:])  # of the user's own code
-    return f"{type(error).__name__}: {first} ({where}run.log has the traceback)"
+    if not isinstance(error, MjstackError):
+        log.error("unexpected error", exc_info=error)
+    return describe_error(error, "run.log has the traceback")

@@ -15,7 +15,7 @@ from mjstack.bench.timing import EnergyMeter, Measurement
 from mjstack.config.schema import Backend
 from mjstack.envs import build_env
 from mjstack.episodes.context import RunContext, lacks_episode
-from mjstack.gates.runner import describe_error
+from mjstack.gates.runner import log_error
 from mjstack.report.record import GateResult, Status
 
 CUDA = "throughput_cuda"
@@ -120,7 +120,7 @@ def _on_driven_worlds(
     try:
         sim = context.simulation(context.cfg.nworld, backend, device)
     except Exception as error:
-        problem = describe_error(error)
+        problem = log_error(error)
         return {name: Measurement(name=name, problem=problem) for name in wanted}
     result.metrics["build_and_compile_s"] = time.perf_counter() - began
     result.notes["backend"] = sim.description
@@ -179,4 +179,4 @@ def _guarded(
     try:
         return measure(*args, **options)
     except Exception as error:
-        return Measurement(name=name, problem=describe_error(error).rstrip("."))
+        return Measurement(name=name, problem=log_error(error).rstrip("."))

@@ -1,6 +1,5 @@
 """Jobs: how they are checked and run, and the report that is written after each result."""
 
-import contextlib
 import hashlib
 import logging
 import os
@@ -9,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -24,7 +24,7 @@ from mjstack.episodes.context import Artifacts, RunContext
 from mjstack.episodes.observers import StepHook
 from mjstack.errors import ConfigError
 from mjstack.files import write_atomic
-from mjstack.gates.runner import describe_error
+from mjstack.gates.runner import log_error
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
 from mjstack.report.picture import require_video, save_scene, save_trajectories, save_video
 from mjstack.report.provenance import collect_provenance
@@ -136,14 +136,16 @@ class CheckedJob:
                 f"mjstack: {folder} cannot be written: {error.strerror}. Free space, or set"
                 " hydra.run.dir."
             )
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             report.status = Status.failed
-            problem = describe_error(error)
+            problem = log_error(error)
             log.error("%s", problem)
             errors.print(f"mjstack: {problem}")
-        with contextlib.suppress(OSError):
-            write_report(report)
-        _print_summary(console, report)
+        for finish in (write_report, partial(_print_summary, console)):
+            try:
+                finish(report)
+            except Exception as error:
+                log_error(error)
         return report
 
 

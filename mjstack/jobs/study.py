@@ -20,7 +20,7 @@ from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
 from mjstack.episodes.context import RunContext, Stage, require_episode
 from mjstack.errors import MjstackError
 from mjstack.files import to_csv
-from mjstack.gates.runner import describe_error
+from mjstack.gates.runner import log_error
 from mjstack.jobs.gates import check_machine
 from mjstack.jobs.runner import CheckedJob, Job, write_tables
 from mjstack.report.picture import figure
@@ -69,7 +69,7 @@ def run_study(context: RunContext, folder: Path) -> None:
             base = HeldPhysics(sim, state, cfg.timing.decimation)
             steps = steps_that_fit(job.steps, job.max_seconds, base.warm_up())
         except Exception as error:  # nothing can be compared with it
-            reason = f"the configured solver cannot be timed: {describe_error(error)}"
+            reason = f"the configured solver cannot be timed: {log_error(error)}"
             context.record(GateResult(name="base", status=Status.failed, reason=reason))
             return
         for name, solver in job.variants.items():
@@ -98,7 +98,7 @@ def _guarded(
     try:
         return row | _measure(replace(context, cfg=cfg, stage=stage), base, steps)
     except Exception as error:
-        return row | {"reason": describe_error(error)}
+        return row | {"reason": log_error(error)}
 
 
 def _measure(context: RunContext, base: HeldPhysics, steps: int) -> Row:
