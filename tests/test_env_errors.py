@@ -90,6 +90,13 @@ def test_action_that_is_not_finite_names_its_world(env: Env, bad: float) -> None
     fails(ArgumentError, lambda: env.step(action), "action: found", "in world 1", "finite")
 
 
+def test_a_reward_that_a_huge_action_breaks_names_the_action(env: Env) -> None:
+    action = zeros(env)
+    action[1, 4] = 1e20
+    words = ("the reward is not finite in 1 of 3 worlds (1)", "after an action of 1e+20", "policy")
+    fails(FaultError, lambda: env.step(action), *words)
+
+
 def test_argument_errors_leave_the_environment_as_it_was(env: Env) -> None:
     action = 0.3 * torch.ones_like(zeros(env))
     expected = [returned(env.step(action)), returned(env.step(-action))]

@@ -354,8 +354,11 @@ def test_a_start_that_is_not_the_recorded_one_is_refused(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Such as after random numbers have changed."""
+    """Such as after random numbers have changed; a run of before schema 2 names none."""
     folder = copy_of(earlier, tmp_path)
+    report = json.loads((folder / "report.json").read_text())
+    assert report["provenance"].pop("starts_schema") == 2
+    (folder / "report.json").write_text(json.dumps(report))
     record = record_of(folder, 1)
     assert record.start is not None
     record.start[3, 14] += 0.002
@@ -365,7 +368,7 @@ def test_a_start_that_is_not_the_recorded_one_is_refused(
     _refused(
         capsys,
         "world 3 of seed 1 would start up to 0.002 (m, rad) from where it did, expected its own"
-        " start. Use mjstack at",
+        " start. Random starts are drawn otherwise now (schema 2, not 1). Use mjstack at",
     )
     assert [path.name for path in tmp_path.iterdir()] == ["copy"]
 

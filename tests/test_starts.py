@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
+from collections.abc import Sequence
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -11,11 +14,14 @@ import torch
 from environments import configure, on_shared_sim, state_of
 from stack_checker import rotation_matrix
 
+import mjstack
 from mjstack.config.schema import Config
 from mjstack.envs import Env
+from mjstack.mdp.starts.placement import Placement, may_meet
 from mjstack.scene import table_top
 
 MANY = 200
+EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
 def start_of(cfg: Config, seed: int = 0) -> Env:
@@ -208,3 +214,75 @@ def test_a_masked_reset_draws_for_its_worlds_alone(robot: str) -> None:
             1 if before[name].dim() > 1 else 0
         )
         assert (differs.any(1) if differs.dim() > 1 else differs).all(), name
+
+
+# SHA-256 of joints and positions at commit 29170ca.
+BEFORE = {
+    ("stack", "so101"): "71b3963283ae4dcd",
+    ("stack", "rebot"): "d40c72cee9a06859",
+    ("push", "so101"): "d8eca037dd76d04c",
+    ("push", "rebot"): "dbd123628d60e32b",
+    ("tower", "so101"): "b767ec02bd38ed74",
+    ("tower", "rebot"): "2b6dab0809db45a8",
+}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("task", "robot"), BEFORE)
+def test_starts_of_objects_that_do_not_meet_are_those_of_before(task: str, robot: str) -> None:
+    """Cubes of the reBot's tower could meet, and do in no world of this seed."""
+    folder = None if task == "stack" else EXAMPLES / task / "conf"
+    chosen = [f"task={task}", f"robot={robot}", "reset=randomized", "sim=native"]
+    env = mjstack.make_env(chosen, config_dir=folder, nworld=256)
+    env.reset(seed=1)
+    columns = [*env.index.robot_qpos, *(a + i for a in env.index.object_qpos for i in range(2))]
+    start = env.sim.qpos[:, columns].numpy()
+    assert hashlib.sha256(start.tobytes()).hexdigest()[:16] == BEFORE[task, robot]
+    region = env.cfg.scene.random_xy
+    meeting = may_meet(env.cfg.scene, region, env.cfg.robot.finger_room)
+    assert meeting is ((task, robot) == ("tower", "rebot"))
+    env.close()
+
+
+def chi_square_tail(counts: Sequence[np.ndarray]) -> float:
+    """The probability that two samples of one distribution differ more than these counts."""
+    sizes = [each.sum() for each in counts]
+    weights = [math.sqrt(sizes[1] / sizes[0]), math.sqrt(sizes[0] / sizes[1])]
+    parts = (weights[0] * counts[0] - weights[1] * counts[1]) ** 2 / (counts[0] + counts[1])
+    half = torch.tensor([(len(parts) - 1) / 2, parts.sum() / 2], dtype=torch.float64)
+    return float(torch.special.gammaincc(*half))
+
+
+@pytest.mark.full
+def test_starts_in_the_box_scene_are_uniform_over_the_pairs_that_fit(robot: str) -> None:
+    """Against pairs drawn in NumPy until one fits. Placing red first gives less than 1e-100."""
+    cfg = configure("task=box", "reset=randomized", robot=robot)
+    cfg.nworld = 1000
+    env = mjstack.envs.build_env(cfg, device="cpu")
+    region = np.array(cfg.scene.random_xy)
+    gap = cfg.robot.finger_room
+    nominal = np.array([cube.xy for cube in cfg.scene.free.values()])
+    drawn = []
+    for seed in range(6):
+        env.reset(seed=seed)
+        drawn += [env.sim.qpos[:, [[a, a + 1] for a in env.index.object_qpos]].numpy().copy()]
+    placed = np.concatenate(drawn) - nominal
+
+    # Both on the table and clear of arm and walls, each by itself; and far enough apart
+    alone = Placement(
+        cfg, env.sim.model, env.index, region=region, gap=gap, pose=cfg.robot.start, noise=0.02
+    )
+    alone._apart = [[0.0, 0.0], [0.0, 0.0]]
+    tried = np.random.default_rng(0).uniform(-1.0, 1.0, (200_000, 2, 1, 2))
+    free = alone.choose(torch.from_numpy(tried))[1].numpy()
+    offsets = tried[:, :, 0] * region
+    apart = np.linalg.norm((nominal[0] + offsets[:, 0]) - (nominal[1] + offsets[:, 1]), axis=1)
+    footprints = [cube.footprint for cube in cfg.scene.free.values()]
+    fitting = offsets[free & (apart >= sum(footprints) + gap)]
+
+    edges = [np.linspace(-half, half, 5) for half in (*region, *region)]
+    counts = [np.histogramdd(each.reshape(-1, 4), edges)[0].ravel() for each in (placed, fitting)]
+    possible = counts[1] >= 25
+    assert counts[0][~possible].sum() < 0.01 * len(placed)
+    assert chi_square_tail([each[possible] for each in counts]) > 1e-3
+    env.close()

@@ -16,6 +16,7 @@ from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Overflow, Simulation, describe_overflow
 
 POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
+_HUGE = 1e18  # an action whose square may be more than a float32 holds
 NO_KEY = "Simplify the model, or run sim=native"
 
 
@@ -90,6 +91,10 @@ class FaultLatch:
             if worlds:
                 terms = self._terms(what, worlds[0])
                 culprits = f", from {', '.join(terms)}" if terms else ""
+                action = self._actions.action[worlds[0]].abs().tolist()
+                if largest := max(filter(_HUGE.__lt__, action), default=0.0):
+                    culprits += f", after an action of {largest:.3g}"
+                    fix = _FIXES["actions were not finite"]
                 raise FaultError(f"{what} in {name_worlds(worlds, nworld)}{culprits}", fix)
 
     def _terms(self, what: str, world: int) -> list[str]:

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import torch
 
+from mjstack.config.check import places_objects
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import offered
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
@@ -20,6 +21,7 @@ from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import play_episode
 from mjstack.episodes.rollout import Observer, reset_worlds
 from mjstack.errors import ConfigError
+from mjstack.mdp.starts.placement import GAP, SCHEMA, may_meet
 from mjstack.sim import Simulation, resolve_backend
 
 STATE = "observation.state"
@@ -166,6 +168,9 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     backend, _ = resolve_backend(cfg)
     config["sim"] = {"backend": backend.value}
     config["job"] = {"keep_failures": cast(CollectJobCfg, cfg.job).keep_failures}
+    placed = [term.params for term in cfg.reset.values() if places_objects(term)]
+    if any(may_meet(cfg.scene, params["xy"], params.get("gap", GAP)) for params in placed):
+        config["starts_schema"] = SCHEMA  # the others are drawn as ever
     return config
 
 

@@ -24,6 +24,7 @@ from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job, check_showing, run_provenance
+from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import resolve_backend, resolve_device
 
@@ -158,6 +159,8 @@ def _check_start(plan: ReplayPlan) -> None:
     copies = ", ".join(copy_names(plan.run.cfg).values())
     commit = plan.run.provenance.get("git_commit")
     fix = f"Put back what it started from, as {copies}" if copies else f"Use mjstack at {commit}"
+    if not copies and (then_drawn := plan.run.provenance.get("starts_schema", 1)) != SCHEMA:
+        fix = f"Random starts are drawn otherwise now (schema {SCHEMA}, not {then_drawn}). {fix}"
     raise RunError(
         f"run={plan.run.folder}: world {plan.world} of seed {plan.seed} would start up to {off:.3g}"
         f" (m, rad) from where it did, expected its own start. {fix}."

@@ -26,6 +26,7 @@ from mjstack.errors import ConfigError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import log_error
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
+from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.report.picture import require_video, save_scene, save_trajectories, save_video
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
@@ -222,6 +223,7 @@ def run_provenance(context: RunContext) -> Provenance:
         "driver": cuda_driver() if device.startswith("cuda") else "no CUDA device",
         "config_sha256": config_hash(config_content(context.cfg)),
         "model_sha256": hashlib.sha256(buffer.tobytes().hex().encode()).hexdigest(),
+        "starts_schema": SCHEMA,
     }
 
 

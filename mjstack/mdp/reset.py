@@ -21,7 +21,7 @@ from mjstack.mdp.geometry import (
     write_object,
     write_robot,
 )
-from mjstack.mdp.starts.placement import Placement
+from mjstack.mdp.starts.placement import GAP, Placement, may_meet
 from mjstack.mdp.starts.randomization import (
     ObjectMasses,
     Quantity,
@@ -106,8 +106,8 @@ class RandomizeObjects:
 
     Objects stay on the table, apart from each other, and clear of what is fixed to the world and of
     the arm at its start, joint noise included. Each world draws some candidates and takes the first
-    that fit, so that the number of operations is fixed. Regions that the arm does not reach are
-    refused.
+    that fit together, so that the number of operations is fixed, and all starts that fit are
+    equally likely. Regions that the arm does not reach are refused.
     """
 
     label = "reset.cubes"
@@ -118,7 +118,7 @@ class RandomizeObjects:
         *,
         xy: Sequence[float],
         yaw: float = math.pi,
-        gap: float = 0.01,
+        gap: float = GAP,
         candidates: int = 16,
         pose: str = "start",
     ) -> None:
@@ -129,7 +129,7 @@ class RandomizeObjects:
             xy: Half-widths of the region in x and y [m].
             yaw: Half-width of the rotation about z [rad].
             gap: Free room around an object, for fingers [m].
-            candidates: Draws per object and world.
+            candidates: Draws per object and world; four times as many where objects may meet.
             pose: Where the arm is then, ``home`` or ``start``.
 
         Raises:
@@ -144,6 +144,8 @@ class RandomizeObjects:
         require_positive("candidates", candidates)
         self._yaw = yaw
         self._candidates = candidates
+        # The first draws are the same for every scene; the others follow.
+        self._more = 3 * candidates if may_meet(env.cfg.scene, region, gap) else 0
         noise = [
             term.params.get("arm", 0.0)
             for term in env.cfg.reset.values()
@@ -158,21 +160,21 @@ class RandomizeObjects:
             pose=named_pose(env, pose).tolist(),
             noise=sum(noise),
         )
-        self._placement.require_room(region, candidates)
+        self._placement.require_room(region, candidates + self._more)
         require_reach(env, region)
         self._placement.to(env.device, env.sim.qpos.dtype)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos."""
         count = len(env.index.objects)
-        draws = random_uniform(env, self.label, count * (2 * self._candidates + 1)).view(
-            env.nworld, count, -1
-        )
-        offsets, _ = self._placement.choose(
-            draws[..., 1:].reshape(env.nworld, count, self._candidates, 2)
-        )
+        some = count * (2 * self._candidates + 1)
+        draws = random_uniform(env, self.label, some + 2 * count * self._more)
+        first = draws[:, :some].reshape(env.nworld, count, -1)
+        more = draws[:, some:].reshape(env.nworld, count, -1)
+        candidates = torch.cat((first[..., 1:], more), dim=2)
+        offsets, _ = self._placement.choose(candidates.reshape(env.nworld, count, -1, 2))
         for number, name in enumerate(env.index.objects):
-            _write_object(env, mask, name, offsets[:, number], self._yaw * draws[:, number, 0])
+            _write_object(env, mask, name, offsets[:, number], self._yaw * first[:, number, 0])
 
 
 class _Randomized:

@@ -3,6 +3,7 @@ fixed.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import mujoco
@@ -10,16 +11,37 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import Config, ObjectCfg
+from mjstack.config.schema import Config, ObjectCfg, SceneCfg
 from mjstack.errors import ParameterError
 from mjstack.rng import uniform
 from mjstack.scene import SceneIndex, table_top
 
+SCHEMA = 2
+"""How objects that may meet are placed: 1 was one after the other, 2 is all together."""
+GAP = 0.01
+"""Free room around an object, unless a term has another [m]."""
 _TRIALS = 20_000  # imaginary worlds that try a region before it is used
 _SHARE = 2_000  # of them at a time
 _FIRST = 3  # candidates that are tried first
 # [m] between an object and the arm at its start, noise included: it is the arm that moves away
 _ARM_ROOM = 0.001
+
+
+def may_meet(scene: SceneCfg, region: Sequence[float], gap: float = GAP) -> bool:
+    """Whether free objects in a region around their nominal positions can be too close together.
+
+    Args:
+        scene: The scene.
+        region: Half-widths of the region in x and y [m].
+        gap: Free room between objects [m].
+    """
+    return any(
+        math.hypot(
+            *(max(abs(p - q) - 2 * r, 0) for p, q, r in zip(a.xy, b.xy, region, strict=True))
+        )
+        < a.footprint + b.footprint + gap
+        for a, b in itertools.combinations(scene.free.values(), 2)
+    )
 
 
 class Placement:
@@ -123,10 +145,10 @@ class Placement:
             )
 
     def choose(self, draws: Tensor) -> tuple[Tensor, Tensor]:
-        """The first candidates that fit.
+        """The first candidates that fit together.
 
-        One object after the other takes its first candidate that is free, clear of those before,
-        and leaves each of those after it one that is clear too.
+        The first free candidate of each object is tried with those of the others, then the second
+        of each, and so on. So all sets of free positions that are apart are equally likely.
 
         Args:
             draws: Numbers in [-1, 1), shape ``(n, objects, candidates, 2)``: x and y.
@@ -145,23 +167,18 @@ class Placement:
                     (places[:, number, :, None, :] - around[:, :2]).abs() - around[:, 2:4]
                 ).clamp_min(0.0)
                 free[:, number] &= (away.square().sum(-1) >= around[:, 4].square()).all(-1)
-        rows = torch.arange(draws.shape[0], device=draws.device)
-        fits = torch.ones_like(rows, dtype=torch.bool)
-        chosen = []
-        count = len(rectangles)
-        for k in range(count):
-            good = free[:, k]
-            clear = {}
-            for m in range(k + 1, count):
-                x, y = (places[:, k, :, None] - places[:, m, None]).unbind(-1)
-                clear[m] = (x.square() + y.square() >= self._apart[k][m] ** 2) & free[:, m, None]
-                good = good & clear[m].any(2)
-            first = good.to(torch.uint8).argmax(1)
-            fits &= good.any(1)
-            chosen.append(offsets[rows, k, first])
-            for m, table in clear.items():
-                free[:, m] = table[rows, first]
-        return torch.where(fits[:, None, None], torch.stack(chosen, dim=1), 0.0), fits
+        # The free candidates of each object first; the k-th of all objects are tried together
+        order = (~free).to(torch.uint8).argsort(dim=2, stable=True)
+        good = free.take_along_dim(order, dim=2).all(1)
+        offsets = offsets.take_along_dim(order[..., None], dim=2)
+        places = nominal[None, :, None] + offsets
+        for k, m in itertools.combinations(range(len(rectangles)), 2):
+            x, y = (places[:, k] - places[:, m]).unbind(-1)
+            good &= x.square() + y.square() >= self._apart[k][m] ** 2
+        first = good.to(torch.uint8).argmax(1)
+        chosen = offsets[torch.arange(len(first), device=first.device), :, first]
+        fits = good.any(1)
+        return torch.where(fits[:, None, None], chosen, 0.0), fits
 
 
 def _around(

@@ -1,0 +1,269 @@
+"""Seeded command lines and damaged folders. The check of each passes, or ends in one line and exit
+status 2 with nothing written; a tenth of those that pass is run to its end.
+
+The cases run in forked children of a process of their own, whose modules are loaded already:
+``python tests/test_fuzz.py commands 17`` runs case 17 alone and prints its output.
+"""
+
+from __future__ import annotations
+
+import copy
+import gc
+import hashlib
+import importlib
+import os
+import pkgutil
+import random
+import re
+import resource
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from fuzz_cases import Make, command_lines, damaged_folders, is_short
+
+COUNTS = {"commands": 1000, "folders": 200}
+CASES = {"commands": command_lines, "folders": damaged_folders}
+PASSED = 77  # exit status of a child whose check has passed
+SECONDS = 40  # of processor time that a check may take; the slowest of them takes three
+AT_ONCE = 2
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("kind", COUNTS)
+def test_a_check_passes_or_says_one_line(kind: str) -> None:
+    done = subprocess.run(
+        [sys.executable, __file__, kind], capture_output=True, text=True, timeout=1500
+    )
+    print(done.stdout[-20_000:])
+    assert done.returncode == 0, done.stdout[-20_000:] + done.stderr[-3000:]
+    assert f"{COUNTS[kind]} cases" in done.stdout
+
+
+class Outcome(NamedTuple):
+    """How a child ended."""
+
+    status: int
+    out: str
+    err: str
+    changed: list[str]
+    seconds: float
+
+    def problem(self, *, ran: bool = False) -> str:
+        """Why that is not one of the answers that are allowed; empty if it is."""
+        if "Traceback" in self.out + self.err:
+            return "a traceback"
+        if self.status == 2:
+            lines = [line for line in self.err.splitlines() if line.strip()]
+            if len(lines) != 1 or not lines[0].startswith("mjstack: "):
+                return f"{len(lines)} lines on stderr"
+            if re.search(r"[\x00-\x08\x0b-\x1f\x7f]", lines[0]):
+                return "control characters"
+            if self.changed:
+                return f"wrote {', '.join(self.changed[:3])}"
+            return "" if not self.out.strip() else "exit 2 with output"
+        if self.status in ((0, 1) if ran else (0, PASSED)):
+            return ""
+        return "too slow" if self.status < 0 else f"exit status {self.status}"
+
+    def lines(self) -> str:
+        """The first lines of what it said."""
+        text = (self.err.strip() or self.out.strip()).splitlines()
+        return " / ".join([*text[:1], *text[-1:]])[:300]
+
+
+@dataclass
+class Child:
+    """A forked case."""
+
+    case: int
+    ran: bool
+    args: list[str]
+    home: Path
+    before: dict[str, str]
+    pid: int = 0
+    began: float = field(default_factory=time.monotonic)
+
+
+# The process that forks
+
+
+def main(kind: str, *numbers: str) -> int:
+    """Run all cases of a kind, or some of them."""
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory() as temporary:
+        fixture = Path(temporary)
+        _preload()
+        make = CASES[kind](fixture)
+        cases = [int(number) for number in numbers] or range(COUNTS[kind])
+        told: Counter[str] = Counter()
+        bad = 0
+        passed = []
+        for child, outcome in _fork_all(cases, make, fixture):
+            problem = outcome.problem()
+            told[problem or {PASSED: "passed", 0: "shown", 2: "one line"}[outcome.status]] += 1
+            bad += bool(problem)
+            if problem or numbers:
+                print(
+                    f"{kind} {child.case}: {shlex.join(child.args)}\n  {problem}:"
+                    f" {outcome.lines()}",
+                    flush=True,
+                )
+            if outcome.status == PASSED and is_short(child.args):
+                passed.append(child.case)
+        chosen = (
+            passed if numbers else sorted(random.Random(kind).sample(passed, len(passed) // 10))
+        )
+        for child, outcome in _fork_all(chosen, make, fixture, run=True):
+            problem = outcome.problem(ran=True)
+            told[problem or f"run to its end: {outcome.status}"] += 1
+            bad += bool(problem)
+            if problem or numbers:
+                print(
+                    f"{kind} {child.case}, run: {shlex.join(child.args)}\n  {problem}:"
+                    f" {outcome.lines()}",
+                    flush=True,
+                )
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    print(
+        f"{len(cases)} cases: {dict(told)}; {time.monotonic() - began:.0f} s, of which the"
+        f" processors worked {used.ru_utime + used.ru_stime:.0f} s"
+    )
+    return min(bad, 1)
+
+
+def _fork_all(
+    cases: Sequence[int], make: Make, fixture: Path, *, run: bool = False
+) -> Iterator[tuple[Child, Outcome]]:
+    """Fork a child per case, two at a time."""
+    running: dict[int, Child] = {}
+    waiting = iter(cases)
+    while True:
+        while len(running) < AT_ONCE and (case := next(waiting, None)) is not None:
+            child = _fork(case, make, fixture, run)
+            running[child.pid] = child
+        if not running:
+            return
+        pid, status = os.waitpid(-1, os.WNOHANG)
+        if pid in running:
+            yield running[pid], _outcome(running.pop(pid), os.waitstatus_to_exitcode(status))
+        elif not pid:
+            time.sleep(0.005)
+            for child in running.values():
+                if time.monotonic() - child.began > 20 * SECONDS:
+                    os.killpg(child.pid, signal.SIGKILL)
+
+
+def _fork(case: int, make: Make, fixture: Path, run: bool) -> Child:
+    home = Path(tempfile.mkdtemp(dir=fixture))
+    (home / "cwd").mkdir()
+    args = make(case, home / "cwd")
+    child = Child(case, run, args, home, _content(home / "cwd"))
+    child.pid = os.fork()
+    if not child.pid:
+        _be_the_command(child)
+    return child
+
+
+def _be_the_command(child: Child) -> None:
+    """Become the command line, in a folder that is empty but for what the case put there."""
+    status = 1
+    try:
+        os.setsid()
+        gc.disable()  # a child lives for a second
+        os.chdir(child.home / "cwd")
+        for number, name in ((0, os.devnull), (1, child.home / "out"), (2, child.home / "err")):
+            file = os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+            os.dup2(file, number)
+        resource.setrlimit(resource.RLIMIT_CPU, (3 * SECONDS if child.ran else SECONDS,) * 2)
+        resource.setrlimit(resource.RLIMIT_AS, (2**34, 2**34))
+        if not child.ran:
+            from hydra._internal.hydra import Hydra
+
+            Hydra.run = Hydra.multirun = _pass  # type: ignore[method-assign, assignment]
+        sys.argv = ["mjstack", *child.args]
+        from mjstack.__main__ import main as command
+
+        command()
+    except SystemExit as stop:
+        status = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        os._exit(status)
+
+
+def _pass(*_: object, **__: object) -> None:
+    """The check has passed, and Hydra would make the folder now."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(PASSED)
+
+
+def _outcome(child: Child, status: int) -> Outcome:
+    out, err = ((child.home / name).read_text(errors="replace") for name in ("out", "err"))
+    now = _content(child.home / "cwd")
+    changed = sorted(name for name in now | child.before if now.get(name) != child.before.get(name))
+    shutil.rmtree(child.home, ignore_errors=True)
+    return Outcome(status, out, err, changed, time.monotonic() - child.began)
+
+
+def _content(folder: Path) -> dict[str, str]:
+    """Every path below a folder, with the hash of a file and the target of a link."""
+    found = {}
+    for path in folder.rglob("*"):
+        if path.is_symlink():
+            said = os.readlink(path)
+        elif path.is_file():
+            said = hashlib.sha256(path.read_bytes()).hexdigest()
+        else:
+            said = ""
+        found[str(path.relative_to(folder))] = said
+    return found
+
+
+def _preload() -> None:
+    """Load what a command line loads, and keep what it reads of YAML."""
+    import matplotlib
+    import yaml
+
+    import mjstack.cli
+
+    matplotlib.use("Agg")
+    for module in pkgutil.walk_packages(mjstack.__path__, "mjstack."):
+        if not re.search(r"__main__|adapters|bench", module.name):
+            importlib.import_module(module.name)
+    read = yaml.load
+    known: dict[str, Any] = {}
+
+    def load(stream: Any, Loader: Any) -> Any:
+        if not hasattr(stream, "seek"):
+            return read(stream, Loader=Loader)
+        text = stream.read()
+        if text not in known:
+            stream.seek(0)
+            known[text] = read(stream, Loader=Loader)
+        return copy.deepcopy(known[text])
+
+    yaml.load = load
+    for args in (["nworld=-1"], ["job=collect", "nworld=-1"], ["task=box", "nworld=-1"]):
+        mjstack.cli.run(args)
+    gc.collect()
+    gc.freeze()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(*sys.argv[1:]))
