@@ -85,14 +85,14 @@ def typed(key: str, node: Any, kind: type) -> Any:
     items = {field.name: field for field in fields(kind)}
     if not isinstance(node, dict):
         raise ConfigError(key, node, f"a mapping with some of {', '.join(items)}")
-    typed = _schema(kind).copy()
-    for name, value in node.items():
+    for name in node:
         if name not in items:
             raise UnknownName(f"{key}: key", str(name), items)
-        try:
-            typed.merge_with({name: value})
-        except OmegaConfBaseException as error:
-            raise ConfigError(f"{key}.{name}", value, accepted(kind, items[name])) from error
+    try:
+        typed = OmegaConf.merge(_schema(kind), node)
+    except OmegaConfBaseException as error:
+        name = str(error.full_key).partition(".")[0]
+        raise ConfigError(f"{key}.{name}", node[name], accepted(kind, items[name])) from error
     missing = sorted(OmegaConf.missing_keys(typed))
     if missing:
         raise TermError(key, f"'{missing[0]}' is missing: set {key}.{missing[0]}")
