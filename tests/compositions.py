@@ -1,4 +1,6 @@
-"""Configurations for tests, each composed once in a process: a composition takes half a second."""
+"""Configurations for tests: each choice of groups is composed once in a process, and values are set
+in a copy of it, as Hydra sets them. A composition takes half a second.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +9,39 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
 import mjstack
 from mjstack.config.check import validate
 from mjstack.config.explain import parse
+from mjstack.config.load import compose, to_config
 from mjstack.config.schema import Config
+from mjstack.config.session import hydra_session, list_choices, without_hydra
 from mjstack.envs import Env, build_env
 from mjstack.tasks.check import make_check
 
 
 @cache
+def _choices(groups: tuple[str, ...]) -> DictConfig:
+    with hydra_session() as hydra:
+        return without_hydra(compose(hydra, groups))
+
+
+@cache
 def _composed(overrides: tuple[str, ...]) -> Config:
-    return mjstack.load_config(overrides)
+    known = list_choices()
+    groups = tuple(o for o in overrides if o.partition("=")[0] in known)
+    values = [o for o in overrides if o not in groups]
+    if any(o[0] in "+~" or "func" in o for o in values):
+        return mjstack.load_config(overrides)
+    cfg = copy.deepcopy(_choices(groups))
+    try:
+        for parsed in map(parse, values):
+            OmegaConf.update(cfg, parsed.key_or_group, parsed.value(), merge=True)
+    except OmegaConfBaseException:
+        return mjstack.load_config(overrides)  # with the error that a user sees
+    return to_config(cfg)
 
 
 def load_config(overrides: Sequence[str] = ()) -> Config:

@@ -205,7 +205,7 @@ def list_choices() -> dict[str, list[str]]:
 class _Repository(ConfigRepository):
     """Parses a file once in a process, which is a quarter of the time of a composition."""
 
-    _parsed: ClassVar[dict[tuple, ConfigResult]] = {}
+    _parsed: ClassVar[dict[tuple, ConfigResult | None]] = {}
 
     def load_config(self, config_path: str) -> ConfigResult | None:
         """Load a file, or copy what an earlier composition loaded, as long as it is unchanged."""
