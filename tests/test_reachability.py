@@ -367,7 +367,7 @@ def test_a_wall_that_leaves_no_room_is_said() -> None:
 
 @pytest.mark.full
 def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
-    """Red's first free candidate alone would leave blue no place in some worlds."""
+    """Three of four pairs of free positions are too close."""
     overrides = [
         "scene.objects.red.xy=[0.29,-0.13]",
         "scene.objects.blue.xy=[0.37,-0.13]",
@@ -378,11 +378,11 @@ def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
     model = build_model(cfg)
     index = SceneIndex(model, cfg.robot, cfg.scene)
     placement = Placement(cfg, model, index, region=(0.03, 0.03), gap=0.04, pose=cfg.robot.start)
-    placement.require_room([0.03, 0.03], 16)
+    placement.require_room([0.03, 0.03], 64)
     draws = (
         2.0
         * torch.rand(
-            (500, 2, 16, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+            (500, 2, 64, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
         )
         - 1.0
     )
