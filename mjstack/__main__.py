@@ -2,15 +2,16 @@
 
 import sys
 
+from mjstack.interrupt import EXIT_CODE, handle_interrupts, interrupted
+
 
 def main() -> None:
     """Entry point of the console script; leaves with the exit status of the run."""
-    try:
+    with handle_interrupts():
         from mjstack.cli import run  # takes seconds
-    except KeyboardInterrupt:
-        print("mjstack: interrupted before anything ran", file=sys.stderr)
-        raise SystemExit(130) from None
-    raise SystemExit(run(sys.argv[1:]))
+
+        status = run(sys.argv[1:])
+        raise SystemExit(EXIT_CODE if interrupted() else status)
 
 
 if __name__ == "__main__":

@@ -44,6 +44,7 @@ from mjstack.errors import (
     first_line,
     suggest,
 )
+from mjstack.interrupt import EXIT_CODE, begin_job
 from mjstack.report.record import Report, Status
 from mjstack.report.table import Table
 
@@ -69,10 +70,8 @@ def run(args: list[str]) -> int:
         flags = _parse(args)
         with extended_search_path(flags.overrides, flags.config_dir) as overrides:
             return _dispatch(flags, overrides)
-    except KeyboardInterrupt:
-        if not _results:
-            errors.print("mjstack: interrupted before anything ran")
-        return 130
+    except KeyboardInterrupt:  # the job has said so
+        return EXIT_CODE
     except BrokenPipeError:
         # The reader may not want all of it, such as ``| head``. Python writes once more at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -123,6 +122,7 @@ def _run_one(hydra: Hydra, overrides: list[str]) -> int:
     checked = _check(cfg, overrides)
     if checked.folder is not None and not any(o.startswith("hydra.run.dir=") for o in overrides):
         cfg.hydra.run.dir = str(checked.folder)
+    begin_job()
     _check_writable(cfg, "run")
     hydra.run(CONFIG_NAME, run_job, overrides)
     return max(result.exit_code for result in _results)
@@ -138,6 +138,7 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     master = compose(hydra, overrides, RunMode.MULTIRUN)
     for job in jobs:
         _check(compose(hydra, job, sweep=master), job)
+    begin_job()
     _check_writable(master, "sweep")
     returned = hydra.multirun(CONFIG_NAME, run_job, overrides)
     batches = returned if isinstance(returned, list) else []  # a launcher's own processes return

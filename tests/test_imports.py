@@ -12,7 +12,7 @@ import mjstack
 ROOT = Path(mjstack.__file__).parent
 # A module may import from its own layer and from earlier ones.
 LAYERS = [
-    {"errors", "math", "rng", "files"},
+    {"errors", "math", "rng", "files", "interrupt"},
     {"config"},
     {"robots"},
     {"scene"},
@@ -30,7 +30,7 @@ LAYERS = [
     {"__main__"},
 ]
 LEAVES = {
-    "report": {"errors", "files", "report"}
+    "report": {"errors", "files", "interrupt", "report"}
 }  # anything may import it, and it imports only these
 HOMES = {
     "mujoco_warp": ("sim/",),

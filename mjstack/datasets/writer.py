@@ -5,8 +5,6 @@ committed.
 import contextlib
 import json
 import os
-import signal
-import threading
 import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -283,43 +281,24 @@ class DatasetWriter:
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Let Ctrl-C wait until the block has ended, so that an episode is written as a whole or
-        not at all. If something goes wrong, close the writer and remove what is not committed.
-        """
+        """If something goes wrong, close the writer and remove what is not committed."""
         kept = len(self.committed)
         frames = self.frames
-        with _interrupts_deferred():
-            try:
-                yield
-            except BaseException as error:
-                self._open = False
-                self._rows = []
-                del self.committed[kept:]
-                self.frames = frames
-                if self._frames_writer is not None:
-                    self._frames_writer.is_open = False  # its destructor would complete the file
-                if self._file is not None:
-                    with contextlib.suppress(OSError):  # closing writes what is buffered
-                        self._file.close()
-                info = read_info(self.folder)
-                for path in uncommitted(self.folder, info["mjstack"]["shards"] if info else 0):
-                    path.unlink()
-                if isinstance(error, OSError):
-                    raise UnwrittenError(str(self.folder), error, kept) from error
-                raise
-
-
-@contextlib.contextmanager
-def _interrupts_deferred() -> Iterator[None]:
-    """Let Ctrl-C wait until the block has ended."""
-    if threading.current_thread() is not threading.main_thread():  # which alone is interrupted
-        yield
-        return
-    caught: list[tuple] = []
-    before = signal.signal(signal.SIGINT, lambda *args: caught.append(args))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if caught and callable(before):
-            before(*caught[0])
+        try:
+            yield
+        except BaseException as error:
+            self._open = False
+            self._rows = []
+            del self.committed[kept:]
+            self.frames = frames
+            if self._frames_writer is not None:
+                self._frames_writer.is_open = False  # its destructor would complete the file
+            if self._file is not None:
+                with contextlib.suppress(OSError):  # closing writes what is buffered
+                    self._file.close()
+            info = read_info(self.folder)
+            for path in uncommitted(self.folder, info["mjstack"]["shards"] if info else 0):
+                path.unlink()
+            if isinstance(error, OSError):
+                raise UnwrittenError(str(self.folder), error, kept) from error
+            raise

@@ -4,11 +4,11 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from multiprocessing import get_context, parent_process
+from multiprocessing import active_children, get_context, parent_process
 from threading import Thread
 from types import ModuleType
 from typing import Any
@@ -18,6 +18,7 @@ import torch
 
 from mjstack.config.schema import Config
 from mjstack.errors import Unreachable, WorkerLost
+from mjstack.interrupt import check_interrupt
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.scene.phases import build_phases, nominal_xy, target_xy
 from mjstack.sim.native import available_cores
@@ -25,6 +26,7 @@ from mjstack.sim.native import available_cores
 # Distinct worlds: some 6 s of planning; a process needs 3 s before its first plan.
 PARALLEL_FROM = 512
 WORLDS_PER_PROCESS = 128  # distinct worlds that pay for one process more
+_POLL = 0.2  # s, between two looks at whether the command was interrupted
 _CHUNK = 8  # worlds, 0.1 s of planning: messages cost little beside it
 
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -276,10 +278,19 @@ def plan_in_parallel(
     """
     # Processes are not forks: this one may hold a CUDA context and threads.
     pool = ProcessPoolExecutor(processes, get_context("spawn"), _start_process, (cfg,))
+    theirs = active_children()
     try:
         with _as_programs():
-            plans = pool.map(_plan, worlds, sources_xy[list(worlds)], chunksize=_CHUNK)
-        yield from plans
+            chunks = [worlds[first : first + _CHUNK] for first in range(0, len(worlds), _CHUNK)]
+            jobs = [pool.submit(_plan, chunk, sources_xy[list(chunk)]) for chunk in chunks]
+        for job in jobs:
+            while not wait([job], _POLL).done:
+                check_interrupt()
+            yield from job.result()
+    except (KeyboardInterrupt, GeneratorExit):
+        for process in set(active_children()).difference(theirs):
+            process.kill()  # it may still be loading
+        raise
     except BrokenProcessPool:
         raise WorkerLost(
             "a planning process was killed or ended before every world was planned",
@@ -323,8 +334,8 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _plan(world: int, xy: np.ndarray) -> Plan:
-    return world, *_planner.plan_world(world, xy)
+def _plan(worlds: Sequence[int], xy: np.ndarray) -> list[Plan]:
+    return [(w, *_planner.plan_world(w, row)) for w, row in zip(worlds, xy, strict=True)]
 
 
 def smoothstep(u: Any) -> Any:

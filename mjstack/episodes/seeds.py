@@ -10,6 +10,7 @@ from mjstack.episodes.rollout import Observer
 from mjstack.episodes.tally import EpisodeTally
 from mjstack.errors import first_line
 from mjstack.files import to_csv, write_atomic
+from mjstack.interrupt import check_interrupt
 
 log = logging.getLogger(__name__)
 
@@ -78,6 +79,7 @@ def play_seeds(
                     record.circumstances = Circumstances.of(episode, monitor)
                 tally.add(record, episode, sim)
             except Exception as error:
+                check_interrupt()
                 if seed == cfg.seed:
                     raise
                 log.exception("seed %d broke", seed)

@@ -9,6 +9,7 @@ from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
 from mjstack.episodes.context import RunContext, lacks_episode
 from mjstack.errors import MjstackError, describe_error
+from mjstack.interrupt import check_interrupt
 from mjstack.report.record import GateResult, Status
 
 log = logging.getLogger(__name__)
@@ -66,7 +67,12 @@ def run_guarded(context: RunContext, name: str, run: Gate) -> None:
 
 
 def log_error(error: BaseException) -> str:
-    """An error in one line. The traceback of an unexpected one goes to run.log."""
+    """An error in one line. The traceback of an unexpected one goes to run.log.
+
+    Raises:
+        KeyboardInterrupt: The command was interrupted, which may have caused the error.
+    """
+    check_interrupt()
     if not isinstance(error, MjstackError):
         log.error("unexpected error", exc_info=error)
     return describe_error(error, "run.log has the traceback")

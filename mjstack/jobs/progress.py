@@ -12,6 +12,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from mjstack.interrupt import check_interrupt
 from mjstack.report.record import GateResult, Status
 
 STATUS_COLOR = {
@@ -23,7 +24,10 @@ STATUS_COLOR = {
 
 
 class ProgressBar:
-    """A bar per gate with rate and time left on a terminal; a line now and then elsewhere."""
+    """A bar per gate with rate and time left on a terminal; a line now and then elsewhere.
+
+    A job reports its progress where nothing is half done, so it is interrupted there.
+    """
 
     def __init__(self, console: Console) -> None:
         self._progress = Progress(
@@ -55,6 +59,7 @@ class ProgressBar:
 
     def start(self, gate: str) -> None:
         """Begin something with a name."""
+        check_interrupt()
         self._gate = gate
         self._unit = ""
         self._spoke = time.monotonic()
@@ -62,6 +67,7 @@ class ProgressBar:
 
     def advance(self, unit: str, done: int, total: int) -> None:
         """Show how much of something is done."""
+        check_interrupt()
         now = time.monotonic()
         if unit != self._unit or done <= 1:
             self._unit = unit
@@ -82,6 +88,7 @@ class ProgressBar:
             f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s):"
             f" {escape(result.reason or 'ok')}"
         )
+        check_interrupt()
 
     def _show(self, text: str, total: int, rate: str = "") -> None:
         """Begin the bar anew."""

@@ -25,6 +25,7 @@ from mjstack.episodes.observers import StepHook
 from mjstack.errors import ConfigError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import log_error
+from mjstack.interrupt import interrupted
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
 from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.report.picture import require_video, save_scene, save_trajectories, save_video
@@ -128,20 +129,19 @@ class CheckedJob:
             write_report(report)
             report.pictures = [*_draw(context, console), *context.artifacts.pictures]
         # However it ends, the finished results are in the report.
-        except KeyboardInterrupt:
-            report.status = Status.interrupted
-            console.print("interrupted; the finished gates are in the report")
-        except OSError as error:
-            report.status = Status.failed
-            errors.print(
-                f"mjstack: {folder} cannot be written: {error.strerror}. Free space, or set"
-                " hydra.run.dir."
-            )
-        except (Exception, SystemExit) as error:
-            report.status = Status.failed
-            problem = log_error(error)
-            log.error("%s", problem)
-            errors.print(f"mjstack: {problem}")
+        except (Exception, SystemExit, KeyboardInterrupt) as error:
+            if interrupted() or isinstance(error, KeyboardInterrupt):
+                report.status = Status.interrupted
+                console.print("interrupted; the finished gates are in the report")
+            else:
+                report.status = Status.failed
+                if isinstance(error, OSError):
+                    problem = f"{folder} cannot be written: {error.strerror}. Free space, or set"
+                    problem += " hydra.run.dir."
+                else:
+                    problem = log_error(error)
+                    log.error("%s", problem)
+                errors.print(f"mjstack: {problem}")
         for finish in (write_report, partial(_print_summary, console)):
             try:
                 finish(report)

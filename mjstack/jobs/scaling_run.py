@@ -11,11 +11,13 @@ from typing import Any
 from mjstack.config.session import search_path_args
 from mjstack.errors import is_out_of_memory
 from mjstack.files import write_atomic
+from mjstack.interrupt import check_interrupt
 
 PASS = "pass"
 NOT_RUN = "not run"
 RESULT = "run.json"
 _START = "from mjstack.__main__ import main; main()"
+_POLL = 0.1  # s, between two looks at the process
 _GRACE = 20.0  # s, for a process that was asked to stop
 
 Row = dict[str, Any]
@@ -58,7 +60,7 @@ def run_process(
         reason.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C; the process has been stopped.
+        KeyboardInterrupt: The command was interrupted; the process has been stopped.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "report.json").unlink(missing_ok=True)  # an earlier try's
@@ -72,11 +74,12 @@ def run_process(
             stdout=log,
             stderr=subprocess.STDOUT,
         )
-        code: int | None = None
         try:
-            code = process.wait(min(run_seconds, job_seconds))
-        except subprocess.TimeoutExpired:
-            pass
+            while (code := process.poll()) is None and (
+                time.monotonic() - began < min(run_seconds, job_seconds)
+            ):
+                check_interrupt()
+                time.sleep(_POLL)
         finally:
             _stop(process)
     seconds = time.monotonic() - began
@@ -126,13 +129,10 @@ def read_report(folder: Path, nworld: int, backend: str, code: int | None) -> Ro
 
 
 def _stop(process: subprocess.Popen) -> None:
-    """Ask a process that still runs to stop, as Ctrl-C would, and end it if it does not."""
+    """Ask a process that still runs to stop, and end it if it does not."""
+    process.terminate()
     try:
-        process.wait(1.0)  # a terminal's Ctrl-C has reached it too
+        process.wait(_GRACE)
     except subprocess.TimeoutExpired:
-        process.terminate() if sys.platform == "win32" else process.send_signal(2)
-        try:
-            process.wait(_GRACE)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        process.kill()
+        process.wait()

@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from mjstack.errors import MissingExtra, MjstackError
+from mjstack.interrupt import check_interrupt
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -75,6 +76,7 @@ def _render(
     camera.elevation = -24.0
     with renderer:
         for state in states:
+            check_interrupt()
             data.qpos[:] = state
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)

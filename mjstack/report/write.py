@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from mjstack.files import write_atomic
+from mjstack.interrupt import check_interrupt
 from mjstack.report.record import GateResult, Report
 from mjstack.report.table import Table, format_value, to_document
 
@@ -64,11 +65,14 @@ def safely_write(path: Path, write: Callable[..., object], *args: object) -> str
     Returns:
         Empty, or one line that says why there is no such file. run.log has the traceback.
     """
+    check_interrupt()
     try:
         write(path, *args)
-    except Exception as error:
-        log.exception("%s was not written", path.name)
+    except (Exception, KeyboardInterrupt) as error:
         path.unlink(missing_ok=True)  # it may be there in part
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        log.exception("%s was not written", path.name)
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         return f"{path.name} was not written: {reason}"
     return ""

@@ -16,6 +16,7 @@ import torch
 
 from mjstack.config.schema import GraphMode
 from mjstack.errors import CaptureError
+from mjstack.interrupt import check_interrupt
 
 if TYPE_CHECKING:
     import warp as wp
@@ -102,7 +103,8 @@ class StepGraph:
         return self._replay is not None and self._version() == self._seen
 
     def __call__(self) -> None:
-        """Do the work, in one way or another."""
+        """Do the work, in one way or another; between two calls a command can be interrupted."""
+        check_interrupt()
         if self._version() != self._seen:
             self.drop()
         if self._mode is GraphMode.off or self._failed:

@@ -5,15 +5,20 @@ cores.
 import copy
 import os
 import platform
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
+import time
+import weakref
+from _thread import start_new_thread
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
+from queue import Empty, SimpleQueue
 
 import mujoco
 import numpy as np
 import torch
 
+from mjstack.interrupt import check_interrupt
 from mjstack.sim.model_fields import Fields, SimpleBodies, check_fields
 from mjstack.sim.simulation import Overflow, Simulation, named_options
 
@@ -28,6 +33,7 @@ _SPEC = int(
 )
 _CONTACT_FULL = int(mujoco.mjtWarning.mjWARN_CONTACTFULL)
 _CONSTRAINT_FULL = int(mujoco.mjtWarning.mjWARN_CNSTRFULL)
+_POLL = 0.2  # s, between two looks at whether the command was interrupted
 _SAMEFRAME = {
     "body_sameframe": {"body_ipos", "body_iquat"},
     "geom_sameframe": {"geom_pos", "geom_quat"},
@@ -49,6 +55,65 @@ class _Worker:
     fields: list[tuple[np.ndarray, np.ndarray]]
     poses: list[tuple[np.ndarray, np.ndarray]]
     others: list[tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True, slots=True)
+class _Visit:
+    """Work on worlds that threads share.
+
+    Ctrl-C in a script may raise anywhere in the calling thread. So what the threads share is atomic
+    in C, and needs no lock that an exception could leave in a wrong state.
+    """
+
+    work: Callable[[_Worker, Iterable[int]], None]
+    worlds: Iterator[int]
+    begun: list[_Worker] = field(default_factory=list)
+    ended: list[BaseException | None] = field(default_factory=list)
+    wake: SimpleQueue[None] = field(default_factory=SimpleQueue)
+
+    def run(self, worker: _Worker) -> None:
+        """Do a thread's share. All of them draw from one iterator, so that none waits for another
+        one's share. Which of them gets a world does not matter to it: the whole state is loaded.
+        """
+        self.begun.append(worker)
+        error = None
+        try:
+            self.work(worker, self.worlds)
+        except BaseException as found:
+            error = found
+        self.ended.append(error)
+        self.wake.put(None)
+
+    def wait(self, workers: int) -> None:
+        """Wait for every thread, and raise what went wrong."""
+        while len(self.ended) < workers:
+            with suppress(Empty):
+                self.wake.get(timeout=_POLL)
+            check_interrupt()
+        for error in self.ended:
+            if error is not None:
+                raise error
+
+    def abandon(self) -> None:
+        """Take the worlds away, and wait until no thread writes into the state or uses its data.
+        One that begins later finds no world.
+        """
+        for _ in self.worlds:
+            pass
+        while len(self.ended) < len(self.begun):
+            time.sleep(1e-4)
+
+
+def _serve(tasks: SimpleQueue[Callable[[], None] | None]) -> None:
+    """Do tasks until None comes. A task is not held on to: it knows the simulation."""
+    while (task := tasks.get()) is not None:
+        task()
+        del task
+
+
+def _dismiss(tasks: SimpleQueue[Callable[[], None] | None], threads: int) -> None:
+    for _ in range(threads):
+        tasks.put(None)
 
 
 class NativeSimulation(Simulation):
@@ -90,7 +155,11 @@ class NativeSimulation(Simulation):
         self.description = (
             f"MuJoCo {mujoco.__version__} on {nthread} threads, {platform.machine()} CPU"
         )
-        self._pool = ThreadPoolExecutor(nthread) if nthread > 1 else None
+        self._tasks: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._visited: _Visit | None = None  # and perhaps not to its end
+        for _ in range(nthread):
+            start_new_thread(_serve, (self._tasks,))
+        self._stop = weakref.finalize(self, _dismiss, self._tasks, nthread)
 
         # The state
         # mj_getState's order: time, qpos, qvel, act, warm start, ctrl.
@@ -185,8 +254,7 @@ class NativeSimulation(Simulation):
 
     def close(self) -> None:
         """Stop the threads."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        self._stop()
 
     def _worker(self) -> _Worker:
         """A thread's data, and its own model if worlds differ in it."""
@@ -238,31 +306,27 @@ class NativeSimulation(Simulation):
 
     def _visit(self, work: Callable[[_Worker, Iterable[int]], None], worlds: list[int]) -> None:
         """Share worlds out among the threads."""
+        if self._visited is not None:
+            self._visited.abandon()
         if self._simple is not None:
             self._simple.update()
-        if self._pool is None or len(worlds) < 2:
+        if len(worlds) < 2:
             work(self._workers[0], worlds)
             return
-        # All threads draw from one iterator, so that none waits for another one's share. Which of
-        # them gets a world does not matter to it: the whole state is loaded. Taking the next item
-        # is atomic under the interpreter lock.
-        queue = iter(worlds)
-        jobs = [self._pool.submit(work, worker, queue) for worker in self._workers]
+        visit = self._visited = _Visit(work, iter(worlds))
         try:
-            wait(jobs)
-        # Ctrl-C: no thread may write into the state, or use its data, after this call has ended.
+            for worker in self._workers:
+                self._tasks.put(partial(visit.run, worker))
+            visit.wait(self.nthread)
         except BaseException:
-            for _ in queue:
-                pass
-            wait(jobs)
+            visit.abandon()
             raise
-        for job in jobs:
-            job.result()
+        self._visited = None
 
     def _load(self, worker: _Worker, w: int) -> None:
         """Make a thread's model and data those of world w."""
-        for values, field in worker.fields:
-            field[:] = values[w]
+        for values, own in worker.fields:
+            own[:] = values[w]
         mujoco.mj_setState(worker.model, worker.data, self._state[w], _SPEC)
 
     def _step(self, worker: _Worker, worlds: Iterable[int], *, n: int, kinematics: bool) -> None:
