@@ -8,7 +8,6 @@ import copy
 import json
 import os
 import shutil
-import signal
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from dataset_checker import check_dataset
 from environments import configure, one_second_episode
 from stubs import episodes_of, fake_demonstrations, pairs
 
+from mjstack import interrupt
 from mjstack.cli import run
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import CollectJobCfg
@@ -178,7 +178,7 @@ def interrupt_at(call: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(self: DatasetWriter, *args: Any) -> None:
         calls.append(args)
         if len(calls) == call:
-            os.kill(os.getpid(), signal.SIGINT)
+            monkeypatch.setattr(interrupt, "_asked", True)  # as the command's handler does
         add(self, *args)
 
     monkeypatch.setattr(DatasetWriter, "_write", interrupted)
@@ -186,15 +186,12 @@ def interrupt_at(call: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def play_interrupted(home: Path, call: int, *overrides: str, **kwargs: Any) -> GateResult:
     """What a call leaves in which Ctrl-C comes during an episode."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     playing = collection_at(home, *overrides, **kwargs)
-    try:
-        with pytest.MonkeyPatch.context() as monkeypatch:
-            interrupt_at(call, monkeypatch)
-            with pytest.raises(KeyboardInterrupt):
-                playing.play()
-    finally:
-        signal.signal(signal.SIGINT, before)
+    playing._context.advance = lambda *_: interrupt.check_interrupt()
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        interrupt_at(call, monkeypatch)
+        with pytest.raises(KeyboardInterrupt):
+            playing.play()
     return playing.result(Status.interrupted, "interrupted", 1.0)
 
 
@@ -455,16 +452,12 @@ def test_ctrl_c_on_cuda() -> None:
         "sim.device=cuda:0",
     ]
     home = Path("demos")
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(collection, "play_demonstrations", play_demonstrations)
         monkeypatch.setattr(demonstration, "config_content", config_content)
-        try:
-            with pytest.MonkeyPatch.context() as inner:
-                interrupt_at(3, inner)
-                assert run(args) == 130
-        finally:
-            signal.signal(signal.SIGINT, before)
+        with pytest.MonkeyPatch.context() as inner:
+            interrupt_at(3, inner)
+            assert run(args) == 130
         first = episodes_of(home / "dataset")
         data = (home / "dataset/data/chunk-000/file-000.parquet").read_bytes()
         assert len(first) == 3

@@ -525,8 +525,10 @@ except t.UnwrittenError as error:
     assert not leftover(tmp_path / "dataset")
 
 
-def test_ctrl_c_waits_for_the_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It comes in the middle of the second of three: two are kept."""
+def test_ctrl_c_in_a_script_keeps_what_is_committed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It comes in the middle of the second of three, of which the first was committed."""
     add = DatasetWriter._write
     calls = []
 
@@ -541,11 +543,15 @@ def test_ctrl_c_waits_for_the_episode(tmp_path: Path, monkeypatch: pytest.Monkey
         signal.SIGINT, signal.default_int_handler
     )  # a shell's background jobs start with it ignored
     try:
-        with pytest.raises(KeyboardInterrupt), DatasetWriter(tmp_path, SPEC) as writer:
-            writer.add([episode(world) for world in range(3)])
+        with DatasetWriter(tmp_path, SPEC) as writer:
+            writer.add([episode(0)])
+            writer.flush()
+            with pytest.raises(KeyboardInterrupt):
+                writer.add([episode(world) for world in (1, 2)])
     finally:
         signal.signal(signal.SIGINT, before)
-    assert worlds_of(tmp_path) == [0, 1]
+    assert worlds_of(tmp_path) == [0]
+    assert not leftover(tmp_path)
 
 
 def test_an_error_elsewhere_keeps_what_was_added(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from mjstack.episodes.observers import StepHook
 from mjstack.errors import ConfigError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import log_error
-from mjstack.interrupt import interrupted
+from mjstack.interrupt import check_interrupt, interrupted
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
 from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.report.picture import require_video, save_scene, save_trajectories, save_video
@@ -128,6 +128,7 @@ class CheckedJob:
             report.conclude()
             write_report(report)
             report.pictures = [*_draw(context, console), *context.artifacts.pictures]
+            check_interrupt()
         # However it ends, the finished results are in the report.
         except (Exception, SystemExit, KeyboardInterrupt) as error:
             if interrupted() or isinstance(error, KeyboardInterrupt):

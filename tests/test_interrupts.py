@@ -1,0 +1,159 @@
+"""Ctrl-C and SIGTERM at random moments: of a command, in forked children of a process of their own
+as in test_fuzz.py, and of a script that steps an environment.
+
+``python tests/test_interrupts.py gates 250`` interrupts 250 runs and prints how they ended.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import warnings
+from collections import Counter
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+import test_fuzz as fuzz
+import torch
+from compositions import make_env
+from environments import one_second_episode
+
+from mjstack.interrupt import EXIT_CODE
+
+NO_WORK = "mjstack: interrupted before anything ran\n"
+WORK = "interrupted; the finished gates are in the report\n"
+PROPER = {"before it ran", "while it ran", "after its last step", "ended by itself"}
+SECONDS = 2.0  # of processor time, in which an interrupted command ends
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("kind", ["gates", "collect"])
+def test_a_command_that_is_interrupted(kind: str) -> None:
+    done = subprocess.run(
+        [sys.executable, __file__, kind, "20"], capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-3000:]
+    assert "20 runs" in done.stdout
+
+
+@pytest.mark.full
+def test_a_script_that_is_interrupted() -> None:
+    """KeyboardInterrupt reaches it and no other error does, and the environment goes on."""
+    assert interrupt_steps(30) == {"KeyboardInterrupt": 30}
+
+
+def interrupt_steps(count: int) -> Counter[str]:
+    """Interrupt a loop of `Env.step` at random moments; how each time ended."""
+    moments = random.Random(0)
+    ended: Counter[str] = Counter()
+    env = make_env(["sim=native"], nworld=8)
+    env.reset(seed=0)
+    action = torch.zeros((env.nworld, env.action_manager.action_dim))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        for number in range(count):
+            timer = threading.Timer(
+                moments.uniform(0.001, 0.02), signal.raise_signal, (signal.SIGINT,)
+            )
+            try:
+                timer.start()
+                while True:
+                    env.step(action)
+            except BaseException as error:
+                ended[type(error).__name__] += 1
+            timer.join()
+            if number % 2:
+                env.reset(seed=0)
+            observed, *_ = env.step(action)
+            assert all(group.isfinite().all() for group in observed.values())
+    finally:
+        signal.signal(signal.SIGINT, before)
+    env.close()
+    return ended
+
+
+# The process that forks
+
+
+def main(kind: str, count: str) -> int:
+    """Interrupt commands of a kind at random moments, and print how each ended."""
+    moments = random.Random(kind)
+    ended: Counter[str] = Counter()
+    slowest = 0.0
+    with tempfile.TemporaryDirectory() as fixture:
+        fuzz._preload()
+        warnings.simplefilter("ignore")  # of a machine that cannot draw
+        whole = min(interrupt_command(kind, Path(fixture), None)[1] for _ in range(2))
+        for _ in range(int(count)):
+            delay = moments.uniform(0.0, 0.95 * whole)
+            how, seconds = interrupt_command(kind, Path(fixture), delay)
+            print(f"after {delay:.2f} s: {how}, {seconds:.2f} s later", flush=True)
+            slowest = max(slowest, seconds)
+            ended[how] += 1
+    print(f"{count} runs of {whole:.1f} s: {dict(ended)}, slowest {slowest:.2f} s")
+    return int(slowest > SECONDS or not ended.keys() <= PROPER)
+
+
+def interrupt_command(kind: str, fixture: Path, delay: float | None) -> tuple[str, float]:
+    """How a command ended that was interrupted after some seconds of processor time, or was not,
+    and the processor time from then on.
+    """
+    commands = {
+        "gates": ["gates=[baseline,batch]", "gate.batch.seeds=3"],
+        "collect": ["job=collect", "job.folder=demos", "job.episodes=5", "job.keep_failures=true"],
+    }
+    args = [*commands[kind], "nworld=2", "sim=native", *one_second_episode()]
+    child = fuzz._fork(0, lambda case, folder: args, fixture, True)
+    before = 0.0
+    if delay is not None:
+        while (before := used_by(child.pid)) < delay:
+            time.sleep(0.01)
+        os.kill(child.pid, random.Random(delay).choice([signal.SIGINT, signal.SIGTERM]))
+    _, status, usage = os.wait4(child.pid, 0)
+    seconds = usage.ru_utime + usage.ru_stime - before
+    try:
+        if before == math.inf:
+            return "ended by itself", 0.0
+        return describe_end(child.home, os.waitstatus_to_exitcode(status)), seconds
+    finally:
+        shutil.rmtree(child.home)
+
+
+def used_by(pid: int) -> float:
+    """Processor time of a process so far [s]: others may use this machine too."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return math.inf if fields[0] == "Z" else sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+
+
+def describe_end(home: Path, status: int) -> str:
+    """Which of the proper ends of an interrupted command it was, or what is wrong."""
+    out, err = ((home / name).read_text() for name in ("out", "err"))
+    err = "".join(line for line in err.splitlines(True) if not line.startswith("Warp CUDA"))
+    files = [path for path in (home / "cwd").rglob("*") if path.is_file()]
+    for path in files:
+        if path.suffix == ".json":
+            json.loads(path.read_text())
+        elif path.suffix == ".parquet":
+            pq.read_table(path)
+    reports = [json.loads(path.read_text()) for path in files if path.name == "report.json"]
+    if (status, out, err, files) == (EXIT_CODE, "", NO_WORK, []):
+        return "before it ran"
+    if (status, err, len(reports)) == (EXIT_CODE, "", 1):
+        stopped = reports[0]["status"] == "interrupted"
+        if out.count(WORK) == stopped:
+            return "while it ran" if stopped else "after its last step"
+    return f"exit status {status}, {len(reports)} reports: {out[-300:]}{err[-300:]}"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(*sys.argv[1:]))
