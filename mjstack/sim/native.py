@@ -61,8 +61,8 @@ class _Worker:
 class _Visit:
     """Work on worlds that threads share.
 
-    Ctrl-C in a script may raise anywhere in the calling thread. So what the threads share is atomic
-    in C, and needs no lock that an exception could leave in a wrong state.
+    Ctrl-C in a script may raise anywhere in the calling thread. So all that is shared is atomic in
+    C: there is no lock that could be left as it should not be.
     """
 
     work: Callable[[_Worker, Iterable[int]], None]
@@ -72,8 +72,8 @@ class _Visit:
     wake: SimpleQueue[None] = field(default_factory=SimpleQueue)
 
     def run(self, worker: _Worker) -> None:
-        """Do a thread's share. All of them draw from one iterator, so that none waits for another
-        one's share. Which of them gets a world does not matter to it: the whole state is loaded.
+        """Do a thread's share: all draw from one iterator, so that none waits for another. Which of
+        them gets a world does not matter to it, because its whole state is loaded.
         """
         self.begun.append(worker)
         error = None
@@ -105,15 +105,11 @@ class _Visit:
 
 
 def _serve(tasks: SimpleQueue[Callable[[], None] | None]) -> None:
-    """Do tasks until None comes. A task is not held on to: it knows the simulation."""
+    """Do tasks until None comes, which ends every thread."""
     while (task := tasks.get()) is not None:
         task()
-        del task
-
-
-def _dismiss(tasks: SimpleQueue[Callable[[], None] | None], threads: int) -> None:
-    for _ in range(threads):
-        tasks.put(None)
+        del task  # it refers to the simulation
+    tasks.put(None)
 
 
 class NativeSimulation(Simulation):
@@ -159,7 +155,7 @@ class NativeSimulation(Simulation):
         self._visited: _Visit | None = None  # and perhaps not to its end
         for _ in range(nthread):
             start_new_thread(_serve, (self._tasks,))
-        self._stop = weakref.finalize(self, _dismiss, self._tasks, nthread)
+        self._stop = weakref.finalize(self, self._tasks.put, None)
 
         # The state
         # mj_getState's order: time, qpos, qvel, act, warm start, ctrl.
