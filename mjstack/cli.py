@@ -214,7 +214,10 @@ def _expand(overrides: Sequence[str]) -> list[list[str]]:
             f"this sweep cannot be expanded: {first_line(error)}. List its values, such as"
             " robot=so101,rebot."
         ) from error
-    return [list(job) for batch in batches for job in batch]
+    jobs = [list(job) for batch in batches for job in batch]
+    if not jobs:
+        raise CompositionError(f"{' '.join(overrides)}: has no jobs, expected at least one value.")
+    return jobs
 
 
 def _check_writable(cfg: DictConfig, kind: str) -> None:

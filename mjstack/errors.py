@@ -102,9 +102,15 @@ class UnsupportedModel(MjstackError):
 class TermError(InputError):
     """A term of a manager that cannot be found, built or used."""
 
-    def __init__(self, label: str, problem: str) -> None:
+    def __init__(self, key: str, problem: str) -> None:
         """Build the message from the term's dotted configuration key and what is wrong with it."""
-        super().__init__(f"{label}: {problem}")
+        super().__init__(f"{key}: {problem}")
+        self.key = key
+        self._problem = problem
+
+    def at(self, key: str) -> "TermError":
+        """The same error under the key that the user has set."""
+        return TermError(key, self._problem)
 
 
 class ParameterError(ConfigError):

@@ -79,6 +79,7 @@ BAD = [
     ["reset=randomized", "reset.cubes.params.xy=[0.0,0.001]", "reset.cubes.params.gap=0.5"],
     ["-cn", "foo"],
     ["-m", "robot=glob(*)"],
+    ["-m", "nworld=range(4,1)"],
 ]
 
 

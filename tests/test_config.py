@@ -204,6 +204,16 @@ BAD_VALUES = [
     ("scene.objects.red.shape=sphere", "expected 1 number: the radius"),
     ("scene.objects.red.xy=[0.33,0.06]", "clear of blue"),
     ("scene.objects.red.mass=0", "scene.objects.red.mass"),
+    ("scene.objects.red.mass=1e-30", "from 1e-05 to 1000 [kg]"),
+    ("scene.objects.red.size=[1e-9,0.1,0.1]", "from 0.0001 to 10 [m]"),
+    ("controller.phases.done.seconds=1e308", "above 0 and at most 600 [s]"),
+    ("controller.knots=1000000", "from 3 to 1000"),
+    ("gate.batch.distinct_fraction=nan", "from 0 to 1"),
+    ("gate.batch.distinct_fraction=2", "from 0 to 1"),
+    ("gate.parity.object_position=inf", "gate.parity.object_position=inf"),
+    ("task.check.airborne_height=-inf", "task.check.airborne_height=-inf"),
+    ("task.check.dz_min=nan", "task.check.dz_min=nan"),
+    ("task.check.dz_min=1", "at most dz_max=0.055"),
     ("task.episode_steps=0", "task.episode_steps=0"),
     ("solver.tolerance=0", "solver.tolerance"),
     ("task.check.carry_phase=above_blu", "Did you mean 'above_blue'?"),
@@ -280,7 +290,7 @@ BAD = [
     (["nworld=null"], "nworld=null: expected an integer from 1"),
     (["sim.device=[a]"], "sim.device=[a]: expected text."),
     (["gates={a:1}"], "gates={a:1}: expected a list of names."),
-    (["controller=[a]"], "controller=a: 'a' does not exist. Available: closed_loop, open_loop."),
+    (["job=[gates,study]"], "job=[gates,study]: expected one choice, no list."),
     (["robot={homes:[1]}"], "Did you mean 'robot.home'?"),
     (["nworld=range(1,4)"], "'nworld=range(1,4)': several values are a sweep. Add -m"),
     (["robot=so101,rebot"], "'robot=so101,rebot': several values are a sweep. Add -m"),
@@ -305,6 +315,34 @@ def test_bad_input_is_one_line(overrides: list[str], says: str) -> None:
     assert caught.value.exit_code == 2
     message = str(caught.value)
     assert message.strip()
+    assert "\n" not in message
+    assert says in message
+
+
+REFUSED_BY_THE_CHECK = [
+    (["robot.jaw_bodies=[nope]"], "robot.jaw_bodies: body 'nope' does not exist."),
+    (["robot.approach_body=nope"], "robot.approach_body: body 'nope' does not exist."),
+    (["robot.approach_body=base", "controller=closed_loop"], "that carries both grasp sites"),
+    (["task.episode_steps=10"], "task.episode_steps=10: expected at least"),
+    (["task.check.func=nope"], "task.check: func=nope: expected a dotted name"),
+    (["task.check.func=os.system"], "expected a subclass of mjstack.tasks.check.EpisodeCheck"),
+    (["task.check.func=mjstack.tasks.check.EpisodeCheck"], "method 'build' is missing"),
+    (["task.success.func=nope"], "task.success: "),
+    (["controller.action.arm.func=nope"], "controller.action.arm: "),
+    (["gate.capacity.reset.cubes.func=nope", "gates=[capacity]"], "gate.capacity.reset.cubes: "),
+    (["gate.success.reset.cubes.func=nope", "gates=[success]"], "gate.success.reset.cubes: "),
+]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("overrides", "says"), REFUSED_BY_THE_CHECK, ids=[" ".join(o) for o, _ in REFUSED_BY_THE_CHECK]
+)
+def test_the_whole_job_is_checked_before_its_folder_exists(overrides: list[str], says: str) -> None:
+    with pytest.raises(MjstackError) as caught:
+        check_machine(load_config(["gates=[baseline]", *overrides]))
+    assert caught.value.exit_code == 2
+    message = str(caught.value)
     assert "\n" not in message
     assert says in message
 
@@ -341,7 +379,7 @@ def test_the_reference_has_every_group_and_job() -> None:
     text = runpy.run_path(str(hooks))["reference_markdown"]()
     for key in ("nworld", "gate.batch.seeds", "controller.phases.NAME.gripper", "job.margin"):
         assert f"| `{key}` |" in text, key
-    assert "| a number above 0 [s] | Duration of one physics step. |" in text
+    assert "| a number above 0 and at most 1 [s] | Duration of one physics step. |" in text
 
 
 def test_missing_cuda_device_is_refused_before_the_run() -> None:

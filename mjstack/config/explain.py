@@ -44,6 +44,8 @@ def check_overrides(overrides: Sequence[str]) -> None:
                     f"~{key}: expected a term of {', '.join(TERM_GROUPS)}, such as ~reward.lift."
                     f" Keys and groups at the top are always there: set {key}=VALUE."
                 )
+        elif isinstance(parsed.value(), list) and key in list_choices() and key != "experiment":
+            raise CompositionError(f"{override}: expected one choice, no list.")
         elif key == "gate":
             raise CompositionError(
                 "gate: expected no choice, because the thresholds of all gates are in use."

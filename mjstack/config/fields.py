@@ -108,11 +108,17 @@ def check_fields(key: str, value: Any) -> None:
         value: A dataclass. Dataclasses in its fields, lists and mappings are checked too.
 
     Raises:
-        ConfigError: The first value that its field does not accept.
+        ConfigError: The first value that its field does not accept, or a ``NAME_min`` above its
+            ``NAME_max``.
     """
     for item in fields(value):
         path = f"{key}.{item.name}" if key else item.name
         _check(path, getattr(value, item.name), type(value), item)
+        if item.name.endswith("_min"):
+            high = item.name.removesuffix("min") + "max"
+            bounds = (getattr(value, item.name), getattr(value, high, None))
+            if None not in bounds and bounds[0] > bounds[1]:
+                raise ConfigError(path, bounds[0], f"at most {high}={bounds[1]}")
 
 
 def _check(path: str, value: object, owner: type, item: Field) -> None:
@@ -146,13 +152,11 @@ def accepted(owner: type, item: Field) -> str:
         words = "a finite number"
     else:
         words = _NOUNS.get(kind, "a value")
+    most = "" if limits.le is None else f"{limits.le:.10g}"
     if limits.gt is not None:
-        words += f" above {limits.gt:.10g}"
-    if limits.ge is not None:
-        low = f"{limits.ge:.10g}"
-        words += f" of at least {low}" if limits.le is None else f" from {low} to {limits.le:.10g}"
-    elif limits.le is not None:
-        words += f" of at most {limits.le:.10g}"
+        words += f" above {limits.gt:.10g}" + f" and at most {most}" * bool(most)
+    elif limits.ge is not None:
+        words += f" from {limits.ge:.10g} to {most}" if most else f" of at least {limits.ge:.10g}"
     unit = f" [{limits.unit}]" if limits.unit else ""
     null = " or null" if NoneType in get_args(hint) else ""
     return words + unit + null

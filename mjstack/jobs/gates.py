@@ -1,16 +1,18 @@
 """Job *gates*: a configuration and a folder in, gates run, a report left behind."""
 
+import contextlib
 from dataclasses import replace
 from pathlib import Path
 
-from mjstack.config.check import reads_starts_file
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.tilt import turn_sign
 from mjstack.envs import build_env
+from mjstack.envs.build import driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.earlier_run import archive_starts
 from mjstack.episodes.record import clear_records
-from mjstack.errors import ConfigError
+from mjstack.episodes.rollout import CLOSED_LOOP
+from mjstack.errors import ConfigError, TermError, Unreachable
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
 from mjstack.jobs.runner import CheckedJob, Job, check_showing
@@ -31,23 +33,26 @@ def check_machine(cfg: Config) -> RunContext:
         expected = "gates with baseline or parity, whose world is shown"
         raise ConfigError(key, "true", expected, "Add one of them to gates")
     check_showing(cfg)
-    if "success" in cfg.gates:
-        _check_success(context)
+    _check_starts(context)
     return context
 
 
-def _check_success(context: RunContext) -> None:
-    """Raise if worlds cannot start as the success gate has them, by the key that says so."""
+def _check_starts(context: RunContext) -> None:
+    """Raise if worlds cannot start as a gate has them, by the key that says so."""
     cfg = context.cfg
-    try:
-        check_env(context, success_config(cfg))
-    except ConfigError as error:
-        if error.key.startswith("reset.") and not reads_starts_file(cfg.reset):
-            region = cfg.gate.success.region is not None and error.key.endswith(".params.xy")
-            raise error.at(
-                "gate.success.region" if region else f"gate.success.{error.key}"
-            ) from error
-        raise
+    if "capacity" in cfg.gates:
+        with contextlib.suppress(Unreachable):  # the gate reports it
+            own = driven_config(cfg, cfg.gate.capacity.reset)
+            check_env(context, own, reset="gate.capacity.reset")
+    if "success" in cfg.gates:
+        own = driven_config(success_config(cfg))
+        reset = "reset" if own.reset == cfg.reset else "gate.success.reset"
+        try:
+            check_env(context, own, reset=reset)
+        except ConfigError as error:
+            if cfg.gate.success.region is not None and error.key.endswith(".params.xy"):
+                raise error.at("gate.success.region") from error
+            raise
 
 
 def check_task(context: RunContext) -> None:
@@ -56,16 +61,38 @@ def check_task(context: RunContext) -> None:
     resolve_backend(cfg)
     if cfg.task.check is not None:
         _ = context.check  # reads its thresholds
-    if cfg.controller.phases:
-        _ = context.planner  # reads the robot, and reaches every nominal target
     check_env(context, cfg)
-    if cfg.controller.phases and cfg.controller.approach_gain > 0.0:
+    if not cfg.controller.phases:
+        return
+    phases = context.planner.phases  # reads the robot, and reaches every nominal target
+    if phases[-1].stop > cfg.task.episode_steps:
+        expected = f"at least the steps of the phases, {phases[-1].stop}"
+        raise ConfigError("task.episode_steps", cfg.task.episode_steps, expected)
+    check_env(context, driven_config(cfg), action="controller.action")
+    if cfg.controller.approach_gain > 0.0:
         turn_sign(context.model, cfg)
+    if cfg.controller.name == CLOSED_LOOP or "success" in cfg.gates:
+        # Loads Warp, which a native open-loop run does not need.
+        from mjstack.kinematics.chain import build_chain
+
+        build_chain(context.model, cfg.robot)
 
 
-def check_env(context: RunContext, cfg: Config) -> None:
-    """Build an environment in the context's scene, which checks every term."""
-    build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu").close()
+def check_env(context: RunContext, cfg: Config, **keys: str) -> None:
+    """Build an environment in the context's scene, which checks every term.
+
+    Args:
+        context: The scene.
+        cfg: The configuration.
+        keys: The key of a group whose terms come from elsewhere, by the group.
+    """
+    try:
+        build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu").close()
+    except (ConfigError, TermError) as error:
+        group, _, rest = error.key.partition(".")
+        if group not in keys:
+            raise
+        raise error.at(f"{keys[group]}.{rest}") from error
 
 
 def check_gates(cfg: Config) -> CheckedJob:

@@ -47,6 +47,8 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
         _replace_collision(spec, robot)
     for name in robot.jaw_bodies:
         _require("robot.jaw_bodies: body", name, spec.bodies)
+    if robot.approach_body:
+        _require("robot.approach_body: body", robot.approach_body, spec.bodies)
     _add_grasp_sites(spec, robot)
     for key in ("arm_joints", "gripper_joints"):
         for name in getattr(robot, key):

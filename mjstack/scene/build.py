@@ -30,11 +30,10 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
     try:
         return build_scene(spec, cfg, visuals=visuals)
     except ValueError as error:
-        problem = str(error).splitlines()[0].removeprefix("Error: ")
+        problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
         raise SourceError(
-            f"robot {cfg.robot.name} in scene {cfg.scene.name}: {problem}, expected a robot whose"
-            " names are not the scene's (floor, table and the objects). Rename it in the robot's"
-            " file."
+            f"robot {cfg.robot.name} in scene {cfg.scene.name}: {problem}. Correct the robot's file"
+            " or the scene, whose names (floor, table and the objects) the robot cannot have."
         ) from error
 
 

@@ -34,9 +34,9 @@ class Cone(Enum):
 class TimingCfg:
     """Physics step and control interval."""
 
-    physics_dt: float = spec(unit="s", gt=0.0)
+    physics_dt: float = spec(unit="s", gt=0.0, le=1.0)
     """Duration of one physics step."""
-    decimation: int = spec(unit="physics steps", ge=1)
+    decimation: int = spec(unit="physics steps", ge=1, le=10_000)
     """Physics steps of one control step."""
 
     @property

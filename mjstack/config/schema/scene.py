@@ -51,9 +51,9 @@ class ObjectCfg:
 
     shape: str = spec("box", choices=tuple(SHAPES))
     """box, cylinder (upright), sphere, or capsule (lying along its own x axis)."""
-    size: list[float] = spec(unit="m", gt=0.0)
+    size: list[float] = spec(unit="m", ge=1e-4, le=10.0)
     """Half sizes of a box; radius of a sphere; radius and half length of the others."""
-    mass: float = spec(unit="kg", gt=0.0)
+    mass: float = spec(unit="kg", ge=1e-5, le=1000.0)
     """Mass."""
     friction: list[float] = spec(factory=_friction, length=3, gt=0.0)
     """Sliding, torsional and rolling coefficient."""

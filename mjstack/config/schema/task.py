@@ -26,7 +26,7 @@ class ObservationTermCfg(TermCfg):
     """Smallest and largest value."""
     noise: float = spec(0.0, unit="the term's", ge=0.0)
     """Half-width of uniform noise, added first."""
-    history: int = spec(1, unit="steps", ge=1)
+    history: int = spec(1, unit="steps", ge=1, le=1000)
     """Steps that are kept, oldest first."""
 
 
@@ -64,9 +64,9 @@ class TaskCfg:
     """Name of the task."""
     instruction: str | None = None
     """The task in words, for datasets; null: its name."""
-    control_hz: float = spec(unit="Hz", gt=0.0)
+    control_hz: float = spec(unit="Hz", gt=0.0, le=1e6)
     """Control steps per second."""
-    episode_steps: int = spec(unit="steps", ge=1)
+    episode_steps: int = spec(unit="steps", ge=1, le=1_000_000)
     """Length of an episode of the environment."""
     params: dict[str, Any] = field(default_factory=dict)
     """Numbers that several terms of the task share, as ``${task.params.NAME}``."""
@@ -101,7 +101,7 @@ class PhaseCfg:
     """Whether ``scene.grasp_offset`` is added to the height."""
     gripper: str = spec(choices=("open", "closed"))
     """open or closed."""
-    seconds: float = spec(unit="s", gt=0.0)
+    seconds: float = spec(unit="s", gt=0.0, le=600.0)
     """Duration."""
     observe: bool = False
     """With controller=closed_loop: measure anchor and ``toward`` anew when the phase begins."""
@@ -121,13 +121,13 @@ class ControllerCfg:
     """Its action terms, by name."""
     phases: dict[str, PhaseCfg] = spec(factory=dict)
     """Phases in their order."""
-    knots: int = spec(ge=3)
+    knots: int = spec(ge=3, le=1000)
     """Inverse-kinematics solutions per phase of a plan."""
     ik_tolerance: float = spec(unit="m", gt=0.0)
     """Largest distance of the grasp point from a target."""
-    ik_iterations: int = spec(ge=1)
+    ik_iterations: int = spec(ge=1, le=10_000)
     """Iterations per solution of a plan."""
-    step_iterations: int = spec(ge=1)
+    step_iterations: int = spec(ge=1, le=1000)
     """Iterations of batched inverse kinematics per control step of closed_loop."""
     posture_gain: float = spec(ge=0.0, le=1.0)
     """How strongly redundant joints follow the nominal plan per iteration."""
@@ -137,7 +137,7 @@ class ControllerCfg:
     """
     yaw_alignment: float = spec(ge=0.0, le=1.0)
     """Share of the turn of the jaws to an object's nearest face."""
-    speed_limit: float = spec(ge=1.0)
+    speed_limit: float = spec(ge=1.0, le=100.0)
     """How many times as fast a world may go after a retry."""
-    rest_seconds: float = spec(unit="s", ge=0.0)
+    rest_seconds: float = spec(unit="s", ge=0.0, le=600.0)
     """Time between the last motion and the window of rest after a retry."""
