@@ -20,7 +20,6 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -207,13 +206,7 @@ def _expand(overrides: Sequence[str]) -> list[list[str]]:
     if any(o.startswith("hydra/sweeper=") and o != "hydra/sweeper=basic" for o in overrides):
         return []
     parsed = [parse(override) for override in own_overrides(overrides)]
-    try:
-        batches = BasicSweeper.split_arguments(parsed, max_batch_size=None)
-    except HydraException as error:
-        raise CompositionError(
-            f"this sweep cannot be expanded: {first_line(error)}. List its values, such as"
-            " robot=so101,rebot."
-        ) from error
+    batches = BasicSweeper.split_arguments(parsed, max_batch_size=None)
     jobs = [list(job) for batch in batches for job in batch]
     if not jobs:
         raise CompositionError(f"{' '.join(overrides)}: has no jobs, expected at least one value.")

@@ -5,6 +5,7 @@ command line returns for it.
 """
 
 import difflib
+import json
 import re
 import sysconfig
 import traceback
@@ -63,7 +64,8 @@ class ConfigError(InputError):
             expected: What would have been accepted.
             fix: What to do about it, a sentence without its full stop.
         """
-        super().__init__(f"{key}={value}: expected {expected}", fix)
+        shown = json.dumps(value) if value is None or isinstance(value, bool) else value
+        super().__init__(f"{key}={shown}: expected {expected}", fix)
         self.key = key
         self._facts = (value, expected, fix)
 

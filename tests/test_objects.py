@@ -295,7 +295,7 @@ def test_what_is_stacked_is_higher_from_then_on() -> None:
         (("[0.03, 0.012]", "[0.03, 0.012, 0.1]"), "scene.objects.puck.size"),
         (("mass: 0.1", "mass: 0.0"), "scene.objects.puck.mass=0"),
         (("xy: [0.33, -0.10]", "xy: [0.9, -0.10]"), "on the table"),
-        (("goal:", "puck:"), "a name that no object has"),
+        (("goal:", "puck:"), "names that no object has"),
         (("random_xy: [0.03, 0.02]", "random_xy: [0.03, 0.5]"), "scene.places.goal.xy"),
     ],
 )

@@ -4,6 +4,7 @@ import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from mjstack.config.fields import check_fields
 from mjstack.config.functions import offered
@@ -19,15 +20,11 @@ def validate(cfg: Config) -> None:
     """Raise a `ConfigError` or `UnknownName` for the first value that cannot be used."""
     check_fields("", cfg)
     known = cfg.gate.functions()
-    _refuse(not cfg.gates, "gates", "[]", f"at least one of {', '.join(known)}")
+    _refuse(not cfg.gates, cfg, "gates", f"at least one of {', '.join(known)}")
     for name in (*cfg.gates, *cfg.gate.added):  # a misspelt one has no function
         _require("gate", name, known)
-    _refuse(
-        not _DEVICE.fullmatch(cfg.sim.device),
-        "sim.device",
-        cfg.sim.device,
-        "auto, cpu or cuda:N, such as cuda:0",
-    )
+    expected = "auto, cpu or cuda:N, such as cuda:0"
+    _refuse(not _DEVICE.fullmatch(cfg.sim.device), cfg, "sim.device", expected)
     step_dt = 1.0 / cfg.task.control_hz
     if not math.isclose(cfg.timing.step_dt, step_dt, rel_tol=1e-9):
         raise ConfigError(
@@ -37,19 +34,11 @@ def validate(cfg: Config) -> None:
             f" {cfg.task.control_hz:g} Hz",
             "Change both together",
         )
-    _replay(cfg)
+    _jobs(cfg)
     _robot(cfg)
-    needs_free = cfg.task.check is not None or any(map(places_objects, cfg.reset.values()))
-    _refuse(
-        needs_free and not cfg.scene.free,
-        "scene.objects",
-        list(cfg.scene.objects),
-        "at least one object that is not fixed, for the check and for random starts",
-    )
-    _scene(cfg.scene)
+    _scene(cfg)
     _phases(cfg)
     _gates(cfg)
-    _success(cfg)
 
 
 def reads_starts_file(reset: Mapping[str, TermCfg]) -> bool:
@@ -69,35 +58,26 @@ def _require(what: str, name: str | None, known: Mapping | Sequence) -> None:
         raise UnknownName(what, name, known)
 
 
-def _refuse(wrong: bool, key: str, value: object, expected: str, fix: str = "") -> None:
-    """Raise a `ConfigError` for a value that is wrong."""
+def _refuse(wrong: bool, cfg: Config, key: str, expected: str) -> None:
+    """Raise a `ConfigError` for the value of a key that is wrong."""
     if wrong:
-        raise ConfigError(key, value, expected, fix)
+        value: Any = cfg
+        for name in key.split("."):
+            value = value[name] if isinstance(value, dict) else getattr(value, name)
+        value = list(value) if isinstance(value, dict) else value
+        raise ConfigError(key, value, expected)
 
 
-def _replay(cfg: Config) -> None:
+def _jobs(cfg: Config) -> None:
     """Keys that only one job or one group reads."""
-    _refuse(
-        cfg.world is not None and not _WORLD.fullmatch(cfg.world),
-        "world",
-        cfg.world,
-        "a world such as 17, or a seed and a world such as 3:17",
-    )
+    wrong = cfg.world is not None and not _WORLD.fullmatch(cfg.world)
+    _refuse(wrong, cfg, "world", "a world such as 17, or a seed and a world such as 3:17")
     for key in ("run", "world"):
-        _refuse(
-            getattr(cfg, key) is not None and cfg.job.name != "replay",
-            key,
-            getattr(cfg, key),
-            "null, because it is for job=replay alone",
-            "Add job=replay",
-        )
-    _refuse(
-        cfg.starts is not None and not reads_starts_file(cfg.reset),
-        "starts",
-        cfg.starts,
-        "null, because no reset term reads it",
-        "Add reset=starts_file",
-    )
+        wrong = getattr(cfg, key) is not None and cfg.job.name != "replay"
+        _refuse(wrong, cfg, key, "null, because it is for job=replay alone. Add job=replay")
+    wrong = cfg.starts is not None and not reads_starts_file(cfg.reset)
+    expected = "null, because no reset term reads it. Add reset=starts_file"
+    _refuse(wrong, cfg, "starts", expected)
 
 
 def _robot(cfg: Config) -> None:
@@ -107,50 +87,39 @@ def _robot(cfg: Config) -> None:
     joints = len(robot.arm_joints) + grip
     lengths = {"home": joints, "start": joints, "gripper_open": grip, "gripper_closed": grip}
     for key, size in lengths.items():
-        values = getattr(robot, key)
-        _refuse(len(values) != size, f"robot.{key}", values, f"{size} numbers, one per joint")
-    _refuse(
-        abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3,
-        "robot.approach_axis",
-        robot.approach_axis,
-        "a vector of length 1, such as [0, 0, -1]",
-    )
+        wrong = len(getattr(robot, key)) != size
+        _refuse(wrong, cfg, f"robot.{key}", f"{size} numbers, one per joint")
+    wrong = abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3
+    _refuse(wrong, cfg, "robot.approach_axis", "a vector of length 1, such as [0, 0, -1]")
     for name in (*robot.ik_joints, *robot.locked):
         _require("robot.ik_joints, robot.locked: arm joint", name, robot.arm_joints)
     _require("robot.roll_joint: arm joint", robot.roll_joint, robot.arm_joints)
-    _refuse(
-        cfg.controller.yaw_alignment > 0.0 and robot.roll_joint is None,
-        "controller.yaw_alignment",
-        cfg.controller.yaw_alignment,
-        "0, because robot.roll_joint is null",
-    )
+    wrong = cfg.controller.yaw_alignment > 0.0 and robot.roll_joint is None
+    _refuse(wrong, cfg, "controller.yaw_alignment", "0, because robot.roll_joint is null")
 
 
-def _scene(scene: SceneCfg) -> None:
+def _scene(cfg: Config) -> None:
     """Objects, places and the box are on the table and clear of each other."""
+    scene = cfg.scene
+    needs_free = cfg.task.check is not None or any(map(places_objects, cfg.reset.values()))
+    expected = "at least one object that is not fixed, for the check and for random starts"
+    _refuse(needs_free and not scene.free, cfg, "scene.objects", expected)
     for name, thing in scene.objects.items():
         key = f"scene.objects.{name}"
         count, words = SHAPES[thing.shape]
-        _refuse(
-            len(thing.size) != count,
-            f"{key}.size",
-            thing.size,
-            f"{count} number{'s' * (count > 1)}: {words}",
-        )
+        expected = f"{count} number{'s' * (count > 1)}: {words}"
+        _refuse(len(thing.size) != count, cfg, f"{key}.size", expected)
         edge = min(thing.size[:2]) if thing.shape == "box" else thing.footprint
         _on_table(scene, f"{key}.xy", thing.xy, (edge, edge))
     for name, place in scene.places.items():
-        _refuse(name in scene.objects, f"scene.places.{name}", name, "a name that no object has")
+        _refuse(name in scene.objects, cfg, "scene.places", "names that no object has")
         _on_table(scene, f"scene.places.{name}.xy", place.xy, place.random_xy)
     for (one, first), (other, second) in itertools.combinations(scene.objects.items(), 2):
-        _refuse(
-            math.dist(first.xy, second.xy) < first.footprint + second.footprint,
-            f"scene.objects.{one}.xy",
-            first.xy,
-            f"a position clear of {other}, which is at {second.xy}",
-        )
+        wrong = math.dist(first.xy, second.xy) < first.footprint + second.footprint
+        expected = f"a position clear of {other}, which is at {second.xy}"
+        _refuse(wrong, cfg, f"scene.objects.{one}.xy", expected)
     if scene.box is not None:
-        _box(scene, scene.box)
+        _box(cfg, scene.box)
 
 
 def _on_table(scene: SceneCfg, key: str, xy: list[float], edge: Sequence[float]) -> None:
@@ -163,35 +132,24 @@ def _on_table(scene: SceneCfg, key: str, xy: list[float], edge: Sequence[float])
             raise ConfigError(key, xy, f"{expected} on the table")
 
 
-def _box(scene: SceneCfg, box: BoxCfg) -> None:
-    _refuse(
-        box.height <= box.floor,
-        "scene.box.height",
-        box.height,
-        f"more than the floor's thickness, {box.floor:g} m",
-    )
+def _box(cfg: Config, box: BoxCfg) -> None:
+    expected = f"more than the floor's thickness, {box.floor:g} m"
+    _refuse(box.height <= box.floor, cfg, "scene.box.height", expected)
     outer = [half + box.wall for half in box.half]
-    _on_table(scene, "scene.box.center", box.center, outer)
-    for name, thing in scene.objects.items():
+    _on_table(cfg.scene, "scene.box.center", box.center, outer)
+    for name, thing in cfg.scene.objects.items():
         away = (abs(thing.xy[i] - box.center[i]) - outer[i] for i in (0, 1))
-        _refuse(
-            all(a < half for a, half in zip(away, thing.half, strict=False)),
-            f"scene.objects.{name}.xy",
-            thing.xy,
-            "a position beside the box",
-        )
+        wrong = all(a < half for a, half in zip(away, thing.half, strict=False))
+        _refuse(wrong, cfg, f"scene.objects.{name}.xy", "a position beside the box")
 
 
 def _phases(cfg: Config) -> None:
     """The scripted phases, and how their targets are followed."""
     controller = cfg.controller
     gain = max(controller.posture_gain, controller.approach_gain)
-    _refuse(
-        gain > 0 and controller.step_iterations < 4,
-        "controller.step_iterations",
-        controller.step_iterations,
-        "at least 4 with a posture_gain or an approach_gain",
-    )
+    wrong = gain > 0 and controller.step_iterations < 4
+    expected = "at least 4 with a posture_gain or an approach_gain"
+    _refuse(wrong, cfg, "controller.step_iterations", expected)
 
     # Each phase
     phases = controller.phases
@@ -201,6 +159,8 @@ def _phases(cfg: Config) -> None:
     grasped = False
     for number, (name, phase) in enumerate(phases.items()):
         key = f"controller.phases.{name}"
+        wrong = number == 0 and phase.anchor is None
+        _refuse(wrong, cfg, f"{key}.anchor", "an object or a place, as the phase is the first")
         _require(f"{key}.grasps: object", phase.grasps, cfg.scene.objects)
         _require(f"{key}.retry: phase", phase.retry, phases)
         for role in ("anchor", "toward"):
@@ -209,49 +169,26 @@ def _phases(cfg: Config) -> None:
                 continue
             known = [*cfg.scene.objects, *cfg.scene.places]
             _require(f"{key}.{role}: object or place", source, known)
-            if phase.observe:
-                observed.add(source)
-            elif closed_loop and source not in observed:
-                expected = "true here or in a phase before, because controller=closed_loop does not"
-                raise ConfigError(
-                    f"{key}.observe", "false", f"{expected} know yet where {source} is"
-                )
-        _refuse(
-            phase.level == "on_top" and not grasped,
-            f"{key}.level",
-            "on_top",
-            "center or table, as no phase before grasps",
-        )
+            expected = "true here or in a phase before, because controller=closed_loop does not"
+            expected += f" know yet where {source} is"
+            wrong = closed_loop and not phase.observe and source not in observed
+            _refuse(wrong, cfg, f"{key}.observe", expected)
+            observed.add(source)
+        wrong = phase.level == "on_top" and not grasped
+        _refuse(wrong, cfg, f"{key}.level", "center or table, as no phase before grasps")
         grasped = grasped or phase.grasps is not None
-        _refuse(
-            phase.retry is not None and phase.grasps is None,
-            f"{key}.retry",
-            phase.retry,
-            f"null, or {key}.grasps=OBJECT, whose empty grasp is tried again",
-        )
-        _refuse(
-            phase.retry is not None and names.index(phase.retry) > number,
-            f"{key}.retry",
-            phase.retry,
-            "this phase or one before it",
-        )
+        if phase.retry is not None:
+            expected = f"null, or {key}.grasps=OBJECT, whose empty grasp is tried again"
+            _refuse(phase.grasps is None, cfg, f"{key}.retry", expected)
+            later = names.index(phase.retry) > number
+            _refuse(later, cfg, f"{key}.retry", "this phase or one before it")
         steps = phase.seconds / cfg.timing.step_dt
-        _refuse(
-            abs(steps - round(steps)) > 1e-6,
-            f"{key}.seconds",
-            phase.seconds,
-            f"a multiple of the step, {cfg.timing.step_dt:g} s",
-        )
-
-    # The first one
-    for name in names[:1]:
-        _refuse(
-            phases[name].anchor is None, "controller.phases", name, "a first phase with an anchor"
-        )
+        expected = f"a multiple of the step, {cfg.timing.step_dt:g} s"
+        _refuse(abs(steps - round(steps)) > 1e-6, cfg, f"{key}.seconds", expected)
 
 
 def _gates(cfg: Config) -> None:
-    """Names of phases and fields in the gates' parameters."""
+    """Names in the gates' parameters, and seeds and region that fit random starts."""
     gate = cfg.gate
     phases = cfg.controller.phases
     for name in gate.parity.states.values():
@@ -259,29 +196,13 @@ def _gates(cfg: Config) -> None:
     if phases:
         _require("gate.throughput.from_phase: phase", gate.throughput.from_phase, phases)
     for name in ("step1", "step50"):
-        limits = getattr(gate.parity, name)
-        _refuse(
-            set(limits) != set(PARITY_FIELDS),
-            f"gate.parity.{name}",
-            list(limits),
-            f"a number for each of {', '.join(PARITY_FIELDS)}",
-        )
-
-
-def _success(cfg: Config) -> None:
-    """Seeds and region of the success gate fit its starts."""
-    success = cfg.gate.success
+        wrong = set(getattr(gate.parity, name)) != set(PARITY_FIELDS)
+        expected = f"a number for each of {', '.join(PARITY_FIELDS)}"
+        _refuse(wrong, cfg, f"gate.parity.{name}", expected)
     from_file = reads_starts_file(cfg.reset)
-    _refuse(
-        from_file and success.seeds > 1,
-        "gate.success.seeds",
-        success.seeds,
-        "1, because with reset=starts_file worlds start alike under every seed",
-    )
-    _refuse(
-        success.region is not None
-        and (from_file or not any(map(places_objects, success.reset.values()))),
-        "gate.success.region",
-        success.region,
-        "null, because no reset term of the success gate has a region",
-    )
+    expected = "1, because with reset=starts_file worlds start alike under every seed"
+    _refuse(from_file and gate.success.seeds > 1, cfg, "gate.success.seeds", expected)
+    has_region = not from_file and any(map(places_objects, gate.success.reset.values()))
+    wrong = gate.success.region is not None and not has_region
+    expected = "null, because no reset term of the success gate has a region"
+    _refuse(wrong, cfg, "gate.success.region", expected)
