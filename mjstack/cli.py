@@ -80,7 +80,7 @@ def run(args: list[str]) -> int:
             traceback.print_exception(error)
         problem = describe_error(error, "MJSTACK_DEBUG=1 shows the traceback")
         errors.print(f"mjstack: {problem}")
-        return getattr(error, "exit_code", 1 if _results else 2)
+        return max(getattr(error, "exit_code", 1), 1 if _results else 2)
 
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
