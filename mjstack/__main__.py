@@ -1,6 +1,7 @@
 """The command: ``mjstack``, ``python -m mjstack`` and ``python scripts/run.py``."""
 
 import sys
+from pathlib import Path
 
 from mjstack.interrupt import EXIT_CODE, handle_interrupts, interrupted
 
@@ -15,4 +16,9 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    # Python puts the working folder first, and that may be a stranger's. A checkout that mjstack
+    # was imported from stays, behind everything else.
+    if not sys.flags.safe_path:
+        sys.path[:1] = []
+        sys.path.append(str(Path(__file__).resolve().parents[1]))
     main()

@@ -23,7 +23,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from rich.console import Console
 
 import mjstack
 from mjstack.config.explain import own_overrides, parse
@@ -34,6 +33,7 @@ from mjstack.config.session import (
     hydra_session,
     lacking_folders,
     list_items,
+    resolve_values,
     search_path,
 )
 from mjstack.errors import (
@@ -45,7 +45,7 @@ from mjstack.errors import (
 )
 from mjstack.interrupt import EXIT_CODE, begin_job
 from mjstack.report.record import Report, Status
-from mjstack.report.table import Table
+from mjstack.report.table import Console, Table
 
 if TYPE_CHECKING:
     from mjstack.jobs import CheckedJob
@@ -123,6 +123,7 @@ def _run_one(hydra: Hydra, overrides: list[str]) -> int:
         cfg.hydra.run.dir = str(checked.folder)
     begin_job()
     _check_writable(cfg, "run")
+    resolve_values(cfg)
     hydra.run(CONFIG_NAME, run_job, overrides)
     return max(result.exit_code for result in _results)
 

@@ -1,14 +1,39 @@
-"""Files that appear complete or not at all, and rows as CSV."""
+"""Files that appear complete or not at all, or may hold anything; rows as CSV."""
 
 import csv
 import io
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from mjstack.errors import MjstackError, first_line
+
+
+@contextmanager
+def reading(path: Path, kind: type[MjstackError], fix: str) -> Iterator[None]:
+    """Raise one line for a file that is missing or damaged: one of a run's folder, which may be a
+    stranger's, can hold anything.
+
+    Args:
+        path: The file that is read inside.
+        kind: Class of the error.
+        fix: What to do about it, a sentence without its full stop.
+
+    Raises:
+        MjstackError: Something went wrong inside.
+    """
+    try:
+        yield
+    except MjstackError:
+        raise
+    except Exception as error:
+        reason = f"{type(error).__name__}: {first_line(error)}"
+        raise kind(f"{path}: cannot be read ({reason}), expected it as written", fix) from error
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:

@@ -745,7 +745,7 @@ DAMAGE: dict[str, tuple[str, Any]] = {
         INFO,
         lambda info: info.update(total_episodes=4),
     ),
-    "cannot be read as mjstack's .*'robot_type'": (INFO, lambda info: info.pop("robot_type")),
+    "cannot be read .*'robot_type'": (INFO, lambda info: info.pop("robot_type")),
 }
 
 

@@ -645,10 +645,10 @@ def _refused(capsys: pytest.CaptureFixture[str], says: str) -> None:
 
 DAMAGE = {
     "no report": (lambda f: (f / "report.json").unlink(), "has no report.json"),
-    "no JSON": (lambda f: (f / "report.json").write_text("{"), "report.json cannot be read"),
+    "no JSON": (lambda f: (f / "report.json").write_text("{"), "report.json: cannot be read"),
     "another report": (
         lambda f: (f / "report.json").write_text("[]"),
-        "report.json cannot be read",
+        "report.json: cannot be read",
     ),
     "no YAML": (
         lambda f: (f / ".hydra" / "config.yaml").write_text("a: [1"),

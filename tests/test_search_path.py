@@ -42,6 +42,10 @@ def height(env, *, scale=3.0):
     return scale * env.sim.qpos[:, 0]
 
 
+def lean(env, mask):
+    pass
+
+
 @dataclass(kw_only=True)
 class UprightCfg(GateFuncCfg):
     limit: float = spec(unit="m", gt=0.0)
@@ -143,19 +147,19 @@ def test_a_sweep_and_a_replay(
     lean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = ["--config-dir", str(lean), "-m", "task=stack", "gates=[upright]"]
-    reward = "+reward.height={func: lean.height, weight: 1.0}"
+    reset = "+reset.lean={func: lean.lean}"
     swapped = "reward.reach.func=mjstack.mdp.reward.action_rate"  # without the other's parameters
-    assert run([*flags, reward, swapped, "seed=1,2"]) == 0
+    assert run([*flags, reset, swapped, "seed=1,2"]) == 0
     first, _ = sorted(tmp_path.rglob("report.json"))
     assert json.loads(first.read_text())["status"] == "pass"
     saved = first.parent / ".hydra" / "config.yaml"
     with pytest.raises(MjstackError) as caught:
         load_saved(saved)
-    assert "reward.height.func=lean.height" in str(caught.value)
+    assert "reset.lean.func=lean.lean: expected a name of mjstack" in str(caught.value)
     assert f"--config-dir {lean}" in str(caught.value)
     with search_path([lean]):
-        assert load_saved(saved).reward["height"].func == "lean.height"
-    saved.write_text(saved.read_text().replace("lean.height", "shutil.rmtree"))
+        assert load_saved(saved).reset["lean"].func == "lean.lean"
+    saved.write_text(saved.read_text().replace("lean.lean", "shutil.rmtree"))
     with search_path([lean]), pytest.raises(MjstackError, match=r"shutil\.rmtree"):
         load_saved(saved)
 
@@ -204,12 +208,13 @@ def test_an_installed_package_registers_its_configuration(lean: Path) -> None:
     task.write_text(TASK.replace("lean.height", "leaning.height"))
     program = (
         f"import sys; sys.path.insert(0, {str(site)!r}); from mjstack.config import load_config;"
-        "from mjstack.config.session import is_trusted;"
-        "print(load_config(['task=lean']).reward['height'].func, is_trusted('leaning.height'))"
+        "from mjstack.config.session import is_trusted; from pathlib import Path;"
+        "print(load_config(['task=lean']).reward['height'].func,"
+        " is_trusted('leaning.height', Path('config.yaml')))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout.split() == ["leaning.height", "True"], done.stderr
-    assert not is_trusted("leaning.height")
+    assert not is_trusted("leaning.height", Path("config.yaml"))
 
 
 def test_only_modules_beside_the_folder_are_trusted(
@@ -217,6 +222,6 @@ def test_only_modules_beside_the_folder_are_trusted(
 ) -> None:
     monkeypatch.chdir(lean.parent)  # a built-in module has no file: it is not beside the folder
     with search_path([lean]):
-        assert is_trusted("lean.height")
+        assert is_trusted("lean.height", Path("config.yaml"))
         for name in ("os.system", "sys.exit", "shutil.rmtree", "nowhere.at_all"):
-            assert not is_trusted(name), name
+            assert not is_trusted(name, Path("config.yaml")), name

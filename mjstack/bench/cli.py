@@ -6,7 +6,6 @@ import statistics
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from rich.console import Console
 
 from mjstack.bench import env_step, ik, physics
 from mjstack.config import load_config
@@ -15,7 +14,7 @@ from mjstack.envs import build_env
 from mjstack.envs.buffers import Advance
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.report.table import Table
+from mjstack.report.table import Console, Table
 from mjstack.sim import resolve_device
 
 Work = Callable[[argparse.Namespace, Config, Advance], Table]

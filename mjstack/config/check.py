@@ -4,6 +4,7 @@ import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from mjstack.config.fields import check_fields
@@ -91,6 +92,10 @@ def _robot(cfg: Config) -> None:
         _refuse(wrong, cfg, f"robot.{key}", f"{size} numbers, one per joint")
     wrong = abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3
     _refuse(wrong, cfg, "robot.approach_axis", "a vector of length 1, such as [0, 0, -1]")
+    for key in ("name", "menagerie_name", "menagerie_file"):  # they become paths
+        path = Path(getattr(robot, key))
+        wrong = path.is_absolute() or ".." in path.parts
+        _refuse(wrong, cfg, f"robot.{key}", "a name that does not lead out of a folder")
     for name in (*robot.ik_joints, *robot.locked):
         _require("robot.ik_joints, robot.locked: arm joint", name, robot.arm_joints)
     _require("robot.roll_joint: arm joint", robot.roll_joint, robot.arm_joints)

@@ -1,30 +1,50 @@
-"""Functions and classes by dotted name: the only place that imports what a configuration names."""
+"""Functions and classes by dotted name: the only place that imports what a configuration names.
+
+A name may be anything that Python can import. Only objects that declare themselves are called: by
+the name of their first parameter, or by their base class.
+"""
 
 import importlib
+import inspect
 from collections.abc import Callable
 from typing import Any
 
 from mjstack.errors import TermError, first_line, suggest
 
 
-def resolve_func(label: str, path: str, base: type | None = None) -> Callable[..., Any]:
-    """Find a function or class by its dotted name.
+def resolve_func(
+    label: str, path: str, *, first: str = "env", base: type | None = None
+) -> Callable[..., Any]:
+    """Find a function or class by its dotted name, and check that it declares itself.
 
     Args:
         label: Dotted configuration key, for errors.
         path: The dotted name.
-        base: The class that it must be a subclass of.
+        first: Name of its first parameter.
+        base: The class that it must be a subclass of, instead.
 
     Raises:
-        TermError: There is no such module, or nothing callable of that name in it.
+        TermError: There is no such module, or nothing of that name in it that is meant to be called
+            here.
     """
     func = find_object(label, path)
-    if not callable(func):
-        raise TermError(label, f"func={path}: expected a function or a class")
-    if base is not None and not (isinstance(func, type) and issubclass(func, base)):
-        expected = f"expected a subclass of {base.__module__}.{base.__name__}"
-        raise TermError(label, f"func={path}: {expected}")
+    expected = f"a function or class whose first parameter is named {first}"
+    if base is None:
+        declared = _first_parameter(func) == first
+    else:
+        expected = f"a subclass of {base.__module__}.{base.__name__}"
+        declared = isinstance(func, type) and issubclass(func, base)
+    if not declared:
+        raise TermError(label, f"func={path}: expected {expected}")
     return func
+
+
+def _first_parameter(func: Any) -> str:
+    """Name of the first parameter of a call; empty if there is none, or it cannot be called."""
+    try:
+        return next(iter(inspect.signature(func).parameters), "")
+    except (TypeError, ValueError):  # functions in C have no names
+        return ""
 
 
 def find_object(label: str, path: str) -> Any:

@@ -22,12 +22,15 @@ from mjstack.config.schema import JOB_SCHEMAS, Config
 from mjstack.config.session import (
     CONFIG_NAME,
     add_folder,
+    check_beside,
     check_trusted,
     hydra_session,
+    read_yaml,
     search_path,
     without_hydra,
 )
 from mjstack.errors import CompositionError, ConfigError
+from mjstack.files import reading
 
 _schema = OmegaConf.structured(Config)
 _schema.gate._set_flag("struct", False)  # gates of the search path are added to it
@@ -148,26 +151,28 @@ def load_saved(path: Path) -> Config:
 
     Raises:
         MjstackError: The file cannot be read, is no configuration of this version, or names
-            functions that are not in the search path.
+            functions or a robot that are not in the search path.
     """
-    try:
-        merged = OmegaConf.merge(_schema, OmegaConf.load(path))
-        missing = sorted(OmegaConf.missing_keys(merged))
-    except OmegaConfBaseException as error:
-        raise explain(error) from error
-    except Exception as error:  # the YAML parser fails in its own ways
-        raise CompositionError(
-            f"{path.name} cannot be read ({type(error).__name__}), expected YAML."
-        ) from error
-    if missing:
-        raise CompositionError(f"{missing[0]} is missing, expected every key of this version.")
-    check_trusted(cast(DictConfig, merged), path)
-    try:
-        return to_config(cast(DictConfig, merged))
-    except ConfigError as error:
-        if error.key != "robot.file":
-            raise
-        raise CompositionError(f"{error} {add_folder(path)}") from error
+    with reading(path, CompositionError, "Name another folder"):
+        plain = read_yaml(path)
+        if "${" in str(plain):
+            raise ValueError("it has ${...}")
+        try:
+            merged = cast(DictConfig, OmegaConf.merge(_schema, plain))
+            missing = sorted(OmegaConf.missing_keys(merged))
+        except OmegaConfBaseException as error:
+            raise explain(error) from error
+        if missing:
+            raise CompositionError(f"{missing[0]} is missing, expected every key of this version.")
+        check_trusted(merged, path)
+        try:
+            cfg = to_config(merged)
+        except ConfigError as error:
+            if error.key != "robot.file":
+                raise
+            raise CompositionError(f"{error} {add_folder(path)}") from error
+        check_beside(cfg.robot.file)
+    return cfg
 
 
 def to_config(cfg: DictConfig) -> Config:

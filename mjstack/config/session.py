@@ -18,6 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
+import yaml  # type: ignore[import-untyped]
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
 from hydra._internal.hydra import Hydra
@@ -30,7 +31,9 @@ from hydra.plugins.config_source import ConfigResult
 from hydra.types import RunMode
 from hydra.version import setbase
 from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf._utils import get_yaml_loader
 
+from mjstack.config.functions import find_object
 from mjstack.errors import CompositionError
 
 _PACKAGE_FOLDER = Path(__file__).parents[1]
@@ -44,6 +47,8 @@ CONFIG_NAME = "config"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
 _FILE = "file://"
+# Where a replay's functions are named.
+_REPLAYED = ("controller.action.", "gate.success.reset.", "reset.", "task.check.")
 
 _added: ContextVar[tuple[Path, ...]] = ContextVar("search path", default=())
 
@@ -86,16 +91,28 @@ def add_folder(saved: Path) -> str:
     Args:
         saved: The run's ``config.yaml``.
     """
-    file = saved.with_name("hydra.yaml")
-    sources = OmegaConf.load(file).hydra.runtime.config_sources if file.is_file() else []
-    flag = shlex.join(search_path_args(lacking_folders(sources))) or "--config-dir DIR"
+    try:
+        sources = read_yaml(saved.with_name("hydra.yaml"))["hydra"]["runtime"]["config_sources"]
+        folders = lacking_folders(sources)
+    except Exception:  # the file may be missing, or hold anything
+        folders = []
+    flag = shlex.join(search_path_args(folders)) or "--config-dir DIR"
     return f"If you trust the folder that the run had used, add {flag}."
 
 
 def lacking_folders(sources: Iterable[Any]) -> list[Path]:
     """Added folders among Hydra's sources of a composition that the current search path lacks."""
-    used = [Path(source.path) for source in sources if source.provider == PROVIDER]
+    used = [Path(source["path"]) for source in sources if source["provider"] == PROVIDER]
     return [folder for folder in used if folder not in config_folders()]
+
+
+def read_yaml(path: Path) -> Any:
+    """Read YAML of a run's folder, which may be a stranger's: interpolations stay text.
+
+    Raises:
+        Exception: It cannot be read.
+    """
+    return yaml.load(path.read_text(), _Reader)
 
 
 def config_folders() -> list[Path]:
@@ -111,10 +128,40 @@ def _registered() -> list[str]:
     return [point.value for point in entry_points(group=ENTRY_POINTS)]
 
 
-def is_trusted(dotted: str) -> bool:
-    """Whether a dotted name is mjstack's, of a registered package, or in the search path.
+def check_trusted(cfg: DictConfig, saved: Path) -> None:
+    """Check that every function that a replay uses is in the current search path, and so is the
+    module that has it: ``mjstack.cli.run`` is mjstack's, ``mjstack.cli.parse.os.system`` is not.
 
-    A saved run may name any function; only these may be imported on its word.
+    Args:
+        cfg: The configuration of an earlier run.
+        saved: Its file.
+
+    Raises:
+        CompositionError: A function is elsewhere; names it.
+        TermError: There is no such function.
+    """
+    for key, name in list_items(cfg):
+        if not (key.startswith(_REPLAYED) and key.endswith(".func")):
+            continue
+        label = key.removesuffix(".func")
+        # A module runs when it is imported.
+        if not (
+            is_trusted(str(name), saved)
+            and is_trusted(str(getattr(find_object(label, str(name)), "__module__", "")), saved)
+        ):
+            raise CompositionError(
+                f"{key}={name}: expected a name of mjstack, of a package registered under"
+                f" {ENTRY_POINTS}, or beside a folder of the search path. {add_folder(saved)}"
+            )
+
+
+def is_trusted(dotted: str, saved: Path) -> bool:
+    """Whether a saved run may name a function or module: one of mjstack, of a registered package,
+    or of the search path.
+
+    Args:
+        dotted: Its dotted name.
+        saved: The run's ``config.yaml``. No package that it lies in is trusted.
     """
     package = dotted.partition(".")[0]
     if package in {"mjstack", *(name.partition(".")[0] for name in _registered())}:
@@ -123,28 +170,29 @@ def is_trusted(dotted: str) -> bool:
         found = find_spec(package)
     except ValueError:  # no name of a module, or __main__
         return False
-    places = [*(found.submodule_search_locations or ()), found.origin or ""] if found else []
-    parents = [folder.parent for folder in _added.get()]
     # The origin of a module of Python's own is a word, such as frozen.
-    return any(Path(p).is_absolute() and Path(p).resolve().parent in parents for p in places)
+    places = [*(found.submodule_search_locations or ()), found.origin or ""] if found else []
+    beside = [folder.parent for folder in _added.get()]
+    return any(
+        Path(place).is_absolute()
+        and Path(place).resolve().parent in beside
+        and not saved.resolve().is_relative_to(Path(place).resolve())
+        for place in places
+    )
 
 
-def check_trusted(cfg: DictConfig, saved: Path) -> None:
-    """Check that every function that a saved configuration names is in the current search path.
-
-    Args:
-        cfg: The configuration of an earlier run.
-        saved: Its file.
+def check_beside(file: str | None) -> None:
+    """Check that a robot's file, if a saved run names one, lies beside a folder of the search path.
 
     Raises:
-        CompositionError: A function is elsewhere; names it.
+        CompositionError: It lies elsewhere.
     """
-    for key, name in list_items(cfg):
-        if key.endswith(".func") and isinstance(name, str) and not is_trusted(name):
-            raise CompositionError(
-                f"{key}={name}: expected a name of mjstack, of a package registered under"
-                f" mjstack.configs, or beside a folder of the search path. {add_folder(saved)}"
-            )
+    folders = [folder.parent for folder in config_folders()]
+    if file is not None and not any(map(Path(file).is_relative_to, folders)):
+        raise CompositionError(
+            f"robot.file={file}: expected a file beside a folder of the search path. If you trust"
+            f" it, add {shlex.join(search_path_args([Path(file).parent]))}."
+        )
 
 
 def list_items(node: object, prefix: str = "") -> Iterator[tuple[str, object]]:
@@ -192,6 +240,16 @@ def without_hydra(cfg: DictConfig) -> DictConfig:
     return own
 
 
+def resolve_values(cfg: DictConfig) -> None:
+    """Put values in the place of interpolations, in all but Hydra's own part, so that a run's
+    folder has them.
+    """
+    with open_dict(cfg):
+        hydra = cfg.pop("hydra")
+        OmegaConf.resolve(cfg)
+        cfg.hydra = hydra
+
+
 def list_choices() -> dict[str, list[str]]:
     """Names of every group's files in the whole search path, sorted, by group."""
     folders = (CONFIG_FOLDER, *config_folders())
@@ -218,6 +276,14 @@ class _Repository(ConfigRepository):
         if key not in self._parsed:
             self._parsed[key] = super().load_config(config_path)
         return copy.deepcopy(self._parsed[key])
+
+
+class _Reader(get_yaml_loader()):  # type: ignore[misc]
+    """Reads YAML as OmegaConf does, but no aliases: a few stand for any number of values."""
+
+    def fetch_alias(self) -> None:
+        """Refuse an alias."""
+        raise yaml.YAMLError("an alias")
 
 
 class _Loader(ConfigLoaderImpl):
@@ -250,6 +316,14 @@ class _Loader(ConfigLoaderImpl):
             cfg.hydra.overrides.task = [override for override in said if override not in gates]
             self._composed[key] = cfg
         return self._composed[key]
+
+    def load_sweep_config(
+        self, master_config: DictConfig, sweep_overrides: list[str]
+    ) -> DictConfig:
+        """Compose a job of a sweep with values."""
+        cfg = super().load_sweep_config(master_config, sweep_overrides)
+        resolve_values(cfg)
+        return cfg
 
 
 def _checked_folder(text: str) -> Path:

@@ -226,10 +226,19 @@ def name_statistics(
 
 
 def row_statistics(features: Mapping[str, Feature], row: Mapping[str, Any]) -> np.ndarray:
-    """Statistics of an episode from its row, as `episode_statistics` returns them."""
-    return np.array(
+    """Statistics of an episode from its row, as `episode_statistics` returns them.
+
+    Raises:
+        Exception: The row has others.
+    """
+    found = np.array(
         [
             np.concatenate([row[f"stats/{name}/{kind}"] for name in all_features(features)])
             for kind in STATISTICS
-        ]
+        ],
+        dtype=float,
     )
+    dims = sum(dim for _, dim in all_features(features).values())
+    if found.shape != (len(STATISTICS), dims) or not np.isfinite(found).all():
+        raise ValueError(f"statistics of episode {row['episode_index']}")
+    return found

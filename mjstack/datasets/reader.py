@@ -1,10 +1,10 @@
 """Opening a dataset: to read it, or to go on with it."""
 
-import contextlib
 import fcntl
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 from mjstack.datasets import lerobot
 from mjstack.datasets.spec import DatasetSpec
 from mjstack.errors import DatasetError, UnknownName
+from mjstack.files import reading
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -49,14 +50,21 @@ class StoredDataset:
         features = self.info["features"]
         if name not in features:
             raise UnknownName("feature", name, features)
-        parts = [np.empty(0, features[name]["dtype"])]
+        dtype = features[name]["dtype"]
+        shape = features[name]["shape"]
+        parts = [np.empty((0, *shape), dtype)]
         for shard in range(self.info["mjstack"]["shards"]):
-            column = _read_table(lerobot.shard_path(self.folder, lerobot.DATA, shard), [name])[name]
-            values = column.combine_chunks()
-            if features[name]["shape"] != [1]:
-                values = values.flatten()
-            parts.append(values.to_numpy(zero_copy_only=False))
-        return np.concatenate(parts).reshape(-1, *features[name]["shape"])
+            path = lerobot.shard_path(self.folder, lerobot.DATA, shard)
+            with readable(path):
+                column = _read_table(path, [name])[name]
+                values = column.combine_chunks()
+                if shape != [1]:
+                    values = values.flatten()
+                part = values.to_numpy(zero_copy_only=False).reshape(len(column), *shape)
+                if part.dtype != dtype:
+                    raise ValueError(f"{name} is {part.dtype}")
+                parts.append(part)
+        return np.concatenate(parts)
 
 
 def read_dataset(folder: Path | str) -> StoredDataset:
@@ -94,15 +102,24 @@ def read_info(folder: Path) -> dict[str, Any] | None:
                     " dataset or an empty folder. Give another"
                 )
         return None
-    try:
+    with readable(path):
         info = json.loads(path.read_text(encoding="utf-8"))
-        _identity(info)
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(
-            f"{path} cannot be read as mjstack's ({type(error).__name__}: {error}), expected a"
-            " dataset written by mjstack. Give another folder"
-        ) from error
+        _check_types(info)
     return info
+
+
+def _check_types(info: Any) -> None:
+    """Raise an error of any kind where info.json is not what `make_info` makes."""
+    empty = lerobot.make_info(DatasetSpec(robot_type="", fps=1, features={}, config_sha256=""))
+    for found, wanted in ((info, empty), (info["mjstack"], empty["mjstack"])):
+        for name, value in wanted.items():
+            if type(found[name]) is not type(value):
+                raise ValueError(f"{name} is {found[name]!r:.60}")
+    for feature in info["features"].values():
+        np.empty(feature["shape"], feature["dtype"])
+    for entry in info["mjstack"]["provenance"]:
+        if not 0 <= entry["from_episode"] <= info["total_episodes"]:
+            raise ValueError(f"from_episode is {entry['from_episode']}")
 
 
 def check_same(folder: Path, info: dict[str, Any], spec: DatasetSpec) -> None:
@@ -143,7 +160,12 @@ def read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
     count = info["total_tasks"]
     if not count:
         return []
-    return _read_table(folder / lerobot.TASKS, ["task"])["task"].to_pylist()[:count]
+    path = folder / lerobot.TASKS
+    with readable(path):
+        tasks = _read_table(path, ["task"])["task"].to_pylist()[:count]
+        if [type(task) for task in tasks] != [str] * count:
+            raise ValueError(f"not {count} texts")
+    return tasks
 
 
 def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
@@ -155,9 +177,19 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     frames = 0
     for shard in range(info["mjstack"]["shards"]):
-        rows += _read_table(lerobot.shard_path(folder, lerobot.EPISODES, shard)).to_pylist()
+        path = lerobot.shard_path(folder, lerobot.EPISODES, shard)
+        with readable(path):
+            for row in _read_table(path).to_pylist():
+                start = rows[-1]["dataset_to_index"] if rows else 0
+                place = (len(rows), start, start + row["length"])
+                names = ("episode_index", "dataset_from_index", "dataset_to_index")
+                if tuple(row[name] for name in names) != place or row["length"] < 1:
+                    raise ValueError(f"row {len(rows)} is not of that episode")
+                if min(row["seed"], row["world"]) < 0:
+                    raise ValueError(f"row {len(rows)} has a negative seed or world")
+                rows.append(row)
         path = lerobot.shard_path(folder, lerobot.DATA, shard)
-        with _readable(path):
+        with readable(path):
             frames += lerobot.require_pyarrow()[1].read_metadata(path).num_rows
     found = (len(rows), frames)
     expected = (info["total_episodes"], info["total_frames"])
@@ -209,23 +241,20 @@ def uncommitted(folder: Path, shards: int) -> list[Path]:
     places += [
         f"meta/.{Path(name).name}.*" for name in (lerobot.INFO, lerobot.STATS, lerobot.TASKS)
     ]
-    return [path for place in places for path in folder.glob(place) if path not in counted]
+    home = folder.resolve()
+    return [
+        path
+        for place in places
+        for path in folder.glob(place)
+        # A link out of the dataset is not followed.
+        if path not in counted and path.parent.resolve().is_relative_to(home)
+    ]
 
 
 def _read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
-    with _readable(path):
-        return lerobot.require_pyarrow()[1].ParquetFile(path).read(columns=columns)
+    return lerobot.require_pyarrow()[1].ParquetFile(path).read(columns=columns)
 
 
-@contextlib.contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Turn what pyarrow says of a missing or damaged file into one line."""
-    pa, _ = lerobot.require_pyarrow()
-    try:
-        yield
-    except (OSError, ValueError, pa.ArrowException) as error:
-        reason = str(error).partition("\n")[0].rstrip(".")
-        raise DatasetError(
-            f"{path} cannot be read ({reason}), expected it as it was written. Restore it, or give"
-            " another folder"
-        ) from error
+def readable(path: Path) -> AbstractContextManager[None]:
+    """Raise a `DatasetError` for whatever goes wrong with a file inside."""
+    return reading(path, DatasetError, "Restore it, or give another folder")

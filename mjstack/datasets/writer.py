@@ -19,6 +19,7 @@ from mjstack.datasets.reader import (
     read_info,
     read_rows,
     read_tasks,
+    readable,
     uncommitted,
 )
 from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData, typed_arrays, typed_values
@@ -149,8 +150,10 @@ class DatasetWriter:
             check_same(self.folder, info, self.spec)
             self._tasks = {task: index for index, task in enumerate(read_tasks(self.folder, info))}
             self._provenance = info["mjstack"]["provenance"]
-            for row in read_rows(self.folder, info):
-                self._count(row)
+            rows = read_rows(self.folder, info)
+            with readable(self.folder / "meta/episodes"):
+                for row in rows:
+                    self._count(row)
             self._shards = info["mjstack"]["shards"]
         for path in uncommitted(self.folder, self._shards):
             path.unlink()

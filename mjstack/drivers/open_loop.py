@@ -29,7 +29,8 @@ WORLDS_PER_PROCESS = 128  # distinct worlds that pay for one process more
 _POLL = 0.2  # s, between two looks at whether the command was interrupted
 _CHUNK = 8  # worlds, 0.1 s of planning: messages cost little beside it
 
-_THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# Variables of a planning process, each 1: no threads, and no imports from the working folder.
+_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONSAFEPATH")
 
 # World, commands at the knots (n, nu), largest distance [m] from a target.
 Plan = tuple[int, np.ndarray, float]
@@ -277,7 +278,8 @@ def plan_in_parallel(
         WorkerLost: A process has ended by itself.
     """
     # Processes are not forks: this one may hold a CUDA context and threads.
-    pool = ProcessPoolExecutor(processes, get_context("spawn"), _start_process, (cfg,))
+    with _as_programs():
+        pool = ProcessPoolExecutor(processes, get_context("spawn"), _start_process, (cfg,))
     theirs = active_children()
     try:
         with _as_programs():
@@ -309,7 +311,7 @@ def _as_programs() -> Iterator[None]:
     main = sys.modules["__main__"]
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     sys.modules["__main__"] = ModuleType("__main__")
-    limits = {name: "1" for name in _THREAD_LIMITS if name not in os.environ}
+    limits = {name: "1" for name in _VARIABLES if name not in os.environ}
     os.environ.update(limits)
     try:
         yield

@@ -11,7 +11,7 @@ from mjstack.config.load import load_saved
 from mjstack.config.schema import Config, TermCfg
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import ConfigError, MjstackError, RunError
-from mjstack.files import write_atomic
+from mjstack.files import reading, write_atomic
 
 STEM = "starts_played"
 
@@ -49,16 +49,13 @@ class EarlierRun:
                 )
         try:
             cfg = load_saved(saved)
-            provenance = dict(json.loads(report.read_text())["provenance"])
         except MjstackError as error:
             raise RunError(
                 f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error}"
             ) from error
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise RunError(
-                f"run={name}: report.json cannot be read ({type(error).__name__}), expected"
-                " mjstack's. Name another folder."
-            ) from error
+        with reading(report, RunError, "Name another folder"):
+            provenance = dict(json.loads(report.read_text())["provenance"])
+            provenance["versions"] = dict(provenance["versions"])
         if cfg.job.name != "gates":
             raise RunError(
                 f"run={name}: is a run of job={cfg.job.name}, expected one of job=gates. Name that"

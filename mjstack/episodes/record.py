@@ -2,6 +2,7 @@
 people.
 """
 
+import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import torch
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.observers import Episode
 from mjstack.errors import RunError
-from mjstack.files import write_npz
+from mjstack.files import reading, write_npz
 from mjstack.tasks.check import Rules
 
 STEMS = {"batch": "worlds", "success": "success"}
@@ -137,21 +138,29 @@ class EpisodeRecord:
         path = folder / _file_name(gate, seed)
         if not path.exists():
             return None
-        try:
-            with np.load(path) as held:
-                values = [name for name in held.files if name.startswith("value.")]
-                return cls(
-                    **{name: held[name].item() for name in ("seed", "backend", "device")},
-                    failed=held["failed"],
-                    values={name.removeprefix("value."): held[name] for name in values},
-                    qpos=held["qpos"],
-                    start=held["start_qpos"],
-                )
-        except Exception as error:  # numpy and zipfile fail in their own ways
-            raise RunError(
-                f"{path}: cannot be read ({type(error).__name__}), expected what the gate wrote."
-                " Run the gate again."
-            ) from error
+        with reading(path, RunError, "Run the gate again"), np.load(path) as held:
+            values = [name for name in held.files if name.startswith("value.")]
+            record = cls(
+                **{name: held[name].item() for name in ("seed", "backend", "device")},
+                failed=held["failed"],
+                values={name.removeprefix("value."): held[name] for name in values},
+                qpos=held["qpos"],
+                start=held["start_qpos"],
+            )
+            record._check()
+        return record
+
+    def _check(self) -> None:
+        """Raise a `ValueError` where types or shapes are not those that a gate writes."""
+        rows = (len(self.failed), self.qpos.shape[-1])
+        shapes = {"qpos": rows, "start": rows, "failed": rows[:1]}
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            if array.shape != shape or array.dtype.kind != ("i" if name == "failed" else "f"):
+                raise ValueError(f"{name} is {array.dtype} of shape {array.shape}")
+        where = f"{self.backend} on {self.device}"
+        if not re.fullmatch(r"(native|mjwarp) on (cpu|cuda:\d+)", where):
+            raise ValueError(f"played by {where}")
 
     @property
     def succeeded(self) -> np.ndarray:

@@ -30,7 +30,7 @@ def find_gates(cfg: Config) -> dict[str, Gate]:
     for name, path in cfg.gate.functions().items():
         if name not in cfg.gates:
             continue
-        func = resolve_func(f"gate.{name}", path)
+        func = resolve_func(f"gate.{name}", path, first="context")
         kind = getattr(func, "config", None)
         if kind is not None and isinstance(cfg.gate[name], dict):
             cfg.gate.added[name] = typed(f"gate.{name}", cfg.gate[name], kind)

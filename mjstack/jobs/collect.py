@@ -164,7 +164,7 @@ def _check_folder(dataset: Path, spec: DatasetSpec) -> None:
     if info is None:
         return
     if info["mjstack"]["config_sha256"] != spec.config_sha256:
-        theirs = info["mjstack"]["provenance"][-1]["config"]
+        theirs = (info["mjstack"]["provenance"] or [{}])[-1].get("config", {})
         found = differences(theirs, spec.provenance["config"])
         more = f", and {len(found) - 3} more keys" if len(found) > 3 else ""
         raise DatasetError(

@@ -18,7 +18,7 @@ from mjstack.datasets import DatasetSpec, DatasetWriter, EpisodeData, lerobot
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, DatasetError
-from mjstack.files import write_atomic
+from mjstack.files import reading, write_atomic
 from mjstack.jobs.demonstration import (
     STATE,
     Played,
@@ -110,14 +110,16 @@ def read_batches(folder: Path, committed: Sequence[tuple[int, int]]) -> list[Col
     path = folder / FILE
     if not path.exists():
         return []
-    try:
+    fix = (
+        f"Remove {FILE}: the dataset stands, and the expert's success rate is counted from then on"
+    )
+    with reading(path, DatasetError, fix):
         batches = [CollectedBatch(**batch) for batch in json.loads(path.read_text())]
-    except (OSError, ValueError, TypeError) as error:
-        raise DatasetError(
-            f"{path} cannot be read ({type(error).__name__}), expected what job=collect wrote."
-            f" Remove {FILE}: the dataset stands, and the expert's success rate is counted from"
-            " then on"
-        ) from error
+        for batch in batches:
+            counts = asdict(batch) | batch.broken
+            del counts["broken"]
+            if any(type(count) is not int or count < 0 for count in counts.values()):
+                raise ValueError(counts)
     _count_kept(batches, committed)
     return batches
 

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from rich.markup import escape
 
 from mjstack.config.schema import Backend, Config, SimCfg
+from mjstack.envs import driven_config
 from mjstack.episodes.context import RunContext, judge_one, require_episode
 from mjstack.episodes.earlier_run import EarlierRun, archived_starts, copy_names
 from mjstack.episodes.failures import FailureMonitor, describe_sign
@@ -122,7 +123,8 @@ def _plan(cfg: Config) -> ReplayPlan:
     return ReplayPlan(
         run=run,
         gate=gate,
-        context=RunContext(replace(played, sim=sim, view=cfg.view, video=cfg.video)),
+        # The folder may be a stranger's: what a replay does not play is not built.
+        context=RunContext(replace(driven_config(played), sim=sim, view=cfg.view, video=cfg.video)),
         seed=seed,
         world=world,
         where=where,
@@ -170,7 +172,7 @@ def _check_start(plan: ReplayPlan) -> None:
 def _changes(then: dict, now: dict) -> list[str]:
     """Facts that differ from the earlier run's and could change a result, or its last bits."""
     before, here = (
-        one.get("versions", {}) | {name: one.get(key) for key, name in _PLACES.items()}
+        one["versions"] | {name: one.get(key) for key, name in _PLACES.items()}
         for one in (then, now)
     )
     lines = [

@@ -14,7 +14,6 @@ from typing import cast
 
 import mujoco
 import numpy as np
-from rich.console import Console
 from rich.markup import escape
 
 from mjstack.config.fingerprint import config_content, config_hash
@@ -31,7 +30,7 @@ from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.report.picture import require_video, save_scene, save_trajectories, save_video
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
-from mjstack.report.table import Table, to_document
+from mjstack.report.table import Console, Table, to_document
 from mjstack.report.write import safely_write, summarize, write_report
 from mjstack.sim import Simulation, cuda_driver, cuda_name
 

@@ -16,8 +16,12 @@ from mjstack.interrupt import check_interrupt
 PASS = "pass"
 NOT_RUN = "not run"
 RESULT = "run.json"
-_START = "from mjstack.__main__ import main; main()"
 _POLL = 0.1  # s, between two looks at the process
+# The working folder is not imported from (-P), so a checkout that was is named.
+_START = (
+    f"import sys; sys.path.append({str(Path(__file__).parents[2])!r});"
+    " from mjstack.__main__ import main; main()"
+)
 _GRACE = 20.0  # s, for a process that was asked to stop
 
 Row = dict[str, Any]
@@ -34,13 +38,19 @@ def new_row(nworld: int, backend: str, **values: Any) -> Row:
 
 def read_run(folder: Path, nworld: int, backend: str) -> Row:
     """The row of a run, as not run where it has not finished."""
+    empty = new_row(nworld, backend)
     try:
         row = json.loads((folder / RESULT).read_text())
-        if "status" in row:
+        figures = [value for name, value in row.items() if name not in empty]
+        if (
+            all(type(row[name]) is type(value) for name, value in empty.items())
+            and (row["nworld"], row["backend"]) == (nworld, backend)
+            and all(isinstance(value, int | float) for value in figures)
+        ):
             return row
-    except (OSError, ValueError):  # not there, or of another version
+    except Exception:  # not there, or it may hold anything
         pass
-    return new_row(nworld, backend)
+    return empty
 
 
 def run_process(
@@ -65,7 +75,7 @@ def run_process(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "report.json").unlink(missing_ok=True)  # an earlier try's
     target = str(folder).replace("\\", "\\\\").replace("'", "\\'")
-    command = [sys.executable, "-c", _START, *overrides, *search_path_args()]
+    command = [sys.executable, "-P", "-c", _START, *overrides, *search_path_args()]
     began = time.monotonic()
     with (folder / "output.log").open("w") as log:
         process = subprocess.Popen(

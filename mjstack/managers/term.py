@@ -203,7 +203,7 @@ class Term:
         """
         self.label = label
         check_fields(label, cfg)
-        func = resolve_func(label, cfg.func, base)
+        func = resolve_func(label, cfg.func, base=base)
         self.params = dict(cfg.params)
         is_class = inspect.isclass(func)
         check_params(label, func, self.params, 1 if is_class or not masked else 2)

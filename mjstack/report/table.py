@@ -1,11 +1,25 @@
 """Tables of text cells, as Markdown and on a terminal."""
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import rich.console
 import rich.table
 from rich.markup import escape
+from rich.text import Text
+
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+
+
+class Console(rich.console.Console):
+    """A terminal that gets no control characters from texts: a text may be a stranger's."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """See `rich.console.Console`."""
+        return super().render_str(_CONTROL.sub("", text), **options)
 
 
 @dataclass(kw_only=True, slots=True)

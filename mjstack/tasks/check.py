@@ -344,7 +344,7 @@ def check_class(cfg: Config) -> type[EpisodeCheck] | None:
     if cfg.task.check is None:
         return None
     name = str(cfg.task.check.get("func"))
-    found = cast(type[EpisodeCheck], resolve_func("task.check", name, EpisodeCheck))
+    found = cast(type[EpisodeCheck], resolve_func("task.check", name, base=EpisodeCheck))
     for method in sorted(found.__abstractmethods__):
         raise TermError("task.check.func", f"{name}: method '{method}' is missing")
     return found

@@ -1,0 +1,257 @@
+"""Nothing that a stranger's folder names is run or followed, and no damage in it is a traceback."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from compositions import load_config
+from environments import one_second_episode
+from omegaconf import OmegaConf
+
+from mjstack.cli import run
+from mjstack.config.session import is_trusted, search_path
+from mjstack.episodes.record import EpisodeRecord
+from mjstack.errors import MjstackError
+from mjstack.jobs import check_job
+from mjstack.jobs.scaling_run import new_row, run_process
+
+ROOT = Path(__file__).parents[1]
+SHELL = {"func": "pydoc.pipepager", "params": {"cmd": "id > PWNED"}}
+PAYLOAD = "open('PWNED', 'w').close()\nfrom shutil import rmtree\ndef X(env): ...\n"
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run."""
+    folder = tmp_path_factory.mktemp("own") / "run"
+    args = ["gates=[batch]", "sim=native", "nworld=2", *one_second_episode()]
+    assert run([*args, f"hydra.run.dir={folder}"]) == 1
+    return folder
+
+
+@pytest.fixture
+def stranger(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it below the working folder, which a payload would write to."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return Path(shutil.copytree(own, tmp_path / "stranger"))
+
+
+def edit(folder: Path, key: str, value: Any) -> None:
+    """Set a key of the run's configuration, as text where it is."""
+    path = folder / ".hydra" / "config.yaml"
+    cfg = OmegaConf.load(path)
+    OmegaConf.update(cfg, key, value, merge=False, force_add=True)
+    path.write_text(OmegaConf.to_yaml(cfg))
+
+
+def replay(folder: Path) -> None:
+    """All of job=replay that comes before it writes."""
+    cfg = load_config(["job=replay"])
+    cfg.run = str(folder)
+    cfg.world = "1"
+    check_job(cfg)
+
+
+def refused(call: Callable[[], object]) -> str:
+    with pytest.raises(MjstackError) as caught:
+        call()
+    assert caught.value.exit_code == 2
+    assert "\n" not in str(caught.value)
+    assert not Path("PWNED").exists()
+    return str(caught.value)
+
+
+def test_a_run_has_values(own: Path) -> None:
+    assert "${" not in (own / ".hydra" / "config.yaml").read_text()
+
+
+@pytest.mark.full
+def test_a_run_of_a_sweep_has_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    args = ["gates=[batch]", "sim=native", "nworld=1", *one_second_episode()]
+    assert run([*args, "-m", "seed=1,2", "hydra.sweep.dir=all"]) == 1
+    assert "${" not in (tmp_path / "all" / "1" / ".hydra" / "config.yaml").read_text()
+
+
+UNUSED = ("observation.policy.terms.evil", "reward.evil", "termination.evil", "task.success")
+USED = ("reset.evil", "controller.action.arm", "gate.success.reset.evil", "task.check")
+
+
+@pytest.mark.parametrize("key", [*UNUSED, *USED])
+def test_a_replay_runs_no_command_of_its_folder(key: str, stranger: Path) -> None:
+    edit(stranger, key, SHELL | ({"weight": 1.0} if key.startswith("reward") else {}))
+    if key in USED:
+        found = refused(lambda: replay(stranger))
+        assert f"{key}.func=pydoc.pipepager: expected a name of mjstack" in found
+        assert found.endswith("add --config-dir DIR.")
+    else:
+        replay(stranger)
+    assert not Path("PWNED").exists()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["pydoc.pipepager", "builtins.max", "builtins.dict", "sys.exit", "os.system", "torch.save"],
+)
+def test_only_what_declares_itself_is_called(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run([f"+reward.evil={{func: {name}, params: {{cmd: 'id > PWNED'}}, weight: 1}}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"func={name}: expected a function or class whose first parameter is named env" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_gate_declares_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["gate.batch.func=os.system", "gates=[batch]"]) == 2
+    assert "first parameter is named context" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("key", ["reset.evil", "controller.action.arm", "task.check"])
+@pytest.mark.parametrize("given", ["", "conf", "beside"])
+def test_no_module_of_the_folder_is_imported(
+    key: str, given: str, stranger: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither from the working folder, nor where a search path makes that importable."""
+    (stranger / "payload.py").write_text(PAYLOAD)
+    (Path("conf") / "task").mkdir(parents=True)
+    Path("beside.py").write_text(PAYLOAD.replace("open", "# open"))
+    sys.path.insert(0, str(Path.cwd()))
+    monkeypatch.delitem(sys.modules, "beside", raising=False)
+    # The second is the user's own module, whose import runs nothing, with another's function.
+    edit(stranger, key, {"func": "beside.rmtree" if given == "beside" else "stranger.payload.X"})
+    with search_path(["conf"] if given else []):
+        found = refused(lambda: replay(stranger))
+        assert not given or is_trusted("beside.X", stranger)
+    assert f"{key}.func=" in found
+    assert "stranger.payload" not in sys.modules
+
+
+@pytest.mark.parametrize("start", ["-m mjstack", "scaling"])
+def test_the_working_folder_is_not_imported_from(
+    start: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("hydra", "omegaconf", "rich"):
+        Path(f"{name}.py").write_text(PAYLOAD)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    if start == "scaling":
+        row = new_row(1, "native")
+        run_process(tmp_path / "case", row, ["--version"], run_seconds=60, job_seconds=90)
+        told = (tmp_path / "case" / "output.log").read_text()
+    else:
+        done = [sys.executable, *start.split(), "--cfg", "job", "-p", "nworld"]
+        told = subprocess.run(done, capture_output=True, text=True).stdout
+    assert not Path("PWNED").exists()
+    assert told.split()[-1] == ("0.1.0" if start == "scaling" else "256")
+
+
+FOLLOWED = {
+    "environment": ("task.instruction", "${oc.env:HOME}", "it has ${...}"),
+    "robot's name": ("robot.name", "../../x", "robot.name=../../x: expected a name that"),
+    "absolute name": ("robot.menagerie_file", "/etc/passwd", "robot.menagerie_file=/etc/passwd"),
+    "robot's file": ("robot.file", "{stranger}/arm.xml", "robot.file={stranger}/arm.xml: expected"),
+    "relative file": ("robot.file", "stranger/arm.xml", "add --config-dir {stranger}."),
+}
+
+
+@pytest.mark.parametrize("name", FOLLOWED)
+def test_nothing_outside_is_read(name: str, stranger: Path) -> None:
+    shutil.copy(ROOT / "mjstack" / "robots" / "so101.xml", stranger / "arm.xml")
+    key, value, says = (part.replace("{stranger}", str(stranger)) for part in FOLLOWED[name])
+    edit(stranger, key, value)
+    assert says in refused(lambda: replay(stranger))
+    if key == "robot.file":  # the line tells how to allow it
+        with search_path([stranger]):
+            replay(stranger)
+
+
+def test_aliases_are_refused_at_once(stranger: Path) -> None:
+    path = stranger / ".hydra" / "config.yaml"
+    bomb = "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 9))
+    path.write_text(f"{path.read_text()}a0: &a0 [x]\n{bomb}")
+    assert "(YAMLError: an alias)" in refused(lambda: replay(stranger))
+
+
+def damage_record(**changes: Any) -> Callable[[Path], object]:
+    def write(folder: Path) -> None:
+        path = folder / "worlds_seed0.npz"
+        with np.load(path) as held:
+            arrays = dict(held)
+        arrays.update({k: f(arrays[k]) if callable(f) else f for k, f in changes.items()})
+        np.savez(path, **arrays)
+
+    return write
+
+
+def damage_report(text: str) -> Callable[[Path], object]:
+    return lambda folder: (folder / "report.json").write_text(text)
+
+
+DEEP = 100_000
+DAMAGE = {
+    "backend": (damage_record(backend="evil"), "worlds_seed0.npz: cannot be read"),
+    "device": (damage_record(device="cuda:x"), "worlds_seed0.npz: cannot be read"),
+    "scalar": (damage_record(failed=np.int32(0)), "worlds_seed0.npz: cannot be read"),
+    "rows": (damage_record(start_qpos=lambda x: x[:1]), "worlds_seed0.npz: cannot be read"),
+    "text": (damage_record(start_qpos=lambda x: x.astype(str)), "worlds_seed0.npz: cannot be read"),
+    "flat": (damage_record(qpos=lambda x: x.ravel()), "worlds_seed0.npz: cannot be read"),
+    "deep report": (damage_report("[" * DEEP), "report.json: cannot be read (RecursionError"),
+    "list": (damage_report('{"provenance": []}'), "report.json: cannot be read"),
+    "versions": (damage_report('{"provenance": {"versions": 3}}'), "report.json: cannot be read"),
+    "deep configuration": (
+        lambda folder: (folder / ".hydra" / "config.yaml").write_text("[" * DEEP),
+        "config.yaml: cannot be read (RecursionError",
+    ),
+    "bytes": (
+        lambda folder: (folder / ".hydra" / "config.yaml").write_bytes(bytes(range(256))),
+        "config.yaml: cannot be read",
+    ),
+    "hydra": (
+        lambda folder: (
+            edit(folder, "task.check.func", "os.system"),
+            (folder / ".hydra" / "hydra.yaml").write_text("hydra: [3]"),
+        ),
+        "add --config-dir DIR.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damage_is_one_line(name: str, stranger: Path) -> None:
+    damage, says = DAMAGE[name]
+    damage(stranger)
+    assert says in refused(lambda: replay(stranger))
+
+
+def test_a_record_is_read_as_it_was_written(own: Path) -> None:
+    record = EpisodeRecord.read(own, 0)
+    assert record is not None
+    assert record.qpos.shape == record.start.shape == (2, 20)
+
+
+def test_no_control_character_reaches_the_terminal(
+    stranger: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = json.loads((stranger / "report.json").read_text())
+    report["provenance"]["git_commit"] = "\x1b]0;PWNED\x07\x9b2J"
+    (stranger / "report.json").write_text(json.dumps(report))
+    edit(stranger, "robot.title", "\x1b[8m[/]")
+    assert run(["job=replay", f"run={stranger}", "world=1", "hydra.run.dir=out"]) in (0, 1)
+    told = "".join(capsys.readouterr())
+    assert "commit was ]0;PWNED2J in that run" in " ".join(told.split())
+    assert not {"\x1b", "\x07", "\x9b"} & set(told)
+    edit(stranger, "robot.title", 3)
+    edit(stranger, "controller.action.arm.func", "os.\x1b[8m")
+    assert run(["job=replay", f"run={stranger}", "world=1"]) == 2
+    assert "\x1b" not in capsys.readouterr().err
