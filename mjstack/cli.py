@@ -33,7 +33,6 @@ from mjstack.config.session import (
     hydra_session,
     lacking_folders,
     list_items,
-    resolve_values,
     search_path,
 )
 from mjstack.errors import (
@@ -43,6 +42,7 @@ from mjstack.errors import (
     first_line,
     suggest,
 )
+from mjstack.files import write_atomic
 from mjstack.interrupt import EXIT_CODE, begin_job
 from mjstack.report.record import Report, Status
 from mjstack.report.table import Console, Table
@@ -123,7 +123,6 @@ def _run_one(hydra: Hydra, overrides: list[str]) -> int:
         cfg.hydra.run.dir = str(checked.folder)
     begin_job()
     _check_writable(cfg, "run")
-    resolve_values(cfg)
     hydra.run(CONFIG_NAME, run_job, overrides)
     return max(result.exit_code for result in _results)
 
@@ -166,6 +165,9 @@ def run_job(cfg: DictConfig) -> Report:
     overrides = list(own.overrides.task)
     with search_path(lacking_folders(own.runtime.config_sources)):
         checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
+        if own.output_subdir is not None:  # a replay reads values, no interpolations
+            saved = Path(own.runtime.output_dir) / own.output_subdir / "config.yaml"
+            write_atomic(saved, OmegaConf.to_yaml(cfg, resolve=True))
         result = checked.run(Path(own.runtime.output_dir), overrides)
     _results.append(result)
     if result.status is Status.interrupted:

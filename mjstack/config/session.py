@@ -240,16 +240,6 @@ def without_hydra(cfg: DictConfig) -> DictConfig:
     return own
 
 
-def resolve_values(cfg: DictConfig) -> None:
-    """Put values in the place of interpolations, in all but Hydra's own part, so that a run's
-    folder has them.
-    """
-    with open_dict(cfg):
-        hydra = cfg.pop("hydra")
-        OmegaConf.resolve(cfg)
-        cfg.hydra = hydra
-
-
 def list_choices() -> dict[str, list[str]]:
     """Names of every group's files in the whole search path, sorted, by group."""
     folders = (CONFIG_FOLDER, *config_folders())
@@ -316,14 +306,6 @@ class _Loader(ConfigLoaderImpl):
             cfg.hydra.overrides.task = [override for override in said if override not in gates]
             self._composed[key] = cfg
         return self._composed[key]
-
-    def load_sweep_config(
-        self, master_config: DictConfig, sweep_overrides: list[str]
-    ) -> DictConfig:
-        """Compose a job of a sweep with values."""
-        cfg = super().load_sweep_config(master_config, sweep_overrides)
-        resolve_values(cfg)
-        return cfg
 
 
 def _checked_folder(text: str) -> Path:
