@@ -776,6 +776,75 @@ def test_missing_and_cut_files_are_named(file: str, tmp_path: Path) -> None:
             use(tmp_path)
 
 
+def set_column(name: str, value: Any) -> Callable[[pa.Table], pa.Table]:
+    """Puts one value into every row of a column."""
+
+    def change(table: pa.Table) -> pa.Table:
+        column = table.schema.get_field_index(name)
+        return table.set_column(column, name, [[value] * len(table)])
+
+    return change
+
+
+STRANGE: dict[str, tuple[str, Any]] = {
+    "features": (INFO, lambda info: info.update(features=[3])),
+    "shape": (INFO, lambda info: info["features"]["action"].update(shape="x")),
+    "dtype": (INFO, lambda info: info["features"]["action"].update(dtype="evil")),
+    "values": (INFO, lambda info: info["mjstack"].update(values=["x"])),
+    "provenance": (INFO, lambda info: info["mjstack"].update(provenance=[3])),
+    "from_episode": (INFO, lambda info: info["mjstack"]["provenance"][0].update(from_episode="x")),
+    "shards": (INFO, lambda info: info["mjstack"].update(shards=1.5)),
+    "total_tasks": (INFO, lambda info: info.update(total_tasks=2)),
+    "length": (ROWS, set_column("length", None)),
+    "seed": (ROWS, set_column("seed", None)),
+    "world": (ROWS, set_column("world", "x")),
+    "dataset_from_index": (ROWS, set_column("dataset_from_index", 7)),
+    "task": (lerobot.TASKS, set_column("task", None)),
+}
+
+
+@pytest.mark.parametrize("name", [*STRANGE, "deep"])
+def test_a_strangers_files_are_one_line(name: str, tmp_path: Path) -> None:
+    write(tmp_path, range(3))
+    if name == "deep":
+        (tmp_path / INFO).write_text("[" * 100_000)
+    elif STRANGE[name][0] == INFO:
+        edit_json(tmp_path / INFO, STRANGE[name][1])
+    else:
+        edit_table(tmp_path / STRANGE[name][0], STRANGE[name][1])
+    before = contents(tmp_path)
+    for use in (read_dataset, lambda folder: DatasetWriter(folder, SPEC)):
+        with pytest.raises(DatasetError, match="cannot be read") as caught:
+            use(tmp_path)
+        assert "\n" not in str(caught.value)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("value", [None, [1.0], [float("nan")] * 2, ["x", "y"]])
+def test_strange_statistics_and_frames_are_one_line(value: Any, tmp_path: Path) -> None:
+    write(tmp_path, range(3))
+    edit_table(tmp_path / ROWS, set_column("stats/action/mean", value))
+    with pytest.raises(DatasetError, match="cannot be read"):
+        DatasetWriter(tmp_path, SPEC)
+    edit_table(tmp_path / DATA, set_column("action", value))
+    with pytest.raises(DatasetError, match="cannot be read"):
+        read_dataset(tmp_path).frames("action")
+
+
+def test_clearing_follows_no_link_out_of_the_dataset(tmp_path: Path) -> None:
+    folder = tmp_path / "dataset"
+    write(folder, range(3))
+    (folder / "data").rename(tmp_path / "elsewhere")
+    (folder / "data").symlink_to(tmp_path / "elsewhere")
+    stale = tmp_path / "elsewhere" / "chunk-000" / "file-007.parquet"
+    stale.write_bytes(b"somebody's")
+    own = folder / "meta" / "episodes" / "chunk-000" / "file-007.parquet"
+    own.write_bytes(b"left by a writer")
+    DatasetWriter(folder, SPEC).close()
+    assert stale.read_bytes() == b"somebody's"
+    assert not own.exists()
+
+
 def test_statistics_that_were_removed_are_written_anew(tmp_path: Path) -> None:
     write(tmp_path, range(3))
     before = contents(tmp_path)

@@ -233,12 +233,26 @@ def test_run_without_a_report_says_its_last_line(tmp_path: Path) -> None:
     assert (row["status"], row["reason"]) == ("fail", "ImportError: no such thing")
 
 
-@pytest.mark.parametrize("text", [None, "", "{", '{"nworld": 1}', '{"other": 1}'])
+def as_written(**changes: object) -> str:
+    """A run's file with some values changed."""
+    return json.dumps(new_row(4, "native", status=PASS, world_steps_per_s=1.0) | changes)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(None, "", "{", "[" * 100_000, "[]", '{"nworld": 1}', '{"other": 1}'),
+        *(as_written(nworld=999), as_written(backend="mjwarp"), as_written(reason=3)),
+        *(as_written(status=None), as_written(world_steps_per_s="fast")),
+    ],
+)
 def test_unreadable_run_counts_as_not_run(tmp_path: Path, text: str | None) -> None:
     if text is not None:
         (tmp_path / "run.json").write_text(text)
     row = read_run(tmp_path, 4, "native")
     assert (row["nworld"], row["backend"], row["status"]) == (4, "native", NOT_RUN)
+    (tmp_path / "run.json").write_text(as_written())
+    assert read_run(tmp_path, 4, "native") == json.loads(as_written())
 
 
 @pytest.fixture
