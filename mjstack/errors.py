@@ -152,20 +152,6 @@ class Unreachable(InputError):
         )
 
 
-class WorkerLost(MjstackError):
-    """A process that plans worlds has ended before its work was done."""
-
-
-class MissingField(MjstackError):
-    """A per-world model field that the simulation was made without."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__(
-            f"sim.fields['{name}'] is not a per-world field of this simulation: make it with"
-            f" fields=['{name}'], or mark the reset term with uses_fields('{name}')."
-        )
-
-
 class RebindError(MjstackError):
     """A view of a simulation was assigned to instead of written into."""
 
@@ -178,24 +164,6 @@ class RebindError(MjstackError):
         super().__init__(
             f"{view} is a view of the simulation's memory and cannot be rebound: write {view}[:] ="
             " ... instead."
-        )
-
-
-class CaptureError(MjstackError):
-    """Work that cannot be captured into a graph."""
-
-    def __init__(self, name: str, culprit: str, error: Exception) -> None:
-        """Build the message.
-
-        Args:
-            name: What was to be captured.
-            culprit: The current term, if that is known.
-            error: The error of the capture.
-        """
-        where = f" because of {culprit}" if culprit else ""
-        super().__init__(
-            f"{name} cannot be captured{where} ({first_line(error)}): expected fixed shapes and no"
-            " host read (.item(), .cpu(), nonzero, if tensor). Correct it, or set graph=off."
         )
 
 

@@ -401,19 +401,19 @@ def test_parameters_of_functions_and_actions(cfg: Config) -> None:
             "action",
             "arm",
             {"joints": "arm", "scale": 0.0},
-            ["action.arm.params.scale=0.0", "positive"],
+            ["action.arm.params.scale=0.0", "a number above 0"],
         ),
         (
             "termination",
             "joint_limit",
             {"margin": -0.1},
-            ["termination.joint_limit.params.margin=-0.1", "not negative"],
+            ["termination.joint_limit.params.margin=-0.1", "a number of at least 0"],
         ),
         (
             "reset",
             "cubes",
             {"xy": -0.1, "yaw": 0.0},
-            ["reset.cubes.params.xy=-0.1", "not negative"],
+            ["reset.cubes.params.xy=-0.1", "a number of at least 0"],
         ),
         ("reset", "cubes", {"xy": 0.2, "yaw": 0.0}, ["reset.cubes.params.xy=0.2", "free position"]),
     ],
@@ -432,7 +432,12 @@ def test_parameters_out_of_range(
 def test_end_effector_action_out_of_range() -> None:
     cfg = configure("action=ee_delta")
     cfg.action["arm"].params = {"scale": 0.01, "iterations": 0}
-    fails(ConfigError, lambda: build(cfg), "action.arm.params.iterations=0", "a positive number")
+    fails(
+        ConfigError,
+        lambda: build(cfg),
+        "action.arm.params.iterations=0",
+        "an integer of at least 1",
+    )
 
 
 @pytest.mark.parametrize("open_fraction", [-0.1, 1.5])
@@ -505,7 +510,7 @@ def test_reset_term_without_its_fields(cfg: Config) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
-        ("history", 0, ["history=0", "at least 1"]),
+        ("history", 0, ["history=0", "from 1 to 1000"]),
         ("noise", -1.0, ["noise=-1.0", "at least 0"]),
         ("noise", float("nan"), ["noise=nan"]),
         ("scale", float("inf"), ["scale=inf", "finite"]),

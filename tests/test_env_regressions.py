@@ -16,7 +16,7 @@ import mjstack
 from mjstack.config.schema import ObservationTermCfg, TermCfg
 from mjstack.envs import Env, build_env
 from mjstack.episodes.context import RunContext
-from mjstack.errors import ConfigError, FaultError, MissingField, TermError
+from mjstack.errors import ConfigError, FaultError, MjstackError, TermError
 
 pytestmark = pytest.mark.full
 
@@ -204,20 +204,21 @@ def test_episode_length_is_the_time_out_terms() -> None:
         (["reward.reach.params.scale=abc"], "reward.reach.params.scale=abc: expected a number"),
         (
             ["reward.reach.params.scale=0"],
-            "reward.reach.params.scale=0: expected a positive number",
+            "reward.reach.params.scale=0: expected a number above 0",
         ),
         (
             ["reward.lift.params.height=-1"],
-            "reward.lift.params.height=-1: expected a positive number",
+            "reward.lift.params.height=-1: expected a number above 0",
         ),
         (
             ["termination.time_out.params.steps=0"],
-            "termination.time_out.params.steps=0: expected a positive number",
+            "termination.time_out.params.steps=0: expected an integer of at least 1",
         ),
         (
             ["action=ee_delta", "action.arm.params.iterations=2.5"],
             "action.arm.params.iterations=2.5: expected an integer",
         ),
+        (["task.success.params.open_fraction=2"], "open_fraction=2: expected a number from 0 to 1"),
         (["action.arm.params.joints=[shoulder_pan,shoulder_pan]"], "action.arm.params.joints"),
     ],
 )
@@ -254,7 +255,7 @@ def test_keys_that_can_be_added_say_how() -> None:
 
 def test_a_closed_environment_and_a_missing_field_say_so() -> None:
     env = native()
-    with pytest.raises(MissingField, match="uses_fields"):
+    with pytest.raises(MjstackError, match="uses_fields"):
         env.sim.fields["body_mass"]
     env.close()
     for call in (lambda: env.step(zeros(env)), env.reset):

@@ -14,7 +14,7 @@ from environments import actions, configure, returned
 
 from mjstack.config.schema import GraphMode
 from mjstack.envs import Env
-from mjstack.errors import CaptureError
+from mjstack.errors import MjstackError
 from mjstack.managers.view import EnvView
 from mjstack.rng import uniform
 from mjstack.sim.draws import draw_uniform
@@ -149,7 +149,7 @@ def test_a_term_that_reads_the_device_is_named(
     with caplog.at_level(logging.WARNING):
         if graph == "require":
             with pytest.raises(
-                CaptureError, match=r"env\.step cannot be captured because of termination\.spy"
+                MjstackError, match=r"env\.step cannot be captured because of termination\.spy"
             ):
                 env.step(zero)
         else:

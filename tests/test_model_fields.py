@@ -14,7 +14,7 @@ from compositions import load_config
 
 from mjstack.config.schema import Backend
 from mjstack.episodes.context import RunContext
-from mjstack.errors import MissingField, RebindError, UnknownName
+from mjstack.errors import MjstackError, RebindError, UnknownName
 from mjstack.sim import BatchSizes, Simulation, make_simulation
 from mjstack.sim.model_fields import FIELD_NAMES
 
@@ -155,7 +155,7 @@ def test_fields_keep_their_address(backend: str, make_fields: Make) -> None:
     ):
         sim.fields["body_mass"] = torch.zeros(N)
     with pytest.raises(
-        MissingField, match=r"geom_size.* is not a per-world field of this simulation"
+        MjstackError, match=r"geom_size.* is not a per-world field of this simulation"
     ):
         sim.fields["geom_size"]
 

@@ -19,7 +19,7 @@ from enum import EnumMeta
 from functools import cache
 from itertools import pairwise
 from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import MISSING
 
@@ -66,6 +66,22 @@ class Range:
             and (self.ge is None or value >= self.ge)
             and (self.le is None or value <= self.le)
         )
+
+    def describe(self, noun: str) -> str:
+        """The noun for a value, with these limits in words."""
+        most = "" if self.le is None else f"{self.le:.10g}"
+        if self.gt is not None:
+            noun += f" above {self.gt:.10g}" + f" and at most {most}" * bool(most)
+        elif self.ge is not None:
+            noun += f" from {self.ge:.10g} to {most}" if most else f" of at least {self.ge:.10g}"
+        return noun + (f" [{self.unit}]" if self.unit else "")
+
+
+# Annotations of a term's parameters, which its manager checks
+Positive = Annotated[float, Range(gt=0.0)]
+NotNegative = Annotated[float, Range(ge=0.0)]
+Fraction = Annotated[float, Range(ge=0.0, le=1.0)]
+Count = Annotated[int, Range(ge=1)]
 
 
 def spec(default: Any = MISSING, *, factory: Callable[[], Any] | None = None, **limits: Any) -> Any:
@@ -152,14 +168,7 @@ def accepted(owner: type, item: Field) -> str:
         words = "a finite number"
     else:
         words = _NOUNS.get(kind, "a value")
-    most = "" if limits.le is None else f"{limits.le:.10g}"
-    if limits.gt is not None:
-        words += f" above {limits.gt:.10g}" + f" and at most {most}" * bool(most)
-    elif limits.ge is not None:
-        words += f" from {limits.ge:.10g} to {most}" if most else f" of at least {limits.ge:.10g}"
-    unit = f" [{limits.unit}]" if limits.unit else ""
-    null = " or null" if NoneType in get_args(hint) else ""
-    return words + unit + null
+    return limits.describe(words) + (" or null" if NoneType in get_args(hint) else "")
 
 
 def field_docs(owner: type) -> dict[str, str]:

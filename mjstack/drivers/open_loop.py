@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.errors import Unreachable, WorkerLost
+from mjstack.errors import MjstackError, Unreachable
 from mjstack.interrupt import check_interrupt
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.scene.phases import build_phases, nominal_xy, target_xy
@@ -125,7 +125,7 @@ class OpenLoopPlanner:
         Raises:
             Unreachable: A target is out of reach; names the world (the first one), the phase and
                 the distance.
-            WorkerLost: A process that helps has ended.
+            MjstackError: A process that helps has ended.
         """
         if self._last is not None and np.array_equal(self._last[0], sources_xy):
             return self._last[1]  # the gates of one run play the same batch
@@ -275,7 +275,7 @@ def plan_in_parallel(
     Raises:
         Unreachable: A target is out of reach; of several such worlds it names the first, as one
             process would.
-        WorkerLost: A process has ended by itself.
+        MjstackError: A process has ended by itself.
     """
     # Processes are not forks: this one may hold a CUDA context and threads.
     with _as_programs():
@@ -294,7 +294,7 @@ def plan_in_parallel(
             process.kill()  # it may still be loading
         raise
     except BrokenProcessPool:
-        raise WorkerLost(
+        raise MjstackError(
             "a planning process was killed or ended before every world was planned",
             "Run again with more free memory, or on one core (taskset -c 0), which starts no"
             " processes",

@@ -2,18 +2,17 @@
 
 import inspect
 import io
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import torch
 from rich.console import Console
 from rich.table import Table
 
-from mjstack.config.fields import check_fields
+from mjstack.config.fields import Range, check_fields
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import TermCfg
 from mjstack.errors import (
@@ -67,7 +66,8 @@ def check_params(
             label, f"parameter '{missing[0]}' is missing: set {label}.params.{missing[0]}"
         )
     try:
-        hints = get_type_hints(func.__init__ if inspect.isclass(func) else func)
+        called = func.__init__ if inspect.isclass(func) else func
+        hints = get_type_hints(called, include_extras=True)
     except (NameError, TypeError):  # a user's annotations may name what cannot be resolved here
         return
     for name, value in params.items():
@@ -81,13 +81,17 @@ def _mismatch(value: Any, hint: Any) -> str:
     cannot be judged.
     """
     inner = get_args(hint)
+    if get_origin(hint) is Annotated and isinstance(inner[1], Range):
+        words = inner[1].describe(_WORDS.get(inner[0], "a value"))
+        return "" if not _mismatch(value, inner[0]) and inner[1].holds(value) else words
     if get_origin(hint) in (Union, UnionType):
         problems = [_mismatch(value, option) for option in inner]
         return "" if "" in problems else " or ".join(problems)
     if get_origin(hint) in (list, Sequence):
-        words = f"a list, each of it {_WORDS.get(inner[0], 'a value')}"
-        listed = isinstance(value, list | tuple)
-        return "" if listed and not any(_mismatch(part, inner[0]) for part in value) else words
+        if not isinstance(value, list | tuple):
+            return "a list"
+        wrong = max((_mismatch(part, inner[0]) for part in value), default="")
+        return f"a list, each of it {wrong}" if wrong else ""
     if hint not in _WORDS:
         return ""
     fits = isinstance(value, (int, float) if hint is float else hint)
@@ -140,17 +144,6 @@ def step_cache() -> Iterator[None]:
         yield
     finally:
         current_term.values = outer
-
-
-def require_positive(name: str, value: float, *, zero: bool = False) -> None:
-    """Refuse a parameter that is not a positive number, or zero where that will do.
-
-    Raises:
-        ParameterError: It is not.
-    """
-    if not 0.0 <= value < math.inf or (value == 0.0 and not zero):
-        expected = "a number that is not negative" if zero else "a positive number"
-        raise ParameterError(name, value, expected)
 
 
 def shared(key: Any, compute: Callable[[], torch.Tensor]) -> torch.Tensor:

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from mjstack.config.fields import Count, Positive
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
-from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import named_pose, robot, robot_joints
 from mjstack.scene.index import Columns
@@ -47,7 +47,7 @@ class JointPosition(_Commands):
         *,
         joints: str | list[str],
         mode: str = "relative",
-        scale: float = 1.0,
+        scale: Positive = 1.0,
         pose: str = "home",
     ) -> None:
         """Choose joints.
@@ -60,11 +60,10 @@ class JointPosition(_Commands):
             pose: ``home`` or ``start``: what ``relative`` counts from.
 
         Raises:
-            MjstackError: A joint or mode does not exist, or the scale is not finite.
+            MjstackError: A joint or mode does not exist.
         """
         if mode not in MODES:
             raise UnknownName("action mode", mode, MODES)
-        require_positive("scale", scale)
         names = robot_joints(env)
         n_arm = env.index.n_arm
         parts = {"arm": names[:n_arm], "gripper": names[n_arm:], "all": names}
@@ -121,22 +120,17 @@ class EndEffectorDelta(_Commands):
     does, closing it moves the grasp point, by up to 16 mm there.
     """
 
-    def __init__(self, env: EnvView, *, scale: float, iterations: int = 8) -> None:
+    def __init__(self, env: EnvView, *, scale: Positive, iterations: Count = 8) -> None:
         """Build the solver.
 
         Args:
             env: The environment.
             scale: Distance for an action of 1 [m per step].
             iterations: Steps of damped least squares per step.
-
-        Raises:
-            MjstackError: A parameter is out of range.
         """
         # Loads Warp, which other actions do not need.
         from mjstack.kinematics.batched_ik import BatchedIk
 
-        require_positive("scale", scale)
-        require_positive("iterations", iterations)
         self._n_arm = env.index.n_arm
         self._set_up(env, range(self._n_arm), dim=3)
         self._all = robot(env).ctrl

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from mjstack.errors import ParameterError, UnknownName
-from mjstack.managers.term import require_positive, shared
+from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, episode_draw
 from mjstack.math import lowest_point
 from mjstack.scene import table_top
@@ -92,12 +92,7 @@ def write_object(env: EnvView, mask: Tensor, name: str, xy: Tensor, quat: Tensor
 
 
 def nearness(offset: Tensor, scale: float) -> Tensor:
-    """``1 - tanh(distance / scale)`` of offsets [m], shape ``(nworld, d)``; shape ``(nworld,)``.
-
-    Raises:
-        ParameterError: The scale is not positive.
-    """
-    require_positive("scale", scale)
+    """``1 - tanh(distance / scale)`` of offsets [m], shape ``(nworld, d)``; shape ``(nworld,)``."""
     return 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
 
 

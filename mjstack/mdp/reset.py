@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from mjstack.config.fields import Count, NotNegative
 from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
-from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import (
@@ -47,7 +47,7 @@ class JointNoise:
         "reset.joints"
     )
 
-    def __init__(self, env: EnvView, *, arm: float, gripper: float = 0.0) -> None:
+    def __init__(self, env: EnvView, *, arm: NotNegative, gripper: NotNegative = 0.0) -> None:
         """Take the half-widths.
 
         Args:
@@ -55,8 +55,6 @@ class JointNoise:
             arm: Of the arm's joints [rad].
             gripper: Of the gripper's [rad or m].
         """
-        require_positive("arm", arm, zero=True)
-        require_positive("gripper", gripper, zero=True)
         self._width = torch.full_like(robot(env).home, gripper)
         self._width[: env.index.n_arm] = arm
         limits = joint_limits(env.sim.model, robot_joints(env))
@@ -74,7 +72,7 @@ class JitterObjects:
 
     label = "reset.cubes"
 
-    def __init__(self, env: EnvView, *, xy: float, yaw: float) -> None:
+    def __init__(self, env: EnvView, *, xy: NotNegative, yaw: NotNegative) -> None:
         """Take the half-widths.
 
         Args:
@@ -82,8 +80,6 @@ class JitterObjects:
             xy: Of x and y [m].
             yaw: Of the rotation about z [rad].
         """
-        require_positive("xy", xy, zero=True)
-        require_positive("yaw", yaw, zero=True)
         placement = Placement(
             env.cfg, env.sim.model, env.index, region=(xy, xy), gap=0.0, pose=env.cfg.robot.home
         )
@@ -116,10 +112,10 @@ class RandomizeObjects:
         self,
         env: EnvView,
         *,
-        xy: Sequence[float],
-        yaw: float = math.pi,
-        gap: float = GAP,
-        candidates: int = 16,
+        xy: Sequence[NotNegative],
+        yaw: NotNegative = math.pi,
+        gap: NotNegative = GAP,
+        candidates: Count = 16,
         pose: str = "start",
     ) -> None:
         """Check that the region has room.
@@ -133,15 +129,11 @@ class RandomizeObjects:
             pose: Where the arm is then, ``home`` or ``start``.
 
         Raises:
-            ParameterError: A value is out of range, the region leaves no free place, or the arm
-                does not reach all of it.
+            ParameterError: The region leaves no free place, or the arm does not reach all of it.
         """
         region = list(xy)
         if len(region) != 2:
             raise ParameterError("xy", region, "two numbers [m]")
-        for name, value in (("xy", min(xy)), ("yaw", yaw), ("gap", gap)):
-            require_positive(name, value, zero=True)
-        require_positive("candidates", candidates)
         self._yaw = yaw
         self._candidates = candidates
         # The first draws are the same for every scene; the others follow.

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from mjstack.managers.term import require_positive
+from mjstack.config.fields import NotNegative, Positive
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import (
     above_table,
@@ -16,7 +16,7 @@ from mjstack.mdp.geometry import (
 from mjstack.mdp.observation import grasp_point_to_object
 
 
-def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> Tensor:
+def reach(env: EnvView, *, object: str, scale: Positive, height: float = 0.0) -> Tensor:
     """Nearness of the grasp point to a point above an object: ``1 - tanh(distance / scale)``.
 
     Args:
@@ -28,20 +28,19 @@ def reach(env: EnvView, *, object: str, scale: float, height: float = 0.0) -> Te
     return nearness(grasp_point_to_object(env, object=object, height=height), scale)
 
 
-def grasp(env: EnvView, *, object: str, force: float = 0.05) -> Tensor:
+def grasp(env: EnvView, *, object: str, force: NotNegative = 0.05) -> Tensor:
     """1 while both jaws press on an object with more than ``force`` [N], else 0."""
     return (jaw_forces(env, object) > force).all(1).to(torch.float32)
 
 
-def lift(env: EnvView, *, object: str, height: float) -> Tensor:
+def lift(env: EnvView, *, object: str, height: Positive) -> Tensor:
     """Height of an object's lowest point above the table as a fraction of ``height`` [m], from 0 to
     1.
     """
-    require_positive("height", height)
     return (above_table(env, object) / height).clamp(0.0, 1.0)
 
 
-def place(env: EnvView, *, a: str, b: str, scale: float) -> Tensor:
+def place(env: EnvView, *, a: str, b: str, scale: Positive) -> Tensor:
     """Nearness of object ``a`` to its position on object ``b``, while it is off the table: ``1 -
     tanh(distance / scale)``.
     """
@@ -51,7 +50,7 @@ def place(env: EnvView, *, a: str, b: str, scale: float) -> Tensor:
     return nearness(offset, scale) * (above_table(env, a) > 0.005)
 
 
-def near_place(env: EnvView, *, object: str, place: str, scale: float) -> Tensor:
+def near_place(env: EnvView, *, object: str, place: str, scale: Positive) -> Tensor:
     """Horizontal nearness of an object to a place: ``1 - tanh(distance / scale)``."""
     return nearness(place_xy(env, place) - pose_w(env, object)[:, :2], scale)
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from mjstack.managers.term import require_positive
+from mjstack.config.fields import Count, NotNegative
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import joint_positions, pose_w, robot
@@ -11,9 +11,8 @@ from mjstack.scene import table_top
 from mjstack.sim import LOST_PHYSICS
 
 
-def time_out(env: EnvView, *, steps: int) -> Tensor:
+def time_out(env: EnvView, *, steps: Count) -> Tensor:
     """After this many steps."""
-    require_positive("steps", steps)
     return env.episode_step >= steps
 
 
@@ -46,17 +45,13 @@ class JointLimit:
     soft.
     """
 
-    def __init__(self, env: EnvView, *, margin: float) -> None:
+    def __init__(self, env: EnvView, *, margin: NotNegative) -> None:
         """Read the ranges.
 
         Args:
             env: The environment.
             margin: How far outside is too far, as a fraction of each joint's range.
-
-        Raises:
-            ParameterError: The margin is negative or not finite.
         """
-        require_positive("margin", margin, zero=True)
         limits = robot(env).range
         room = margin * (limits[:, 1] - limits[:, 0])
         self._low = limits[:, 0] - room

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjstack.config.schema import GraphMode
-from mjstack.errors import CaptureError
+from mjstack.errors import MjstackError, first_line
 from mjstack.interrupt import check_interrupt
 
 if TYPE_CHECKING:
@@ -154,7 +154,12 @@ class StepGraph:
                 capture = self._capture_cuda if device.is_cuda else self._capture_cpu
                 self._replay = capture(device)
         except Exception as error:
-            failure = CaptureError(self._name, self._culprit(), error)
+            culprit = f" because of {found}" if (found := self._culprit()) else ""
+            failure = MjstackError(
+                f"{self._name} cannot be captured{culprit} ({first_line(error)}): expected fixed"
+                " shapes and no host read (.item(), .cpu(), nonzero, if tensor)",
+                "Correct it, or set graph=off",
+            )
             if device.is_cuda:
                 with suppress(RuntimeError):  # it reports the failed capture once more
                     torch.cuda.synchronize(wp.device_to_torch(device))

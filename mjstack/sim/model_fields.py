@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import torch
 
-from mjstack.errors import MissingField, RebindError, UnknownName
+from mjstack.errors import MjstackError, RebindError, UnknownName
 
 # The float arrays that `mujoco_warp.put_model` batches, as of 4.0, by the first word of MuJoCo's
 # names; a test compares them with the installed version. Left out: integers, which are the model's
@@ -69,7 +69,10 @@ class Fields(Mapping[str, torch.Tensor]):
 
     def __getitem__(self, name: str) -> torch.Tensor:
         if name not in self._tensors:
-            raise MissingField(name)
+            raise MjstackError(
+                f"sim.fields['{name}'] is not a per-world field of this simulation: make it with"
+                f" fields=['{name}'], or mark the reset term with uses_fields('{name}')"
+            )
         return self._tensors[name]
 
     def __setitem__(self, name: str, value: torch.Tensor) -> None:

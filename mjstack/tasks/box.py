@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mjstack.config.fields import spec
+from mjstack.config.fields import Fraction, spec
 from mjstack.errors import ConfigError, UnknownName
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import gripper_opening
@@ -369,7 +369,7 @@ class BoxSuccess(ReleasedSuccess):
     window, and the gripper is open. It shares the thresholds of the task's check.
     """
 
-    def __init__(self, env: EnvView, *, open_fraction: float) -> None:
+    def __init__(self, env: EnvView, *, open_fraction: Fraction) -> None:
         """Allocate the streak; see `ReleasedSuccess`.
 
         Raises:

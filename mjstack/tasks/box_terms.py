@@ -5,8 +5,9 @@ task's check.
 import torch
 from torch import Tensor
 
+from mjstack.config.fields import NotNegative, Positive
 from mjstack.errors import UnknownName
-from mjstack.managers.term import require_positive, shared
+from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, offers
 from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, nearness, place_xy, pose_w
 from mjstack.scene import table_top
@@ -51,7 +52,7 @@ class Place:
     floor, ``scene.box.floor``: also one that rests in the box, however thin that floor is.
     """
 
-    def __init__(self, env: EnvView, *, object: str, scale: float) -> None:
+    def __init__(self, env: EnvView, *, object: str, scale: Positive) -> None:
         """Find the place.
 
         Args:
@@ -60,7 +61,7 @@ class Place:
             scale: Distance over which the reward falls [m].
 
         Raises:
-            MjstackError: There is no such cube, no box, or the scale is out of range.
+            MjstackError: There is no such cube, or no box.
         """
         self._to_slot = ToSlot(env, object=object)
         self._object = object
@@ -110,7 +111,7 @@ class ReachNext(_ByObject):
     are.
     """
 
-    def __init__(self, env: EnvView, *, scale: float) -> None:
+    def __init__(self, env: EnvView, *, scale: Positive) -> None:
         """Read the box's place.
 
         Args:
@@ -118,7 +119,7 @@ class ReachNext(_ByObject):
             scale: Distance over which the reward falls [m].
 
         Raises:
-            MjstackError: There is no box, or the scale is out of range.
+            MjstackError: There is no box.
         """
         super().__init__(env)
         self._scale = scale
@@ -135,7 +136,7 @@ class GraspNext(_ByObject):
     0.
     """
 
-    def __init__(self, env: EnvView, *, force: float = 0.05) -> None:
+    def __init__(self, env: EnvView, *, force: NotNegative = 0.05) -> None:
         """Read the box's place.
 
         Args:
@@ -143,9 +144,8 @@ class GraspNext(_ByObject):
             force: Force that each jaw must exceed [N].
 
         Raises:
-            MjstackError: There is no box, or the force is out of range.
+            MjstackError: There is no box.
         """
-        require_positive("force", force, zero=True)
         super().__init__(env)
         self._force = force
 

@@ -10,8 +10,6 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from mjstack.errors import ParameterError
-from mjstack.managers.term import require_positive
 from mjstack.managers.view import EnvView
 from mjstack.math import quat_angle
 from mjstack.mdp.geometry import gripper_opening, place_xy
@@ -348,11 +346,7 @@ class HeldSuccess:
             env: The environment.
             condition: Whether it holds now, shape ``(nworld,)``, bool.
             steps: How many steps in a row.
-
-        Raises:
-            ParameterError: The number is out of range.
         """
-        require_positive("steps", steps)
         self._condition = condition
         self._steps = steps
         self._length = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
@@ -381,12 +375,7 @@ class ReleasedSuccess(HeldSuccess):
             condition: A condition of a step.
             open_fraction: How far the gripper must be open, from 0 (closed) to 1 (open), as
                 measured.
-
-        Raises:
-            ParameterError: The fraction is out of range.
         """
-        if not 0.0 <= open_fraction <= 1.0:
-            raise ParameterError("open_fraction", open_fraction, "a number from 0 to 1")
         view = check.view(env)
         super().__init__(env, lambda: condition(view.step()), check.settle_steps)
         self._open = open_fraction

@@ -1,5 +1,6 @@
 """Success of any task that has a check: every object is where it belongs."""
 
+from mjstack.config.fields import Count
 from mjstack.managers.view import EnvView
 from mjstack.tasks.check import make_check
 from mjstack.tasks.parts import HeldSuccess
@@ -10,7 +11,7 @@ class Placed(HeldSuccess):
     `EpisodeCheck.placed`, for some steps in a row.
     """
 
-    def __init__(self, env: EnvView, *, steps: int = 1) -> None:
+    def __init__(self, env: EnvView, *, steps: Count = 1) -> None:
         """Allocate the streaks.
 
         Args:

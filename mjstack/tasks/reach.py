@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from mjstack.managers.term import require_positive
+from mjstack.config.fields import Count, Positive
 from mjstack.managers.view import EnvView
 from mjstack.mdp.observation import grasp_point_to_object
 from mjstack.tasks.parts import HeldSuccess
@@ -13,7 +13,7 @@ class ReachSuccess(HeldSuccess):
     """Achieved while the grasp point has been near the point for some steps in a row."""
 
     def __init__(
-        self, env: EnvView, *, object: str, height: float, distance: float, steps: int
+        self, env: EnvView, *, object: str, height: float, distance: Positive, steps: Count
     ) -> None:
         """Take the thresholds.
 
@@ -25,9 +25,8 @@ class ReachSuccess(HeldSuccess):
             steps: How many steps in a row.
 
         Raises:
-            MjstackError: There is no such object, or a number is out of range.
+            MjstackError: There is no such object.
         """
-        require_positive("distance", distance)
 
         def near() -> Tensor:
             offset = grasp_point_to_object(env, object=object, height=height)

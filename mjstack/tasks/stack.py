@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mjstack.config.fields import spec
+from mjstack.config.fields import Fraction, spec
 from mjstack.managers.view import EnvView
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import (
@@ -145,7 +145,7 @@ class StackSuccess(ReleasedSuccess):
     takes its own along. Distances stay squared, and angles stay cosines, until they are judged.
     """
 
-    def __init__(self, env: EnvView, *, open_fraction: float) -> None:
+    def __init__(self, env: EnvView, *, open_fraction: Fraction) -> None:
         """Allocate a ring of the last steps; see `ReleasedSuccess`.
 
         Raises:
