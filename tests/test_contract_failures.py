@@ -5,6 +5,7 @@ and no other world is.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -14,16 +15,19 @@ from check_cases import rules_of
 from comparison import assert_same_run
 from environments import at_double_speed, one_second_episode
 
+from mjstack import interrupt
 from mjstack.config import Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Episode, Hook, play_episode
+from mjstack.errors import ConfigError
 from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import run_capacity
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.throughput import run_throughput
+from mjstack.jobs import gates
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Overflow, Simulation
 from mjstack.tasks.check import make_check
@@ -254,3 +258,29 @@ def test_memory_that_runs_out_is_said(error: Exception, so101_cfg: Config) -> No
     (result,) = results
     assert result.status is Status.failed
     assert result.reason.startswith(f"out of memory ({error}). Run fewer worlds")
+
+
+def test_worlds_that_do_not_fit_are_refused(
+    new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert 0 < gates.available_memory() < 2**44
+    monkeypatch.setattr(gates, "available_memory", lambda: 10**9)
+    with pytest.raises(ConfigError, match=r"not enough memory .* GiB needed") as caught:
+        gates._check_memory(new_context("sim=native", "nworld=10000000"))
+    most = re.search(r"at most (\d+),", str(caught.value))[1]
+    gates._check_memory(new_context("sim=native", f"nworld={most}"))
+    with pytest.raises(ConfigError, match=f"at most {most}, because"):
+        gates._check_memory(new_context("sim=native", f"nworld={int(most) + 1}"))
+
+
+def test_an_interrupt_fails_no_gate(so101_cfg: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where it breaks something that would have gone on otherwise."""
+
+    def gate(context: RunContext) -> list[GateResult]:
+        monkeypatch.setattr(interrupt, "_asked", True)  # as the command's handler does
+        raise RuntimeError("a helper was interrupted too")
+
+    results: list[GateResult] = []
+    with pytest.raises(KeyboardInterrupt):
+        run_guarded(RunContext(cfg=so101_cfg, record=results.append), "batch", gate)
+    assert not results

@@ -24,7 +24,7 @@ from matplotlib.axes import Axes
 from mjstack.cli import run
 from mjstack.config.check import validate
 from mjstack.config.schema import Backend
-from mjstack.errors import ConfigError
+from mjstack.errors import ConfigError, MjstackError
 from mjstack.jobs import check_job, scaling, scaling_run
 from mjstack.jobs.scaling import (
     RATE,
@@ -70,11 +70,21 @@ class OwnProcess:
     """
 
     def __init__(self, command: list[str], *, stdout: TextIO, **_: object) -> None:
-        assert command[1] == "-c"
-        *overrides, target = command[3:]
+        assert command[1:3] == ["-P", "-c"]
+        *overrides, target = command[4:]
         folder = Path(target.removeprefix("hydra.run.dir=").strip("'"))
         with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stdout):
-            self.code = check_job(load_config(overrides), overrides).run(folder).exit_code
+            try:
+                self.code = check_job(load_config(overrides), overrides).run(folder).exit_code
+            except MjstackError as error:
+                print(f"mjstack: {error}")
+                self.code = error.exit_code
+
+    def poll(self) -> int:
+        return self.code
+
+    def terminate(self) -> None:
+        """It has ended."""
 
     def wait(self, _: float) -> int:
         return self.code

@@ -1,6 +1,8 @@
 """Job *gates*: a configuration and a folder in, gates run, a report left behind."""
 
 import contextlib
+import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +18,14 @@ from mjstack.errors import ConfigError, TermError, Unreachable
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
 from mjstack.jobs.runner import CheckedJob, Job, check_showing
+from mjstack.managers.episode import required_fields
 from mjstack.sim import resolve_backend
+from mjstack.sim.native import NativeSimulation
+
+# Bytes of a whole run (environment, plan, check) over those of its native worlds: measured 3.2 to
+# 4.6, for both drivers.
+_SHARE = 4
+_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
 def check_machine(cfg: Config) -> RunContext:
@@ -34,7 +43,33 @@ def check_machine(cfg: Config) -> RunContext:
         raise ConfigError(key, "true", expected, "Add one of them to gates")
     check_showing(cfg)
     _check_starts(context)
+    if context.backend[0] is Backend.native and {"batch", "success", "throughput"} & set(cfg.gates):
+        _check_memory(context)
     return context
+
+
+def _check_memory(context: RunContext) -> None:
+    """Raise if as many native worlds as are asked for do not fit into the memory that is left."""
+    nworld = context.cfg.nworld
+    sim = NativeSimulation(context.model, 1, fields=required_fields(context.cfg.reset))
+    sim.close()
+    size = _SHARE * sim.world_bytes
+    free = available_memory()
+    if nworld * size > free:
+        sizes = f"{nworld * size / 2**30:.3g} GiB needed, {free / 2**30:.3g} GiB free"
+        expected = f"at most {free // size}, because there is not enough memory for more ({sizes})"
+        raise ConfigError("nworld", nworld, expected)
+
+
+def available_memory() -> int:
+    """Memory that this process may still take, in bytes: the system's, or its container's."""
+    found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    for path in ("/proc/meminfo", *_LIMITS):
+        with contextlib.suppress(OSError):
+            text = Path(path).read_text()
+            for number, kib in re.findall(r"(?m)(?:^|MemAvailable: +)(\d+)( kB)?$", text):
+                found.append(int(number) * (1024 if kib else 1))
+    return min(found)
 
 
 def _check_starts(context: RunContext) -> None:

@@ -239,6 +239,12 @@ class NativeSimulation(Simulation):
         self._counts[rows] = 0
         self._steps[rows] = 0
 
+    @property
+    def world_bytes(self) -> int:
+        """Memory that a world takes."""
+        arrays = (self._state, *self._poses.values(), *self._others.values())
+        return sum(a.nbytes for a in (*arrays, *self._fields.values())) // self.nworld
+
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options of the model."""
         option = self.model.opt
