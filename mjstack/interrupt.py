@@ -14,7 +14,6 @@ from threading import current_thread, main_thread
 from types import FrameType
 
 EXIT_CODE = 130
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 _running = False  # a job may be writing
 _asked = False  # to stop
@@ -27,11 +26,11 @@ def handle_interrupts() -> Iterator[None]:
     """
     global _running, _asked
     _running = _asked = False
-    owned = current_thread() is main_thread()  # which alone may set handlers
-    found = {number: signal.getsignal(number) for number in _SIGNALS if owned}
-    before = {number: handler for number, handler in found.items() if handler != signal.SIG_IGN}
-    for number in before:
-        signal.signal(number, _handle)
+    before = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # The main thread alone may set handlers.
+        if current_thread() is main_thread() and signal.getsignal(number) != signal.SIG_IGN:
+            before[number] = signal.signal(number, _handle)
     try:
         yield
     finally:

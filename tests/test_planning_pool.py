@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mjstack import interrupt
 from mjstack.config.schema import Config
 from mjstack.drivers import open_loop
 from mjstack.drivers.open_loop import OpenLoopPlanner, Plan
@@ -105,6 +107,20 @@ def test_interrupt_ends_the_processes(stage: Stage) -> None:
         OpenLoopPlanner(context.cfg).plan(layouts(context, 256), interrupt)
     assert caught.tb is not None  # they are gone although every step is still alive
     assert not active_children()
+
+
+@pytest.mark.usefixtures("two_processes")
+def test_an_interrupted_command_does_not_wait_until_they_have_loaded(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = stage("so101")
+    planner = OpenLoopPlanner(context.cfg)
+    monkeypatch.setattr(interrupt, "_asked", True)  # as the command's handler does
+    used = os.times()
+    with pytest.raises(KeyboardInterrupt):
+        planner.plan(layouts(context, 256))
+    assert not active_children()
+    assert os.times().children_user - used.children_user < 2.0
 
 
 SCRIPT = """

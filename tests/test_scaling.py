@@ -83,11 +83,10 @@ class OwnProcess:
     def poll(self) -> int:
         return self.code
 
-    def terminate(self) -> None:
+    def kill(self) -> None:
         """It has ended."""
 
-    def wait(self, _: float) -> int:
-        return self.code
+    wait = kill
 
 
 def run_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:

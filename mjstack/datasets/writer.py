@@ -32,8 +32,8 @@ class DatasetWriter:
 
     `add` writes episodes into a hidden file, one after the other, and keeps none of their frames;
     `flush` commits what was added. info.json is the last file to change in a commit and says how
-    many files count: a kill before it costs the episodes since the last commit, and the next writer
-    clears away what they left. One writer has a dataset at a time.
+    many files count: a kill or a Ctrl-C before it costs the episodes since the last commit, and the
+    next writer clears away what they left. One writer has a dataset at a time.
 
         with DatasetWriter(folder, spec) as writer:
             for seed in seeds:

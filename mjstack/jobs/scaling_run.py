@@ -22,7 +22,6 @@ _START = (
     f"import sys; sys.path.append({str(Path(__file__).parents[2])!r});"
     " from mjstack.__main__ import main; main()"
 )
-_GRACE = 20.0  # s, for a process that was asked to stop
 
 Row = dict[str, Any]
 """One run of the job: ``nworld``, ``backend``, ``status`` (pass, fail, out of memory or not run),
@@ -91,15 +90,15 @@ def run_process(
                 check_interrupt()
                 time.sleep(_POLL)
         finally:
-            _stop(process)
+            process.kill()  # it writes its files in one step each
+            process.wait()
+    check_interrupt()
     seconds = time.monotonic() - began
     nworld = row["nworld"]
     backend = row["backend"]
     if code is None and job_seconds <= run_seconds:
         stopped = f"{backend}, {nworld} worlds: stopped after {seconds:.0f} s"
         return new_row(nworld, backend, reason=stopped)
-    if code == 130:
-        raise KeyboardInterrupt
     row = read_report(folder, nworld, backend, code) | {"seconds": seconds}
     if code is None:
         row["reason"] = f"not done after {seconds:.0f} s (job.run_minutes)"
@@ -136,13 +135,3 @@ def read_report(folder: Path, nworld: int, backend: str, code: int | None) -> Ro
     # The system kills (9) where memory runs out.
     no_memory = code == -9 or is_out_of_memory(reason if code == 2 else f"{reason} {output}")
     return row | {"status": "out of memory" if no_memory else "fail", "reason": reason}
-
-
-def _stop(process: subprocess.Popen) -> None:
-    """Ask a process that still runs to stop, and end it if it does not."""
-    process.terminate()
-    try:
-        process.wait(_GRACE)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
