@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -39,13 +41,27 @@ def test_a_step_reads_nothing_from_the_device(task: str, action: str) -> None:
     assert (env.episode >= 2).all()
 
 
-def test_a_bad_action_is_named_within_the_window() -> None:
-    env = mjstack.make_env(["task=reach", "sim=mjwarp"], nworld=4)
-    env.reset(seed=0)
-    action = torch.zeros((4, env.action_manager.action_dim), device=env.device)
-    action[2, 0] = float("nan")
-    env.step(action)
-    with pytest.raises(
-        mjstack.MjstackError, match=r"actions were not finite in 1 of 4 worlds \(2\)"
-    ):
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e20, 1e38])
+def test_a_bad_action_is_named_and_stays_in_its_world(value: float) -> None:
+    """Its CPU twins are in test_env_errors.py."""
+    env = mjstack.make_env(["task=reach", "sim=mjwarp"], nworld=2048)
+    ends = []
+    for spoilt in (False, True):
+        env.reset(seed=0)
+        generator = torch.Generator().manual_seed(0)
+        for step in range(6):  # the second is captured
+            draw = torch.rand((2048, env.action_manager.action_dim), generator=generator)
+            action = (2.0 * draw - 1.0).to(env.device)
+            if spoilt and step == 5:
+                action[2, 0] = value
+            env.step(action)
+        ends.append(env.sim.qpos.clone())
+        if not spoilt:
+            env.raise_faults()
+    cause = "the reward is not finite" if math.isfinite(value) else "actions were not finite"
+    with pytest.raises(mjstack.MjstackError, match=rf"{cause} in 1 of 2048 worlds \(2\)") as caught:
         env.raise_faults()
+    assert ("after an action of" in str(caught.value)) is math.isfinite(value)
+    others = [end[torch.arange(2048, device=env.device) != 2] for end in ends]
+    assert ((others[0] - others[1]).abs().amax(1) < 1e-3).float().mean() > 0.99
+    env.close()

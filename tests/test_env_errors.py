@@ -90,11 +90,20 @@ def test_action_that_is_not_finite_names_its_world(env: Env, bad: float) -> None
     fails(ArgumentError, lambda: env.step(action), "action: found", "in world 1", "finite")
 
 
-def test_a_reward_that_a_huge_action_breaks_names_the_action(env: Env) -> None:
+@pytest.mark.parametrize("huge", [1e20, 1e38])
+def test_a_reward_that_a_huge_action_breaks_names_the_action(env: Env, huge: float) -> None:
+    env.step(zeros(env))
+    clean = env.sim.qpos.clone()
+    env.reset(seed=0)
     action = zeros(env)
-    action[1, 4] = 1e20
-    words = ("the reward is not finite in 1 of 3 worlds (1)", "after an action of 1e+20", "policy")
+    action[1, 4] = huge
+    words = (
+        "reward is not finite in 1 of 3 worlds (1)",
+        f"after an action of {huge:.3g}",
+        "policy",
+    )
     fails(FaultError, lambda: env.step(action), *words)
+    assert torch.equal(env.sim.qpos[[0, 2]], clean[[0, 2]])
 
 
 def test_argument_errors_leave_the_environment_as_it_was(env: Env) -> None:

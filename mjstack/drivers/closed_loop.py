@@ -157,7 +157,8 @@ class ClosedLoopDriver:
         command, distance = self._ik.solve(
             start, target, posture if self._cfg.controller.posture_gain > 0.0 else None, approach
         )
-        self._command.copy_(command)
+        # A world whose state is not finite keeps its command, and the check fails it
+        self._command.copy_(torch.where(torch.isfinite(command), command, self._command))
         last = self._time >= length - _DONE
         _put(self.error, last, torch.maximum(self.error, distance))
         self.unreachable |= last & ~(distance <= self._cfg.controller.ik_tolerance)
