@@ -218,7 +218,7 @@ class MissingExtra(InputError):
 def describe_error(error: BaseException, traceback_at: str) -> str:
     """An error in one line: kind, text, the line of the user's own code, where the traceback is."""
     if isinstance(error, MjstackError):
-        return str(error)
+        return " ".join(str(error).splitlines())  # a value in it may have several
     first = first_line(error)
     if is_out_of_memory(f"{type(error).__name__}: {error}"):
         smaller = "Run fewer worlds, or with smaller buffers (batch.nconmax, batch.njmax)"

@@ -123,7 +123,9 @@ def test_a_target_that_is_not_finite_is_refused_by_its_world(value: float) -> No
 @pytest.mark.parametrize("controller", ["open_loop", "closed_loop"])
 def test_a_fault_stays_in_its_world(backend: str, controller: str) -> None:
     if (backend, controller) == ("mjwarp", "closed_loop"):
-        pytest.skip("the expert's kernels take a minute on Warp's CPU device; native and CUDA do it")
+        pytest.skip(
+            "the expert's kernels take a minute on Warp's CPU device; native and CUDA do it"
+        )
     context, sim = worlds_of(backend, controller)
     is_cuda = backend.endswith("cuda")
     nworld = sim.nworld

@@ -2,7 +2,7 @@
 status 2 with nothing written; a tenth of those that pass is run to its end.
 
 The cases run in forked children of a process of their own, whose modules are loaded already:
-``python tests/test_fuzz.py commands 17`` runs case 17 alone and prints its output.
+``python tests/test_fuzz.py commands 17 200-220`` runs these cases and prints what they say.
 """
 
 from __future__ import annotations
@@ -106,7 +106,10 @@ def main(kind: str, *numbers: str) -> int:
         fixture = Path(temporary)
         _preload()
         make = CASES[kind](fixture)
-        cases = [int(number) for number in numbers] or range(COUNTS[kind])
+        spans = [[int(end) for end in number.split("-")] for number in numbers]
+        cases = [case for span in spans for case in range(span[0], span[-1] + 1)]
+        cases = cases or list(range(COUNTS[kind]))
+        talks = len(cases) < 30
         told: Counter[str] = Counter()
         bad = 0
         passed = []
@@ -114,7 +117,7 @@ def main(kind: str, *numbers: str) -> int:
             problem = outcome.problem()
             told[problem or {PASSED: "passed", 0: "shown", 2: "one line"}[outcome.status]] += 1
             bad += bool(problem)
-            if problem or numbers:
+            if problem or talks:
                 print(
                     f"{kind} {child.case}: {shlex.join(child.args)}\n  {problem}:"
                     f" {outcome.lines()}",
@@ -129,7 +132,7 @@ def main(kind: str, *numbers: str) -> int:
             problem = outcome.problem(ran=True)
             told[problem or f"run to its end: {outcome.status}"] += 1
             bad += bool(problem)
-            if problem or numbers:
+            if problem or talks:
                 print(
                     f"{kind} {child.case}, run: {shlex.join(child.args)}\n  {problem}:"
                     f" {outcome.lines()}",
