@@ -16,9 +16,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    # Python puts the working folder first, and that may be a stranger's. A checkout that mjstack
-    # was imported from stays, behind everything else.
-    if not sys.flags.safe_path:
-        sys.path[:1] = []
-        sys.path.append(str(Path(__file__).resolve().parents[1]))
+    # Python puts the working folder first, which may be a stranger's; a checkout's own stays.
+    if not sys.flags.safe_path and sys.path[0] != str(Path(__file__).parents[1]):
+        del sys.path[0]
     main()

@@ -6,7 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +86,12 @@ UNUSED = ("observation.policy.terms.evil", "reward.evil", "termination.evil", "t
 USED = ("reset.evil", "controller.action.arm", "gate.success.reset.evil", "task.check")
 
 
-@pytest.mark.parametrize("key", [*UNUSED, *USED])
+def others_full(values: Sequence[str], *essential: str) -> list[Any]:
+    """Parameters of which some run with the essential tests."""
+    return [v if v in essential else pytest.param(v, marks=pytest.mark.full) for v in values]
+
+
+@pytest.mark.parametrize("key", others_full([*UNUSED, *USED], UNUSED[0], USED[0]))
 def test_a_replay_runs_no_command_of_its_folder(key: str, stranger: Path) -> None:
     edit(stranger, key, SHELL | ({"weight": 1.0} if key.startswith("reward") else {}))
     if key in USED:
@@ -98,10 +103,10 @@ def test_a_replay_runs_no_command_of_its_folder(key: str, stranger: Path) -> Non
     assert not Path("PWNED").exists()
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["pydoc.pipepager", "builtins.max", "builtins.dict", "sys.exit", "os.system", "torch.save"],
-)
+CALLABLE = ("pydoc.pipepager", "builtins.max", "builtins.dict", "sys.exit", "torch.save")
+
+
+@pytest.mark.parametrize("name", others_full(CALLABLE, CALLABLE[0]))
 def test_only_what_declares_itself_is_called(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -112,11 +117,13 @@ def test_only_what_declares_itself_is_called(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.full
 def test_a_gate_declares_itself(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["gate.batch.func=os.system", "gates=[batch]"]) == 2
     assert "first parameter is named context" in capsys.readouterr().err
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("key", ["reset.evil", "controller.action.arm", "task.check"])
 @pytest.mark.parametrize("given", ["", "conf", "beside"])
 def test_no_module_of_the_folder_is_imported(
@@ -137,6 +144,7 @@ def test_no_module_of_the_folder_is_imported(
     assert "stranger.payload" not in sys.modules
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("start", ["-m mjstack", "scaling"])
 def test_the_working_folder_is_not_imported_from(
     start: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -165,6 +173,7 @@ FOLLOWED = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", FOLLOWED)
 def test_nothing_outside_is_read(name: str, stranger: Path) -> None:
     shutil.copy(ROOT / "mjstack" / "robots" / "so101.xml", stranger / "arm.xml")
@@ -176,6 +185,7 @@ def test_nothing_outside_is_read(name: str, stranger: Path) -> None:
             replay(stranger)
 
 
+@pytest.mark.full
 def test_aliases_are_refused_at_once(stranger: Path) -> None:
     path = stranger / ".hydra" / "config.yaml"
     bomb = "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 9))
@@ -227,6 +237,7 @@ DAMAGE = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", DAMAGE)
 def test_damage_is_one_line(name: str, stranger: Path) -> None:
     damage, says = DAMAGE[name]
@@ -234,12 +245,14 @@ def test_damage_is_one_line(name: str, stranger: Path) -> None:
     assert says in refused(lambda: replay(stranger))
 
 
+@pytest.mark.full
 def test_a_record_is_read_as_it_was_written(own: Path) -> None:
     record = EpisodeRecord.read(own, 0)
     assert record is not None
     assert record.qpos.shape == record.start.shape == (2, 20)
 
 
+@pytest.mark.full
 def test_no_control_character_reaches_the_terminal(
     stranger: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -129,8 +129,8 @@ def _registered() -> list[str]:
 
 
 def check_trusted(cfg: DictConfig, saved: Path) -> None:
-    """Check that every function that a replay uses is in the current search path, and so is the
-    module that has it: ``mjstack.cli.run`` is mjstack's, ``mjstack.cli.parse.os.system`` is not.
+    """Check that every function that a replay uses is in the current search path, and that it was
+    defined there: a module imports others' functions too.
 
     Args:
         cfg: The configuration of an earlier run.

@@ -17,9 +17,9 @@ PASS = "pass"
 NOT_RUN = "not run"
 RESULT = "run.json"
 _POLL = 0.1  # s, between two looks at the process
-# The working folder is not imported from (-P), so a checkout that was is named.
+# The working folder is not imported from (-P), only the folder that has this mjstack.
 _START = (
-    f"import sys; sys.path.append({str(Path(__file__).parents[2])!r});"
+    f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r});"
     " from mjstack.__main__ import main; main()"
 )
 
