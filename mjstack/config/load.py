@@ -157,12 +157,8 @@ def load_saved(path: Path) -> Config:
         plain = read_yaml(path)
         if "${" in str(plain):
             raise ValueError("it has ${...}")
-        try:
-            merged = cast(DictConfig, OmegaConf.merge(_schema, plain))
-            missing = sorted(OmegaConf.missing_keys(merged))
-        except OmegaConfBaseException as error:
-            raise explain(error) from error
-        if missing:
+        merged = cast(DictConfig, OmegaConf.merge(_schema, plain))
+        if missing := sorted(OmegaConf.missing_keys(merged)):
             raise CompositionError(f"{missing[0]} is missing, expected every key of this version.")
         check_trusted(merged, path)
         try:
