@@ -6,10 +6,10 @@ makes the run folder before calling it. So every job is composed, checked and bu
 Hydra runs what was composed.
 """
 
+import logging
 import os
 import shutil
 import sys
-import tempfile
 import traceback
 from argparse import Namespace
 from collections.abc import Sequence
@@ -21,8 +21,7 @@ from hydra._internal.hydra import Hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 import mjstack
 from mjstack.config.explain import own_overrides, parse
@@ -42,7 +41,7 @@ from mjstack.errors import (
     first_line,
     suggest,
 )
-from mjstack.files import write_atomic
+from mjstack.files import check_unused, claim_folder, write_atomic
 from mjstack.interrupt import EXIT_CODE, begin_job
 from mjstack.report.record import Report, Status
 from mjstack.report.table import Console, Table
@@ -119,11 +118,14 @@ def _run_one(hydra: Hydra, overrides: list[str]) -> int:
     """Compose, check and run one job."""
     cfg = compose(hydra, overrides)
     checked = _check(cfg, overrides)
-    if checked.folder is not None and not any(o.startswith("hydra.run.dir=") for o in overrides):
-        cfg.hydra.run.dir = str(checked.folder)
+    given = _is_set("hydra.run.dir", overrides)
+    resumed = None if given else checked.folder
+    folder = resumed or _hydra_path(cfg, "run.dir")
+    own = "" if given else checked.own
     begin_job()
-    _check_writable(cfg, "run")
-    hydra.run(CONFIG_NAME, run_job, overrides)
+    with claim_folder(folder, checked.resumes, own, numbered=not (given or resumed)) as claimed:
+        cfg.hydra.run.dir = str(claimed)
+        hydra.run(CONFIG_NAME, run_job, overrides)
     return max(result.exit_code for result in _results)
 
 
@@ -135,14 +137,31 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     jobs = _expand(overrides)
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
     master = compose(hydra, overrides, RunMode.MULTIRUN)
-    for job in jobs:
-        _check(compose(hydra, job, sweep=master), job)
+    folder = _hydra_path(master, "sweep.dir")
+    taken: dict[Path, int] = {}
+    for number, job in enumerate(jobs):
+        cfg = compose(hydra, job, sweep=master)
+        _check(cfg, job)
+        with open_dict(cfg):
+            cfg.hydra.job.num = number
+            cfg.hydra.job.id = str(number)
+        one = Path(os.path.normpath(folder / _hydra_path(cfg, "sweep.subdir")))
+        if not one.is_relative_to(folder):
+            check_unused(one)
+        if taken.setdefault(one, number) != number:
+            raise CompositionError(
+                f"hydra.sweep.subdir: jobs {taken[one]} and {number} would both write into {one},"
+                " expected a folder for each job. Leave it out, or let it name what differs."
+            )
     begin_job()
-    _check_writable(master, "sweep")
-    returned = hydra.multirun(CONFIG_NAME, run_job, overrides)
+    with claim_folder(folder, numbered=not _is_set("hydra.sweep.dir", overrides)) as claimed:
+        if claimed != folder:
+            master.hydra.sweep.dir = str(claimed)
+            master.hydra.overrides.hydra.append(f"hydra.sweep.dir='{claimed}'")  # of its jobs
+        returned = hydra.multirun(CONFIG_NAME, run_job, overrides)
     batches = returned if isinstance(returned, list) else []  # a launcher's own processes return
     results = _results or [job.return_value for batch in batches for job in batch]
-    _print_sweep(results)
+    _print_sweep(results, claimed)
     return max(result.exit_code for result in results)
 
 
@@ -161,6 +180,7 @@ def run_job(cfg: DictConfig) -> Report:
     """Run a job in the folder that Hydra made. A launcher may call it in another process, where
     nothing has been checked yet.
     """
+    logging.raiseExceptions = False  # a full disk would print a traceback for each line of run.log
     own = HydraConfig.get()
     overrides = list(own.overrides.task)
     with search_path(lacking_folders(own.runtime.config_sources)):
@@ -216,25 +236,18 @@ def _expand(overrides: Sequence[str]) -> list[list[str]]:
     return jobs
 
 
-def _check_writable(cfg: DictConfig, kind: str) -> None:
-    """Check that the folder that Hydra will make for ``run`` or ``sweep`` can be written, by a file
-    that is gone at once.
-    """
-    try:
-        existing = folder = Path(cfg.hydra[kind].dir).absolute()
-        while not existing.exists():
-            existing = existing.parent
-        tempfile.TemporaryFile(dir=existing).close()
-    except OmegaConfBaseException as error:
-        raise CompositionError(f"hydra.{kind}.dir cannot be used: {first_line(error)}.") from error
-    except OSError as error:
-        raise CompositionError(
-            f"outputs folder {folder}: {existing} cannot be written ({error.strerror}), expected a"
-            f" writable folder. Run from another folder, or set hydra.{kind}.dir."
-        ) from error
+def _is_set(key: str, overrides: Sequence[str]) -> bool:
+    return any(override.lstrip("+").startswith(f"{key}=") for override in overrides)
 
 
-def _print_sweep(outcomes: list[Report]) -> None:
+def _hydra_path(cfg: DictConfig, key: str) -> Path:
+    """A path below ``hydra``, as Hydra will find it."""
+    HydraConfig.instance().set_config(cfg)  # for what is interpolated
+    OmegaConf.set_readonly(cfg.hydra, None)
+    return Path(str(OmegaConf.select(cfg, f"hydra.{key}")))
+
+
+def _print_sweep(outcomes: list[Report], folder: Path) -> None:
     """One row per job, also written beside the jobs as summary.md."""
     names = dict.fromkeys(gate.name for outcome in outcomes for gate in outcome.gates)
     columns = ["job", "overrides", *names, "status"]
@@ -250,7 +263,6 @@ def _print_sweep(outcomes: list[Report]) -> None:
     title = f"sweep of {len(outcomes)} jobs"
     table = Table.of({name: name for name in columns}, rows, title)
     Console().print(table.to_console())
-    sweep_folder = os.path.commonpath([str(outcome.folder) for outcome in outcomes])
     if len(outcomes) > 1:
-        (Path(sweep_folder) / "summary.md").write_text("\n".join(table.to_markdown()) + "\n")
-        Console(soft_wrap=True).print(f"summary: {sweep_folder}/summary.md")
+        write_atomic(folder / "summary.md", "\n".join(table.to_markdown()) + "\n")
+        Console(soft_wrap=True).print(f"summary: {folder}/summary.md")

@@ -97,6 +97,10 @@ class RunError(InputError):
     """The folder of an earlier run that cannot be read, or has not what is asked for."""
 
 
+class FolderError(InputError):
+    """A folder that has another run, or that another process is writing."""
+
+
 class UnsupportedModel(MjstackError):
     """MJWarp does not implement a feature of the model."""
 

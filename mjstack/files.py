@@ -1,17 +1,21 @@
-"""Files that appear complete or not at all, or may hold anything; rows as CSV."""
+"""Files that appear complete or not at all, folders of one run each, and rows as CSV."""
 
 import csv
+import fcntl
 import io
+import itertools
+import json
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mjstack.errors import MjstackError, first_line
+from mjstack.errors import FolderError, InputError, MjstackError, first_line
 
 
 @contextmanager
@@ -72,6 +76,106 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomic(path, buffer.getvalue())
+
+
+@contextmanager
+def claim_folder(
+    folder: Path, job: str = "", own: str = "", *, numbered: bool = False
+) -> Iterator[Path]:
+    """Make a run's folder, and keep other runs out of it until the block ends.
+
+    If the block fails before anything but Hydra's files was written, a folder that was made here is
+    gone again.
+
+    Args:
+        folder: The folder.
+        job: As of `check_unused`.
+        own: As of `check_unused`.
+        numbered: Where the folder is there, make another: its name and ``-2``, ``-3``, ...
+
+    Yields:
+        The folder.
+
+    Raises:
+        FolderError: It cannot be made, has another run, or another process is writing it.
+    """
+    name = folder.name
+    made: list[Path] = []
+    handle = None
+    try:
+        lacking = [path for path in folder.parents if not path.exists()]
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        for number in itertools.count(2):
+            with suppress(FileExistsError):
+                folder.mkdir()
+                made = [folder, *lacking]
+            if made or not numbered:
+                break
+            folder = folder.with_name(f"{name}-{number}")
+        handle = lock_folder(folder)
+        check_unused(folder, job, own)
+        yield folder
+    except BaseException as error:
+        with suppress(OSError, InputError):
+            check_unused(folder)
+            for path in made:
+                shutil.rmtree(path) if path == folder else path.rmdir()
+        if not isinstance(error, OSError):
+            raise
+        raise FolderError(
+            f"{folder} cannot be written ({error.strerror or error}). Make room, or set"
+            " hydra.run.dir (a sweep: hydra.sweep.dir) to a folder that can"
+        ) from error
+    finally:
+        if handle is not None:
+            os.close(handle)
+
+
+def check_unused(folder: Path, job: str = "", own: str = "") -> None:
+    """Check that no run has begun in a folder, or one that a job goes on with.
+
+    Before a run begins there are only logs and Hydra's files, perhaps half-written.
+
+    Args:
+        folder: The folder, which need not be there.
+        job: As report.json names a job that goes on with the run; empty if none may.
+        own: A file by which the job knows its folder even without the report.
+
+    Raises:
+        FolderError: It has another run, or other files.
+    """
+    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    used = sorted(name for name in names if name != ".hydra" and not name.endswith(".log"))
+    if not used or own in names:
+        return
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        if job and json.loads((folder / "report.json").read_text())["resumes"] == job:
+            return
+    raise FolderError(
+        f"{folder} has {used[0]}, expected a new or an empty folder, or one with which this job can"
+        " go on. Set hydra.run.dir (job=collect: job.folder) to another"
+    )
+
+
+def lock_folder(folder: Path) -> int:
+    """A descriptor that keeps other writers out until it is closed, also by the end of the process.
+
+    Raises:
+        FolderError: Another writer has the folder.
+        OSError: The folder cannot be opened.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise FolderError(
+            f"{folder} is open in another writer, expected one at a time. Wait, or give another"
+            " folder"
+        ) from error
+    except OSError:
+        pass  # a file system without locks
+    return handle
 
 
 def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) -> str:

@@ -22,7 +22,7 @@ from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import Episode, play_episode
-from mjstack.episodes.record import FAILING, EpisodeRecord, clear_records
+from mjstack.episodes.record import FAILING, EpisodeRecord
 from mjstack.errors import RunError
 from mjstack.files import write_atomic
 from mjstack.gates.batch import run_batch
@@ -241,13 +241,6 @@ def test_table_is_replaced_in_one_step(tmp_path: Path, monkeypatch: pytest.Monke
         write_atomic(tmp_path / FAILING, "seed,world\n0,1\n1,2\n")
     assert (tmp_path / FAILING).read_text() == "seed,world\n0,1\n"
     assert [path.name for path in tmp_path.iterdir()] == [FAILING]
-
-
-def test_records_of_an_earlier_run_go(tmp_path: Path) -> None:
-    for name in (FAILING, "worlds_seed0.npz", "worlds_seed11.npz", "report.json"):
-        (tmp_path / name).write_text("old")
-    clear_records(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 
 def test_damaged_record_is_one_line(tmp_path: Path) -> None:

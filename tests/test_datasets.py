@@ -40,6 +40,7 @@ from mjstack.datasets.reader import uncommitted
 from mjstack.errors import (
     ArgumentError,
     DatasetError,
+    FolderError,
     MissingExtra,
     UnknownName,
     UnwrittenError,
@@ -622,7 +623,7 @@ def test_other_folders_are_left_alone(tmp_path: Path) -> None:
 
 def test_a_writer_at_a_time(tmp_path: Path) -> None:
     with DatasetWriter(tmp_path, SPEC) as writer:
-        with pytest.raises(DatasetError, match="is open in another writer"):
+        with pytest.raises(FolderError, match="is open in another writer"):
             DatasetWriter(tmp_path, SPEC)
         writer.add([episode(0)])
     write(tmp_path, range(1, 2))

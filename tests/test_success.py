@@ -26,7 +26,7 @@ from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.observers import Episode, Hook, play_episode
-from mjstack.episodes.record import FAILING, PICTURE, REGIONS, EpisodeRecord, clear_records
+from mjstack.episodes.record import FAILING, PICTURE, REGIONS, EpisodeRecord
 from mjstack.episodes.regions import Region, find_regions, radial_yaw_deg, regions_table
 from mjstack.errors import ConfigError
 from mjstack.gates.success import run_success, success_config
@@ -181,16 +181,6 @@ def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
     ]
     assert all("LIFT" in row["rules"].split() for row in rows)
     assert any("no region of at least 20 episodes (gate" in line for line in gate["details"])
-    # It stands alone: where nothing fails, the same folder keeps nothing of this.
-    clear_records(folder, keep=None)
-    assert sorted(path.name for path in folder.iterdir()) == sorted(
-        [
-            ".hydra",
-            "report.json",
-            "report.md",
-            "run.log",
-        ]
-    )
 
 
 @pytest.fixture
@@ -417,24 +407,9 @@ def test_full_disk_takes_no_verdict_back(
     result = play(hasty("gate.success.rate=0"), tmp_path)
     assert result.status is Status.passed
     told = [line for line in result.details if "No space left on device" in line]
-    for name in ("starts_seed0.csv", "no record of its episodes", REGIONS):
+    for name in ("starts_seed0.csv", "no record of its episodes", REGIONS, PICTURE):
         assert any(name in line for line in told)
-    assert [path.name for path in tmp_path.iterdir()] == [PICTURE]
-
-
-def test_an_earlier_runs_files_go_but_not_the_layouts_that_are_read(tmp_path: Path) -> None:
-    names = [
-        "success_seed0.npz",
-        "success_seed12.npz",
-        "starts_seed0.csv",
-        "starts_seed1.csv",
-        REGIONS,
-        PICTURE,
-    ]
-    for name in [*names, "report.json"]:
-        (tmp_path / name).write_text("old")
-    clear_records(tmp_path, keep=tmp_path / "." / "starts_seed1.csv")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.json", "starts_seed1.csv"]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,8 +1,6 @@
 """Opening a dataset: to read it, or to go on with it."""
 
-import fcntl
 import json
-import os
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -199,26 +197,6 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
             f" {expected[1]} as {lerobot.INFO} says. Restore its files, or give another folder"
         )
     return rows
-
-
-def lock_folder(folder: Path) -> int:
-    """A descriptor that keeps other writers out until it is closed, also by the end of the process.
-
-    Raises:
-        DatasetError: Another writer has the folder.
-    """
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(handle)
-        raise DatasetError(
-            f"{folder} is open in another writer, expected one at a time. Wait, or give another"
-            " folder"
-        ) from error
-    except OSError:
-        pass  # a file system without locks
-    return handle
 
 
 def uncommitted(folder: Path, shards: int) -> list[Path]:

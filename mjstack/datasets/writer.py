@@ -15,7 +15,6 @@ import numpy as np
 from mjstack.datasets import lerobot
 from mjstack.datasets.reader import (
     check_same,
-    lock_folder,
     read_info,
     read_rows,
     read_tasks,
@@ -24,7 +23,7 @@ from mjstack.datasets.reader import (
 )
 from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData, typed_arrays, typed_values
 from mjstack.errors import DatasetError, UnwrittenError
-from mjstack.files import write_atomic
+from mjstack.files import lock_folder, write_atomic
 
 
 class DatasetWriter:
@@ -56,8 +55,8 @@ class DatasetWriter:
             file_mb: Size of a data file at which it is committed and the next one begins [MiB].
 
         Raises:
-            DatasetError: Something else is there, or a dataset of another configuration, or another
-                process is writing it.
+            DatasetError: Something else is there, or a dataset of another configuration.
+            FolderError: Another process is writing it.
             UnwrittenError: The folder cannot be written.
         """
         self._pa, self._parquet = lerobot.require_pyarrow()

@@ -197,19 +197,5 @@ def starts_name(seed: int | str) -> str:
     return f"starts_seed{seed}.csv"
 
 
-def clear_records(folder: Path, keep: Path | None = None) -> None:
-    """Remove the files of an earlier run in the same folder, which would pass for this one's.
-
-    Args:
-        folder: The run's.
-        keep: The starts file of this run, which may be among them.
-    """
-    files = [folder / name for name in (FAILING, SUCCESS_FAILING, REGIONS, PICTURE)]
-    patterns = [*(_file_name(gate, "*") for gate in STEMS), starts_name("*")]
-    for path in [*files, *(path for pattern in patterns for path in folder.glob(pattern))]:
-        if keep is None or path.resolve() != keep.resolve():
-            path.unlink(missing_ok=True)
-
-
 def _file_name(gate: str, seed: int | str) -> str:
     return f"{STEMS[gate]}_seed{seed}.npz"

@@ -16,11 +16,11 @@ from rich.markup import escape
 from mjstack.config.fingerprint import config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
 from mjstack.datasets import DatasetSpec, lerobot, require_pyarrow
-from mjstack.datasets.reader import check_same, lock_folder, read_info
+from mjstack.datasets.reader import check_same, read_info
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.context import RunContext, require_episode
 from mjstack.errors import ConfigError, DatasetError, UnwrittenError
-from mjstack.files import write_atomic
+from mjstack.files import check_unused, lock_folder, write_atomic
 from mjstack.jobs.collection import DATASET, Collection, CollectPlan, read_batches
 from mjstack.jobs.demonstration import ACTION, STATE, differences, episode_config
 from mjstack.jobs.gates import check_task
@@ -28,6 +28,7 @@ from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table, format_value, to_document
 
+NAME = "collect"
 LOADING = """\
 import json
 from pathlib import Path
@@ -60,7 +61,9 @@ def check_collect(cfg: Config) -> CheckedJob:
     count = cast(CollectJobCfg, cfg.job).episodes
     title = f"task {cfg.task.name}, {count:,} demonstrations"
     work = partial(run_collect, plan)
-    return CheckedJob(context=context, title=title, work=work, folder=plan.home)
+    return CheckedJob(
+        context=context, title=title, work=work, folder=plan.home, own=DATASET, resumes=NAME
+    )
 
 
 def plan_collection(context: RunContext) -> CollectPlan:
@@ -82,7 +85,7 @@ def plan_collection(context: RunContext) -> CollectPlan:
 
 def run_collect(plan: CollectPlan, context: RunContext, folder: Path) -> None:
     """Add the missing episodes to the dataset, and leave dataset.md in the folder."""
-    context.begin("collect")
+    context.begin(NAME)
     began = time.perf_counter()
     collection = Collection(plan, context)
 
@@ -155,8 +158,10 @@ def _check_folder(dataset: Path, spec: DatasetSpec) -> None:
     """Refuse a dataset that is not this configuration's.
 
     Raises:
-        DatasetError: It is of another one, or another process is writing it.
+        DatasetError: It is of another one.
+        FolderError: Another process is writing it, or the job's folder has a run of another job.
     """
+    check_unused(dataset.parent, NAME, DATASET)
     if not dataset.exists():
         return
     os.close(lock_folder(dataset))

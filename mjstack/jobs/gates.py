@@ -12,7 +12,6 @@ from mjstack.envs import build_env
 from mjstack.envs.build import driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.earlier_run import archive_starts
-from mjstack.episodes.record import clear_records
 from mjstack.episodes.rollout import CLOSED_LOOP
 from mjstack.errors import ConfigError, TermError, Unreachable
 from mjstack.gates.runner import find_gates, run_gates
@@ -137,11 +136,7 @@ def check_gates(cfg: Config) -> CheckedJob:
 
 
 def _run_gates(context: RunContext, folder: Path) -> None:
-    """Run the gates in a folder without an earlier run's records."""
-    context = replace(context, cfg=archive_starts(context.cfg, folder))
-    starts = context.cfg.starts
-    clear_records(folder, keep=None if starts is None else Path(starts))
-    run_gates(context)
+    run_gates(replace(context, cfg=archive_starts(context.cfg, folder)))
 
 
 JOB = Job(check_gates, shows=True)

@@ -76,12 +76,16 @@ class CheckedJob:
         title: The work in one line.
         work: Does it in a folder, and hands each result to the context's ``record``.
         folder: The default folder of a job that resumes; None for a folder of the hour.
+        own: A file by which it knows that folder.
+        resumes: Its name in report.json, by which it knows any folder that it goes on with.
     """
 
     context: RunContext
     title: str
     work: Callable[[RunContext, Path], None]
     folder: Path | None = None
+    own: str = ""
+    resumes: str = ""
 
     def run(self, folder: Path, overrides: Sequence[str] = ()) -> Report:
         """Do the work and write its report after each result.
@@ -96,7 +100,7 @@ class CheckedJob:
         """
         console = Console(highlight=False, soft_wrap=True)
         errors = Console(stderr=True, soft_wrap=True, markup=False)
-        report = Report(folder=folder, overrides=list(overrides))
+        report = Report(folder=folder, overrides=list(overrides), resumes=self.resumes)
         cfg = self.context.cfg
 
         def record(result: GateResult) -> None:

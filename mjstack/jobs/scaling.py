@@ -22,6 +22,7 @@ from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
 from mjstack.sim import resolve_device
 
+RUNS = "runs"  # within the job's folder
 RATE = "physics.world_steps_per_s.median"
 # A run sets these itself, and the user is told that the command line does not.
 _UNUSED = {"nworld", "gates", "gate.throughput.repetitions"}
@@ -39,11 +40,14 @@ def check_scaling(cfg: Config) -> CheckedJob:
     require_episode(cfg)
     resolve_device(cfg.sim.device)
     count = len(_job(cfg).nworlds) * len(_backends(cfg))
+    folder = scaling_folder(cfg)
     return CheckedJob(
         context=check_machine(cfg),
         title=f"task {cfg.task.name}, scaling: {count} runs",
         work=run_scaling,
-        folder=scaling_folder(cfg),
+        folder=folder,
+        own=RUNS,
+        resumes=f"scaling {folder.name}",
     )
 
 
@@ -143,7 +147,7 @@ def _run_all(context: RunContext, folder: Path, rows: list[Row]) -> str:
 
 
 def _folder(folder: Path, nworld: int, backend: str) -> Path:
-    return folder / "runs" / f"{backend}-{nworld}"
+    return folder / RUNS / f"{backend}-{nworld}"
 
 
 def _job(cfg: Config) -> ScalingJobCfg:

@@ -1,6 +1,7 @@
 """One run of the scaling job: the gates, for one backend and number of worlds, in a process."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -71,8 +72,9 @@ def run_process(
     Raises:
         KeyboardInterrupt: The command was interrupted; the process has been stopped.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "report.json").unlink(missing_ok=True)  # an earlier try's
+    if folder.exists():
+        shutil.rmtree(folder)  # an earlier try's
+    folder.mkdir(parents=True)
     target = str(folder).replace("\\", "\\\\").replace("'", "\\'")
     command = [sys.executable, "-P", "-c", _START, *overrides, *search_path_args()]
     began = time.monotonic()

@@ -52,6 +52,7 @@ class Report:
     Attributes:
         folder: Where report.json, report.md, pictures and logs go.
         overrides: The command line.
+        resumes: Names a job that goes on with the run; empty if none does.
         provenance: Versions, device, hashes.
         status: How it ended.
         gates: The results.
@@ -60,6 +61,7 @@ class Report:
 
     folder: Path
     overrides: list[str] = field(default_factory=list)
+    resumes: str = ""
     provenance: Provenance = field(default_factory=dict)
     status: Status = Status.interrupted
     gates: list[GateResult] = field(default_factory=list)

@@ -41,6 +41,7 @@ def write_report(report: Report) -> None:
     data = {
         "schema": SCHEMA,
         "status": report.status.value,
+        "resumes": report.resumes,
         "provenance": report.provenance,
         "gates": gates,
         "pictures": report.pictures,
@@ -55,21 +56,23 @@ def write_report(report: Report) -> None:
 
 
 def safely_write(path: Path, write: Callable[..., object], *args: object) -> str:
-    """Write a file beside the result; a failure takes no result back.
+    """Write a file beside the result, complete or not at all; a failure takes no result back.
 
     Args:
         path: The file.
-        write: Called with the path and ``args``.
+        write: Called with a path beside it, and ``args``.
         args: Its content.
 
     Returns:
         Empty, or one line that says why there is no such file. run.log has the traceback.
     """
     check_interrupt()
+    begun = path.with_name(f".{path.name}")
     try:
-        write(path, *args)
+        write(begun, *args)
+        begun.replace(path)
     except (Exception, KeyboardInterrupt) as error:
-        path.unlink(missing_ok=True)  # it may be there in part
+        begun.unlink(missing_ok=True)
         if isinstance(error, KeyboardInterrupt):
             raise
         log.exception("%s was not written", path.name)

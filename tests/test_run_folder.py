@@ -1,0 +1,326 @@
+"""A run's folder: two runs never share one, and what a full disk or a kill leaves in it does not
+keep the same command from going on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from types import SimpleNamespace
+
+import hydra.core.utils
+import pytest
+from compositions import load_config
+
+from mjstack import cli
+from mjstack.config.explain import own_overrides
+from mjstack.errors import FolderError
+from mjstack.files import claim_folder
+from mjstack.jobs import CheckedJob, check_job
+from mjstack.report.record import GateResult, Status
+
+NOON = "outputs/2026-11-21/12-00-00"
+SWEEP = "outputs/sweeps/2026-11-21/12-00-00"
+
+
+@pytest.fixture(scope="module")
+def checked() -> CheckedJob:
+    """A job that does nothing and passes."""
+
+    def work(context: object, folder: Path) -> None:
+        context.record(GateResult(name="nothing", status=Status.passed))  # type: ignore[attr-defined]
+
+    return replace(check_job(load_config(["gates=[baseline]"])), work=work)
+
+
+@pytest.fixture
+def begin(
+    checked: CheckedJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., int]:
+    """Run a command line at noon with that job, or a variant of it."""
+    monkeypatch.chdir(tmp_path)
+    noon = SimpleNamespace(now=lambda: datetime(2026, 11, 21, 12, 0, 0))
+    monkeypatch.setattr(hydra.core.utils, "datetime", noon)
+
+    def begin(*args: str, **changes: object) -> int:
+        def check(cfg: object, overrides: list[str]) -> CheckedJob:
+            job = replace(checked, **changes)  # type: ignore[arg-type]
+            return cli._checked.setdefault(tuple(own_overrides(overrides)), job)
+
+        monkeypatch.setattr(cli, "_check", check)
+        return cli.run(list(args))
+
+    return begin
+
+
+def in_children(
+    count: int, work: Callable[[int], int | None], output: Path | None = None
+) -> list[int]:
+    """Exit statuses of forked processes that do the same, as nearly at once as can be."""
+    ready, start = os.pipe()
+    pids = []
+    for number in range(count):
+        pid = os.fork()
+        if pid == 0:
+            status = 99
+            try:
+                os.close(start)
+                os.read(ready, 1)  # until the parent closes its end
+                if output is not None:
+                    sys.stdout = sys.stderr = output.open("a", buffering=1)
+                status = work(number) or 0
+            except BaseException:
+                traceback.print_exc(file=sys.__stderr__)
+            finally:
+                sys.stdout.flush()
+                os._exit(status)
+        pids.append(pid)
+    os.close(ready)
+    os.close(start)
+    return [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in pids]
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def put(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+
+def test_runs_that_begin_at_once_have_a_folder_each(begin: Callable[..., int]) -> None:
+    assert in_children(3, lambda number: begin(f"seed={number}")) == [0, 0, 0]
+    seeds = set()
+    for folder in (NOON, f"{NOON}-2", f"{NOON}-3"):
+        assert json.loads(Path(folder, "report.json").read_text())["status"] == "pass"
+        (seed,) = Path(folder, ".hydra", "overrides.yaml").read_text().split("- ")[1:]
+        seeds.add(seed.strip())
+        assert f"seed: {seed.strip()[5:]}\n" in Path(folder, ".hydra", "config.yaml").read_text()
+    assert seeds == {"seed=0", "seed=1", "seed=2"}
+    assert len(list(Path(NOON).parent.iterdir())) == 3
+
+
+def test_claims_at_once(tmp_path: Path) -> None:
+    def claim(_: int) -> None:
+        with claim_folder(tmp_path / "a" / "run", numbered=True) as folder:
+            (folder / "mine").mkdir()  # fails where there is one
+
+    assert in_children(8, claim) == [0] * 8
+    assert len(list((tmp_path / "a").iterdir())) == 8
+
+
+@pytest.mark.full
+def test_sweeps_that_begin_at_once_have_a_folder_each(begin: Callable[..., int]) -> None:
+    assert begin("-m", "seed=1,2") == begin("-m", "seed=3,4") == 0
+    for folder, seeds in ((SWEEP, (1, 2)), (f"{SWEEP}-2", (3, 4))):
+        assert {path.name for path in Path(folder).iterdir()} == {
+            "0",
+            "1",
+            "multirun.yaml",
+            "summary.md",
+        }
+        for number, seed in enumerate(seeds):
+            text = Path(folder, str(number), ".hydra", "overrides.yaml").read_text()
+            assert text == f"- seed={seed}\n"
+
+
+@pytest.mark.parametrize("subdir", ["", "same", "x/../same"])
+def test_jobs_of_a_sweep_may_not_share_a_folder(
+    subdir: str, begin: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert begin("-m", "seed=1,2", f"hydra.sweep.subdir={subdir}") == 2
+    err = capsys.readouterr().err
+    assert err.startswith("mjstack: hydra.sweep.subdir: jobs 0 and 1 would both write into ")
+    assert contents(Path()) == {}
+
+
+@pytest.mark.full
+def test_jobs_of_a_sweep_may_be_named(begin: Callable[..., int]) -> None:
+    assert begin("-m", "seed=1,2", "hydra.sweep.subdir=s${seed}", "hydra.sweep.dir=x") == 0
+    assert {path.name for path in Path("x").iterdir() if path.is_dir()} == {"s1", "s2"}
+
+
+GATES = {"report.json": '{"resumes": ""}', ".hydra/config.yaml": "job: {name: gates}\n"}
+COLLECT = {"report.json": '{"resumes": "collect"}', "dataset/meta/info.json": "{}"}
+COLLECTING = {"resumes": "collect", "own": "dataset", "folder": Path("given")}
+SCALING = {"resumes": "scaling 12", "own": "runs", "folder": Path("elsewhere")}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("files", "args", "changes"),
+    [
+        (GATES, ["hydra.run.dir=given"], {}),
+        (GATES, ["job=replay", "run=given", "world=1", "hydra.run.dir=given"], {}),
+        (GATES, ["job=study", "++hydra.run.dir=given"], {}),
+        (GATES, ["job=collect", "job.folder=given"], COLLECTING),
+        (GATES, ["job=scaling", "hydra.run.dir=given"], SCALING),
+        (GATES, ["-m", "seed=1,2", "hydra.sweep.dir=given"], {}),
+        (GATES, ["-m", "seed=1,2", "hydra.sweep.dir=x", "hydra.sweep.subdir=../given"], {}),
+        ({"report.json": "{", "run.log": ""}, ["hydra.run.dir=given"], {}),
+        (COLLECT, ["hydra.run.dir=given"], {}),
+        (COLLECT, ["job=scaling", "hydra.run.dir=given"], SCALING),
+        (
+            {"report.json": '{"resumes": "scaling 34"}'},
+            ["job=scaling", "hydra.run.dir=given"],
+            SCALING,
+        ),
+        ({"notes.txt": "mine"}, ["hydra.run.dir=given"], {}),
+        ({"report.json": '{"resumes": ""}'}, ["job=collect"], COLLECTING),
+    ],
+)
+def test_a_given_folder_of_another_run_is_refused(
+    files: dict[str, str],
+    args: list[str],
+    changes: dict[str, object],
+    begin: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    put(Path("given"), files)
+    before = contents(Path())
+    assert begin(*args, **changes) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("mjstack: given has ")
+    assert len(err.splitlines()) == 1
+    assert contents(Path()) == before
+
+
+HALF = {".hydra/config.yaml": "a: [", ".hydra/hydra.yaml": "", "run.log": "2026"}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("files", "changes"),
+    [
+        ({}, {}),
+        (HALF, {}),
+        (HALF, COLLECTING),
+        (COLLECT | HALF, COLLECTING),
+        ({"report.json": '{"resumes": "collect"}'} | HALF, COLLECTING),
+        ({"report.json": "{", "dataset/meta/info.json": "{}"} | HALF, COLLECTING),
+        ({"report.json": '{"resumes": "scaling 12"}'} | HALF, SCALING),
+        ({"runs/native-1/run.json": "{}"} | HALF, {**SCALING, "folder": Path("given")}),
+    ],
+)
+def test_a_job_goes_on_in_its_folder(
+    files: dict[str, str], changes: dict[str, object], begin: Callable[..., int]
+) -> None:
+    Path("given").mkdir()
+    put(Path("given"), files)
+    job = str(changes.get("resumes", "gates"))
+    given = [] if changes.get("folder") == Path("given") else ["hydra.run.dir=given"]
+    assert begin(f"job={job.split()[0]}", *given, **changes) == 0
+    report = json.loads(Path("given", "report.json").read_text())
+    assert (report["resumes"], report["status"]) == (changes.get("resumes", ""), "pass")
+    assert "job:\n" in Path("given", ".hydra", "config.yaml").read_text()
+
+
+def test_the_second_of_two_writes_nothing(
+    begin: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both have passed their checks; the first has begun and has written nothing yet."""
+    with claim_folder(Path("given"), "collect", "dataset"):
+        assert begin("job=collect", **COLLECTING) == 2
+        assert "given is open in another writer" in capsys.readouterr().err
+        assert contents(Path()) == {"given": None}
+        with pytest.raises(FolderError), claim_folder(Path("given")):
+            pass
+    assert begin("job=collect", **COLLECTING) == 0
+
+
+def test_a_run_that_did_not_begin_leaves_nothing(begin: Callable[..., int]) -> None:
+    assert begin("hydra.job_logging.handlers.file.filename=/proc/x") == 2
+    assert contents(Path()) == {}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("limit", [0, 1, 4, 8, 12, 16, 28, 40])
+def test_a_full_disk_is_a_line_and_the_same_command_goes_on(
+    limit: int, begin: Callable[..., int], tmp_path: Path
+) -> None:
+    """No file can have more than that many KiB."""
+    told = tmp_path.parent / "told"
+    told.unlink(missing_ok=True)
+
+    def full(_: int) -> int:
+        (reader, writer) = os.pipe()
+        sys.stdout = sys.stderr = os.fdopen(writer, "w")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * limit, resource.RLIM_INFINITY))
+        status = begin("job=collect", **COLLECTING)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
+        sys.stdout.flush()
+        os.set_blocking(reader, False)
+        told.write_bytes(os.read(reader, 65536))
+        return status
+
+    (status,) = in_children(1, full)
+    lines = told.read_text().splitlines()
+    assert "Traceback" not in " ".join(lines)
+    problems = [line for line in lines if line.startswith("mjstack: ")]
+    if status:
+        assert status in (1, 2)
+        assert len(problems) == 1
+        assert status == 1 or lines == problems
+    else:
+        assert not problems
+        assert limit > 8
+    assert begin("job=collect", **COLLECTING) == 0
+
+
+DENIED: dict[str, tuple[Callable[[Path], object], list[str]]] = {
+    "a folder": (lambda f: f.chmod(0), ["hydra.run.dir=given"]),
+    "the job's folder": (lambda f: f.chmod(0), []),
+    ".hydra": (lambda f: (f / ".hydra").chmod(0), []),
+    "a foreign .hydra": (lambda f: os.chown(f / ".hydra", 0, 0), []),
+    "a file of Hydra's": (lambda f: (f / ".hydra" / "config.yaml").chmod(0o444), []),
+    "run.log": (lambda f: (f / "run.log").mkdir(), []),
+    "the folder above": (lambda f: f.parent.chmod(0o555), ["hydra.run.dir=new"]),
+}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("what", ["nothing", *DENIED])
+def test_no_permission_is_a_line(what: str, begin: Callable[..., int], tmp_path: Path) -> None:
+    """As another user, who owns everything there but for what a case takes away."""
+    put(Path("given"), {".hydra/config.yaml": "", "report.json": '{"resumes": "collect"}'})
+    deny, args = DENIED.get(what, (lambda f: None, []))
+    if os.geteuid() == 0:
+        for path in (Path(), *Path().rglob("*")):
+            os.chown(path, 65534, 65534)
+        for path in tmp_path.parents[:2]:
+            path.chmod(0o711)
+    elif "foreign" in what:
+        pytest.skip("only root gives files away")
+    deny(Path("given"))
+    told = tmp_path.parent / "told"
+    told.write_text("")
+    told.chmod(0o666)
+
+    def denied(_: int) -> int:
+        if os.geteuid() == 0:
+            os.setgid(65534)
+            os.setuid(65534)
+        return begin("job=collect", *args, **COLLECTING)
+
+    (status,) = in_children(1, denied, told)
+    Path().chmod(0o755)
+    lines = told.read_text().splitlines()
+    if what == "nothing":
+        assert status == 0, lines
+    else:
+        assert status == 2, lines
+        assert len(lines) == 1
+        assert lines[0].startswith("mjstack: ")
