@@ -13,6 +13,7 @@ import sys
 import traceback
 from argparse import Namespace
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -38,7 +39,6 @@ from mjstack.errors import (
     CompositionError,
     UnknownName,
     describe_error,
-    first_line,
     suggest,
 )
 from mjstack.files import check_unused, claim_folder, write_atomic
@@ -187,7 +187,8 @@ def run_job(cfg: DictConfig) -> Report:
         checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
         if own.output_subdir is not None:  # a replay reads values, no interpolations
             saved = Path(own.runtime.output_dir) / own.output_subdir / "config.yaml"
-            write_atomic(saved, OmegaConf.to_yaml(cfg, resolve=True))
+            with suppress(OSError):  # the job says so
+                write_atomic(saved, OmegaConf.to_yaml(cfg, resolve=True))
         result = checked.run(Path(own.runtime.output_dir), overrides)
     _results.append(result)
     if result.status is Status.interrupted:
