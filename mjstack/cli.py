@@ -21,6 +21,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
@@ -37,6 +38,7 @@ from mjstack.config.session import (
 )
 from mjstack.errors import (
     CompositionError,
+    MjstackError,
     UnknownName,
     describe_error,
     suggest,
@@ -79,7 +81,7 @@ def run(args: list[str]) -> int:
             traceback.print_exception(error)
         problem = describe_error(error, "MJSTACK_DEBUG=1 shows the traceback")
         errors.print(f"mjstack: {problem}")
-        return max(getattr(error, "exit_code", 1), 1 if _results else 2)
+        return 1 if _results else MjstackError.exit_code
 
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
@@ -230,7 +232,10 @@ def _expand(overrides: Sequence[str]) -> list[list[str]]:
     if any(o.startswith("hydra/sweeper=") and o != "hydra/sweeper=basic" for o in overrides):
         return []
     parsed = [parse(override) for override in own_overrides(overrides)]
-    batches = BasicSweeper.split_arguments(parsed, max_batch_size=None)
+    try:
+        batches = BasicSweeper.split_arguments(parsed, max_batch_size=None)
+    except HydraException as error:  # a glob
+        raise CompositionError(f"{' '.join(overrides)}: expected a list of values.") from error
     jobs = [list(job) for batch in batches for job in batch]
     if not jobs:
         raise CompositionError(f"{' '.join(overrides)}: has no jobs, expected at least one value.")

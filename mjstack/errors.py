@@ -1,7 +1,6 @@
 """Errors built from facts: what is wrong with its value, what was expected, what to do.
 
-Every error that a user can cause derives from `MjstackError` and carries the exit status that the
-command line returns for it.
+Every error that a user can cause derives from `MjstackError`.
 """
 
 import difflib
@@ -33,7 +32,7 @@ def is_out_of_memory(text: str) -> bool:
 class MjstackError(Exception):
     """Base class. Its message is one line that a user can act on."""
 
-    exit_code = 1
+    exit_code = 2  # of a command line that could not begin
 
     def __init__(self, problem: str, fix: str = "") -> None:
         """Build the message.
@@ -46,13 +45,7 @@ class MjstackError(Exception):
         super().__init__(f"{problem}{stop}{f' {fix}.' if fix else ''}")
 
 
-class InputError(MjstackError):
-    """Bad configuration or input. Raised before anything is written."""
-
-    exit_code = 2
-
-
-class ConfigError(InputError):
+class ConfigError(MjstackError):
     """A value in the configuration cannot be used."""
 
     def __init__(self, key: str, value: object, expected: str, fix: str = "") -> None:
@@ -74,30 +67,30 @@ class ConfigError(InputError):
         return ConfigError(key, *self._facts)
 
 
-class CompositionError(InputError):
+class CompositionError(MjstackError):
     """Overrides do not fit the configuration files."""
 
 
-class UnknownName(InputError):
+class UnknownName(MjstackError):
     """A name that does not exist, listed with the ones that do."""
 
     def __init__(self, what: str, name: str, available: Iterable[str]) -> None:
         super().__init__(f"{what} '{name}' does not exist. {suggest(name, available)}")
 
 
-class SourceError(InputError):
+class SourceError(MjstackError):
     """A robot description that cannot be fetched, found or read."""
 
 
-class DeviceError(InputError):
+class DeviceError(MjstackError):
     """A compute device that was asked for and is not there."""
 
 
-class RunError(InputError):
+class RunError(MjstackError):
     """The folder of an earlier run that cannot be read, or has not what is asked for."""
 
 
-class FolderError(InputError):
+class FolderError(MjstackError):
     """A folder that has another run, or that another process is writing."""
 
 
@@ -105,7 +98,7 @@ class UnsupportedModel(MjstackError):
     """MJWarp does not implement a feature of the model."""
 
 
-class TermError(InputError):
+class TermError(MjstackError):
     """A term of a manager that cannot be found, built or used."""
 
     def __init__(self, key: str, problem: str) -> None:
@@ -129,7 +122,7 @@ class FaultError(MjstackError):
     """Something went wrong while worlds were stepped."""
 
 
-class Unreachable(InputError):
+class Unreachable(MjstackError):
     """The arm cannot bring its grasp point to a target."""
 
     def __init__(
@@ -171,7 +164,7 @@ class RebindError(MjstackError):
         )
 
 
-class ArgumentError(InputError):
+class ArgumentError(MjstackError):
     """An argument of a function cannot be used."""
 
     def __init__(self, name: str, found: object, expected: str, fix: str = "") -> None:
@@ -186,7 +179,7 @@ class ArgumentError(InputError):
         super().__init__(f"{name}: found {found}, expected {expected}", fix)
 
 
-class DatasetError(InputError):
+class DatasetError(MjstackError):
     """A dataset of demonstrations that cannot be opened or read, or an episode that does not fit
     into it.
     """
@@ -210,7 +203,7 @@ class UnwrittenError(MjstackError):
         )
 
 
-class MissingExtra(InputError):
+class MissingExtra(MjstackError):
     """A package that is not installed, because it comes with an extra."""
 
     def __init__(self, what: str, package: str, extra: str) -> None:

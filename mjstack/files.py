@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.errors import FolderError, InputError, MjstackError, first_line
+from mjstack.errors import FolderError, MjstackError, first_line
 
 
 @contextmanager
@@ -116,7 +116,7 @@ def claim_folder(
         check_unused(folder, job, own)
         yield folder
     except BaseException as error:
-        with suppress(OSError, InputError):
+        with suppress(OSError, MjstackError):
             check_unused(folder)
             for path in made:
                 shutil.rmtree(path) if path == folder else path.rmdir()

@@ -441,7 +441,7 @@ def test_unsupported_model_says_so_in_one_line() -> None:
     assert "\n" not in message
     assert "MJWarp does not support this model: " in message
     assert "sim=native" in message
-    assert caught.value.exit_code == 1
+    assert caught.value.exit_code == 2
 
 
 @pytest.mark.full
