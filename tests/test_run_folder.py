@@ -8,6 +8,7 @@ import json
 import os
 import resource
 import sys
+import tempfile
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
@@ -293,34 +294,40 @@ DENIED: dict[str, tuple[Callable[[Path], object], list[str]]] = {
 
 @pytest.mark.full
 @pytest.mark.parametrize("what", ["nothing", *DENIED])
-def test_no_permission_is_a_line(what: str, begin: Callable[..., int], tmp_path: Path) -> None:
+def test_no_permission_is_a_line(
+    what: str, begin: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As another user, who owns everything there but for what a case takes away."""
-    put(Path("given"), {".hydra/config.yaml": "", "report.json": '{"resumes": "collect"}'})
-    deny, args = DENIED.get(what, (lambda f: None, []))
-    if os.geteuid() == 0:
-        for path in (Path(), *Path().rglob("*")):
-            os.chown(path, 65534, 65534)
-        for path in tmp_path.parents[:2]:
-            path.chmod(0o711)
-    elif "foreign" in what:
-        pytest.skip("only root gives files away")
-    deny(Path("given"))
-    told = tmp_path.parent / "told"
-    told.write_text("")
-    told.chmod(0o666)
-
-    def denied(_: int) -> int:
-        if os.geteuid() == 0:
-            os.setgid(65534)
-            os.setuid(65534)
-        return begin("job=collect", *args, **COLLECTING)
-
-    (status,) = in_children(1, denied, told)
-    Path().chmod(0o755)
-    lines = told.read_text().splitlines()
+    with tempfile.TemporaryDirectory() as home:  # pytest's own is its user's alone
+        monkeypatch.chdir(home)
+        status, lines = denied(what, begin, tmp_path / "told")
+        monkeypatch.chdir(tmp_path)
     if what == "nothing":
         assert status == 0, lines
     else:
         assert status == 2, lines
         assert len(lines) == 1
         assert lines[0].startswith("mjstack: ")
+
+
+def denied(what: str, begin: Callable[..., int], told: Path) -> tuple[int, list[str]]:
+    """Exit status and lines of a command in the current folder."""
+    put(Path("given"), {".hydra/config.yaml": "", "report.json": '{"resumes": "collect"}'})
+    deny, args = DENIED.get(what, (lambda f: None, []))
+    if os.geteuid() == 0:
+        for path in (Path(), *Path().rglob("*")):
+            os.chown(path, 65534, 65534)
+    elif "foreign" in what:
+        pytest.skip("only root gives files away")
+    deny(Path("given"))
+
+    def other(_: int) -> int:
+        if os.geteuid() == 0:
+            os.setgid(65534)
+            os.setuid(65534)
+        return begin("job=collect", *args, **COLLECTING)
+
+    (status,) = in_children(1, other, told)
+    for path in (Path(), *Path().glob("*")):
+        path.chmod(0o755)
+    return status, told.read_text().splitlines()
