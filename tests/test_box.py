@@ -454,7 +454,7 @@ def test_bad_input_is_one_line(overrides: list[str], parts: list[str]) -> None:
     ("override", "parts"),
     [
         ("reward.place_red.params.object=red_cub", ["reward.place_red", "red_cub", "red"]),
-        ("reward.reach.params.scale=0", ["reward.reach.params.scale=0", "positive"]),
+        ("reward.reach.params.scale=0", ["reward.reach.params.scale=0", "above 0"]),
         ("task.success.params.open_fraction=2", ["task.success.params.open_fraction=2", "0 to 1"]),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import signal
@@ -151,11 +152,14 @@ def test_any_error_of_the_run_is_a_line(
     folder: Path,
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
     stage: Callable[..., RunContext],
 ) -> None:
     def work(*_: object) -> None:
         raise error
 
+    # Hydra's of an earlier test writes to a stream that is closed.
+    monkeypatch.setattr(logging.getLogger(), "handlers", [caplog.handler])
     job = CheckedJob(context=stage("so101"), title="[/]", work=work)
     assert job.run(folder, ["[/]"]).exit_code == 1
     assert re.fullmatch("mjstack: .+\n", capsys.readouterr().err)

@@ -765,7 +765,7 @@ def test_damaged_notes_are_one_line(
     (folder / FILE).write_text("[{]")
     capsys.readouterr()
     assert run([*COMMAND, "nworld=2", "job.episodes=2"]) == 2
-    assert f"{FILE} cannot be read (JSONDecodeError)" in capsys.readouterr().err
+    assert f"{FILE}: cannot be read (JSONDecodeError: " in capsys.readouterr().err
 
 
 @pytest.mark.full
