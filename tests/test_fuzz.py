@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import pytest
 from fuzz_cases import Make, command_lines, damaged_folders, is_short
 
-COUNTS = {"commands": 1000, "folders": 200}
+COUNTS = {"commands": 500, "folders": 100}
 CASES = {"commands": command_lines, "folders": damaged_folders}
 PASSED = 77  # exit status of a child whose check has passed
 SECONDS = 40  # of processor time that a check may take; the slowest of them takes three
