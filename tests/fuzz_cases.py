@@ -236,8 +236,8 @@ def _insert(draw: random.Random, args: list[str], more: list[str]) -> list[str]:
 
 
 _MUTATIONS = (
-    *[_value] * 8, *[_key] * 3, *[_func] * 4, *[_group] * 3, *[_flag] * 3, *[_sweep] * 2,
-    *[_text] * 5, _hydra, _job,
+    *[_value] * 8, *[_key] * 2, *[_func] * 3, *[_group] * 3, *[_flag] * 3, *[_sweep] * 2,
+    *[_text] * 9, _hydra, _job,
 )  # fmt: skip
 
 
