@@ -1,0 +1,684 @@
+// MuJoCo's Newton solver for one world, by one block of threads: the body of a Warp native function.
+//
+// J stays where it is and is read through the L1 cache; all else of a world lies in shared memory.
+// On Warp's CPU device a block has one thread, and the same text is plain C++.
+//
+// Constants that newton.py puts before it: NV degrees of freedom, NVP of a row of J, NJ rows at
+// most, ITERATIONS and LS_ITERATIONS, and MuJoCo's numbers of constraint types, states and bits.
+
+constexpr int T = WP_TILE_BLOCK_DIM;
+constexpr int LD = NV | 1;            // rows of h in different banks of shared memory
+constexpr int CHUNK = 32;             // rows of s
+constexpr int NB = (NV + 3) / 4;      // blocks of 4 x 4 along the Hessian's side
+constexpr int BLOCKS = NB * (NB + 1) / 2;
+constexpr int GROUPS = T > BLOCKS ? T / BLOCKS : 1;       // of threads, which share the rows
+constexpr int OWN = (BLOCKS + T - 1) / T;                 // blocks of a thread
+constexpr int SPLIT = T > NV ? T / NV : 1;                // of the rows, for J' force
+constexpr float TINY = 1e-15f;
+constexpr float NOISE = 8.0f * 1.1920929e-07f;            // of a sum of derivatives, relative
+constexpr int KEYS = 9;
+
+#ifdef __CUDA_ARCH__
+#define SHARED __shared__
+#define SYNC() do { if constexpr (T > 32) __syncthreads(); else __syncwarp(); } while (0)
+#define WARP_SYNC() __syncwarp()
+#define FROM_FIRST(x) __shfl_sync(~0u, x, 0)
+constexpr int LANES = 32;  // threads that need no barrier
+#else
+#define SHARED
+#define SYNC()
+#define WARP_SYNC()
+#define FROM_FIRST(x) (x)
+constexpr int LANES = 1;
+#endif
+
+SHARED alignas(16) float h[(NV + 1) * LD];  // Hessian's lower triangle, and the gradient below it
+SHARED alignas(16) float s[CHUNK * NVP > SPLIT * NV ? CHUNK * NVP : SPLIT * NV];
+SHARED alignas(16) float search[NVP];
+SHARED alignas(16) float acc[NVP];
+SHARED float ma[NV], mv[NV], smooth[NV], qfrc[NV];
+SHARED float jaref[NJ], jv[NJ];
+// Of a row: in the update weight, direction and force; in the line search three coefficients.
+SHARED float qa[NJ], qb[NJ], qc[NJ];
+SHARED unsigned short head[NJ], item[NJ];  // a row's first row of its contact; contacts' first rows
+SHARED unsigned char state[NJ];
+SHARED float partial[T > 32 ? KEYS * (T / 32) : 1];
+SHARED int counts[2];
+
+const int nefc = wp::min(NJ, nefc_in.data[world]);
+const int ne = ne_in.data[world];
+const int nf = nf_in.data[world];
+const int contacts = wp::min(nefc, ne + nf + nl_in.data[world]);  // where their rows begin
+const float *J = &wp::index(efc_J, world, 0, 0);
+const float *D = &wp::index(efc_D, world, 0);
+const float *M = &wp::index(M_in, world, 0);
+const float *loss = &wp::index(efc_frictionloss, world, 0);
+const int *type = &wp::index(efc_type, world, 0);
+const int *id = &wp::index(efc_id, world, 0);
+const float impratio = impratio_invsqrt.data[world % impratio_invsqrt.shape[0]];
+const float tolerance = opt_tolerance.data[world % opt_tolerance.shape[0]];
+const float ls_tolerance = opt_ls_tolerance.data[world % opt_ls_tolerance.shape[0]];
+
+// Sums over the block; every thread gets the same bits.
+auto sum = [&](auto &values) {
+  constexpr int N = sizeof(values) / sizeof(float);
+#ifdef __CUDA_ARCH__
+  for (int k = 0; k < N; ++k)
+    for (int offset = 16; offset; offset >>= 1)
+      values[k] += __shfl_xor_sync(~0u, values[k], offset);
+  if constexpr (T > 32) {
+    __syncthreads();
+    if (lane % 32 == 0)
+      for (int k = 0; k < N; ++k) partial[k * (T / 32) + lane / 32] = values[k];
+    __syncthreads();
+    for (int k = 0; k < N; ++k) {
+      values[k] = 0.0f;
+      for (int warp = 0; warp < T / 32; ++warp) values[k] += partial[k * (T / 32) + warp];
+    }
+  }
+#endif
+};
+
+// Appends to a list, in their order, the numbers between begin and end that are kept.
+auto compact = [&](int begin, int end, auto keep, unsigned short *list, int &count) {
+  if (lane < LANES) {
+    int n = 0;
+    for (int from = begin; from < end; from += LANES) {
+      const int r = from + lane;
+      const bool kept = r < end && keep(r);
+#ifdef __CUDA_ARCH__
+      const unsigned mask = __ballot_sync(~0u, kept);
+      if (kept) list[n + __popc(mask & ((1u << lane) - 1u))] = r;
+      n += __popc(mask);
+#else
+      if (kept) list[n++] = r;
+#endif
+    }
+    if (lane == 0) count = n;
+  }
+  SYNC();
+};
+
+auto divide = [](float x, float y) { return x / (y != 0.0f ? y : TINY); };
+
+// out = M x
+auto multiply = [&](const float *x, float *out) {
+  for (int i = lane; i < NV; i += T) {
+    float total = 0.0f;
+    for (int k = mulm_rowadr.data[i]; k < mulm_rowadr.data[i + 1]; ++k)
+      total += M[mulm_madr.data[k]] * x[mulm_col.data[k]];
+    out[i] = total;
+  }
+};
+
+// J x of a row
+auto row_dot = [&](int r, const float *x) {
+  const float4 *row = reinterpret_cast<const float4 *>(J + r * NVP);
+  const float4 *y = reinterpret_cast<const float4 *>(x);
+  float total = 0.0f;
+  for (int k = 0; k < NVP / 4; ++k) {
+    const float4 a = row[k], b = y[k];
+    total += a.x * b.x;
+    total += a.y * b.y;
+    total += a.z * b.z;
+    total += a.w * b.w;
+  }
+  return total;
+};
+
+// Where the solver starts
+
+float trace = 0.0f;
+for (int i = lane; i < NVP; i += T) {
+  if (i < NV) {
+    acc[i] = nefc > 0 && WARMSTART ? wp::index(qacc_warmstart, world, i) : wp::index(qacc_smooth, world, i);
+    smooth[i] = wp::index(qfrc_smooth, world, i);
+    trace += M[M_rowadr.data[i] + M_rownnz.data[i] - 1];
+  } else {
+    acc[i] = 0.0f;
+    search[i] = 0.0f;
+  }
+}
+float traces[1] = {trace};
+sum(traces);
+const float scale = 1.0f / wp::max(TINY, traces[0]);
+for (int r = lane; r < nefc; r += T) {
+  int first = r;
+  if (type[r] == ELLIPTIC) {
+    first = wp::index(contact_address, id[r], 0);
+    // Of a contact with more rows than the buffer has left, none counts: the world is void.
+    if (first < 0 || first + contact_dim.data[id[r]] > nefc) first = NJ;
+  }
+  head[r] = first;
+  state[r] = SATISFIED;
+  qa[r] = qb[r] = qc[r] = 0.0f;
+}
+SYNC();
+for (int r = lane; r < nefc; r += T)
+  jaref[r] = row_dot(r, acc) - wp::index(efc_aref, world, r);
+multiply(acc, ma);
+compact(contacts, nefc, [&](int r) { return head[r] == r; }, item, counts[0]);
+const int items = contacts + counts[0];
+auto row_of = [&](int i) { return i < contacts ? i : (int)item[i - contacts]; };
+
+// Force, state and the Hessian's weights of all rows
+auto update = [&]() {
+  for (int i = lane; i < items; i += T) {
+    const int r = row_of(i);
+    const float d = D[r];
+    const float x = jaref[r];
+    if (i >= contacts && type[r] == ELLIPTIC) {
+      const int dim = contact_dim.data[id[r]];
+      const auto &friction = contact_friction.data[id[r]];
+      const float mu = friction[0] * impratio;
+      const float n = x * mu;
+      float tt = 0.0f;
+      for (int k = 1; k < dim; ++k) {
+        const float u = jaref[r + k] * friction[k - 1];
+        tt += u * u;
+      }
+      const float t = tt > 0.0f ? sqrtf(tt) : 0.0f;
+      if (n >= mu * t || (t <= 0.0f && n >= 0.0f)) {
+        for (int k = 0; k < dim; ++k) {
+          state[r + k] = SATISFIED;
+          qa[r + k] = qc[r + k] = 0.0f;
+        }
+      } else if (mu * n + t <= 0.0f || (t <= 0.0f && n < 0.0f)) {
+        for (int k = 0; k < dim; ++k) {
+          state[r + k] = QUADRATIC;
+          qa[r + k] = sqrtf(D[r + k]);
+          qc[r + k] = -D[r + k] * jaref[r + k];
+        }
+      } else {
+        // Of the cone's curvature, one part is along the residual, the other one across it, in the
+        // tangent plane: as many rows as the contact has, and one less with two tangents.
+        const float dm = divide(d, mu * mu * (1.0f + mu * mu));
+        const float normal = -dm * (n - mu * t) * mu;
+        const float pull = divide(normal, t);
+        state[r] = CONE;
+        qa[r] = sqrtf(dm) * mu;
+        qb[r] = sqrtf(wp::max(0.0f, dm * (mu * mu - mu * n / t)));
+        qc[r] = normal;
+        for (int k = 1; k < dim; ++k) {
+          const float u = jaref[r + k] * friction[k - 1];
+          state[r + k] = CONE;
+          qa[r + k] = friction[k - 1];
+          qb[r + k] = u / t;
+          qc[r + k] = -pull * u * friction[k - 1];
+        }
+      }
+      continue;
+    }
+    const bool one_sided = i >= ne + nf;
+    float force = -d * x;
+    int now = QUADRATIC;
+    if (one_sided) {
+      if (x >= 0.0f) now = SATISFIED;
+    } else if (i >= ne) {
+      const float f = loss[r];
+      const float rf = divide(f, d);
+      if (x <= -rf) {
+        now = LINEARNEG;
+        force = f;
+      } else if (x >= rf) {
+        now = LINEARPOS;
+        force = -f;
+      }
+    }
+    state[r] = now;
+    qa[r] = now == QUADRATIC ? sqrtf(d) : 0.0f;
+    qc[r] = now == SATISFIED ? 0.0f : force;
+  }
+  SYNC();
+  // qfrc_constraint = J' force, and the gradient
+  for (int e = lane; e < NV * SPLIT; e += T) {
+    float total = 0.0f;
+#pragma unroll 4
+    for (int r = e / NV; r < nefc; r += SPLIT) total += J[r * NVP + e % NV] * qc[r];
+    s[e] = total;
+  }
+  SYNC();
+  float square[1] = {0.0f};
+  for (int i = lane; i < NV; i += T) {
+    float total = 0.0f;
+    for (int part = 0; part < SPLIT; ++part) total += s[part * NV + i];
+    qfrc[i] = total;
+    const float gradient = ma[i] - smooth[i] - total;
+    h[NV * LD + i] = gradient;
+    square[0] += gradient * gradient;
+  }
+  sum(square);
+  return square[0];
+};
+
+// Row r of S, column c: the Hessian is M + S' S.
+auto weighted = [&](int r, int c) {
+  const float *column = J + c;
+  if (state[r] != CONE) return qa[r] * column[r * NVP];
+  const int r0 = head[r];
+  const int dim = contact_dim.data[id[r]];
+  if (dim == 3 && r > r0)
+    return qb[r0] * (qb[r0 + 1] * qa[r0 + 2] * column[(r0 + 2) * NVP]
+                     - qb[r0 + 2] * qa[r0 + 1] * column[(r0 + 1) * NVP]);
+  float along = 0.0f;
+  for (int k = 1; k < dim; ++k) along += qb[r0 + k] * qa[r0 + k] * column[(r0 + k) * NVP];
+  if (r == r0) return qa[r0] * (column[r0 * NVP] - along);
+  return qb[r0] * (qa[r] * column[r * NVP] - qb[r] * along);
+};
+
+// A thread's blocks of the Hessian's lower triangle: their first rows and columns
+const int group = GROUPS > 1 ? lane / BLOCKS : 0;
+int block_row[OWN], block_col[OWN];
+for (int o = 0; o < OWN; ++o) {
+  const int block = GROUPS > 1 ? lane % BLOCKS : lane + o * T;
+  int i = 0;
+  while ((i + 1) * (i + 2) / 2 <= block) ++i;
+  block_row[o] = group < GROUPS && block < BLOCKS ? 4 * i : -1;
+  block_col[o] = 4 * (block - i * (i + 1) / 2);
+}
+
+// The Newton direction: search = -H^-1 gradient; its square, and the gradient's decrement.
+float search_square = 0.0f;
+auto direction = [&]() {
+  // Rows with a weight; `item` keeps the contacts, and theirs come behind them.
+  unsigned short *active = reinterpret_cast<unsigned short *>(jv);
+  compact(0, nefc, [&](int r) {
+    if (state[r] == CONE) return !(r == head[r] + 2 && contact_dim.data[id[r]] == 3);
+    return qa[r] != 0.0f;
+  }, active, counts[1]);
+  const int rows = counts[1];
+  float own[OWN][4][4] = {};
+  for (int from = 0; from < rows; from += CHUNK) {
+    const int n = wp::min(CHUNK, rows - from);
+    for (int e = lane; e < n * NVP; e += T) s[e] = weighted(active[from + e / NVP], e % NVP);
+    SYNC();
+    for (int o = 0; o < OWN; ++o) {
+      if (block_row[o] >= 0) {
+        for (int r = group; r < n; r += GROUPS) {
+          const float4 a4 = *reinterpret_cast<const float4 *>(s + r * NVP + block_row[o]);
+          const float4 b4 = *reinterpret_cast<const float4 *>(s + r * NVP + block_col[o]);
+          const float a[4] = {a4.x, a4.y, a4.z, a4.w};
+          const float b[4] = {b4.x, b4.y, b4.z, b4.w};
+          for (int p = 0; p < 4; ++p)
+            for (int q = 0; q < 4; ++q) own[o][p][q] += a[p] * b[q];
+        }
+      }
+    }
+    SYNC();
+  }
+  // M's lower triangle, then the groups' parts one after the other: the same bits in every run
+  for (int e = lane; e < NV * LD; e += T) h[e] = 0.0f;
+  SYNC();
+  for (int e = lane; e < entries; e += T) h[M_row.data[e] * LD + M_col.data[e]] = M[e];
+  SYNC();
+  for (int turn = 0; turn < GROUPS; ++turn) {
+    for (int o = 0; o < OWN; ++o)
+      for (int p = 0; p < 4; ++p)
+        for (int q = 0; q < 4; ++q) {
+          const int i = block_row[o] + p, j = block_col[o] + q;
+          if (group == turn && block_row[o] >= 0 && j <= i && i < NV) h[i * LD + j] += own[o][p][q];
+        }
+    SYNC();
+  }
+  // Cholesky of h, column by column; the gradient as a last row becomes L^-1 gradient. The diagonal
+  // keeps the inverses.
+  float squares[2] = {};
+  if (lane < LANES) {
+    for (int j = 0; j < NV; ++j) {
+      float inverse = 0.0f;
+      for (int first = j; first <= NV; first += LANES) {
+        const int i = first + lane;
+        float value = 0.0f;
+        if (i <= NV) {
+          value = h[i * LD + j];
+          for (int k = 0; k < j; ++k) value -= h[i * LD + k] * h[j * LD + k];
+        }
+        if (first == j) inverse = 1.0f / sqrtf(FROM_FIRST(value));
+        if (i <= NV) h[i * LD + j] = i == j ? inverse : value * inverse;
+      }
+      WARP_SYNC();
+    }
+    float *y = h + NV * LD;
+    for (int i = lane; i < NV; i += LANES) squares[1] += y[i] * y[i];
+    for (int j = NV - 1; j >= 0; --j) {
+      WARP_SYNC();
+      const float x = y[j] * h[j * LD + j];
+      for (int i = lane; i < j; i += LANES) y[i] -= h[j * LD + i] * x;
+      if (lane == 0) {
+        search[j] = -x;
+        squares[0] += x * x;
+      }
+    }
+  }
+  SYNC();
+  sum(squares);
+  search_square = squares[0];
+  return squares[1];
+};
+
+// Change of cost, its derivative and second derivative at a step alpha, of one constraint
+struct Point {
+  float cost = 0.0f, slope = 0.0f, curvature = 0.0f;
+};
+auto quadratic = [&](float x0, float v, float d, float a) {
+  const float c = v * v * d;
+  return Point{a * (v * d * x0 + 0.5f * a * c), v * d * x0 + a * c, c};
+};
+auto friction_point = [&](float x, float f, float rf, float v, float d) {
+  if (-rf < x && x < rf) return Point{0.5f * d * x * x, v * d * x, v * v * d};
+  if (x <= -rf) return Point{f * (-0.5f * rf - x), -f * v, 0.0f};
+  return Point{f * (-0.5f * rf + x), f * v, 0.0f};
+};
+
+// A contact's numbers for the line search: the quadratic of all its rows; normal and its change;
+// the tangent's residual, along the step and across it.
+struct Contact {
+  float mu, q0, q1, q2, u0, v0, across, along, speed, dm;
+  float t0, r0, cost0;
+  int state0;
+};
+auto prepare_contact = [&](int r) {
+  const auto &friction = contact_friction.data[id[r]];
+  const int dim = contact_dim.data[id[r]];
+  const float mu = friction[0] * impratio;
+  const float d = D[r], x = jaref[r], v = jv[r];
+  float q0 = 0.5f * x * x * d, q1 = v * d * x, q2 = 0.5f * v * v * d;
+  float uu = 0.0f, uv = 0.0f, vv = 0.0f, det = 0.0f;
+  for (int k = 1; k < dim; ++k) {
+    const float xk = jaref[r + k], vk = jv[r + k], dk = D[r + k];
+    q0 += 0.5f * xk * dk * xk;
+    q1 += vk * dk * xk;
+    q2 += 0.5f * vk * dk * vk;
+    const float u = xk * friction[k - 1], w = vk * friction[k - 1];
+    uu += u * u;
+    uv += u * w;
+    vv += w * w;
+    // Not uu vv - uv^2, which cancels
+    for (int l = 1; l < k; ++l) {
+      const float cross = u * jv[r + l] * friction[l - 1] - jaref[r + l] * friction[l - 1] * w;
+      det += cross * cross;
+    }
+  }
+  float along = 0.0f, speed = 0.0f, across = uu;
+  if (vv > 0.0f) {
+    speed = sqrtf(vv);
+    along = uv / speed;
+    across = det / vv;
+  }
+  qa[r] = q0;
+  qb[r] = q1;
+  qc[r] = q2;
+  qa[r + 1] = x * mu;
+  qb[r + 1] = v * mu;
+  qc[r + 1] = across;
+  qa[r + 2] = along;
+  qb[r + 2] = speed;
+  qc[r + 2] = d / (mu * mu * (1.0f + mu * mu));
+};
+auto contact_at = [&](int r) {
+  Contact c;
+  c.mu = contact_friction.data[id[r]][0] * impratio;
+  c.q0 = qa[r];
+  c.q1 = qb[r];
+  c.q2 = qc[r];
+  c.u0 = qa[r + 1];
+  c.v0 = qb[r + 1];
+  c.across = qc[r + 1];
+  c.along = qa[r + 2];
+  c.speed = qb[r + 2];
+  c.dm = qc[r + 2];
+  const float uu = c.along * c.along + c.across;
+  c.t0 = uu > 0.0f ? sqrtf(uu) : 0.0f;
+  c.r0 = c.cost0 = 0.0f;
+  if (uu <= 0.0f) {
+    c.state0 = c.u0 < 0.0f ? QUADRATIC : SATISFIED;
+  } else if (c.u0 >= c.mu * c.t0) {
+    c.state0 = SATISFIED;
+  } else if (c.mu * c.u0 + c.t0 <= 0.0f) {
+    c.state0 = QUADRATIC;
+  } else {
+    c.state0 = CONE;
+    c.r0 = c.u0 - c.mu * c.t0;
+    c.cost0 = 0.5f * c.dm * c.r0 * c.r0;
+  }
+  if (c.state0 == QUADRATIC) c.cost0 = c.q0;
+  return c;
+};
+// Costs are differences from the step 0, formed without cancellation.
+auto contact_point = [&](const Contact &c, float a) {
+  const float n = c.u0 + a * c.v0;
+  const float w = c.along + a * c.speed;
+  const float tt = w * w + c.across;
+  const float t = tt > 0.0f ? sqrtf(tt) : 0.0f;
+  if (tt > 0.0f ? n >= c.mu * t : n >= 0.0f) return Point{-c.cost0, 0.0f, 0.0f};
+  const float a_q2 = a * c.q2;
+  if (tt <= 0.0f || c.mu * n + t <= 0.0f) {
+    float cost = a * (a_q2 + c.q1);
+    if (c.state0 == CONE) {
+      const float edge = c.mu * c.u0 + c.t0;
+      cost += 0.5f * c.dm * edge * edge;
+    } else if (c.state0 == SATISFIED) {
+      cost = 0.5f * c.dm * (1.0f + c.mu * c.mu) * (n * n + wp::max(tt, 0.0f));
+    }
+    return Point{cost, 2.0f * a_q2 + c.q1, 2.0f * c.q2};
+  }
+  const float t1 = w * c.speed / t;
+  const float t2 = c.across / tt * (c.speed * c.speed / t);
+  const float r = n - c.mu * t;
+  const float r1 = c.v0 - c.mu * t1;
+  float cost = 0.5f * c.dm * r * r;
+  if (c.state0 == CONE) {
+    const float dt = a * c.speed * (c.along + w) / (t + c.t0);
+    const float dr = a * c.v0 - c.mu * dt;
+    cost = 0.5f * c.dm * dr * (2.0f * c.r0 + dr);
+  } else if (c.state0 == QUADRATIC) {
+    const float edge = c.mu * n + t;
+    cost = a * (a_q2 + c.q1) - 0.5f * c.dm * edge * edge;
+  }
+  return Point{cost, c.dm * r * r1, c.dm * (r1 * r1 - c.mu * r * t2)};
+};
+
+// Sums of points, at N steps, over all constraints but equalities
+auto evaluate = [&](const auto &alphas, auto &sums) {
+  constexpr int N = sizeof(alphas) / sizeof(float);
+  for (int k = 0; k < 3 * N; ++k) sums[k] = 0.0f;
+  auto add = [&](int k, const Point &p) {
+    sums[3 * k] += p.cost;
+    sums[3 * k + 1] += p.slope;
+    sums[3 * k + 2] += p.curvature;
+  };
+  for (int i = ne + lane; i < items; i += T) {
+    const int r = row_of(i);
+    if (i >= contacts && type[r] == ELLIPTIC) {
+      const Contact c = contact_at(r);
+      for (int k = 0; k < N; ++k) add(k, contact_point(c, alphas[k]));
+      continue;
+    }
+    const float d = D[r], x0 = jaref[r], v = jv[r];
+    if (i < ne + nf) {
+      const float f = loss[r], rf = divide(f, d);
+      const Point at0 = friction_point(x0, f, rf, v, d);
+      for (int k = 0; k < N; ++k) {
+        Point p = friction_point(x0 + alphas[k] * v, f, rf, v, d);
+        p.cost -= at0.cost;
+        add(k, p);
+      }
+      continue;
+    }
+    const float q0 = 0.5f * d * x0 * x0;
+    const float cost0 = x0 < 0.0f ? q0 : 0.0f;
+    for (int k = 0; k < N; ++k) {
+      Point p{-cost0, 0.0f, 0.0f};
+      if (x0 + alphas[k] * v < 0.0f) {
+        p = quadratic(x0, v, d, alphas[k]);
+        p.cost += q0 - cost0;
+      }
+      add(k, p);
+    }
+  }
+  sum(sums);
+};
+
+// Newton's iterations
+
+float gradient_square = update();
+float decrement = direction();
+int bits = 0;
+int iteration = 0;
+bool done = false;
+while (!done && iteration < ITERATIONS) {
+  // The step's M search and J search
+  multiply(search, mv);
+  for (int r = lane; r < nefc; r += T) jv[r] = row_dot(r, search);
+  SYNC();
+  for (int i = contacts + lane; i < items; i += T)
+    if (type[row_of(i)] == ELLIPTIC) prepare_contact(row_of(i));
+  SYNC();
+
+  // The smooth part's slope and half of its curvature, equalities among it; cost of the rows at 0
+  float smooth_part[3] = {};
+  for (int i = lane; i < NV; i += T) {
+    smooth_part[0] += search[i] * (ma[i] - smooth[i]);
+    smooth_part[1] += 0.5f * search[i] * mv[i];
+  }
+  for (int r = lane; r < ne; r += T) {
+    smooth_part[0] += jv[r] * D[r] * jaref[r];
+    smooth_part[1] += 0.5f * jv[r] * D[r] * jv[r];
+  }
+  for (int i = ne + lane; i < items; i += T) {
+    const int r = row_of(i);
+    if (i >= contacts && type[r] == ELLIPTIC) {
+      smooth_part[2] += contact_at(r).cost0;
+    } else if (i < ne + nf) {
+      smooth_part[2] += friction_point(jaref[r], loss[r], divide(loss[r], D[r]), 0.0f, D[r]).cost;
+    } else if (jaref[r] < 0.0f) {
+      smooth_part[2] += 0.5f * D[r] * jaref[r] * jaref[r];
+    }
+  }
+  sum(smooth_part);
+  const float g1 = smooth_part[0], g2 = smooth_part[1];
+  const float gtol = wp::max(tolerance * ls_tolerance * sqrtf(search_square) / scale, 1e-6f);
+
+  auto points = [&](const auto &alphas, auto &sums) {
+    constexpr int N = sizeof(alphas) / sizeof(float);
+    evaluate(alphas, sums);
+    for (int k = 0; k < N; ++k) {
+      const float a_g2 = alphas[k] * g2;
+      sums[3 * k] += alphas[k] * (a_g2 + g1);
+      sums[3 * k + 1] += 2.0f * a_g2 + g1;
+      sums[3 * k + 2] += 2.0f * g2;
+    }
+  };
+  const float none[1] = {0.0f};
+  float start[3];
+  evaluate(none, start);
+  // Below the rounding of the slope's sum, by Cauchy and Schwarz, there is no descent to be seen.
+  const float gross = sqrtf(2.0f * wp::max(smooth_part[2], 0.0f) * wp::max(start[2], 0.0f)) + fabsf(g1);
+  const float accepted = wp::max(gtol, NOISE * gross);
+  const Point p0{0.0f, g1 + start[1], 2.0f * g2 + start[2]};
+  float alpha = 0.0f, improvement = 0.0f;
+  bool converged = fabsf(p0.slope) < NOISE * gross;
+  const float newton[1] = {-divide(p0.slope, p0.curvature)};
+  Point p1;
+  if (!converged) {
+    float sums[3];
+    points(newton, sums);
+    p1 = Point{sums[0], sums[1], sums[2]};
+    if (fabsf(p1.slope) < accepted && p1.cost < 0.0f) {
+      converged = true;
+      alpha = newton[0];
+      improvement = -p1.cost;
+    }
+  }
+  if (!converged) {
+    // A bracket about the minimum, made smaller by Newton steps from both ends and by its middle
+    const bool less = p1.slope < p0.slope;
+    Point lo = less ? p1 : p0, hi = less ? p0 : p1;
+    float lo_alpha = less ? newton[0] : 0.0f, hi_alpha = less ? 0.0f : newton[0];
+    auto inside = [](const Point &x, const Point &y) {
+      return (x.slope < y.slope && y.slope < 0.0f) || (x.slope > y.slope && y.slope > 0.0f);
+    };
+    for (int k = 0; k < LS_ITERATIONS && !converged; ++k) {
+      const float at[3] = {lo_alpha - divide(lo.slope, lo.curvature),
+                           hi_alpha - divide(hi.slope, hi.curvature), 0.5f * (lo_alpha + hi_alpha)};
+      float sums[9];
+      points(at, sums);
+      Point next[3];
+      bool found = false, swapped = false;
+      Point best{1e10f, 0.0f, 0.0f};
+      float best_alpha = 0.0f;
+      for (int c = 0; c < 3; ++c) {
+        next[c] = Point{sums[3 * c], sums[3 * c + 1], sums[3 * c + 2]};
+        if (fabsf(next[c].slope) < accepted && next[c].cost < 0.0f) {
+          found = true;
+          if (next[c].cost < best.cost) {
+            best = next[c];
+            best_alpha = at[c];
+          }
+        }
+      }
+      if (found) {
+        lo = hi = best;
+        lo_alpha = hi_alpha = best_alpha;
+      } else {
+        const int for_lo[3] = {0, 2, 1}, for_hi[3] = {1, 2, 0};
+        for (int c : for_lo)
+          if (inside(lo, next[c])) {
+            lo = next[c];
+            lo_alpha = at[c];
+            swapped = true;
+          }
+        for (int c : for_hi)
+          if (inside(hi, next[c]) || (c == 1 && hi.slope < 0.0f && next[c].slope > 0.0f)) {
+            hi = next[c];
+            hi_alpha = at[c];
+            swapped = true;
+          }
+      }
+      if (lo.cost < 0.0f || hi.cost < 0.0f) {
+        alpha = lo.cost < hi.cost ? lo_alpha : hi_alpha;
+        improvement = -wp::min(lo.cost, hi.cost);
+      }
+      converged = found || !swapped || (lo.cost < 0.0f && lo.slope < 0.0f && lo.slope > -gtol)
+                  || (hi.cost < 0.0f && hi.slope > 0.0f && hi.slope < gtol);
+    }
+    if (!converged) bits |= LIMIT_LS;
+  }
+
+  // The step
+  for (int i = lane; i < NV; i += T) {
+    acc[i] += alpha * search[i];
+    ma[i] += alpha * mv[i];
+  }
+  for (int r = lane; r < nefc; r += T) jaref[r] += alpha * jv[r];
+  SYNC();
+  gradient_square = update();
+  ++iteration;
+  done = alpha == 0.0f || (improvement > 0.0f && scale * improvement < tolerance)
+         || scale * sqrtf(gradient_square) < tolerance;
+  if (!done) {
+    decrement = direction();
+    done = scale * 0.5f * decrement < tolerance;
+  }
+}
+if (!done) bits |= LIMIT;
+
+// What later stages read
+
+for (int i = lane; i < NV; i += T) {
+  wp::index(qacc, world, i) = acc[i];
+  wp::index(qfrc_constraint, world, i) = qfrc[i];
+  wp::index(efc_Ma, world, i) = ma[i];
+}
+for (int r = lane; r < nefc; r += T) {
+  wp::index(efc_force, world, r) = qc[r];
+  wp::index(efc_state, world, r) = state[r];
+}
+if (lane == 0) {
+  solver_niter.data[world] = iteration;
+  if (bits) overflow.data[world] |= bits;
+}
+#undef SHARED
+#undef SYNC
+#undef WARP_SYNC
+#undef FROM_FIRST
