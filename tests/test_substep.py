@@ -8,12 +8,12 @@ import torch
 import warp as wp
 from environments import configure
 
-from mjstack.config.schema import Backend
+from mjstack.config.schema import Backend, StepMode
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import make_simulation
 from mjstack.sim.mjwarp import MjwarpSimulation
 from mjstack.sim.sizes import resolve_env_sizes
-from mjstack.sim.substep import Arrangement, can_rearrange
+from mjstack.sim.substep import ARRANGEMENTS, can_rearrange
 from mjstack.sim.warp_setup import mjw
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
@@ -36,8 +36,8 @@ def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
     """Random commands, cubes thrown about: on the CPU device bit for bit, sensors included."""
     ours = worlds(robot, device)
     plain = worlds(robot, device)
-    assert ours._can_rearrange
-    plain.arrange(Arrangement(own_stages=False))
+    ours.arrange(ARRANGEMENTS[StepMode.arranged])
+    plain.arrange(ARRANGEMENTS[StepMode.stock])
     low, high = torch.from_numpy(ours.model.actuator_ctrlrange).float().unbind(1)
     generator = torch.Generator().manual_seed(0)
     most = 0
@@ -93,7 +93,8 @@ def test_branches_count_and_sense_what_one_after_the_other_does(robot: str) -> N
     """
     ours = worlds(robot, "cuda:0")
     plain = worlds(robot, "cuda:0")
-    plain.arrange(Arrangement(own_stages=False))
+    ours.arrange(ARRANGEMENTS[StepMode.arranged])
+    plain.arrange(ARRANGEMENTS[StepMode.stock])
     cfg = configure(robot=robot)
     index = SceneIndex(ours.model, cfg.robot, cfg.scene)
     home = torch.tensor(configure(robot=robot).robot.start, device="cuda:0")

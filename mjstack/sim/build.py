@@ -79,7 +79,7 @@ def make_simulation(
 
     Raises:
         UnknownName: A field does not exist, or cannot differ.
-        UnsupportedModel: MJWarp does not implement a feature of the model.
+        UnsupportedModel: MJWarp, or ``sim.step``, does not implement a feature of the model.
     """
     backend, device = resolve_backend(cfg, backend, device)
     if backend is Backend.native:
@@ -87,7 +87,13 @@ def make_simulation(
     from mjstack.sim.mjwarp import MjwarpSimulation  # loads Warp, which native runs do not need
 
     return MjwarpSimulation(
-        model, nworld, sizes or resolve_sizes(cfg), device, cfg.graph, fields=fields
+        model,
+        nworld,
+        sizes or resolve_sizes(cfg),
+        device,
+        cfg.graph,
+        fields=fields,
+        step=cfg.sim.step,
     )
 
 

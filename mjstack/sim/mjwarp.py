@@ -1,19 +1,22 @@
 """MuJoCo Warp: thousands of worlds on CUDA, or on Warp's CPU device for checks."""
 
+import logging
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 
 import mujoco
 import torch
 
-from mjstack.config.schema import GraphMode
+from mjstack.config.schema import GraphMode, StepMode
 from mjstack.errors import UnsupportedModel, first_line
+from mjstack.sim import newton
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
 from mjstack.sim.simulation import Simulation, named_options
 from mjstack.sim.sizes import BatchSizes
 from mjstack.sim.substep import (
+    ARRANGEMENTS,
     Arrangement,
     can_rearrange,
     place_static_geoms,
@@ -21,6 +24,9 @@ from mjstack.sim.substep import (
 )
 from mjstack.sim.usage import Usage
 from mjstack.sim.warp_setup import mjw, torch_stream_scope, wp
+
+log = logging.getLogger(__name__)
+_tell = cache(log.info)  # once per process
 
 
 class MjwarpSimulation(Simulation):
@@ -45,6 +51,7 @@ class MjwarpSimulation(Simulation):
         graph: GraphMode = GraphMode.auto,
         *,
         fields: Sequence[str] = (),
+        step: StepMode = StepMode.auto,
     ) -> None:
         """Upload the model and allocate nworld worlds at qpos0.
 
@@ -55,10 +62,11 @@ class MjwarpSimulation(Simulation):
             device: ``"cpu"`` or ``"cuda:N"``.
             graph: Whether `step` replays a captured graph.
             fields: Model fields that may differ from world to world.
+            step: How a physics step is done.
 
         Raises:
             UnknownName: A field does not exist, or cannot differ.
-            UnsupportedModel: MJWarp does not implement a feature of the model.
+            UnsupportedModel: MJWarp, or the step, does not implement a feature of the model.
         """
         self.model = model
         self.nworld = nworld
@@ -67,11 +75,9 @@ class MjwarpSimulation(Simulation):
         self._device = wp.get_device(device)
         self._graph_mode = graph
         self._graphs: dict[tuple[int, bool], StepGraph] = {}
-        self.arrangement = Arrangement()
         names = check_fields(fields)
         self._placing = not PLACING_FIELDS.isdisjoint(names)
         name = self._device.name if self._device.is_cuda else "Warp's CPU device"
-        self.description = f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}"
 
         # The model and its data on the device
         with wp.ScopedDevice(self._device):
@@ -87,8 +93,13 @@ class MjwarpSimulation(Simulation):
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
-            self._can_rearrange = can_rearrange(model, self._m)
+            step, why = self._resolve(step)
             self._usage = usage = Usage(model, nworld, self.device)
+
+        self.arrangement = ARRANGEMENTS[step]
+        self.description = (
+            f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}, {step.value} step{why}"
+        )
 
         # Views of state, fields and counters
         for name in (
@@ -221,7 +232,7 @@ class MjwarpSimulation(Simulation):
         self._place()
         count = partial(self._usage.count, self._m, self._d, steps=1)
         arrangement = self.arrangement
-        if not (self._can_rearrange and arrangement.own_stages):
+        if not arrangement.own_stages:
             for _ in range(n):
                 mjw.step(self._m, self._d)
                 count()
@@ -238,6 +249,7 @@ class MjwarpSimulation(Simulation):
                 self.device,
                 sensors=i == n - 1 or not arrangement.sensors_once,
                 branches=arrangement.branches,
+                fused=arrangement.fused,
                 beside_kinematics=beside,
             )
             beside = (count,)
@@ -247,6 +259,27 @@ class MjwarpSimulation(Simulation):
             *beside,
             branches=arrangement.branches,
         )
+
+    def _resolve(self, step: StepMode) -> tuple[StepMode, str]:
+        """The step that is done, and why it is no better one."""
+        found = StepMode.fused
+        why = ""
+        if not can_rearrange(self.model, self._m):
+            found = StepMode.stock
+            why = "the model has features that only mujoco_warp.step knows"
+        elif why := newton.why_not(self._m, self._d):
+            found = StepMode.arranged
+        order = list(ARRANGEMENTS)
+        if step is StepMode.auto:
+            if why:
+                _tell(f"sim.step: {found.value}, because {why}.")
+                why = f" ({why})"
+            return found, why
+        if order.index(step) > order.index(found):
+            raise UnsupportedModel(
+                f"sim.step={step.value} does not apply: {why}", "Use sim.step=auto"
+            )
+        return step, ""
 
     def _pose(self) -> None:
         """Poses of the current qpos, and nothing that a later step would start from: its forward

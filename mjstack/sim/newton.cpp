@@ -45,19 +45,19 @@ SHARED unsigned char state[NJ];
 SHARED float partial[T > 32 ? KEYS * (T / 32) : 1];
 SHARED int counts[2];
 
-const int nefc = wp::min(NJ, nefc_in.data[world]);
-const int ne = ne_in.data[world];
-const int nf = nf_in.data[world];
-const int contacts = wp::min(nefc, ne + nf + nl_in.data[world]);  // where their rows begin
-const float *J = &wp::index(efc_J, world, 0, 0);
-const float *D = &wp::index(efc_D, world, 0);
-const float *M = &wp::index(M_in, world, 0);
-const float *loss = &wp::index(efc_frictionloss, world, 0);
-const int *type = &wp::index(efc_type, world, 0);
-const int *id = &wp::index(efc_id, world, 0);
-const float impratio = impratio_invsqrt.data[world % impratio_invsqrt.shape[0]];
-const float tolerance = opt_tolerance.data[world % opt_tolerance.shape[0]];
-const float ls_tolerance = opt_ls_tolerance.data[world % opt_ls_tolerance.shape[0]];
+const int nefc = wp::min(NJ, io.nefc.data[world]);
+const int ne = io.ne.data[world];
+const int nf = io.nf.data[world];
+const int contacts = wp::min(nefc, ne + nf + io.nl.data[world]);  // where their rows begin
+const float *J = &wp::index(io.J, world, 0, 0);
+const float *D = &wp::index(io.D, world, 0);
+const float *M = &wp::index(io.M, world, 0);
+const float *loss = &wp::index(io.frictionloss, world, 0);
+const int *type = &wp::index(io.type, world, 0);
+const int *id = &wp::index(io.id, world, 0);
+const float impratio = io.impratio_invsqrt.data[world % io.impratio_invsqrt.shape[0]];
+const float tolerance = io.tolerance.data[world % io.tolerance.shape[0]];
+const float ls_tolerance = io.ls_tolerance.data[world % io.ls_tolerance.shape[0]];
 
 // Sums over the block; every thread gets the same bits.
 auto sum = [&](auto &values) {
@@ -105,8 +105,8 @@ auto divide = [](float x, float y) { return x / (y != 0.0f ? y : TINY); };
 auto multiply = [&](const float *x, float *out) {
   for (int i = lane; i < NV; i += T) {
     float total = 0.0f;
-    for (int k = mulm_rowadr.data[i]; k < mulm_rowadr.data[i + 1]; ++k)
-      total += M[mulm_madr.data[k]] * x[mulm_col.data[k]];
+    for (int k = io.M_mulm_rowadr.data[i]; k < io.M_mulm_rowadr.data[i + 1]; ++k)
+      total += M[io.M_mulm_madr.data[k]] * x[io.M_mulm_col.data[k]];
     out[i] = total;
   }
 };
@@ -131,9 +131,9 @@ auto row_dot = [&](int r, const float *x) {
 float trace = 0.0f;
 for (int i = lane; i < NVP; i += T) {
   if (i < NV) {
-    acc[i] = nefc > 0 && WARMSTART ? wp::index(qacc_warmstart, world, i) : wp::index(qacc_smooth, world, i);
-    smooth[i] = wp::index(qfrc_smooth, world, i);
-    trace += M[M_rowadr.data[i] + M_rownnz.data[i] - 1];
+    acc[i] = nefc > 0 && WARMSTART ? wp::index(io.qacc_warmstart, world, i) : wp::index(io.qacc_smooth, world, i);
+    smooth[i] = wp::index(io.qfrc_smooth, world, i);
+    trace += M[io.M_rowadr.data[i] + io.M_rownnz.data[i] - 1];
   } else {
     acc[i] = 0.0f;
     search[i] = 0.0f;
@@ -145,9 +145,9 @@ const float scale = 1.0f / wp::max(TINY, traces[0]);
 for (int r = lane; r < nefc; r += T) {
   int first = r;
   if (type[r] == ELLIPTIC) {
-    first = wp::index(contact_address, id[r], 0);
+    first = wp::index(io.efc_address, id[r], 0);
     // Of a contact with more rows than the buffer has left, none counts: the world is void.
-    if (first < 0 || first + contact_dim.data[id[r]] > nefc) first = NJ;
+    if (first < 0 || first + io.dim.data[id[r]] > nefc) first = NJ;
   }
   head[r] = first;
   state[r] = SATISFIED;
@@ -155,7 +155,7 @@ for (int r = lane; r < nefc; r += T) {
 }
 SYNC();
 for (int r = lane; r < nefc; r += T)
-  jaref[r] = row_dot(r, acc) - wp::index(efc_aref, world, r);
+  jaref[r] = row_dot(r, acc) - wp::index(io.aref, world, r);
 multiply(acc, ma);
 compact(contacts, nefc, [&](int r) { return head[r] == r; }, item, counts[0]);
 const int items = contacts + counts[0];
@@ -168,8 +168,8 @@ auto update = [&]() {
     const float d = D[r];
     const float x = jaref[r];
     if (i >= contacts && type[r] == ELLIPTIC) {
-      const int dim = contact_dim.data[id[r]];
-      const auto &friction = contact_friction.data[id[r]];
+      const int dim = io.dim.data[id[r]];
+      const auto &friction = io.friction.data[id[r]];
       const float mu = friction[0] * impratio;
       const float n = x * mu;
       float tt = 0.0f;
@@ -256,7 +256,7 @@ auto weighted = [&](int r, int c) {
   const float *column = J + c;
   if (state[r] != CONE) return qa[r] * column[r * NVP];
   const int r0 = head[r];
-  const int dim = contact_dim.data[id[r]];
+  const int dim = io.dim.data[id[r]];
   if (dim == 3 && r > r0)
     return qb[r0] * (qb[r0 + 1] * qa[r0 + 2] * column[(r0 + 2) * NVP]
                      - qb[r0 + 2] * qa[r0 + 1] * column[(r0 + 1) * NVP]);
@@ -283,7 +283,7 @@ auto direction = [&]() {
   // Rows with a weight; `item` keeps the contacts, and theirs come behind them.
   unsigned short *active = reinterpret_cast<unsigned short *>(jv);
   compact(0, nefc, [&](int r) {
-    if (state[r] == CONE) return !(r == head[r] + 2 && contact_dim.data[id[r]] == 3);
+    if (state[r] == CONE) return !(r == head[r] + 2 && io.dim.data[id[r]] == 3);
     return qa[r] != 0.0f;
   }, active, counts[1]);
   const int rows = counts[1];
@@ -309,7 +309,7 @@ auto direction = [&]() {
   // M's lower triangle, then the groups' parts one after the other: the same bits in every run
   for (int e = lane; e < NV * LD; e += T) h[e] = 0.0f;
   SYNC();
-  for (int e = lane; e < entries; e += T) h[M_row.data[e] * LD + M_col.data[e]] = M[e];
+  for (int e = lane; e < io.M_colind.shape[0]; e += T) h[io.M_hinit_i.data[e] * LD + io.M_colind.data[e]] = M[e];
   SYNC();
   for (int turn = 0; turn < GROUPS; ++turn) {
     for (int o = 0; o < OWN; ++o)
@@ -378,8 +378,8 @@ struct Contact {
   int state0;
 };
 auto prepare_contact = [&](int r) {
-  const auto &friction = contact_friction.data[id[r]];
-  const int dim = contact_dim.data[id[r]];
+  const auto &friction = io.friction.data[id[r]];
+  const int dim = io.dim.data[id[r]];
   const float mu = friction[0] * impratio;
   const float d = D[r], x = jaref[r], v = jv[r];
   float q0 = 0.5f * x * x * d, q1 = v * d * x, q2 = 0.5f * v * v * d;
@@ -417,7 +417,7 @@ auto prepare_contact = [&](int r) {
 };
 auto contact_at = [&](int r) {
   Contact c;
-  c.mu = contact_friction.data[id[r]][0] * impratio;
+  c.mu = io.friction.data[id[r]][0] * impratio;
   c.q0 = qa[r];
   c.q1 = qb[r];
   c.q2 = qc[r];
@@ -666,17 +666,17 @@ if (!done) bits |= LIMIT;
 // What later stages read
 
 for (int i = lane; i < NV; i += T) {
-  wp::index(qacc, world, i) = acc[i];
-  wp::index(qfrc_constraint, world, i) = qfrc[i];
-  wp::index(efc_Ma, world, i) = ma[i];
+  wp::index(io.qacc, world, i) = acc[i];
+  wp::index(io.qfrc_constraint, world, i) = qfrc[i];
+  wp::index(io.Ma, world, i) = ma[i];
 }
 for (int r = lane; r < nefc; r += T) {
-  wp::index(efc_force, world, r) = qc[r];
-  wp::index(efc_state, world, r) = state[r];
+  wp::index(io.force, world, r) = qc[r];
+  wp::index(io.state, world, r) = state[r];
 }
 if (lane == 0) {
-  solver_niter.data[world] = iteration;
-  if (bits) overflow.data[world] |= bits;
+  io.solver_niter.data[world] = iteration;
+  if (bits) io.overflow.data[world] |= bits;
 }
 #undef SHARED
 #undef SYNC

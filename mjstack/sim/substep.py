@@ -7,14 +7,16 @@ from dataclasses import dataclass
 import mujoco
 import torch
 
+from mjstack.config.schema import StepMode
+from mjstack.sim import newton
 from mjstack.sim.graph import side_by_side
 from mjstack.sim.warp_setup import mjw, wp
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Arrangement:
-    """Measures that make a captured step faster than MJWarp's own. All of it leaves the numbers
-    as they are.
+    """Measures that make a captured step faster than MJWarp's own. All but the fused solver leave
+    the numbers as they are.
 
     Attributes:
         branches: Contacts beside smooth dynamics, there inertia beside forces, and counting beside
@@ -23,12 +25,21 @@ class Arrangement:
         own_stages: Only the stages that the model needs: no cameras, lights, tendons, flexes or
             energy.
         scratch: Temporaries at fixed addresses (`Scratch`), not allocated and freed by the graph.
+        fused: The solver as one kernel (`newton.solve`).
     """
 
     branches: bool = True
     sensors_once: bool = True
     own_stages: bool = True
     scratch: bool = True
+    fused: bool = True
+
+
+ARRANGEMENTS = {
+    StepMode.stock: Arrangement(own_stages=False, fused=False),
+    StepMode.arranged: Arrangement(fused=False),
+    StepMode.fused: Arrangement(),
+}
 
 
 def can_rearrange(model: mujoco.MjModel, m: mjw.Model) -> bool:
@@ -65,6 +76,7 @@ def rearranged_step(
     *,
     sensors: bool,
     branches: bool = True,
+    fused: bool = True,
     beside_kinematics: tuple[Callable[[], None], ...] = (),
 ) -> None:
     """`mujoco_warp.step`, with contacts and smooth dynamics as parallel branches: neither needs the
@@ -76,6 +88,7 @@ def rearranged_step(
         device: Where they are.
         sensors: Whether sensordata is computed; of several steps only the last one's is seen.
         branches: Whether a captured graph gets branches.
+        fused: Whether the solver is one kernel.
         beside_kinematics: Work that may run while the poses are computed.
     """
 
@@ -98,7 +111,7 @@ def rearranged_step(
 
     side_by_side(device, kinematics, *beside_kinematics, branches=branches)
     side_by_side(device, contacts, dynamics, branches=branches)
-    mjw.solve(m, d)
+    (newton.solve if fused else mjw.solve)(m, d)
     if sensors:
         d.sensordata.zero_()
         mjw.sensor_pos(m, d)

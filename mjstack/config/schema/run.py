@@ -23,6 +23,15 @@ class GraphMode(Enum):
     off = "off"
 
 
+class StepMode(Enum):
+    """How MJWarp's physics step is done: see docs/performance.md."""
+
+    auto = "auto"
+    fused = "fused"
+    arranged = "arranged"
+    stock = "stock"
+
+
 class Cone(Enum):
     """Shape of the friction cone."""
 
@@ -91,6 +100,10 @@ class SimCfg:
     """Physics engine of batch and throughput: auto is MJWarp where there is CUDA."""
     device: str = spec()
     """auto, cpu or cuda:N."""
+    step: StepMode = spec()
+    """MJWarp's step. stock: ``mujoco_warp.step``; arranged: its stages as parallel branches; fused:
+    with the solver as one kernel too; auto: the last of these that does all that the model needs.
+    """
 
 
 @dataclass(slots=True)
