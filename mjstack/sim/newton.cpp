@@ -13,7 +13,8 @@ constexpr int NB = (NV + 3) / 4;      // blocks of 4 x 4 along the Hessian's sid
 constexpr int BLOCKS = NB * (NB + 1) / 2;
 constexpr int GROUPS = T > BLOCKS ? T / BLOCKS : 1;       // of threads, which share the rows
 constexpr int OWN = (BLOCKS + T - 1) / T;                 // blocks of a thread
-constexpr int SPLIT = T > NV ? T / NV : 1;                // of the rows, for J' force
+constexpr int QUADS = NVP / 4;        // columns by fours
+constexpr int SPLIT = T > QUADS ? T / QUADS : 1;          // of the rows, for J' force
 constexpr float TINY = 1e-15f;
 constexpr float NOISE = 8.0f * 1.1920929e-07f;            // of a sum of derivatives, relative
 constexpr int KEYS = 9;
@@ -33,7 +34,7 @@ constexpr int LANES = 1;
 #endif
 
 SHARED alignas(16) float h[(NV + 1) * LD];  // Hessian's lower triangle, and the gradient below it
-SHARED alignas(16) float s[CHUNK * NVP > SPLIT * NV ? CHUNK * NVP : SPLIT * NV];
+SHARED alignas(16) float s[(CHUNK > SPLIT ? CHUNK : SPLIT) * NVP];
 SHARED alignas(16) float search[NVP];
 SHARED alignas(16) float acc[NVP];
 SHARED float ma[NV], mv[NV], smooth[NV], qfrc[NV];
@@ -41,7 +42,7 @@ SHARED float jaref[NJ], jv[NJ];
 // Of a row: in the update weight, direction and force; in the line search three coefficients.
 SHARED float qa[NJ], qb[NJ], qc[NJ];
 SHARED unsigned short head[NJ], item[NJ];  // a row's first row of its contact; contacts' first rows
-SHARED unsigned char state[NJ];
+SHARED unsigned char state[NJ], dims[NJ];  // dims: rows of a row's contact, or 0
 SHARED float partial[T > 32 ? KEYS * (T / 32) : 1];
 SHARED int counts[2];
 
@@ -143,13 +144,15 @@ float traces[1] = {trace};
 sum(traces);
 const float scale = 1.0f / wp::max(TINY, traces[0]);
 for (int r = lane; r < nefc; r += T) {
-  int first = r;
+  int first = r, dim = 0;
   if (type[r] == ELLIPTIC) {
     first = wp::index(io.efc_address, id[r], 0);
+    dim = io.dim.data[id[r]];
     // Of a contact with more rows than the buffer has left, none counts: the world is void.
-    if (first < 0 || first + io.dim.data[id[r]] > nefc) first = NJ;
+    if (first < 0 || first + dim > nefc) first = NJ;
   }
   head[r] = first;
+  dims[r] = dim;
   state[r] = SATISFIED;
   qa[r] = qb[r] = qc[r] = 0.0f;
 }
@@ -161,14 +164,20 @@ compact(contacts, nefc, [&](int r) { return head[r] == r; }, item, counts[0]);
 const int items = contacts + counts[0];
 auto row_of = [&](int i) { return i < contacts ? i : (int)item[i - contacts]; };
 
+// Of four columns
+auto scaled = [](float a, const float4 &x) { return float4{a * x.x, a * x.y, a * x.z, a * x.w}; };
+auto added = [](const float4 &x, float a, const float4 &y) {
+  return float4{x.x + a * y.x, x.y + a * y.y, x.z + a * y.z, x.w + a * y.w};
+};
+
 // Force, state and the Hessian's weights of all rows
 auto update = [&]() {
   for (int i = lane; i < items; i += T) {
     const int r = row_of(i);
     const float d = D[r];
     const float x = jaref[r];
-    if (i >= contacts && type[r] == ELLIPTIC) {
-      const int dim = io.dim.data[id[r]];
+    if (dims[r]) {
+      const int dim = dims[r];
       const auto &friction = io.friction.data[id[r]];
       const float mu = friction[0] * impratio;
       const float n = x * mu;
@@ -231,17 +240,18 @@ auto update = [&]() {
   }
   SYNC();
   // qfrc_constraint = J' force, and the gradient
-  for (int e = lane; e < NV * SPLIT; e += T) {
-    float total = 0.0f;
+  for (int e = lane; e < QUADS * SPLIT; e += T) {
+    float4 total = {0.0f, 0.0f, 0.0f, 0.0f};
 #pragma unroll 4
-    for (int r = e / NV; r < nefc; r += SPLIT) total += J[r * NVP + e % NV] * qc[r];
-    s[e] = total;
+    for (int r = e / QUADS; r < nefc; r += SPLIT)
+      total = added(total, qc[r], reinterpret_cast<const float4 *>(J + r * NVP)[e % QUADS]);
+    reinterpret_cast<float4 *>(s)[e] = total;
   }
   SYNC();
   float square[1] = {0.0f};
   for (int i = lane; i < NV; i += T) {
     float total = 0.0f;
-    for (int part = 0; part < SPLIT; ++part) total += s[part * NV + i];
+    for (int part = 0; part < SPLIT; ++part) total += s[part * NVP + i];
     qfrc[i] = total;
     const float gradient = ma[i] - smooth[i] - total;
     h[NV * LD + i] = gradient;
@@ -251,19 +261,21 @@ auto update = [&]() {
   return square[0];
 };
 
-// Row r of S, column c: the Hessian is M + S' S.
-auto weighted = [&](int r, int c) {
-  const float *column = J + c;
-  if (state[r] != CONE) return qa[r] * column[r * NVP];
+// Four columns of row r of S: the Hessian is M + S' S.
+auto weighted = [&](int r, int quad) {
+  auto row = [&](int k) { return reinterpret_cast<const float4 *>(J + k * NVP)[quad]; };
+  if (state[r] != CONE) return scaled(qa[r], row(r));
   const int r0 = head[r];
-  const int dim = io.dim.data[id[r]];
-  if (dim == 3 && r > r0)
-    return qb[r0] * (qb[r0 + 1] * qa[r0 + 2] * column[(r0 + 2) * NVP]
-                     - qb[r0 + 2] * qa[r0 + 1] * column[(r0 + 1) * NVP]);
-  float along = 0.0f;
-  for (int k = 1; k < dim; ++k) along += qb[r0 + k] * qa[r0 + k] * column[(r0 + k) * NVP];
-  if (r == r0) return qa[r0] * (column[r0 * NVP] - along);
-  return qb[r0] * (qa[r] * column[r * NVP] - qb[r] * along);
+  const int dim = dims[r0];
+  if (dim == 3 && r > r0) {
+    const float a = qb[r0] * qb[r0 + 1] * qa[r0 + 2];
+    return added(scaled(a, row(r0 + 2)), -qb[r0] * qb[r0 + 2] * qa[r0 + 1], row(r0 + 1));
+  }
+  // The tangents' part along the residual
+  float4 along = scaled(qb[r0 + 1] * qa[r0 + 1], row(r0 + 1));
+  for (int k = 2; k < dim; ++k) along = added(along, qb[r0 + k] * qa[r0 + k], row(r0 + k));
+  if (r == r0) return scaled(qa[r0], added(row(r0), -1.0f, along));
+  return scaled(qb[r0], added(scaled(qa[r], row(r)), -qb[r], along));
 };
 
 // A thread's blocks of the Hessian's lower triangle: their first rows and columns
@@ -283,14 +295,15 @@ auto direction = [&]() {
   // Rows with a weight; `item` keeps the contacts, and theirs come behind them.
   unsigned short *active = reinterpret_cast<unsigned short *>(jv);
   compact(0, nefc, [&](int r) {
-    if (state[r] == CONE) return !(r == head[r] + 2 && io.dim.data[id[r]] == 3);
+    if (state[r] == CONE) return !(r == head[r] + 2 && dims[r] == 3);
     return qa[r] != 0.0f;
   }, active, counts[1]);
   const int rows = counts[1];
   float own[OWN][4][4] = {};
   for (int from = 0; from < rows; from += CHUNK) {
     const int n = wp::min(CHUNK, rows - from);
-    for (int e = lane; e < n * NVP; e += T) s[e] = weighted(active[from + e / NVP], e % NVP);
+    for (int e = lane; e < n * QUADS; e += T)
+      reinterpret_cast<float4 *>(s)[e] = weighted(active[from + e / QUADS], e % QUADS);
     SYNC();
     for (int o = 0; o < OWN; ++o) {
       if (block_row[o] >= 0) {
@@ -306,24 +319,57 @@ auto direction = [&]() {
     }
     SYNC();
   }
-  // M's lower triangle, then the groups' parts one after the other: the same bits in every run
-  for (int e = lane; e < NV * LD; e += T) h[e] = 0.0f;
-  SYNC();
-  for (int e = lane; e < io.M_colind.shape[0]; e += T) h[io.M_hinit_i.data[e] * LD + io.M_colind.data[e]] = M[e];
-  SYNC();
+  // The groups' parts one after the other, so that runs agree in every bit; then M
   for (int turn = 0; turn < GROUPS; ++turn) {
     for (int o = 0; o < OWN; ++o)
       for (int p = 0; p < 4; ++p)
         for (int q = 0; q < 4; ++q) {
           const int i = block_row[o] + p, j = block_col[o] + q;
-          if (group == turn && block_row[o] >= 0 && j <= i && i < NV) h[i * LD + j] += own[o][p][q];
+          if (group == turn && block_row[o] >= 0 && j <= i && i < NV)
+            h[i * LD + j] = own[o][p][q] + (turn ? h[i * LD + j] : 0.0f);
         }
     SYNC();
   }
-  // Cholesky of h, column by column; the gradient as a last row becomes L^-1 gradient. The diagonal
-  // keeps the inverses.
+  for (int e = lane; e < io.M_colind.shape[0]; e += T)
+    h[io.M_hinit_i.data[e] * LD + io.M_colind.data[e]] += M[e];
+  SYNC();
+  // Cholesky of h; the gradient as a last row becomes y = L^-1 gradient; then L'^-1 y.
   float squares[2] = {};
+  float *y = h + NV * LD;
+#ifdef __CUDA_ARCH__
+  if constexpr (NV < 32) {
+    // A row per thread, in registers
+    if (lane < 32) {
+      float a[NV], inverse = 0.0f;
+#pragma unroll
+      for (int k = 0; k < NV; ++k) a[k] = lane <= NV ? h[lane * LD + k] : 0.0f;
+#pragma unroll
+      for (int j = 0; j < NV; ++j) {
+        const float scaled = rsqrtf(__shfl_sync(~0u, a[j], j));
+        if (lane == j) inverse = scaled;
+        a[j] *= scaled;
+#pragma unroll
+        for (int k = j + 1; k < NV; ++k) a[k] -= a[j] * __shfl_sync(~0u, a[j], k);
+      }
+#pragma unroll
+      for (int k = 0; k < NV; ++k)
+        if (lane <= NV) h[lane * LD + k] = a[k];
+      __syncwarp();
+      float rest = lane < NV ? y[lane] : 0.0f, x = 0.0f;
+      squares[1] = rest * rest;
+#pragma unroll
+      for (int j = NV - 1; j >= 0; --j) {
+        const float found = __shfl_sync(~0u, rest * inverse, j);
+        if (lane == j) x = found;
+        if (lane < j) rest -= h[j * LD + lane] * found;
+      }
+      if (lane < NV) search[lane] = -x;
+      squares[0] = x * x;
+    }
+  } else
+#endif
   if (lane < LANES) {
+    // Column by column, in shared memory; the diagonal keeps the inverses
     for (int j = 0; j < NV; ++j) {
       float inverse = 0.0f;
       for (int first = j; first <= NV; first += LANES) {
@@ -338,7 +384,6 @@ auto direction = [&]() {
       }
       WARP_SYNC();
     }
-    float *y = h + NV * LD;
     for (int i = lane; i < NV; i += LANES) squares[1] += y[i] * y[i];
     for (int j = NV - 1; j >= 0; --j) {
       WARP_SYNC();
@@ -379,7 +424,7 @@ struct Contact {
 };
 auto prepare_contact = [&](int r) {
   const auto &friction = io.friction.data[id[r]];
-  const int dim = io.dim.data[id[r]];
+  const int dim = dims[r];
   const float mu = friction[0] * impratio;
   const float d = D[r], x = jaref[r], v = jv[r];
   float q0 = 0.5f * x * x * d, q1 = v * d * x, q2 = 0.5f * v * v * d;
@@ -478,30 +523,31 @@ auto contact_point = [&](const Contact &c, float a) {
   return Point{cost, c.dm * r * r1, c.dm * (r1 * r1 - c.mu * r * t2)};
 };
 
-// Sums of points, at N steps, over all constraints but equalities
-auto evaluate = [&](const auto &alphas, auto &sums) {
+// A thread's share of the points at N steps, over all constraints but equalities. The cost is the
+// change from step 0, or all of it.
+auto evaluate = [&](const auto &alphas, auto &sums, bool all = false) {
   constexpr int N = sizeof(alphas) / sizeof(float);
   for (int k = 0; k < 3 * N; ++k) sums[k] = 0.0f;
-  auto add = [&](int k, const Point &p) {
-    sums[3 * k] += p.cost;
+  auto add = [&](int k, const Point &p, float cost0) {
+    sums[3 * k] += all ? p.cost + cost0 : p.cost;
     sums[3 * k + 1] += p.slope;
     sums[3 * k + 2] += p.curvature;
   };
   for (int i = ne + lane; i < items; i += T) {
     const int r = row_of(i);
-    if (i >= contacts && type[r] == ELLIPTIC) {
+    if (dims[r]) {
       const Contact c = contact_at(r);
-      for (int k = 0; k < N; ++k) add(k, contact_point(c, alphas[k]));
+      for (int k = 0; k < N; ++k) add(k, contact_point(c, alphas[k]), c.cost0);
       continue;
     }
     const float d = D[r], x0 = jaref[r], v = jv[r];
     if (i < ne + nf) {
       const float f = loss[r], rf = divide(f, d);
-      const Point at0 = friction_point(x0, f, rf, v, d);
+      const float cost0 = friction_point(x0, f, rf, v, d).cost;
       for (int k = 0; k < N; ++k) {
         Point p = friction_point(x0 + alphas[k] * v, f, rf, v, d);
-        p.cost -= at0.cost;
-        add(k, p);
+        p.cost -= cost0;
+        add(k, p, cost0);
       }
       continue;
     }
@@ -513,10 +559,9 @@ auto evaluate = [&](const auto &alphas, auto &sums) {
         p = quadratic(x0, v, d, alphas[k]);
         p.cost += q0 - cost0;
       }
-      add(k, p);
+      add(k, p, cost0);
     }
   }
-  sum(sums);
 };
 
 // Newton's iterations
@@ -532,36 +577,30 @@ while (!done && iteration < ITERATIONS) {
   for (int r = lane; r < nefc; r += T) jv[r] = row_dot(r, search);
   SYNC();
   for (int i = contacts + lane; i < items; i += T)
-    if (type[row_of(i)] == ELLIPTIC) prepare_contact(row_of(i));
+    if (dims[row_of(i)]) prepare_contact(row_of(i));
   SYNC();
 
-  // The smooth part's slope and half of its curvature, equalities among it; cost of the rows at 0
-  float smooth_part[3] = {};
+  // Cost, slope and curvature of the rows at step 0; the smooth part's slope and half of its
+  // curvature, equalities among it
+  float start[5] = {};
+  const float none[1] = {0.0f};
+  evaluate(none, start, true);
   for (int i = lane; i < NV; i += T) {
-    smooth_part[0] += search[i] * (ma[i] - smooth[i]);
-    smooth_part[1] += 0.5f * search[i] * mv[i];
+    start[3] += search[i] * (ma[i] - smooth[i]);
+    start[4] += 0.5f * search[i] * mv[i];
   }
   for (int r = lane; r < ne; r += T) {
-    smooth_part[0] += jv[r] * D[r] * jaref[r];
-    smooth_part[1] += 0.5f * jv[r] * D[r] * jv[r];
+    start[3] += jv[r] * D[r] * jaref[r];
+    start[4] += 0.5f * jv[r] * D[r] * jv[r];
   }
-  for (int i = ne + lane; i < items; i += T) {
-    const int r = row_of(i);
-    if (i >= contacts && type[r] == ELLIPTIC) {
-      smooth_part[2] += contact_at(r).cost0;
-    } else if (i < ne + nf) {
-      smooth_part[2] += friction_point(jaref[r], loss[r], divide(loss[r], D[r]), 0.0f, D[r]).cost;
-    } else if (jaref[r] < 0.0f) {
-      smooth_part[2] += 0.5f * D[r] * jaref[r] * jaref[r];
-    }
-  }
-  sum(smooth_part);
-  const float g1 = smooth_part[0], g2 = smooth_part[1];
+  sum(start);
+  const float g1 = start[3], g2 = start[4];
   const float gtol = wp::max(tolerance * ls_tolerance * sqrtf(search_square) / scale, 1e-6f);
 
   auto points = [&](const auto &alphas, auto &sums) {
     constexpr int N = sizeof(alphas) / sizeof(float);
     evaluate(alphas, sums);
+    sum(sums);
     for (int k = 0; k < N; ++k) {
       const float a_g2 = alphas[k] * g2;
       sums[3 * k] += alphas[k] * (a_g2 + g1);
@@ -569,11 +608,8 @@ while (!done && iteration < ITERATIONS) {
       sums[3 * k + 2] += 2.0f * g2;
     }
   };
-  const float none[1] = {0.0f};
-  float start[3];
-  evaluate(none, start);
   // Below the rounding of the slope's sum, by Cauchy and Schwarz, there is no descent to be seen.
-  const float gross = sqrtf(2.0f * wp::max(smooth_part[2], 0.0f) * wp::max(start[2], 0.0f)) + fabsf(g1);
+  const float gross = sqrtf(2.0f * wp::max(start[0], 0.0f) * wp::max(start[2], 0.0f)) + fabsf(g1);
   const float accepted = wp::max(gtol, NOISE * gross);
   const Point p0{0.0f, g1 + start[1], 2.0f * g2 + start[2]};
   float alpha = 0.0f, improvement = 0.0f;

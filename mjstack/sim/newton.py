@@ -85,7 +85,14 @@ def shared_bytes(nv: int, njmax: int) -> int:
 
 @cache
 def _kernel(
-    nv: int, row: int, njmax: int, iterations: int, ls_iterations: int, *, warmstart: bool
+    nv: int,
+    row: int,
+    njmax: int,
+    iterations: int,
+    ls_iterations: int,
+    *,
+    warmstart: bool,
+    cuda: bool,
 ) -> wp.Kernel:
     """The kernel for these sizes and limits."""
     numbers = {
@@ -106,7 +113,10 @@ def _kernel(
     @wp.func_native(constants + _BODY)
     def newton(world: int, lane: int, io: Problem) -> None: ...
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    # Fast on CUDA: division and roots to the last two bits. Of a CPU it would drop NaN.
+    options = {"fast_math": cuda}
+
+    @wp.kernel(module="unique", module_options=options, enable_backward=False, grid_stride=False)
     def kernel(problem: Problem) -> None:
         world, lane = wp.tid()  # type: ignore[misc]
         newton(world, lane, problem)
@@ -134,6 +144,7 @@ def solve(m: mjw.Model, d: mjw.Data, *, threads: int | None = None) -> None:
         m.opt.iterations,
         m.opt.ls_iterations,
         warmstart=not int(m.opt.disableflags) & int(mjw.DisableBit.WARMSTART),
+        cuda=d.qacc.device.is_cuda,
     )
     threads = threads or (32 if d.nworld >= 1024 else 64)
     wp.launch_tiled(kernel, dim=d.nworld, inputs=[problem], block_dim=threads)
