@@ -566,12 +566,22 @@ auto evaluate = [&](const auto &alphas, auto &sums, bool all = false) {
 
 // Newton's iterations
 
-float gradient_square = update();
-float decrement = direction();
 int bits = 0;
 int iteration = 0;
-bool done = false;
-while (!done && iteration < ITERATIONS) {
+float alpha = 0.0f, improvement = 0.0f;
+for (;; ++iteration) {
+  const float gradient = scale * sqrtf(update());
+  if (iteration > 0
+      && (alpha == 0.0f || (improvement > 0.0f && scale * improvement < tolerance)
+          || gradient < tolerance))
+    break;
+  const float decrement = direction();
+  if (iteration > 0 && scale * 0.5f * decrement < tolerance) break;
+  if (iteration == ITERATIONS) {
+    bits |= LIMIT;
+    break;
+  }
+
   // The step's M search and J search
   multiply(search, mv);
   for (int r = lane; r < nefc; r += T) jv[r] = row_dot(r, search);
@@ -612,7 +622,7 @@ while (!done && iteration < ITERATIONS) {
   const float gross = sqrtf(2.0f * wp::max(start[0], 0.0f) * wp::max(start[2], 0.0f)) + fabsf(g1);
   const float accepted = wp::max(gtol, NOISE * gross);
   const Point p0{0.0f, g1 + start[1], 2.0f * g2 + start[2]};
-  float alpha = 0.0f, improvement = 0.0f;
+  alpha = improvement = 0.0f;
   bool converged = fabsf(p0.slope) < NOISE * gross;
   const float newton[1] = {-divide(p0.slope, p0.curvature)};
   Point p1;
@@ -688,16 +698,7 @@ while (!done && iteration < ITERATIONS) {
   }
   for (int r = lane; r < nefc; r += T) jaref[r] += alpha * jv[r];
   SYNC();
-  gradient_square = update();
-  ++iteration;
-  done = alpha == 0.0f || (improvement > 0.0f && scale * improvement < tolerance)
-         || scale * sqrtf(gradient_square) < tolerance;
-  if (!done) {
-    decrement = direction();
-    done = scale * 0.5f * decrement < tolerance;
-  }
 }
-if (!done) bits |= LIMIT;
 
 // What later stages read
 
