@@ -1,37 +1,36 @@
-// MuJoCo's Newton solver for one world, by one block of threads: the body of a Warp native function.
+// MuJoCo's Newton solver for one world, by the 32 threads of a warp: the body of a Warp native
+// function.
 //
 // J stays where it is and is read through the L1 cache; all else of a world lies in shared memory.
-// On Warp's CPU device a block has one thread, and the same text is plain C++.
+// A warp needs no barrier, and with more threads a world would not be done sooner. On Warp's CPU
+// device a block has one thread, and the same text is plain C++.
 //
-// Constants that newton.py puts before it: NV degrees of freedom, NVP of a row of J, NJ rows at
-// most, ITERATIONS and LS_ITERATIONS, and MuJoCo's numbers of constraint types, states and bits.
-
-constexpr int T = WP_TILE_BLOCK_DIM;
-constexpr int LD = NV | 1;            // rows of h in different banks of shared memory
-constexpr int CHUNK = 32;             // rows of s
-constexpr int NB = (NV + 3) / 4;      // blocks of 4 x 4 along the Hessian's side
-constexpr int BLOCKS = NB * (NB + 1) / 2;
-constexpr int GROUPS = T > BLOCKS ? T / BLOCKS : 1;       // of threads, which share the rows
-constexpr int OWN = (BLOCKS + T - 1) / T;                 // blocks of a thread
-constexpr int QUADS = NVP / 4;        // columns by fours
-constexpr int SPLIT = T > QUADS ? T / QUADS : 1;          // of the rows, for J' force
-constexpr float TINY = 1e-15f;
-constexpr float NOISE = 8.0f * 1.1920929e-07f;            // of a sum of derivatives, relative
-constexpr int KEYS = 9;
+// Constants that newton.py puts before it: NV degrees of freedom, NVP columns of J with padding, NJ
+// rows at most, ITERATIONS and LS_ITERATIONS, WARMSTART, and MuJoCo's numbers of the constraint type
+// ELLIPTIC, of constraint states and of limit bits.
 
 #ifdef __CUDA_ARCH__
 #define SHARED __shared__
-#define SYNC() do { if constexpr (T > 32) __syncthreads(); else __syncwarp(); } while (0)
-#define WARP_SYNC() __syncwarp()
-#define FROM_FIRST(x) __shfl_sync(~0u, x, 0)
-constexpr int LANES = 32;  // threads that need no barrier
+#define SYNC() __syncwarp()
+#define FROM(x, thread) __shfl_sync(~0u, x, thread)
+constexpr int T = 32;
 #else
 #define SHARED
 #define SYNC()
-#define WARP_SYNC()
-#define FROM_FIRST(x) (x)
-constexpr int LANES = 1;
+#define FROM(x, thread) (x)
+constexpr int T = 1;
 #endif
+
+constexpr int LD = NV | 1;            // rows of h begin in different banks of shared memory
+constexpr int CHUNK = 32;             // rows of s
+constexpr int QUADS = NVP / 4;        // columns by fours
+constexpr int NB = (NV + 3) / 4;      // blocks of 4 x 4 along the Hessian's side
+constexpr int BLOCKS = NB * (NB + 1) / 2;
+constexpr int GROUPS = T > BLOCKS ? T / BLOCKS : 1;  // of threads, which share the rows
+constexpr int OWN = (BLOCKS + T - 1) / T;            // blocks of a thread
+constexpr int SPLIT = T > QUADS ? T / QUADS : 1;     // of the rows, for J' force
+constexpr float TINY = 1e-15f;
+constexpr float NOISE = 8.0f * 1.1920929e-07f;       // of a sum of derivatives, relative
 
 SHARED alignas(16) float h[(NV + 1) * LD];  // Hessian's lower triangle, and the gradient below it
 SHARED alignas(16) float s[(CHUNK > SPLIT ? CHUNK : SPLIT) * NVP];
@@ -43,8 +42,6 @@ SHARED float jaref[NJ], jv[NJ];
 SHARED float qa[NJ], qb[NJ], qc[NJ];
 SHARED unsigned short head[NJ], item[NJ];  // a row's first row of its contact; contacts' first rows
 SHARED unsigned char state[NJ], dims[NJ];  // dims: rows of a row's contact, or 0
-SHARED float partial[T > 32 ? KEYS * (T / 32) : 1];
-SHARED int counts[2];
 
 const int nefc = wp::min(NJ, io.nefc.data[world]);
 const int ne = io.ne.data[world];
@@ -60,44 +57,30 @@ const float impratio = io.impratio_invsqrt.data[world % io.impratio_invsqrt.shap
 const float tolerance = io.tolerance.data[world % io.tolerance.shape[0]];
 const float ls_tolerance = io.ls_tolerance.data[world % io.ls_tolerance.shape[0]];
 
-// Sums over the block; every thread gets the same bits.
+// Sums over the threads; each gets the same bits.
 auto sum = [&](auto &values) {
-  constexpr int N = sizeof(values) / sizeof(float);
 #ifdef __CUDA_ARCH__
-  for (int k = 0; k < N; ++k)
-    for (int offset = 16; offset; offset >>= 1)
-      values[k] += __shfl_xor_sync(~0u, values[k], offset);
-  if constexpr (T > 32) {
-    __syncthreads();
-    if (lane % 32 == 0)
-      for (int k = 0; k < N; ++k) partial[k * (T / 32) + lane / 32] = values[k];
-    __syncthreads();
-    for (int k = 0; k < N; ++k) {
-      values[k] = 0.0f;
-      for (int warp = 0; warp < T / 32; ++warp) values[k] += partial[k * (T / 32) + warp];
-    }
-  }
+  for (auto &value : values)
+    for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
 #endif
 };
 
-// Appends to a list, in their order, the numbers between begin and end that are kept.
-auto compact = [&](int begin, int end, auto keep, unsigned short *list, int &count) {
-  if (lane < LANES) {
-    int n = 0;
-    for (int from = begin; from < end; from += LANES) {
-      const int r = from + lane;
-      const bool kept = r < end && keep(r);
+// Lists those numbers between begin and end that are kept, in their order; returns their count.
+auto compact = [&](int begin, int end, auto keep, unsigned short *list) {
+  int count = 0;
+  for (int from = begin; from < end; from += T) {
+    const int r = from + lane;
+    const bool kept = r < end && keep(r);
 #ifdef __CUDA_ARCH__
-      const unsigned mask = __ballot_sync(~0u, kept);
-      if (kept) list[n + __popc(mask & ((1u << lane) - 1u))] = r;
-      n += __popc(mask);
+    const unsigned mask = __ballot_sync(~0u, kept);
+    if (kept) list[count + __popc(mask & ((1u << lane) - 1u))] = r;
+    count += __popc(mask);
 #else
-      if (kept) list[n++] = r;
+    if (kept) list[count++] = r;
 #endif
-    }
-    if (lane == 0) count = n;
   }
   SYNC();
+  return count;
 };
 
 auto divide = [](float x, float y) { return x / (y != 0.0f ? y : TINY); };
@@ -129,20 +112,19 @@ auto row_dot = [&](int r, const float *x) {
 
 // Where the solver starts
 
-float trace = 0.0f;
+float trace[1] = {0.0f};
 for (int i = lane; i < NVP; i += T) {
   if (i < NV) {
     acc[i] = nefc > 0 && WARMSTART ? wp::index(io.qacc_warmstart, world, i) : wp::index(io.qacc_smooth, world, i);
     smooth[i] = wp::index(io.qfrc_smooth, world, i);
-    trace += M[io.M_rowadr.data[i] + io.M_rownnz.data[i] - 1];
+    trace[0] += M[io.M_rowadr.data[i] + io.M_rownnz.data[i] - 1];
   } else {
     acc[i] = 0.0f;
     search[i] = 0.0f;
   }
 }
-float traces[1] = {trace};
-sum(traces);
-const float scale = 1.0f / wp::max(TINY, traces[0]);
+sum(trace);
+const float scale = 1.0f / wp::max(TINY, trace[0]);
 for (int r = lane; r < nefc; r += T) {
   int first = r, dim = 0;
   if (type[r] == ELLIPTIC) {
@@ -160,8 +142,8 @@ SYNC();
 for (int r = lane; r < nefc; r += T)
   jaref[r] = row_dot(r, acc) - wp::index(io.aref, world, r);
 multiply(acc, ma);
-compact(contacts, nefc, [&](int r) { return head[r] == r; }, item, counts[0]);
-const int items = contacts + counts[0];
+const int items =
+    contacts + compact(contacts, nefc, [&](int r) { return head[r] == r; }, item);
 auto row_of = [&](int i) { return i < contacts ? i : (int)item[i - contacts]; };
 
 // Of four columns
@@ -273,7 +255,9 @@ auto weighted = [&](int r, int quad) {
   }
   // The tangents' part along the residual
   float4 along = scaled(qb[r0 + 1] * qa[r0 + 1], row(r0 + 1));
-  for (int k = 2; k < dim; ++k) along = added(along, qb[r0 + k] * qa[r0 + k], row(r0 + k));
+  WP_PRAGMA_UNROLL  // so that their loads do not wait for each other
+  for (int k = 2; k < 6; ++k)
+    if (k < dim) along = added(along, qb[r0 + k] * qa[r0 + k], row(r0 + k));
   if (r == r0) return scaled(qa[r0], added(row(r0), -1.0f, along));
   return scaled(qb[r0], added(scaled(qa[r], row(r)), -qb[r], along));
 };
@@ -294,11 +278,10 @@ float search_square = 0.0f;
 auto direction = [&]() {
   // Rows with a weight; `item` keeps the contacts, and theirs come behind them.
   unsigned short *active = reinterpret_cast<unsigned short *>(jv);
-  compact(0, nefc, [&](int r) {
+  const int rows = compact(0, nefc, [&](int r) {
     if (state[r] == CONE) return !(r == head[r] + 2 && dims[r] == 3);
     return qa[r] != 0.0f;
-  }, active, counts[1]);
-  const int rows = counts[1];
+  }, active);
   float own[OWN][4][4] = {};
   for (int from = 0; from < rows; from += CHUNK) {
     const int n = wp::min(CHUNK, rows - from);
@@ -319,17 +302,17 @@ auto direction = [&]() {
     }
     SYNC();
   }
-  // The groups' parts one after the other, so that runs agree in every bit; then M
-  for (int turn = 0; turn < GROUPS; ++turn) {
-    for (int o = 0; o < OWN; ++o)
-      for (int p = 0; p < 4; ++p)
-        for (int q = 0; q < 4; ++q) {
-          const int i = block_row[o] + p, j = block_col[o] + q;
-          if (group == turn && block_row[o] >= 0 && j <= i && i < NV)
-            h[i * LD + j] = own[o][p][q] + (turn ? h[i * LD + j] : 0.0f);
-        }
-    SYNC();
-  }
+  // The first group adds the others' parts.
+  for (int o = 0; o < OWN; ++o)
+    for (int p = 0; p < 4; ++p)
+      for (int q = 0; q < 4; ++q) {
+        float total = own[o][p][q];
+        for (int other = 1; other < GROUPS; ++other)
+          total += FROM(own[o][p][q], (lane + other * BLOCKS) % 32);
+        const int i = block_row[o] + p, j = block_col[o] + q;
+        if (group == 0 && block_row[o] >= 0 && j <= i && i < NV) h[i * LD + j] = total;
+      }
+  SYNC();
   for (int e = lane; e < io.M_colind.shape[0]; e += T)
     h[io.M_hinit_i.data[e] * LD + io.M_colind.data[e]] += M[e];
   SYNC();
@@ -339,56 +322,54 @@ auto direction = [&]() {
 #ifdef __CUDA_ARCH__
   if constexpr (NV < 32) {
     // A row per thread, in registers
-    if (lane < 32) {
-      float a[NV], inverse = 0.0f;
-#pragma unroll
-      for (int k = 0; k < NV; ++k) a[k] = lane <= NV ? h[lane * LD + k] : 0.0f;
-#pragma unroll
-      for (int j = 0; j < NV; ++j) {
-        const float scaled = rsqrtf(__shfl_sync(~0u, a[j], j));
-        if (lane == j) inverse = scaled;
-        a[j] *= scaled;
-#pragma unroll
-        for (int k = j + 1; k < NV; ++k) a[k] -= a[j] * __shfl_sync(~0u, a[j], k);
-      }
-#pragma unroll
-      for (int k = 0; k < NV; ++k)
-        if (lane <= NV) h[lane * LD + k] = a[k];
-      __syncwarp();
-      float rest = lane < NV ? y[lane] : 0.0f, x = 0.0f;
-      squares[1] = rest * rest;
-#pragma unroll
-      for (int j = NV - 1; j >= 0; --j) {
-        const float found = __shfl_sync(~0u, rest * inverse, j);
-        if (lane == j) x = found;
-        if (lane < j) rest -= h[j * LD + lane] * found;
-      }
-      if (lane < NV) search[lane] = -x;
-      squares[0] = x * x;
+    float a[NV], inverse = 0.0f;
+    WP_PRAGMA_UNROLL
+    for (int k = 0; k < NV; ++k) a[k] = lane <= NV ? h[lane * LD + k] : 0.0f;
+    WP_PRAGMA_UNROLL
+    for (int j = 0; j < NV; ++j) {
+      const float scaled = rsqrtf(FROM(a[j], j));
+      if (lane == j) inverse = scaled;
+      a[j] *= scaled;
+      WP_PRAGMA_UNROLL
+      for (int k = j + 1; k < NV; ++k) a[k] -= a[j] * FROM(a[j], k);
     }
+    WP_PRAGMA_UNROLL
+    for (int k = 0; k < NV; ++k)
+      if (lane <= NV) h[lane * LD + k] = a[k];
+    SYNC();
+    float rest = lane < NV ? y[lane] : 0.0f, x = 0.0f;
+    squares[1] = rest * rest;
+    WP_PRAGMA_UNROLL
+    for (int j = NV - 1; j >= 0; --j) {
+      const float found = FROM(rest * inverse, j);
+      if (lane == j) x = found;
+      if (lane < j) rest -= h[j * LD + lane] * found;
+    }
+    if (lane < NV) search[lane] = -x;
+    squares[0] = x * x;
   } else
 #endif
-  if (lane < LANES) {
+  {
     // Column by column, in shared memory; the diagonal keeps the inverses
     for (int j = 0; j < NV; ++j) {
       float inverse = 0.0f;
-      for (int first = j; first <= NV; first += LANES) {
+      for (int first = j; first <= NV; first += T) {
         const int i = first + lane;
         float value = 0.0f;
         if (i <= NV) {
           value = h[i * LD + j];
           for (int k = 0; k < j; ++k) value -= h[i * LD + k] * h[j * LD + k];
         }
-        if (first == j) inverse = 1.0f / sqrtf(FROM_FIRST(value));
+        if (first == j) inverse = 1.0f / sqrtf(FROM(value, 0));
         if (i <= NV) h[i * LD + j] = i == j ? inverse : value * inverse;
       }
-      WARP_SYNC();
+      SYNC();
     }
-    for (int i = lane; i < NV; i += LANES) squares[1] += y[i] * y[i];
+    for (int i = lane; i < NV; i += T) squares[1] += y[i] * y[i];
     for (int j = NV - 1; j >= 0; --j) {
-      WARP_SYNC();
+      SYNC();
       const float x = y[j] * h[j * LD + j];
-      for (int i = lane; i < j; i += LANES) y[i] -= h[j * LD + i] * x;
+      for (int i = lane; i < j; i += T) y[i] -= h[j * LD + i] * x;
       if (lane == 0) {
         search[j] = -x;
         squares[0] += x * x;
@@ -717,5 +698,4 @@ if (lane == 0) {
 }
 #undef SHARED
 #undef SYNC
-#undef WARP_SYNC
-#undef FROM_FIRST
+#undef FROM

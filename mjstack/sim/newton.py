@@ -1,4 +1,4 @@
-"""MuJoCo's Newton solver as one kernel: a block of threads per world, all iterations inside it."""
+"""MuJoCo's Newton solver as one kernel: a warp of threads per world, all iterations inside it."""
 
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
 from functools import cache
@@ -79,8 +79,8 @@ def why_not(m: mjw.Model, d: mjw.Data) -> str:
 def shared_bytes(nv: int, njmax: int) -> int:
     """Shared memory that a world takes, at most [bytes]: the arrays at the head of newton.cpp."""
     row = -(-nv // 16) * 16
-    floats = (nv + 1) * (nv | 1) + 32 * row + 2 * row + 4 * nv + 5 * njmax + 9 * 4 + 16
-    return 4 * floats + 5 * njmax
+    floats = (nv + 1) * (nv | 1) + 32 * row + 2 * row + 4 * nv + 5 * njmax
+    return 4 * floats + 6 * njmax
 
 
 @cache
@@ -124,14 +124,12 @@ def _kernel(
     return kernel
 
 
-def solve(m: mjw.Model, d: mjw.Data, *, threads: int | None = None) -> None:
+def solve(m: mjw.Model, d: mjw.Data) -> None:
     """`mujoco_warp.solve` in one launch: the same cost, tolerances, limits and outputs.
 
     Args:
         m: The uploaded model, to which `why_not` has no objection.
         d: The worlds.
-        threads: Of a world's block, on CUDA: a power of two from 32 to 128. By default more where
-            few worlds leave the device idle.
     """
     problem = Problem()
     for name in Problem.__annotations__:
@@ -146,5 +144,4 @@ def solve(m: mjw.Model, d: mjw.Data, *, threads: int | None = None) -> None:
         warmstart=not int(m.opt.disableflags) & int(mjw.DisableBit.WARMSTART),
         cuda=d.qacc.device.is_cuda,
     )
-    threads = threads or (32 if d.nworld >= 1024 else 64)
-    wp.launch_tiled(kernel, dim=d.nworld, inputs=[problem], block_dim=threads)
+    wp.launch_tiled(kernel, dim=d.nworld, inputs=[problem], block_dim=32)
