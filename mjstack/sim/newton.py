@@ -72,6 +72,7 @@ def why_not(m: mjw.Model, d: mjw.Data) -> str:
         "noslip is on": opt.noslip_iterations > 0,
         "bodies may sleep": bool(int(opt.enableflags) & int(mujoco.mjtEnableBit.mjENBL_SLEEP)),
         "qacc_smooth is not computed": not opt.run_qacc_smooth,
+        "the integrator is discrete": opt.integrator == mjw.IntegratorType.DISCRETE,
     }
     return "; ".join(reason for reason, applies in reasons.items() if applies)
 
