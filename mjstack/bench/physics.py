@@ -16,7 +16,7 @@ from mjstack.bench.timing import (
     steps_that_fit,
     timed,
 )
-from mjstack.config.schema import Backend
+from mjstack.config.schema import Backend, StepMode
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.observers import CommandRecorder, Snapshots
 from mjstack.episodes.rollout import State, restore, rollout, snapshot
@@ -171,16 +171,22 @@ def measure_arrangements(
     Raises:
         MjstackError: Physics was lost, or a state is not finite: the figures would be void.
     """
-    from mjstack.sim.mjwarp import Arrangement, MjwarpSimulation
+    from mjstack.sim.mjwarp import MjwarpSimulation
+    from mjstack.sim.substep import ARRANGEMENTS, Arrangement
 
     cfg = context.cfg
     decimation = cfg.timing.decimation
     arrangements = {
         "and counted, its overflow latched": Arrangement(own_stages=False, scratch=False),
         "temporaries at fixed addresses": Arrangement(own_stages=False),
-        "only the stages that are needed": Arrangement(branches=False, sensors_once=False),
-        "sensors in the last substep of a control step alone": Arrangement(branches=False),
-        "contacts beside smooth dynamics": Arrangement(),
+        "only the stages that are needed": Arrangement(
+            branches=False, sensors_once=False, fused=False
+        ),
+        "sensors in the last substep of a control step alone": Arrangement(
+            branches=False, fused=False
+        ),
+        "contacts beside smooth dynamics": ARRANGEMENTS[StepMode.arranged],
+        "the solver as one kernel": ARRANGEMENTS[StepMode.fused],
     }
     # The trajectory
     sim = context.simulation(cfg.nworld, Backend.mjwarp, resolve_device(cfg.sim.device))
