@@ -43,7 +43,7 @@ SHARED float qa[NJ], qb[NJ], qc[NJ];
 SHARED unsigned short head[NJ], item[NJ];  // a row's first row of its contact; contacts' first rows
 SHARED unsigned char state[NJ], dims[NJ];  // dims: rows of a row's contact, or 0
 
-const int nefc = wp::min(NJ, io.nefc.data[world]);
+const int nefc = wp::min(io.aref.shape[1], io.nefc.data[world]);
 const int ne = io.ne.data[world];
 const int nf = io.nf.data[world];
 const int contacts = wp::min(nefc, ne + nf + io.nl.data[world]);  // where their rows begin

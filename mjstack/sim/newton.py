@@ -62,7 +62,7 @@ class Problem:
 def why_not(m: mjw.Model, d: mjw.Data) -> str:
     """Why `solve` does not apply to a model; empty if it does."""
     opt = m.opt
-    needed = shared_bytes(m.nv, d.njmax)
+    needed = shared_bytes(m.nv, _rows(d.njmax))
     reasons = {
         "the solver is not Newton's": opt.solver != mjw.SolverType.NEWTON,
         "the Jacobian is sparse": m.is_sparse,
@@ -75,6 +75,11 @@ def why_not(m: mjw.Model, d: mjw.Data) -> str:
         "the integrator is discrete": opt.integrator == mjw.IntegratorType.DISCRETE,
     }
     return "; ".join(reason for reason, applies in reasons.items() if applies)
+
+
+def _rows(njmax: int) -> int:
+    """Rows that a kernel has room for: few kernels do for many sizes of the buffers."""
+    return -(-njmax // 64) * 64
 
 
 def shared_bytes(nv: int, njmax: int) -> int:
@@ -139,7 +144,7 @@ def solve(m: mjw.Model, d: mjw.Data) -> None:
     kernel = _kernel(
         m.nv,
         d.efc.J.shape[2],
-        d.njmax,
+        _rows(d.njmax),
         m.opt.iterations,
         m.opt.ls_iterations,
         warmstart=not int(m.opt.disableflags) & int(mjw.DisableBit.WARMSTART),
