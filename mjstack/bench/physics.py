@@ -186,7 +186,7 @@ def measure_arrangements(
             branches=False, fused=False
         ),
         "contacts beside smooth dynamics": ARRANGEMENTS[StepMode.arranged],
-        "the solver as one kernel": ARRANGEMENTS[StepMode.fused],
+        "contact rows and the solver as one kernel each": ARRANGEMENTS[StepMode.fused],
     }
     # The trajectory
     sim = context.simulation(cfg.nworld, Backend.mjwarp, resolve_device(cfg.sim.device))

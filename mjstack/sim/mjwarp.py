@@ -10,7 +10,7 @@ import torch
 
 from mjstack.config.schema import GraphMode, StepMode
 from mjstack.errors import UnsupportedModel, first_line
-from mjstack.sim import newton
+from mjstack.sim import fused
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
 from mjstack.sim.simulation import Simulation, named_options
@@ -249,7 +249,7 @@ class MjwarpSimulation(Simulation):
                 self.device,
                 sensors=i == n - 1 or not arrangement.sensors_once,
                 branches=arrangement.branches,
-                fused=arrangement.fused,
+                own=arrangement.fused,
                 beside_kinematics=beside,
             )
             beside = (count,)
@@ -267,7 +267,7 @@ class MjwarpSimulation(Simulation):
         if not can_rearrange(self.model, self._m):
             found = StepMode.stock
             why = "the model has features that only mujoco_warp.step knows"
-        elif why := newton.why_not(self._m, self._d):
+        elif why := fused.why_not(self._m, self._d):
             found = StepMode.arranged
         order = list(ARRANGEMENTS)
         if step is StepMode.auto:

@@ -8,7 +8,7 @@ import mujoco
 import torch
 
 from mjstack.config.schema import StepMode
-from mjstack.sim import newton
+from mjstack.sim import fused
 from mjstack.sim.graph import side_by_side
 from mjstack.sim.warp_setup import mjw, wp
 
@@ -25,7 +25,7 @@ class Arrangement:
         own_stages: Only the stages that the model needs: no cameras, lights, tendons, flexes or
             energy.
         scratch: Temporaries at fixed addresses (`Scratch`), not allocated and freed by the graph.
-        fused: The solver as one kernel (`newton.solve`).
+        fused: Contact rows and the solver as one kernel each.
     """
 
     branches: bool = True
@@ -76,7 +76,7 @@ def rearranged_step(
     *,
     sensors: bool,
     branches: bool = True,
-    fused: bool = True,
+    own: bool = True,
     beside_kinematics: tuple[Callable[[], None], ...] = (),
 ) -> None:
     """`mujoco_warp.step`, with contacts and smooth dynamics as parallel branches: neither needs the
@@ -88,7 +88,7 @@ def rearranged_step(
         device: Where they are.
         sensors: Whether sensordata is computed; of several steps only the last one's is seen.
         branches: Whether a captured graph gets branches.
-        fused: Whether the solver is one kernel.
+        own: Whether contact rows and the solver are one kernel each.
         beside_kinematics: Work that may run while the poses are computed.
     """
 
@@ -107,11 +107,11 @@ def rearranged_step(
 
     def contacts() -> None:
         mjw.collision(m, d)
-        mjw.make_constraint(m, d)
+        (fused if own else mjw).make_constraint(m, d)
 
     side_by_side(device, kinematics, *beside_kinematics, branches=branches)
     side_by_side(device, contacts, dynamics, branches=branches)
-    (newton.solve if fused else mjw.solve)(m, d)
+    (fused if own else mjw).solve(m, d)
     if sensors:
         d.sensordata.zero_()
         mjw.sensor_pos(m, d)

@@ -5,7 +5,7 @@
 // A warp needs no barrier, and with more threads a world would not be done sooner. On Warp's CPU
 // device a block has one thread, and the same text is plain C++.
 //
-// Constants that newton.py puts before it: NV degrees of freedom, NVP columns of J with padding, NJ
+// Constants that fused.py puts before it: NV degrees of freedom, NVP columns of J with padding, NJ
 // rows at most, ITERATIONS and LS_ITERATIONS, WARMSTART, and MuJoCo's numbers of the constraint type
 // ELLIPTIC, of constraint states and of limit bits.
 
@@ -43,19 +43,19 @@ SHARED float qa[NJ], qb[NJ], qc[NJ];
 SHARED unsigned short head[NJ], item[NJ];  // a row's first row of its contact; contacts' first rows
 SHARED unsigned char state[NJ], dims[NJ];  // dims: rows of a row's contact, or 0
 
-const int nefc = wp::min(io.aref.shape[1], io.nefc.data[world]);
+const int nefc = wp::min(io.efc_aref.shape[1], io.nefc.data[world]);
 const int ne = io.ne.data[world];
 const int nf = io.nf.data[world];
 const int contacts = wp::min(nefc, ne + nf + io.nl.data[world]);  // where their rows begin
-const float *J = &wp::index(io.J, world, 0, 0);
-const float *D = &wp::index(io.D, world, 0);
+const float *J = &wp::index(io.efc_J, world, 0, 0);
+const float *D = &wp::index(io.efc_D, world, 0);
 const float *M = &wp::index(io.M, world, 0);
-const float *loss = &wp::index(io.frictionloss, world, 0);
-const int *type = &wp::index(io.type, world, 0);
-const int *id = &wp::index(io.id, world, 0);
-const float impratio = io.impratio_invsqrt.data[world % io.impratio_invsqrt.shape[0]];
-const float tolerance = io.tolerance.data[world % io.tolerance.shape[0]];
-const float ls_tolerance = io.ls_tolerance.data[world % io.ls_tolerance.shape[0]];
+const float *loss = &wp::index(io.efc_frictionloss, world, 0);
+const int *type = &wp::index(io.efc_type, world, 0);
+const int *id = &wp::index(io.efc_id, world, 0);
+const float impratio = io.opt_impratio_invsqrt.data[world % io.opt_impratio_invsqrt.shape[0]];
+const float tolerance = io.opt_tolerance.data[world % io.opt_tolerance.shape[0]];
+const float ls_tolerance = io.opt_ls_tolerance.data[world % io.opt_ls_tolerance.shape[0]];
 
 // Sums over the threads; each gets the same bits.
 auto sum = [&](auto &values) {
@@ -128,8 +128,8 @@ const float scale = 1.0f / wp::max(TINY, trace[0]);
 for (int r = lane; r < nefc; r += T) {
   int first = r, dim = 0;
   if (type[r] == ELLIPTIC) {
-    first = wp::index(io.efc_address, id[r], 0);
-    dim = io.dim.data[id[r]];
+    first = wp::index(io.contact_efc_address, id[r], 0);
+    dim = io.contact_dim.data[id[r]];
     // Of a contact with more rows than the buffer has left, none counts: the world is void.
     if (first < 0 || first + dim > nefc) first = NJ;
   }
@@ -140,7 +140,7 @@ for (int r = lane; r < nefc; r += T) {
 }
 SYNC();
 for (int r = lane; r < nefc; r += T)
-  jaref[r] = row_dot(r, acc) - wp::index(io.aref, world, r);
+  jaref[r] = row_dot(r, acc) - wp::index(io.efc_aref, world, r);
 multiply(acc, ma);
 const int items =
     contacts + compact(contacts, nefc, [&](int r) { return head[r] == r; }, item);
@@ -160,7 +160,7 @@ auto update = [&]() {
     const float x = jaref[r];
     if (dims[r]) {
       const int dim = dims[r];
-      const auto &friction = io.friction.data[id[r]];
+      const auto &friction = io.contact_friction.data[id[r]];
       const float mu = friction[0] * impratio;
       const float n = x * mu;
       float tt = 0.0f;
@@ -404,7 +404,7 @@ struct Contact {
   int state0;
 };
 auto prepare_contact = [&](int r) {
-  const auto &friction = io.friction.data[id[r]];
+  const auto &friction = io.contact_friction.data[id[r]];
   const int dim = dims[r];
   const float mu = friction[0] * impratio;
   const float d = D[r], x = jaref[r], v = jv[r];
@@ -443,7 +443,7 @@ auto prepare_contact = [&](int r) {
 };
 auto contact_at = [&](int r) {
   Contact c;
-  c.mu = io.friction.data[id[r]][0] * impratio;
+  c.mu = io.contact_friction.data[id[r]][0] * impratio;
   c.q0 = qa[r];
   c.q1 = qb[r];
   c.q2 = qc[r];
@@ -686,11 +686,11 @@ for (;; ++iteration) {
 for (int i = lane; i < NV; i += T) {
   wp::index(io.qacc, world, i) = acc[i];
   wp::index(io.qfrc_constraint, world, i) = qfrc[i];
-  wp::index(io.Ma, world, i) = ma[i];
+  wp::index(io.efc_Ma, world, i) = ma[i];
 }
 for (int r = lane; r < nefc; r += T) {
-  wp::index(io.force, world, r) = qc[r];
-  wp::index(io.state, world, r) = state[r];
+  wp::index(io.efc_force, world, r) = qc[r];
+  wp::index(io.efc_state, world, r) = state[r];
 }
 if (lane == 0) {
   io.solver_niter.data[world] = iteration;
