@@ -13,7 +13,7 @@ from mjstack.envs.build import driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.earlier_run import archive_starts
 from mjstack.episodes.rollout import CLOSED_LOOP
-from mjstack.errors import ConfigError, TermError, Unreachable
+from mjstack.errors import ConfigError, KeyedError, Unreachable
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
 from mjstack.jobs.runner import CheckedJob, Job, check_showing
@@ -85,7 +85,7 @@ def _check_starts(context: RunContext) -> None:
             check_env(context, own, reset=reset)
         except ConfigError as error:
             if cfg.gate.success.region is not None and error.key.endswith(".params.xy"):
-                raise error.at("gate.success.region") from error
+                error.move("gate.success.region")
             raise
 
 
@@ -122,11 +122,10 @@ def check_env(context: RunContext, cfg: Config, **keys: str) -> None:
     """
     try:
         build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu").close()
-    except (ConfigError, TermError) as error:
+    except KeyedError as error:
         group, _, rest = error.key.partition(".")
-        if group not in keys:
-            raise
-        raise error.at(f"{keys[group]}.{rest}") from error
+        error.move(f"{keys.get(group, group)}.{rest}")
+        raise
 
 
 def check_gates(cfg: Config) -> CheckedJob:

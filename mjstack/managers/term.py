@@ -109,7 +109,8 @@ def blamed(label: str) -> Iterator[None]:
     try:
         yield
     except ParameterError as error:
-        raise error.at(f"{label}.params.{error.key}") from error
+        error.move(f"{label}.params.{error.key}")
+        raise
     except ConfigError:  # names its key itself
         raise
     except MjstackError as error:
