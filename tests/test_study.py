@@ -285,7 +285,7 @@ def test_an_own_variant_takes_the_rest_from_the_configured_solver() -> None:
     )
     assert isinstance(cfg.job, StudyJobCfg)
     mine = cfg.job.variants["mine"]
-    assert (mine.iterations, mine.cone.value, mine.impratio) == (7, "pyramidal", None)
+    assert (mine.iterations, mine.cone, mine.impratio) == (7, "pyramidal", None)
     check_job(cfg)
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjstack.bench.timing import Measurement
-from mjstack.config.schema import Config, GraphMode
+from mjstack.config.schema import Config
 from mjstack.errors import MjstackError
 from mjstack.scene import build_model
 
@@ -73,7 +73,7 @@ def measure_solve(
     out = Measurement(name="ik")
     out.samples["eager_ms"] = _time(solves, ik.device, repetitions)
     if ik.device.startswith("cuda"):
-        graph = StepGraph(solves, ik.device, GraphMode.require, name="the solves")
+        graph = StepGraph(solves, ik.device, "require", name="the solves")
         for _ in range(2):  # warm-up and capture
             graph()
         out.samples["graph_ms"] = _time(graph, ik.device, repetitions)

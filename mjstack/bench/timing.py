@@ -8,7 +8,7 @@ from functools import partial
 
 import torch
 
-from mjstack.config.schema import Config, GraphMode
+from mjstack.config.schema import Config
 from mjstack.episodes.rollout import Observer, RolloutTiming
 from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS, Simulation, cuda_uuid, device_memory
@@ -194,7 +194,7 @@ class Measurement:
         graph = None if cuda else sim.graph_of(decimation, kinematics=True)
         if graph is not None:
             self.facts["physics_captured"] = graph.captured
-        if cuda and not captured and cfg.graph is not GraphMode.off:
+        if cuda and not captured and cfg.graph != "off":
             self.problem = self.problem or (
                 "it was not captured and ran eagerly (run.log says why); graph=off measures it like"
                 " that"

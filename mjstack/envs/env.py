@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import Config, GraphMode
+from mjstack.config.schema import Config
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
@@ -239,7 +239,7 @@ class Env:
         return StepGraph(
             work,
             self.device,
-            self.cfg.graph if self.device.type == "cuda" else GraphMode.off,
+            self.cfg.graph if self.device.type == "cuda" else "off",
             name=name,
             version=lambda: self._version,
             culprit=lambda: current_term.label,

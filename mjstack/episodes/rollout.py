@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from mjstack.config.schema import GraphMode, TermCfg
+from mjstack.config.schema import TermCfg
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
@@ -111,7 +111,7 @@ def rollout(
     if physics is None:
         play = env.captured(work, "a step of the episode")
     else:
-        play = StepGraph(work, sim.device, GraphMode.off, name="the physics")
+        play = StepGraph(work, sim.device, "off", name="the physics")
     # On Warp's CPU device physics alone is captured, once for all episodes.
     graph: StepGraph | None = play
     if sim.device.type != "cuda" and physics is None:

@@ -145,7 +145,7 @@ def compare_options(
     requested: dict[str, float | int | str | None] = {
         "timestep": cfg.timing.physics_dt,
         "integrator": "mjINT_IMPLICITFAST",
-        "cone": f"mjCONE_{solver.cone.value.upper()}",
+        "cone": f"mjCONE_{solver.cone.upper()}",
         "box_box": "primitive",
         "iterations": solver.iterations,
         "ls_iterations": solver.ls_iterations,

@@ -14,6 +14,7 @@ from mjstack.config.check import places_objects
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import offered
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
+from mjstack.config.session import list_items
 from mjstack.datasets import DatasetSpec, Feature
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, demonstration_config
@@ -176,22 +177,15 @@ def episode_config(cfg: Config) -> dict[str, Any]:
 
 def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
     """Keys in which two configurations differ, such as ``seed=1, expected 2``."""
-    before = dict(_flat(theirs))
-    now = dict(_flat(ours))
+    before, now = (
+        {key: value for key, value in list_items(one) if value == {} or not isinstance(value, dict)}
+        for one in (theirs, ours)
+    )
     return [
         f"{key}={before.get(key, 'missing')}, expected {now.get(key, 'none')}"
         for key in before | now
         if before.get(key) != now.get(key)
     ]
-
-
-def _flat(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and their values."""
-    if isinstance(node, Mapping) and node:
-        for name, value in node.items():
-            yield from _flat(value, f"{key}.{name}" if key else name)
-    else:
-        yield key, node
 
 
 def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSpec:

@@ -8,7 +8,6 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
-from enum import Enum
 from pathlib import Path
 from typing import Any, cast
 
@@ -164,8 +163,7 @@ def _simulation(context: RunContext) -> Simulation:
 
 def _text(settings: dict[str, object]) -> str:
     """Settings such as ``iterations=5, tolerance=1e-06``; null is the value of the robot's file."""
-    shown = {k: v.value if isinstance(v, Enum) else v for k, v in settings.items()}
-    return ", ".join(f"{key}={value}" for key, value in shown.items()) or "nothing"
+    return ", ".join(f"{key}={value}" for key, value in settings.items()) or "nothing"
 
 
 def _as_result(row: Row, seconds: float) -> GateResult:

@@ -57,7 +57,7 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
     option = spec.option
     option.timestep = cfg.timing.physics_dt
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{solver.cone.name.upper()}")
+    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{solver.cone.upper()}")
     for name in ("iterations", "ls_iterations", "impratio", "tolerance"):
         if (value := getattr(solver, name)) is not None:
             setattr(option, name, value)

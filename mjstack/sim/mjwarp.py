@@ -7,7 +7,6 @@ from functools import partial
 import mujoco
 import torch
 
-from mjstack.config.schema import GraphMode
 from mjstack.errors import UnsupportedModel, first_line
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
@@ -42,7 +41,7 @@ class MjwarpSimulation(Simulation):
         nworld: int,
         sizes: BatchSizes,
         device: str,
-        graph: GraphMode = GraphMode.auto,
+        graph: str = "auto",
         *,
         fields: Sequence[str] = (),
     ) -> None:

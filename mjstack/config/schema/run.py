@@ -15,21 +15,6 @@ class Backend(Enum):
     mjwarp = "mjwarp"
 
 
-class GraphMode(Enum):
-    """Whether control steps are captured into a graph and replayed."""
-
-    auto = "auto"
-    require = "require"
-    off = "off"
-
-
-class Cone(Enum):
-    """Shape of the friction cone."""
-
-    elliptic = "elliptic"
-    pyramidal = "pyramidal"
-
-
 @dataclass(slots=True)
 class TimingCfg:
     """Physics step and control interval."""
@@ -57,7 +42,7 @@ class SolverCfg:
     """Ratio of frictional to normal constraint impedance."""
     tolerance: float | None = spec(None, gt=0.0)
     """Improvement below which the solver stops."""
-    cone: Cone = Cone.elliptic
+    cone: str = spec("elliptic", choices=("elliptic", "pyramidal"))
     """Shape of the friction cone."""
     gripper_condim: int | None = spec(None, choices=(1, 3, 4, 6))
     """Contact dimension of the geoms of ``robot.jaw_bodies``."""
