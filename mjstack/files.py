@@ -87,7 +87,8 @@ def claim_folder(
         folder: The folder.
         job: As of `check_unused`.
         own: As of `check_unused`.
-        numbered: Where the folder is there, make another: its name and ``-2``, ``-3``, ...
+        numbered: Where the folder is there, make another: its name and ``-2``, ``-3``, ... One in
+            which nothing was written is gone again if the block fails.
 
     Yields:
         The folder.
@@ -109,7 +110,12 @@ def claim_folder(
         handle = lock_folder(folder)
         check_unused(folder, job, own)
         yield folder
-    except OSError as error:
+    except BaseException as error:
+        if numbered:
+            with suppress(OSError):  # something was written
+                os.removedirs(folder)
+        if not isinstance(error, OSError):
+            raise
         raise FolderError(
             f"{folder} cannot be written ({error.strerror or error}). Make room, or set"
             " hydra.run.dir (a sweep: hydra.sweep.dir) to a folder that can"

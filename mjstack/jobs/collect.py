@@ -5,7 +5,6 @@ asked for are there.
 import json
 import os
 import time
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -19,9 +18,9 @@ from mjstack.datasets import DatasetSpec, lerobot, require_pyarrow
 from mjstack.datasets.reader import check_same, read_info
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.context import RunContext, require_episode
-from mjstack.errors import ConfigError, DatasetError, UnwrittenError
+from mjstack.errors import ConfigError, DatasetError
 from mjstack.files import check_unused, lock_folder, write_atomic
-from mjstack.jobs.collection import DATASET, Collection, CollectPlan, read_batches
+from mjstack.jobs.collection import DATASET, FILE, Collection, CollectPlan, read_batches
 from mjstack.jobs.demonstration import ACTION, STATE, differences, episode_config
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
@@ -102,10 +101,6 @@ def run_collect(plan: CollectPlan, context: RunContext, folder: Path) -> None:
     except KeyboardInterrupt:
         conclude(Status.interrupted, "interrupted")
         raise
-    except (UnwrittenError, OSError) as error:
-        with suppress(OSError):  # there may be room for a report
-            conclude(Status.failed, str(error))
-        raise
     conclude(Status.failed if problem else Status.passed, problem)
 
 
@@ -177,7 +172,7 @@ def _check_folder(dataset: Path, spec: DatasetSpec) -> None:
             " job.folder to another folder, or these keys back"
         )
     check_same(dataset, info, spec)
-    read_batches(dataset.parent, [])
+    read_batches(dataset.parent / FILE)
 
 
 JOB = Job(check_collect)

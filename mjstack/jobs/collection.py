@@ -5,8 +5,6 @@ until enough are there.
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import cast
@@ -97,17 +95,12 @@ class CollectedBatch:
     broken: dict[str, int] = field(default_factory=dict)
 
 
-def read_batches(folder: Path, committed: Sequence[tuple[int, int]]) -> list[CollectedBatch]:
-    """The batches of earlier calls.
-
-    Args:
-        folder: The job's folder.
-        committed: Seed and world of every episode of the dataset.
+def read_batches(path: Path) -> list[CollectedBatch]:
+    """The batches of earlier calls, ``kept`` as it was then.
 
     Raises:
         DatasetError: The file cannot be read.
     """
-    path = folder / FILE
     if not path.exists():
         return []
     fix = (
@@ -120,14 +113,7 @@ def read_batches(folder: Path, committed: Sequence[tuple[int, int]]) -> list[Col
             del counts["broken"]
             if any(type(count) is not int or count < 0 for count in counts.values()):
                 raise ValueError(counts)
-    _count_kept(batches, committed)
     return batches
-
-
-def _count_kept(batches: Sequence[CollectedBatch], committed: Sequence[tuple[int, int]]) -> None:
-    counts = Counter(seed for seed, _ in committed)
-    for batch in batches:
-        batch.kept = counts[batch.seed]
 
 
 class Collection:
@@ -182,12 +168,11 @@ class Collection:
         """
         try:
             with self._writer:
-                self.batches = read_batches(self._plan.home, self._writer.committed)
+                self.batches = read_batches(self._record_path)
+                self._count_kept()
                 return self._play()
         finally:
-            if self.batches:
-                with suppress(OSError):  # the next call counts again
-                    self._record()
+            self._count_kept()
             if self._sim is not None:
                 self._sim.close()
 
@@ -257,9 +242,14 @@ class Collection:
         self._writer.flush()
         self._record()
 
+    def _count_kept(self) -> None:
+        counts = Counter(seed for seed, _ in self._writer.committed)
+        for batch in self.batches:
+            batch.kept = counts[batch.seed]
+
     def _record(self) -> None:
         """Write the record of all batches."""
-        _count_kept(self.batches, self._writer.committed)
+        self._count_kept()
         records = [asdict(batch) for batch in self.batches]
         write_atomic(self._record_path, json.dumps(records, indent=1) + "\n")
 

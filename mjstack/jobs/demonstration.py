@@ -257,9 +257,7 @@ def _group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
 
 
 def _term_units(func: str, width: int, joints: tuple[str, ...]) -> Sequence[str]:
-    unit = offered(func, "unit")
-    if unit is None:
-        unit = "unknown"
+    unit = offered(func, "unit") or "unknown"
     if unit == "joint":
         return joints
     if unit == "joint/s":
@@ -269,11 +267,7 @@ def _term_units(func: str, width: int, joints: tuple[str, ...]) -> Sequence[str]
 
 def _scaled(units: Sequence[str], scale: float) -> list[str]:
     """Units of 1 after the scaling: ``10 rad/s`` where a speed is multiplied by 0.1."""
-    if scale == 1.0:
-        return list(units)
     if scale == 0.0:
         return ["unknown"] * len(units)
-    return [
-        unit if unit == "unknown" else f"{1.0 / scale:g} {unit}".removesuffix(" 1")
-        for unit in units
-    ]
+    factor = "" if scale == 1.0 else f"{1.0 / scale:g} "
+    return [u if u == "unknown" else f"{factor}{u}".removesuffix(" 1") for u in units]

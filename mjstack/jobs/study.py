@@ -6,7 +6,7 @@ It informs, and gates nothing.
 import statistics
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
@@ -58,27 +58,18 @@ def run_study(context: RunContext, folder: Path) -> None:
     job = cast(StudyJobCfg, cfg.job)
     rows: list[Row] = []
     context.begin("base")
-    with ExitStack() as worlds:
-        try:
-            # The configured solver's worlds are kept beside every variant, so that the repetitions
-            # of both are interleaved and start from one state.
-            sim = _simulation(context)
-            worlds.callback(sim.close)
-            state = play_to_phase(context, sim)
-            base = HeldPhysics(sim, state, cfg.timing.decimation)
-            steps = steps_that_fit(job.steps, job.max_seconds, base.warm_up())
-        except Exception as error:  # nothing can be compared with it
-            reason = f"the configured solver cannot be timed: {log_error(error)}"
-            context.record(GateResult(name="base", status=Status.failed, reason=reason))
-            return
+    # The configured solver's worlds are kept beside every variant, so that the repetitions of both
+    # are interleaved and start from one state.
+    with closing(_simulation(context)) as sim:
+        base = HeldPhysics(sim, play_to_phase(context, sim), cfg.timing.decimation)
+        steps = steps_that_fit(job.steps, job.max_seconds, base.warm_up())
         for name, solver in job.variants.items():
             context.begin(name)
             began = time.perf_counter()
             rows.append(_guarded(context, base, steps, name, solver))
             _write(context, rows)
             context.record(_as_result(rows[-1], time.perf_counter() - began))
-        measured = any(row["status"] == "pass" for row in rows)
-        if measured:
+        if any(row["status"] == "pass" for row in rows):
             _write(context, rows, draw=True)
 
 
