@@ -47,7 +47,7 @@ def measure_episode(
         seconds: Time budget [s].
         repetitions: Most repetitions.
         meter: Measures the energy.
-        step_seconds: About how long a control step takes [s]; 0 if it is not known.
+        step_seconds: About how long a control step takes [s].
     """
     cfg = context.cfg
     mjwarp = sim.backend == "mjwarp"
@@ -113,13 +113,9 @@ def play_bare(
 ) -> tuple[float, str]:
     """Play the same commands from the same start with bare steps.
 
-    Joint trajectories are evaluated in the loop, as in the episode. Overflow bits stay until a
-    reset, so that one look at the end has all.
-
-    Args:
-        context: Scene and planner.
-        sim: The worlds.
-        recorded: The commands, where the driver cannot give them again.
+    Joint trajectories are evaluated in the loop, as in the episode; ``recorded`` has the commands
+    of a driver that cannot give them again. Overflow bits stay until a reset, so that one look at
+    the end has all.
 
     Returns:
         Seconds, and why they do not count: empty where they do.

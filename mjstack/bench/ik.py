@@ -32,16 +32,9 @@ def measure_solve(
     gain: float,
     repetitions: int,
 ) -> Measurement:
-    """Time one case.
+    """Time one case of the configuration's robot in its scene: repetitions of `SOLVES` solves each.
 
-    Args:
-        cfg: The configuration: its robot, in its scene.
-        device: ``"cpu"`` or ``"cuda:N"``.
-        nworld: Number of worlds.
-        iterations: Iterations per solve.
-        block_dim: CUDA threads per block.
-        gain: Of posture and approach; 0 where they do not count.
-        repetitions: Number of repetitions, each of `SOLVES` solves.
+    ``block_dim`` counts CUDA threads, ``gain`` is that of posture and approach.
 
     Returns:
         Samples ``eager_ms`` and, on CUDA, ``graph_ms`` per solve of all worlds; facts of the case,

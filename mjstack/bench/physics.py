@@ -36,13 +36,7 @@ class HeldPhysics:
     """
 
     def __init__(self, sim: Simulation, state: State, decimation: int) -> None:
-        """Put the worlds into the state.
-
-        Args:
-            sim: The worlds.
-            state: Where every repetition starts.
-            decimation: Physics steps in a control step.
-        """
+        """Put the worlds into the state in which every repetition starts."""
         self.sim = sim
         self.state = state
         self.decimation = decimation
@@ -77,14 +71,8 @@ def measure_physics(
 
     A grasp may be empty at the start, about to be retried. The number of full ones is reported, and
     there is no figure if they are less than half. The figure includes the rest of a simulation's
-    step: counting contacts, latching overflow.
-
-    Args:
-        context: Scene and planner.
-        sim: The worlds.
-        seconds: Time budget [s]; fewer steps are made where it is short.
-        repetitions: Number of repetitions.
-        meter: Measures the energy.
+    step: counting contacts, latching overflow. Fewer steps are made where the time budget [s] is
+    short.
     """
     t = context.cfg.gate.throughput
     out = Measurement(name="physics")

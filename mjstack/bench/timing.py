@@ -28,11 +28,7 @@ class EnergyMeter:
     """
 
     def __init__(self, device: str) -> None:
-        """Open the counter.
-
-        Args:
-            device: ``cpu`` or ``cuda:N``.
-        """
+        """Open the counter of ``cpu`` or ``cuda:N``."""
         self._counter: Callable[[], float] = lambda: 0.0  # [mJ]
         self._began = self._first = 0.0
         self.clear()
@@ -95,7 +91,6 @@ class EnergyObserver(Observer):
     """Measures the energy of a rollout's steps from the third on, when all are replayed."""
 
     def __init__(self, meter: EnergyMeter) -> None:
-        """``meter`` adds it up."""
         self._meter = meter
 
     def after_step(self, step: int) -> None:
@@ -162,7 +157,7 @@ class Measurement:
             meter: Has measured their energy.
             work: The captured work, if any; the slowest counts.
             captured: Whether the steps were replayed from a graph.
-            whole: Whether the control steps were whole ones, not physics alone.
+            whole: Whether they were whole, not physics alone.
         """
         # Time and rate per physics step and per whole control step
         decimation = cfg.timing.decimation

@@ -5,6 +5,7 @@ until enough are there.
 import json
 import math
 from collections import Counter
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import cast
@@ -133,12 +134,7 @@ class Collection:
     """
 
     def __init__(self, plan: CollectPlan, context: RunContext) -> None:
-        """Open the dataset of a plan, in the run's context.
-
-        Raises:
-            DatasetError: The folder has another dataset.
-            UnwrittenError: The dataset cannot be written.
-        """
+        """Open the dataset of a plan; raises as `DatasetWriter` does."""
         self._context = context
         self._plan = plan
         self._job = cast(CollectJobCfg, context.cfg.job)
@@ -157,14 +153,14 @@ class Collection:
         return len(self._writer.committed)
 
     def play(self) -> str:
-        """Play and write until the episodes are there.
+        """Play and write until the episodes are there; what was committed is kept.
 
         Returns:
             Why that cannot be done; empty if it is done.
 
         Raises:
-            UnwrittenError: The dataset cannot be written any further; what was committed is kept.
-            OSError: The record of the batches cannot be written; what was committed is kept.
+            UnwrittenError: The dataset cannot be written any further.
+            OSError: The record of the batches cannot be written.
         """
         try:
             with self._writer:
@@ -172,7 +168,9 @@ class Collection:
                 self._count_kept()
                 return self._play()
         finally:
-            self._count_kept()
+            if self.batches:
+                with suppress(OSError):  # the next call counts again
+                    self._record()
             if self._sim is not None:
                 self._sim.close()
 
@@ -283,10 +281,7 @@ class Collection:
     def result(self, status: Status, problem: str, seconds: float) -> GateResult:
         """The dataset and the expert's success, as a result of the report.
 
-        Args:
-            status: How it ended.
-            problem: Why, where it did not pass.
-            seconds: Wall time of this call [s].
+        ``problem`` says why it did not pass; ``seconds`` is the wall time of this call.
         """
         asked = self._job.episodes
         new = self.committed - self._before

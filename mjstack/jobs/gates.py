@@ -28,10 +28,8 @@ _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_b
 
 
 def check_machine(cfg: Config) -> RunContext:
-    """Build scene and plan, and raise for what this machine cannot do, before anything is written.
-
-    Returns:
-        The context of the run.
+    """The context of a run, scene and plan built; raises for what this machine cannot do, before
+    anything is written.
     """
     find_gates(cfg)
     context = RunContext(cfg)
@@ -113,12 +111,8 @@ def check_task(context: RunContext) -> None:
 
 
 def check_env(context: RunContext, cfg: Config, **keys: str) -> None:
-    """Build an environment in the context's scene, which checks every term.
-
-    Args:
-        context: The scene.
-        cfg: The configuration.
-        keys: The key of a group whose terms come from elsewhere, by the group.
+    """Build an environment in the context's scene, which checks every term. ``keys`` has the key of
+    each group whose terms come from elsewhere.
     """
     try:
         build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu").close()

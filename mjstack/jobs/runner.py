@@ -88,11 +88,7 @@ class CheckedJob:
     resumes: str = ""
 
     def run(self, folder: Path, overrides: Sequence[str] = ()) -> Report:
-        """Do the work and write its report after each result.
-
-        Args:
-            folder: Where report.json, report.md, pictures and logs go.
-            overrides: The command line.
+        """Do the work and write its report after each result into the folder.
 
         Returns:
             How it ended. Ctrl-C is an outcome, not an exception: the finished results are in the
@@ -155,11 +151,8 @@ class CheckedJob:
 
 
 def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
-    """Raise for what this machine cannot do, before anything is written.
-
-    Args:
-        cfg: The configuration.
-        overrides: Its command line, without Hydra's own keys.
+    """Raise for what this machine cannot do, before anything is written. The overrides are those of
+    the command line without Hydra's own.
     """
     job = find_object("job.func", cfg.job.func)
     if not isinstance(job, Job):
@@ -185,16 +178,8 @@ def write_tables(
     csv: str,
     draw: Callable[[Path], object] | None = None,
 ) -> None:
-    """Replace ``name.csv``, ``name.md`` and, where ``draw`` is given, ``name.png`` of a run.
-
-    Args:
-        context: The run. A picture that fails is reported.
-        name: Of the files.
-        title: Heading of the text.
-        table: Of the text.
-        notes: Of the text, a line each.
-        csv: All rows.
-        draw: Draws the picture, which may fail.
+    """Replace ``name.csv``, ``name.md`` and, where ``draw`` is given, ``name.png`` of a run. A
+    picture that fails is a printed line.
 
     Raises:
         OSError: A file cannot be written.

@@ -56,12 +56,8 @@ def write_report(report: Report) -> None:
 
 
 def safely_write(path: Path, write: Callable[..., object], *args: object) -> str:
-    """Write a file beside the result, complete or not at all; a failure takes no result back.
-
-    Args:
-        path: The file.
-        write: Called with a path beside it, and ``args``.
-        args: Its content.
+    """Write a file by a call with a path beside it and ``args``, complete or not at all; a failure
+    takes no result back.
 
     Returns:
         Empty, or one line that says why there is no such file. run.log has the traceback.
