@@ -258,11 +258,11 @@ def _print_sweep(outcomes: list[Report], folder: Path) -> None:
     names = dict.fromkeys(gate.name for outcome in outcomes for gate in outcome.gates)
     columns = ["job", "overrides", *names, "status"]
     rows = [
-        {gate.name: f"{gate.status.value}: {gate.reason}" for gate in outcome.gates}
+        {gate.name: f"{gate.status}: {gate.reason}" for gate in outcome.gates}
         | {
             "job": str(job),
             "overrides": " ".join(outcome.overrides),
-            "status": outcome.status.value,
+            "status": outcome.status,
         }
         for job, outcome in enumerate(outcomes)
     ]

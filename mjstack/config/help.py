@@ -8,7 +8,6 @@ import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 from mjstack.config.complete import typed
@@ -190,7 +189,7 @@ def _yaml(value: object) -> str:
     """A value as a command line has it."""
     if isinstance(value, str):
         return value
-    return json.dumps(value, default=attrgetter("value")).replace(", ", ",").replace('"', "")
+    return json.dumps(value).replace(", ", ",").replace('"', "")
 
 
 def _table(rows: Sequence[tuple[str, str]], width: int) -> list[str]:

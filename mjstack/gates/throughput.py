@@ -30,7 +30,7 @@ def run_throughput(context: RunContext) -> list[GateResult]:
     """
     backend, device = context.backend
     if not device.startswith("cuda"):
-        cause = f"sim={backend.value} sim.device={device}"
+        cause = f"sim={backend} sim.device={device}"
         if not torch.cuda.is_available():
             cause = "this machine has none"
         reason = f"no CUDA device was used: {cause}"

@@ -167,7 +167,7 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     for key in _NO_MATTER:
         del config[key]
     backend, _ = resolve_backend(cfg)
-    config["sim"] = {"backend": backend.value}
+    config["sim"] = {"backend": backend}
     config["job"] = {"keep_failures": cast(CollectJobCfg, cfg.job).keep_failures}
     placed = [term.params for term in cfg.reset.values() if places_objects(term)]
     if any(may_meet(cfg.scene, params["xy"], params.get("gap", GAP)) for params in placed):

@@ -15,7 +15,7 @@ from rich.progress import (
 from mjstack.interrupt import check_interrupt
 from mjstack.report.record import GateResult, Status
 
-STATUS_COLOR = {
+STATUS_COLOR: dict[str, str] = {
     Status.passed: "green",
     Status.failed: "red",
     Status.skipped: "yellow",
@@ -85,7 +85,7 @@ class ProgressBar:
         self._progress.update(self._task, visible=False)
         color = STATUS_COLOR[result.status]
         self.print_line(
-            f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s):"
+            f"[{color}]{result.status:>4}[/] {result.name} ({result.seconds:.1f} s):"
             f" {escape(result.reason or 'ok')}"
         )
         check_interrupt()

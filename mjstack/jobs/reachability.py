@@ -53,12 +53,6 @@ class ReachLevel:
         """Shape ``(ny, nx)``, bool."""
         return np.isfinite(self.tilt)
 
-    @property
-    def tilts(self) -> tuple[float, float]:
-        """Smallest and largest tilt [deg]; NaN where no point is reached."""
-        some = self.tilt[self.reached]
-        return (float(some.min()), float(some.max())) if len(some) else (np.nan, np.nan)
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ObjectRegion:
@@ -240,7 +234,8 @@ def _level_result(level: ReachLevel, seconds: float) -> GateResult:
         " table reached"
     )
     if share:
-        low, high = level.tilts
+        low = float(np.nanmin(level.tilt))
+        high = float(np.nanmax(level.tilt))
         metrics |= {"smallest_tilt_deg": low, "largest_tilt_deg": high}
         reason += f", tilted by {low:.0f} to {high:.0f} degrees at least"
     return GateResult(
@@ -349,7 +344,7 @@ def _save_map(
     count = len(levels)
     size = ((3.6 * max(0.6, wide / deep) + 1.0) * count + 1.2, 5.6)
     with figure(path, title, count, figsize=size) as (drawn, panels):
-        top = np.nanmax([level.tilts[1] for level in levels] + [1.0])
+        top = np.nanmax([level.tilt for level in levels], initial=1.0)
         for panel, level in zip(np.atleast_1d(panels), levels, strict=True):
             panel.set_facecolor("0.92")
             center = (x[len(x) // 2], y[len(y) // 2])

@@ -83,7 +83,7 @@ def _replay_all(plan: ReplayPlan, context: RunContext, folder: Path) -> None:
     for line in changes:
         context.print_line(escape(line))
     for number, (backend, _) in enumerate(plan.where):
-        run_guarded(context, f"replay_{backend.value}", partial(_replay, plan, number, changes))
+        run_guarded(context, f"replay_{backend}", partial(_replay, plan, number, changes))
 
 
 def _plan(cfg: Config) -> ReplayPlan:
@@ -207,18 +207,18 @@ def _replay(
     if not kept:
         status = Status.failed
     if first:
-        title = f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
+        title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})"
         context.artifacts.shown = (title, done.recorder)
     told = [*done.findings, *(_first_sign(monitor, done, context) for monitor in monitors)]
     for line in told:
         context.print_line(escape(f"  {line}"))
-    name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
+    name = "trajectory.npz" if first else f"trajectory_{backend}.npz"
     assert context.folder is not None
     write_npz(context.folder / name, done.arrays)
     recorded = rules.describe(int(plan.record.failed[plan.world])) or "succeeded"
     return [
         GateResult(
-            name=f"replay_{backend.value}",
+            name=f"replay_{backend}",
             status=status,
             reason=reason,
             thresholds=context.check.thresholds(),
@@ -255,7 +255,7 @@ def _compare(
     now = int(done.episode.failed[0])
     same = bits == now
     result = "the same result" if same else rules.describe(bits) or "succeeded"
-    if record.backend != backend.value:
+    if record.backend != backend:
         another = "" if same else "another result: "
         return True, f"that run's {record.backend} world had {another}{result}"
     ours = done.recorder.qpos[-1]

@@ -102,7 +102,7 @@ class CheckedJob:
         def record(result: GateResult) -> None:
             report.gates.append(result)
             write_report(report)
-            log.info("%s: %s %s", result.name, result.status.value, result.reason)
+            log.info("%s: %s %s", result.name, result.status, result.reason)
             bar.finish(result)
 
         # The work, and the pictures of its artifacts
@@ -202,7 +202,7 @@ def run_provenance(context: RunContext) -> Provenance:
     name = "Warp's CPU device"
     if device.startswith("cuda"):
         name = cuda_name(device)
-    elif backend.value == "native":
+    elif backend == "native":
         name = f"native MuJoCo on {os.cpu_count()} cores"
     # The numbers of the compiled model: the physics sees these, not the files
     buffer = np.empty(mujoco.mj_sizeModel(context.model), np.uint8)
@@ -265,7 +265,6 @@ def _viewer(context: RunContext) -> StepHook:
 
 
 def _print_summary(console: Console, report: Report) -> None:
-    colors = {status.value: color for status, color in STATUS_COLOR.items()}
-    console.print(summarize(report.gates).to_console(colors))
+    console.print(summarize(report.gates).to_console(STATUS_COLOR))
     console.print(f"report: {escape(str(report.folder))}/report.md")
-    console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status.value}[/]")
+    console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status}[/]")

@@ -184,13 +184,13 @@ def _write(context: RunContext, rows: list[Row], draw: bool = False) -> None:
     notes = [
         f"base: {_text(asdict(cfg.solver))}",
         (
-            f"{backend.value} on {device}. Times: object in hand, joint target held; medians of"
+            f"{backend} on {device}. Times: object in hand, joint target held; medians of"
             f" {cast(StudyJobCfg, cfg.job).repetitions} repetitions, interleaved with those of"
             " base. A ratio is that of two neighbouring repetitions."
         ),
         "base as a variant is a second copy of it: its ratio shows how far equal runs differ.",
     ]
-    if backend.value == "native":
+    if backend == "native":
         notes.append("Native MuJoCo does not tell which worlds stopped at a limit of the solver.")
     done = [row for row in rows if row["status"] == "pass"]
     picture = (lambda path: _draw(path, done, title)) if draw else None

@@ -1,7 +1,7 @@
 """Results of a run as data: gates and provenance."""
 
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 
 from mjstack.report.table import Table
@@ -9,7 +9,7 @@ from mjstack.report.table import Table
 Provenance = dict[str, str | int | dict[str, str] | None]
 
 
-class Status(Enum):
+class Status(StrEnum):
     """How a gate or a run ended."""
 
     passed = "pass"

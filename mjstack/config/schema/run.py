@@ -1,13 +1,13 @@
 """A run: physics, the gates and their parameters, and the jobs."""
 
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 from typing import Any
 
 from mjstack.config.fields import MOST_WORLDS, spec
 
 
-class Backend(Enum):
+class Backend(StrEnum):
     """Which physics engine steps the worlds of batch and throughput."""
 
     auto = "auto"
