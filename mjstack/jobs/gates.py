@@ -1,8 +1,8 @@
 """Job *gates*: a configuration and a folder in, gates run, a report left behind."""
 
 import contextlib
-import os
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +24,11 @@ from mjstack.sim.native import NativeSimulation
 # Bytes of a whole run (environment, plan, check) over those of its native worlds: measured 3.2 to
 # 4.6, for both drivers.
 _SHARE = 4
-_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+_LIMITS = (
+    "/proc/meminfo",
+    "/sys/fs/cgroup/memory.max",
+    "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+)
 
 
 def check_machine(cfg: Config) -> RunContext:
@@ -50,23 +54,18 @@ def _check_memory(context: RunContext) -> None:
     nworld = context.cfg.nworld
     sim = NativeSimulation(context.model, 1, fields=required_fields(context.cfg.reset))
     sim.close()
-    size = _SHARE * sim.world_bytes
     free = available_memory()
-    if nworld * size > free:
-        sizes = f"{nworld * size / 2**30:.3g} GiB needed, {free / 2**30:.3g} GiB free"
-        expected = f"at most {free // size}, because there is not enough memory for more ({sizes})"
+    most = free // (_SHARE * sim.world_bytes)
+    if nworld > most:
+        expected = f"at most {most}, because the memory of {free / 2**30:.3g} GiB holds no more"
         raise ConfigError("nworld", nworld, expected)
 
 
 def available_memory() -> int:
     """Memory that this process may still take, in bytes: the system's, or its container's."""
-    found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
-    for path in ("/proc/meminfo", *_LIMITS):
-        with contextlib.suppress(OSError):
-            text = Path(path).read_text()
-            for number, kib in re.findall(r"(?m)(?:^|MemAvailable: +)(\d+)( kB)?$", text):
-                found.append(int(number) * (1024 if kib else 1))
-    return min(found)
+    text = "".join(path.read_text() for path in map(Path, _LIMITS) if path.exists())
+    found = re.findall(r"(?m)^(?:MemAvailable: +(\d+) kB|(\d+))$", text)
+    return min((1024 * int(kib or 0) or int(limit) for kib, limit in found), default=sys.maxsize)
 
 
 def _check_starts(context: RunContext) -> None:

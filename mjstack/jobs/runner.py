@@ -233,13 +233,15 @@ def _draw(context: RunContext, console: Console) -> list[str]:
     }
     if cfg.video:
         drawn["episode.mp4"] = (save_video, (model, episode.qpos, cfg.timing.step_dt))
-    problems = {
-        name: safely_write(folder / name, draw, *args) for name, (draw, args) in drawn.items()
-    }
-    for name, problem in problems.items():
-        if problem or name == "episode.mp4":
-            console.print(escape(problem or f"video: {folder}/{name}"))
-    return [name for name, problem in problems.items() if not problem and name.endswith(".png")]
+    pictures = []
+    for name, (draw, args) in drawn.items():
+        if problem := safely_write(folder / name, draw, *args):
+            console.print(escape(problem))
+        elif name.endswith(".png"):
+            pictures.append(name)
+        else:
+            console.print(escape(f"video: {folder}/{name}"))
+    return pictures
 
 
 def _viewer(context: RunContext) -> StepHook:
