@@ -133,7 +133,7 @@ class RunContext:
         stage: Scene and plan; by default those of the configuration.
         folder: Where the run's files go, or None for none.
         overrides: The command line of the run.
-        print_line: Prints a line.
+        print_line: Prints a line, which has no markup.
         begin: Told the name of each part of the run as it begins.
         record: Gets each result as soon as there is one.
         advance: Told about progress.

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import cast
 
 import torch
-from rich.markup import escape
 
 from mjstack.config.fingerprint import config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
@@ -92,8 +91,8 @@ def run_collect(plan: CollectPlan, context: RunContext, folder: Path) -> None:
         result = collection.result(status, problem, time.perf_counter() - began)
         if collection.committed:
             _write_table(context.cfg, plan, folder, result)
-            line = f"dataset: {collection.path}, described in {folder}/dataset.md"
-            context.print_line(escape(line))
+            where = f"{collection.path}, described in {folder}/dataset.md"
+            context.print_line(f"dataset: {where}")
         context.record(result)
 
     try:

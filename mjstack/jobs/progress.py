@@ -54,8 +54,8 @@ class ProgressBar:
         self._progress.stop()
 
     def print_line(self, line: str) -> None:
-        """Print a line above the bar."""
-        self._progress.console.print(line, soft_wrap=True)
+        """Print a line of text above the bar."""
+        self._progress.console.print(line, markup=False)
 
     def start(self, gate: str) -> None:
         """Begin something with a name."""
@@ -84,7 +84,7 @@ class ProgressBar:
         """Print a gate's result."""
         self._progress.update(self._task, visible=False)
         color = STATUS_COLOR[result.status]
-        self.print_line(
+        self._progress.console.print(
             f"[{color}]{result.status:>4}[/] {result.name} ({result.seconds:.1f} s):"
             f" {escape(result.reason or 'ok')}"
         )

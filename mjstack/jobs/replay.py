@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from omegaconf import OmegaConf
-from rich.markup import escape
 
 from mjstack.config.schema import Backend, Config, SimCfg
 from mjstack.envs import driven_config
@@ -81,7 +80,7 @@ def _replay_all(plan: ReplayPlan, context: RunContext, folder: Path) -> None:
     write_atomic(folder / "replayed_config.yaml", OmegaConf.to_yaml(played))
     changes = _changes(plan.run.provenance, run_provenance(context))
     for line in changes:
-        context.print_line(escape(line))
+        context.print_line(line)
     for number, (backend, _) in enumerate(plan.where):
         run_guarded(context, f"replay_{backend}", partial(_replay, plan, number, changes))
 
@@ -211,7 +210,7 @@ def _replay(
         context.artifacts.shown = (title, done.recorder)
     told = [*done.findings, *(_first_sign(monitor, done, context) for monitor in monitors)]
     for line in told:
-        context.print_line(escape(f"  {line}"))
+        context.print_line(f"  {line}")
     name = "trajectory.npz" if first else f"trajectory_{backend}.npz"
     assert context.folder is not None
     write_npz(context.folder / name, done.arrays)

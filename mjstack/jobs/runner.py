@@ -188,7 +188,7 @@ def write_tables(
     picture = folder / f"{name}.png"
     if draw is not None:
         if problem := safely_write(picture, draw):
-            context.print_line(escape(problem))
+            context.print_line(problem)
         else:
             context.artifacts.pictures.append(picture.name)
     write_atomic(folder / f"{name}.csv", csv)

@@ -8,8 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
-from rich.markup import escape
-
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.schema import Backend, Config, ScalingJobCfg
 from mjstack.episodes.context import RunContext, require_episode
@@ -76,7 +74,7 @@ def run_scaling(context: RunContext, folder: Path) -> None:
     ]
     for override in context.overrides:
         if override.lstrip("+~").partition("=")[0] in _UNUSED:
-            context.print_line(f"{escape(override)} is not used: each run of job=scaling sets it")
+            context.print_line(f"{override} is not used: each run of job=scaling sets it")
     _write(context, rows)
     left = _run_all(context, folder, rows)
 
@@ -87,7 +85,7 @@ def run_scaling(context: RunContext, folder: Path) -> None:
     if any(row["status"] not in (PASS, NOT_RUN) for row in rows):
         context.print_line("job.retry=true repeats the runs that failed")
     if missing:
-        counts = f"{len(missing)} of {len(rows)} runs have not run ({escape(left)})"
+        counts = f"{len(missing)} of {len(rows)} runs have not run ({left})"
         context.print_line(f"incomplete: {counts}. The same command goes on with them.")
     _write(context, rows, draw=True)
     context.print_line(describe_crossover(rows))
