@@ -35,8 +35,6 @@ _NO_MATTER = (
     "action",
     "termination",
     "batch",
-    "sim",
-    "job",
     "nworld",
     "gates",
     "graph",

@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
@@ -51,14 +50,13 @@ def check_scaling(cfg: Config) -> CheckedJob:
 
 def scaling_folder(cfg: Config) -> Path:
     """Where a configuration's runs are, so that another call finds them."""
-    job = asdict(_job(cfg))
-    for key in ("nworlds", "backends", "run_minutes", "max_minutes", "retry"):  # change no run
-        del job[key]
     config = config_content(cfg)
+    for key in ("nworlds", "backends", "run_minutes", "max_minutes", "retry"):  # change no run
+        del config["job"][key]
     for key in ("nworld", "gates", "view", "video"):
         del config[key]
-    config["sim"].pop("backend")
-    return Path("outputs") / "scaling" / config_hash(config | {"job": job})[:12]
+    del config["sim"]["backend"]
+    return Path("outputs/scaling") / config_hash(config)[:12]
 
 
 def run_scaling(context: RunContext, folder: Path) -> None:
