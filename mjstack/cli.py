@@ -187,11 +187,12 @@ def run_job(cfg: DictConfig) -> Report:
     overrides = list(own.overrides.task)
     with search_path(lacking_folders(own.runtime.config_sources)):
         checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
-        if own.output_subdir is not None:  # a replay reads values, no interpolations
-            saved = Path(own.runtime.output_dir) / own.output_subdir / "config.yaml"
-            with suppress(OSError):  # the job says so
-                write_atomic(saved, OmegaConf.to_yaml(cfg, resolve=True))
-        result = checked.run(Path(own.runtime.output_dir), overrides)
+        folder = Path(own.runtime.output_dir)
+        with suppress(OSError):  # the job says so
+            # A replay reads values, no interpolations.
+            saved = folder / ".hydra" / "config.yaml"
+            write_atomic(saved, OmegaConf.to_yaml(cfg, resolve=True))
+        result = checked.run(folder, overrides)
     _results.append(result)
     if result.status is Status.interrupted:
         raise KeyboardInterrupt

@@ -4,10 +4,13 @@ An exception in the middle of anything could be lost in other people's code, or 
 done. Only the command installs these handlers: in a script nothing sets the flag.
 """
 
+import atexit
 import os
 import signal
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from threading import current_thread, main_thread
 from types import FrameType
 
 EXIT_CODE = 130
@@ -16,13 +19,24 @@ _running = False  # a job may be writing
 _asked = False  # to stop
 
 
-def handle_interrupts() -> None:
-    """Handle the process's signals from here on: before a job has begun they end it, afterwards the
+@contextmanager
+def handle_interrupts() -> Iterator[None]:
+    """Handle the signals of the process inside: before a job has begun they end it, afterwards the
     first one sets the flag and the second ends it. A signal that was ignored stays so.
     """
+    global _running, _asked
+    _running = _asked = False
+    before = {}
     for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, _handle)
+        # The main thread alone may set handlers.
+        if current_thread() is main_thread() and signal.getsignal(number) != signal.SIG_IGN:
+            before[number] = signal.signal(number, _handle)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            atexit.register(signal.signal, number, signal.SIG_DFL)  # no traceback at the end
+            signal.signal(number, handler)
 
 
 def begin_job() -> None:

@@ -54,10 +54,11 @@ def _check_memory(context: RunContext) -> None:
     nworld = context.cfg.nworld
     sim = NativeSimulation(context.model, 1, fields=required_fields(context.cfg.reset))
     sim.close()
+    size = _SHARE * sim.world_bytes
     free = available_memory()
-    most = free // (_SHARE * sim.world_bytes)
-    if nworld > most:
-        expected = f"at most {most}, because the memory of {free / 2**30:.3g} GiB holds no more"
+    if nworld * size > free:
+        sizes = f"{nworld * size / 2**30:.3g} GiB needed, {free / 2**30:.3g} GiB free"
+        expected = f"at most {free // size}, because there is not enough memory for more ({sizes})"
         raise ConfigError("nworld", nworld, expected)
 
 

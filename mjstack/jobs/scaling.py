@@ -156,7 +156,7 @@ def _backends(cfg: Config) -> list[str]:
     if asked is not None:
         return asked
     if cfg.sim.backend is not Backend.auto:
-        return [cfg.sim.backend]
+        return [str(cfg.sim.backend)]
     return ["mjwarp", "native"] if resolve_device(cfg.sim.device).startswith("cuda") else ["native"]
 
 
