@@ -9,7 +9,7 @@ from mjstack.config.fields import Count, Positive
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
 from mjstack.managers.view import EnvView
-from mjstack.mdp.geometry import named_pose, robot, robot_joints
+from mjstack.mdp.geometry import named_pose, robot
 from mjstack.scene.index import Columns
 
 MODES = ("relative", "absolute", "delta")
@@ -64,7 +64,7 @@ class JointPosition(_Commands):
         """
         if mode not in MODES:
             raise UnknownName("action mode", mode, MODES)
-        names = robot_joints(env)
+        names = env.cfg.robot.joints
         n_arm = env.index.n_arm
         parts = {"arm": names[:n_arm], "gripper": names[n_arm:], "all": names}
         if isinstance(joints, str):

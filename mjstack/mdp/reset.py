@@ -13,14 +13,7 @@ from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
-from mjstack.mdp.geometry import (
-    named_pose,
-    pose_w,
-    robot,
-    robot_joints,
-    write_object,
-    write_robot,
-)
+from mjstack.mdp.geometry import named_pose, pose_w, robot, write_object, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet
 from mjstack.mdp.starts.randomization import (
     ObjectMasses,
@@ -57,7 +50,7 @@ class JointNoise:
         """
         self._width = torch.full_like(robot(env).home, gripper)
         self._width[: env.index.n_arm] = arm
-        limits = joint_limits(env.sim.model, robot_joints(env))
+        limits = joint_limits(env.sim.model, env.cfg.robot.joints)
         self._low, self._high = (torch.from_numpy(each).to(self._width) for each in limits)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:

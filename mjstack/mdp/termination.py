@@ -6,7 +6,8 @@ from torch import Tensor
 from mjstack.config.fields import Count, NotNegative
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import not_finite
-from mjstack.mdp.geometry import joint_positions, pose_w, robot
+from mjstack.mdp.geometry import pose_w, robot
+from mjstack.mdp.observation import joint_pos
 from mjstack.scene import table_top
 from mjstack.sim import LOST_PHYSICS
 
@@ -59,7 +60,7 @@ class JointLimit:
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with a joint outside, shape ``(nworld,)``."""
-        q = joint_positions(env)
+        q = joint_pos(env)
         return ((q < self._low) | (q > self._high)).any(1)
 
 

@@ -9,7 +9,8 @@ from mjstack.config.fields import NotNegative, Positive
 from mjstack.errors import UnknownName
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, offers
-from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, nearness, place_xy, pose_w
+from mjstack.mdp.geometry import above_table, nearness, place_xy, pose_w
+from mjstack.mdp.observation import grasp_point_pos, jaw_force
 from mjstack.scene import table_top
 from mjstack.tasks.box import BoxCheck
 
@@ -127,7 +128,7 @@ class ReachNext(_ByObject):
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
         aim = self._next(env, [pose_w(env, name)[:, :3] for name in self._check.objects])
-        near = nearness(aim - grasp_point(env), self._scale)
+        near = nearness(aim - grasp_point_pos(env), self._scale)
         return torch.where(self._inside(env).all(1), 1.0, near)
 
 
@@ -151,6 +152,6 @@ class GraspNext(_ByObject):
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
-        held = [jaw_forces(env, name) > self._force for name in self._check.objects]
+        held = [jaw_force(env, object=name) > self._force for name in self._check.objects]
         grasped = self._next(env, held).all(1)
         return (grasped | self._inside(env).all(1)).to(torch.float32)

@@ -14,15 +14,8 @@ from torch import Tensor
 from mjstack.errors import ArgumentError, ConfigError, ParameterError, suggest
 from mjstack.files import to_csv, write_atomic
 from mjstack.managers.view import EnvView, offers, uses_fields
-from mjstack.mdp.geometry import (
-    joint_positions,
-    named_pose,
-    place_xy,
-    pose_w,
-    robot_joints,
-    write_object,
-    write_robot,
-)
+from mjstack.mdp.geometry import named_pose, place_xy, pose_w, write_object, write_robot
+from mjstack.mdp.observation import joint_pos
 from mjstack.mdp.starts.placement import world_boxes
 from mjstack.mdp.starts.randomization import (
     ObjectMasses,
@@ -180,7 +173,8 @@ class FromStartsFile:
             "gain": ServoGains(env),
         }
         objects = list(env.index.objects)
-        joints = [f"joint_{name}" for name in robot_joints(env)]
+        names = env.cfg.robot.joints
+        joints = [f"joint_{name}" for name in names]
         drawn = {name: _xy(name) for name in _drawn_places(env)}
         columns = [column for held in quantities.values() for column in held.columns]
         required = [column for name in objects for column in (*_xy(name), f"{name}_yaw_rad")]
@@ -199,7 +193,7 @@ class FromStartsFile:
             fix = f"Correct it, or widen reset.starts.params.{name}"
             for column, nominal in zip(held.columns, held.nominal.tolist(), strict=True):
                 file.require_range(column, nominal * low, nominal * high, fix)
-        limits = joint_limits(env.sim.model, robot_joints(env))
+        limits = joint_limits(env.sim.model, names)
         for column, low, high in zip(joints, *limits, strict=True):
             file.require_range(column, low, high)
         for name, pair in drawn.items():
@@ -278,7 +272,7 @@ def write_starts(env: EnvView, path: str | Path) -> None:
             raise ArgumentError("env", found, "objects that stand flat on it")
         add(_xy(name), pose_w(env, name)[:, :2])
         table[f"{name}_yaw_rad"] = _yaw(pose[:, 3], pose[:, 6])
-    add([f"joint_{name}" for name in robot_joints(env)], joint_positions(env))
+    add([f"joint_{name}" for name in env.cfg.robot.joints], joint_pos(env))
     quantities: tuple[type[Quantity], ...] = (ObjectMasses, SlidingFriction, ServoGains)
     for quantity in quantities:
         if _varies(env, quantity.fields):
