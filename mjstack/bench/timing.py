@@ -11,7 +11,8 @@ import torch
 from mjstack.config.schema import Config
 from mjstack.episodes.rollout import Observer, RolloutTiming
 from mjstack.math import not_finite
-from mjstack.sim import LOST_PHYSICS, Simulation, cuda_uuid, device_memory
+from mjstack.sim import LOST_PHYSICS, Simulation
+from mjstack.sim.build import cuda_uuid, device_memory
 from mjstack.sim.graph import StepGraph
 
 WARM_UP = 3  # calls: eager, captured, replayed

@@ -12,7 +12,7 @@ from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, driven_config
-from mjstack.envs.buffers import Advance, Workload, play_workload, recommend_sizes, require_physics
+from mjstack.envs.buffers import Advance, Workload, measured_sizes, play_workload
 from mjstack.episodes.observers import (
     Episode,
     Hook,
@@ -310,15 +310,11 @@ class RunContext:
             return resolve_sizes(self.cfg)
         found = self.artifacts.sizes
         if found is None:
+            what = "the driven task"
+            source = f"{what} in {self.measuring_nworld} worlds"
             task = self.play_task(self.cfg.reset)
-            require_physics("the driven task", task)
-            margin = self.cfg.gate.capacity.margin
-            source = (
-                f"batch=auto: the driven task in {self.measuring_nworld} worlds, times {margin:g}"
-            )
-            found = self.artifacts.sizes = recommend_sizes(task.peaks, margin, source)
-            sizes = apply_configured(self.cfg, found)
-            self.print_line(f"{sizes.as_overrides()} ({found.source})")
+            found = self.artifacts.sizes = measured_sizes(self.cfg, what, task, source)
+            self.print_line(str(apply_configured(self.cfg, found)))
         return apply_configured(self.cfg, found)
 
     @property

@@ -48,14 +48,9 @@ def play_seeds(
         path=None if folder is None else folder / name,
     )
     sim = context.batch_simulation(cfg.nworld)
-    sizes = sim.sizes
     tally.notes = {
         "backend": sim.description,
-        "sizes": (
-            f"{sizes.as_overrides()} ({sizes.source})"
-            if sizes
-            else "native MuJoCo has no fixed buffers"
-        ),
+        "sizes": str(sim.sizes or "native MuJoCo has no fixed buffers"),
     }
 
     # Seed after seed

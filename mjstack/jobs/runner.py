@@ -32,7 +32,8 @@ from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
 from mjstack.report.table import Console, Table, to_document
 from mjstack.report.write import safely_write, summarize, write_report
-from mjstack.sim import Simulation, cuda_driver, cuda_name
+from mjstack.sim import Simulation
+from mjstack.sim.build import cuda_driver, cuda_name
 
 log = logging.getLogger(__name__)
 
