@@ -44,20 +44,9 @@ class Env:
     Values that derive from contacts (``sensordata``, ``contact_count``) are those of the last
     physics step before, and zero in a world that has just been reset.
 
+    It has the attributes of `EnvView`, and these.
+
     Attributes:
-        sim: The worlds.
-        index: Where names lie in their views.
-        cfg: The configuration.
-        nworld: Number of worlds.
-        device: Where tensors live.
-        seed: Seed of every random number; `reset` may set it.
-        key: The same on the device, shape ``(1,)``, int64.
-        world: Number of each world, shape ``(nworld,)``, int64.
-        episode: Episode of each world, shape ``(nworld,)``, int64.
-        episode_step: Steps since each world's last reset, shape ``(nworld,)``, int64.
-        success: Whether the task is achieved, shape ``(nworld,)``, bool.
-        action: The policy's last action, shape ``(nworld, action_dim)``.
-        previous_action: The one before.
         action_manager: Actions; ``action_dim`` is the policy's output.
         observation_manager: Observation groups; ``group_dims`` are the policy's inputs.
         reset_manager: How episodes start.

@@ -22,7 +22,7 @@ class EnvView(Protocol):
         cfg: The configuration.
         nworld: Number of worlds.
         device: Where tensors live.
-        seed: Seed of every random number.
+        seed: Seed of every random number; `Env.reset` may set it.
         key: The same on the device, shape ``(1,)``, int64: what a captured step reads.
         world: Number of each world, shape ``(nworld,)``, int64.
         episode: Episode of each world, shape ``(nworld,)``, int64.

@@ -76,7 +76,7 @@ class Place:
 
 
 class _ByObject:
-    """A term that asks which objects are in the box."""
+    """A term that asks which objects are in the box, and raises a `MjstackError` without one."""
 
     def __init__(self, env: EnvView) -> None:
         self._check = BoxCheck(env.cfg)
@@ -113,15 +113,7 @@ class ReachNext(_ByObject):
     """
 
     def __init__(self, env: EnvView, *, scale: Positive) -> None:
-        """Read the box's place.
-
-        Args:
-            env: The environment.
-            scale: Distance over which the reward falls [m].
-
-        Raises:
-            MjstackError: There is no box.
-        """
+        """Take the distance over which the reward falls [m]."""
         super().__init__(env)
         self._scale = scale
 
@@ -138,15 +130,7 @@ class GraspNext(_ByObject):
     """
 
     def __init__(self, env: EnvView, *, force: NotNegative = 0.05) -> None:
-        """Read the box's place.
-
-        Args:
-            env: The environment.
-            force: Force that each jaw must exceed [N].
-
-        Raises:
-            MjstackError: There is no box.
-        """
+        """Take the force that each jaw must exceed [N]."""
         super().__init__(env)
         self._force = force
 
