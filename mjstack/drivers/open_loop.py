@@ -3,10 +3,10 @@
 import os
 import signal
 import sys
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import active_children, get_context, parent_process
 from threading import Thread
@@ -133,15 +133,21 @@ class OpenLoopPlanner:
         flat = sources_xy.reshape(nworld, -1)
         _, first, kind = np.unique(flat, axis=0, return_index=True, return_inverse=True)
         twin = first[kind.reshape(-1)]
-        alike = np.bincount(twin)
-        done = 0
-        found = {}
-        with closing(self._plans(sorted(first.tolist()), sources_xy)) as plans:
-            for world, *plan in plans:
-                found[world] = plan
-                done += int(alike[world])
-                if progress is not None:
-                    progress(done)
+        worlds = sorted(first.tolist())
+        done = np.cumsum(np.bincount(twin)[worlds])
+        found: dict[int, tuple] = {}
+
+        def take(world: int, *plan: Any) -> None:
+            found[world] = plan
+            if progress is not None:
+                progress(int(done[len(found) - 1]))
+
+        processes = min(available_cores(), len(worlds) // WORLDS_PER_PROCESS)
+        if len(worlds) >= PARALLEL_FROM and processes > 1:
+            plan_in_parallel(self._cfg, worlds, sources_xy, processes, take)
+        else:
+            for world in worlds:
+                take(world, *self.plan_world(world, sources_xy[world]))
         knots, error = (
             np.array(parts) for parts in zip(*(found[world] for world in twin), strict=True)
         )
@@ -204,17 +210,6 @@ class OpenLoopPlanner:
                 knots[k] = command
         return knots, worst
 
-    def _plans(self, worlds: list[int], sources_xy: np.ndarray) -> Generator[Plan]:
-        """The plans of some worlds, one after the other here, or shared out where there are
-        many.
-        """
-        processes = min(available_cores(), len(worlds) // WORLDS_PER_PROCESS)
-        if len(worlds) >= PARALLEL_FROM and processes > 1:
-            yield from plan_in_parallel(self._cfg, worlds, sources_xy, processes)
-            return
-        for world in worlds:
-            yield world, *self.plan_world(world, sources_xy[world])
-
     def _targets(self, xy: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Start and end of each phase: the grasp point [m] and then the gripper's command."""
         robot = self._cfg.robot
@@ -258,8 +253,12 @@ class OpenLoopPlanner:
 
 
 def plan_in_parallel(
-    cfg: Config, worlds: Sequence[int], sources_xy: np.ndarray, processes: int
-) -> Generator[Plan]:
+    cfg: Config,
+    worlds: Sequence[int],
+    sources_xy: np.ndarray,
+    processes: int,
+    take: Callable[..., None],
+) -> None:
     """Plan worlds in processes, which are gone when this has ended in any way.
 
     Args:
@@ -268,9 +267,7 @@ def plan_in_parallel(
         sources_xy: Position of each object and place of every world at the start [m], shape
             ``(nworld, sources, 2)``.
         processes: How many plan.
-
-    Yields:
-        A plan per world, in the order of worlds.
+        take: Gets each `Plan`, in the order of worlds.
 
     Raises:
         Unreachable: A target is out of reach; of several such worlds it names the first, as one
@@ -288,11 +285,8 @@ def plan_in_parallel(
         for job in jobs:
             while not wait([job], _POLL).done:
                 check_interrupt()
-            yield from job.result()
-    except (KeyboardInterrupt, GeneratorExit):
-        for process in set(active_children()).difference(theirs):
-            process.kill()  # it may still be loading
-        raise
+            for plan in job.result():
+                take(*plan)
     except BrokenProcessPool:
         raise MjstackError(
             "a planning process was killed or ended before every world was planned",
@@ -300,6 +294,8 @@ def plan_in_parallel(
             " processes",
         ) from None
     finally:
+        for process in set(active_children()).difference(theirs):
+            process.kill()  # it may still be loading
         pool.shutdown(cancel_futures=True)
 
 
