@@ -196,14 +196,16 @@ def play_workload(
     return done
 
 
-def describe_run_loss(run: Workload) -> tuple[str, str]:
-    """The physics that a run lost although there was room to spare, and what to do; both empty if
-    it lost none.
+def describe_run_loss(run: Workload) -> str:
+    """The physics that a run lost although there was room to spare, and what to do; empty if it
+    lost none.
     """
     loss, keys = describe_loss(run.peaks.overflow, run.sizes)
+    if not loss:
+        return ""
     fix = f"Set {' and '.join(f'batch.{key}' for key in keys)} higher still" if keys else NO_KEY
-    room = f" even with {run.sizes.as_overrides()}" if loss and run.sizes is not None else ""
-    return f"{loss}{room}", fix
+    room = f" even with {run.sizes.as_overrides()}" if run.sizes is not None else ""
+    return f"{loss}{room}. {fix}"
 
 
 def measured_sizes(cfg: Config, what: str, run: Workload, source: str) -> BatchSizes:
@@ -218,9 +220,8 @@ def measured_sizes(cfg: Config, what: str, run: Workload, source: str) -> BatchS
     Raises:
         FaultError: A world lost physics; names the worlds and what to do.
     """
-    loss, fix = describe_run_loss(run)
-    if loss:
-        raise FaultError(f"batch=auto: what {what} needs cannot be measured: {loss}", fix)
+    if loss := describe_run_loss(run):
+        raise FaultError(f"batch=auto: what {what} needs cannot be measured: {loss}")
     margin = cfg.gate.capacity.margin
     return recommend_sizes(run.peaks, margin, f"batch=auto: {source}, times {margin:g}")
 

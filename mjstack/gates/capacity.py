@@ -144,7 +144,7 @@ def _measure(
     peaks = reduce(join_peaks, (run.peaks for run in runs.values()))
     how = f"batch=auto: gate capacity, {context.measuring_nworld} worlds, times {margin:g}"
     wanted = recommend_sizes(peaks, margin, how if cfg.batch.auto else "gate capacity")
-    losses = [describe_run_loss(run) for run in runs.values() if run.sizes]
+    losses = (describe_run_loss(run) for run in runs.values() if run.sizes)
     done = _Group(
         name=group,
         title=title,
@@ -152,7 +152,7 @@ def _measure(
         peaks=peaks,
         sizes=apply_configured(cfg, wanted) if cfg.batch.auto else configured,
         wanted=wanted,
-        lost="; ".join(f"{loss}. {fix}" for loss, fix in losses if loss),
+        lost="; ".join(filter(None, losses)),
     )
     exact = not context.backend[1].startswith("cuda")
     for name, first in reversed(runs.items()):

@@ -20,7 +20,6 @@ from mjstack.kinematics.reach import PointReach
 from mjstack.report.picture import figure, outline
 from mjstack.report.record import GateResult, Status
 from mjstack.report.write import summarize
-from mjstack.scene import table_top
 from mjstack.scene.phases import object_targets
 from mjstack.sim import resolve_backend
 
@@ -126,7 +125,7 @@ def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
         )
     low, high = (end(targets, key=lambda pair: pair[1].z) for end in (min, max))
     first = targets[0]
-    top = table_top(cfg.scene)
+    top = cfg.scene.table_top
     # The jaws close where they grasp, but come there open, which reaches less far where one jaw
     # stays.
     return {
@@ -156,7 +155,7 @@ def map_level(context: RunContext, name: str, height: float, gripper: str) -> Re
     reach = PointReach(context.model, cfg.robot, command)
     tolerance = cfg.controller.ik_tolerance
     x, y = np.meshgrid(*axes(cfg))
-    level = np.full(x.size, table_top(cfg.scene) + height)
+    level = np.full(x.size, cfg.scene.table_top + height)
     points = np.stack([x.ravel(), y.ravel(), level], axis=1)
     residual = np.empty(len(points))
     tilt = np.empty(len(points))

@@ -9,7 +9,6 @@ from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, episode_draw
 from mjstack.math import lowest_point
-from mjstack.scene import table_top
 from mjstack.scene.index import RobotTensors, SceneIndex
 from mjstack.sim.simulation import Simulation
 
@@ -82,7 +81,7 @@ def above_table(env: EnvView, name: str) -> Tensor:
         pose = pose_w(env, name)
         thing = env.cfg.scene.objects[name]
         low = lowest_point(pose[:, :3], pose[:, 3:], thing.shape, thing.size)
-        return low - table_top(env.cfg.scene)
+        return low - env.cfg.scene.table_top
 
     return shared((id(env), above_table, name), compute)
 

@@ -5,7 +5,6 @@ from torch import Tensor
 
 from mjstack.managers.view import EnvView, offers
 from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot
-from mjstack.scene import table_top
 
 
 @offers(unit="joint")
@@ -59,7 +58,7 @@ def object_to_place(env: EnvView, *, object: str, place: str) -> Tensor:
     ``(nworld, 3)``.
     """
     at = pose_w(env, object)[:, :3]
-    height = table_top(env.cfg.scene) + env.cfg.scene.objects[object].half_height
+    height = env.cfg.scene.table_top + env.cfg.scene.objects[object].half_height
     return torch.cat((place_xy(env, place) - at[:, :2], height - at[:, 2:]), dim=1)
 
 

@@ -8,7 +8,6 @@ from mjstack.managers.view import EnvView, offers
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import pose_w, robot
 from mjstack.mdp.observation import joint_pos
-from mjstack.scene import table_top
 from mjstack.sim import LOST_PHYSICS
 
 
@@ -30,7 +29,7 @@ class ObjectOffTable:
         scene = env.cfg.scene
         self._center = env.index.constant(scene.table_center[:2], env.sim.qpos)
         self._half = env.index.constant(scene.table_half[:2], env.sim.qpos)
-        self._top = table_top(scene)
+        self._top = scene.table_top
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with an object off the table, shape ``(nworld,)``."""

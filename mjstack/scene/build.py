@@ -85,9 +85,9 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         rgba=[0.72, 0.66, 0.58, 1],
     )
     if scene.box is not None:
-        _add_box(spec, scene.box, table_top(scene))
+        _add_box(spec, scene.box, scene.table_top)
     for name, thing in scene.objects.items():
-        _add_object(world, name, thing, table_top(scene))
+        _add_object(world, name, thing, scene.table_top)
 
     # Sensors
     pairs = [(jaw, name) for name in scene.objects for jaw in jaw_bodies]
@@ -171,8 +171,3 @@ def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
             solref=solref,
             rgba=[0.50, 0.55, 0.52, 1],
         )
-
-
-def table_top(scene: SceneCfg) -> float:
-    """Height [m] of the table's surface."""
-    return scene.table_center[2] + scene.table_half[2]

@@ -11,7 +11,6 @@ from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, offers
 from mjstack.mdp.geometry import above_table, nearness, place_xy, pose_w
 from mjstack.mdp.observation import grasp_point_pos, jaw_force
-from mjstack.scene import table_top
 from mjstack.tasks.box import BoxCheck
 
 
@@ -38,7 +37,7 @@ class ToSlot:
         self._place = check.slots[object]
         scene = env.cfg.scene
         self.floor = check.box.floor
-        self._height = table_top(scene) + self.floor + scene.objects[object].half_height
+        self._height = scene.table_top + self.floor + scene.objects[object].half_height
 
     def __call__(self, env: EnvView) -> Tensor:
         """The offset."""

@@ -12,7 +12,6 @@ from torch import Tensor
 from mjstack.managers.view import EnvView
 from mjstack.math import lowest_point, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, pose_w
-from mjstack.scene import table_top
 from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
 
@@ -78,7 +77,7 @@ class TaskView:
         index = env.index
         scene = env.cfg.scene
         self.things = [scene.objects[name] for name in objects]
-        self.top = table_top(scene)
+        self.top = scene.table_top
         self.half = torch.tensor([each.half for each in self.things], device=env.device)
         self.radius = torch.tensor([each.radius for each in self.things], device=env.device)
         self.qvel = [

@@ -133,6 +133,11 @@ class SceneCfg:
         """The objects that move."""
         return {name: thing for name, thing in self.objects.items() if not thing.fixed}
 
+    @property
+    def table_top(self) -> float:
+        """Height [m] of the table's surface."""
+        return self.table_center[2] + self.table_half[2]
+
 
 @dataclass(slots=True)
 class ModelCfg:

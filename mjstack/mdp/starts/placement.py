@@ -14,7 +14,7 @@ from torch import Tensor
 from mjstack.config.schema import Config, ObjectCfg, SceneCfg
 from mjstack.errors import ParameterError
 from mjstack.rng import uniform
-from mjstack.scene import SceneIndex, table_top
+from mjstack.scene import SceneIndex
 
 SCHEMA = 2
 """How objects that may meet are placed: 1 was one after the other, 2 is all together."""
@@ -92,7 +92,7 @@ class Placement:
         fixed = world_boxes(data, np.flatnonzero(collides & bolted & ~ground))
 
         rectangles = []
-        top = table_top(scene)
+        top = scene.table_top
         for thing in objects:
             around = np.concatenate(
                 [_around(thing, top, arm, min(gap, _ARM_ROOM)), _around(thing, top, fixed, gap)]
