@@ -7,7 +7,7 @@ import math
 
 import mujoco
 
-from mjstack.config.schema import BoxCfg, Config, ObjectCfg, SceneCfg
+from mjstack.config.schema import BoxCfg, Config, ObjectCfg
 from mjstack.errors import SourceError
 from mjstack.robots import robot_spec
 
