@@ -75,7 +75,7 @@ def measure_episode(
         repetition_began = time.perf_counter()
         played.append(_play(context, sim, meter, out))
         estimate = time.perf_counter() - repetition_began
-        context.report_progress("episode, repetitions", len(played), repetitions)
+        context.advance("episode, repetitions", len(played), repetitions)
     if not played and before is not None:
         played = [before]
     if not played:

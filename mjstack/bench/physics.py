@@ -91,7 +91,7 @@ def measure_physics(
     times = []
     for repetition in range(repetitions):
         times.append(held.play(steps, meter))
-        context.report_progress("physics, repetitions", repetition + 1, repetitions)
+        context.advance("physics, repetitions", repetition + 1, repetitions)
 
     # The result
     graph = sim.graph_of(held.decimation)
@@ -209,7 +209,7 @@ def measure_arrangements(
                 raise MjstackError(
                     f"{name}: physics was lost, and a figure would be void. Run gates=[capacity]."
                 )
-        context.report_progress("repetitions", repetition, repetitions)
+        context.advance("repetitions", repetition, repetitions)
     sim.close()
     return times
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -13,35 +13,15 @@ from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, driven_config
 from mjstack.envs.buffers import Advance, Workload, measured_sizes, play_workload
-from mjstack.episodes.observers import (
-    Episode,
-    Hook,
-    Snapshots,
-    StepHook,
-    WorldRecorder,
-    play_episode,
-)
-from mjstack.episodes.rollout import (
-    CLOSED_LOOP,
-    NOMINAL,
-    Observer,
-    Reset,
-    State,
-    reset_worlds,
-)
+from mjstack.episodes.observers import Episode, Snapshots, WorldRecorder, play_episode
+from mjstack.episodes.rollout import CLOSED_LOOP, NOMINAL, Observer, Reset, State, reset_worlds
 from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
 from mjstack.mdp.geometry import source_xy
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import SceneIndex, build_model
 from mjstack.scene.phases import Phase
-from mjstack.sim import (
-    BatchSizes,
-    Simulation,
-    make_simulation,
-    resolve_backend,
-    resolve_sizes,
-)
+from mjstack.sim import BatchSizes, Simulation, make_simulation, resolve_backend, resolve_sizes
 from mjstack.sim.sizes import apply_configured
 from mjstack.tasks.check import EpisodeCheck, make_check
 
@@ -137,7 +117,7 @@ class RunContext:
         begin: Told the name of each part of the run as it begins.
         record: Gets each result as soon as there is one.
         advance: Told about progress.
-        on_step: Called after each step of the one-world episode that is shown (viewer).
+        viewers: Look on at the one-world episode that is shown.
         artifacts: Products of gates.
     """
 
@@ -148,8 +128,8 @@ class RunContext:
     print_line: TextHook = lambda line: None
     begin: TextHook = lambda name: None
     record: Callable[[GateResult], None] = lambda result: None
-    advance: Advance | None = None
-    on_step: StepHook | None = None
+    advance: Advance = lambda what, done, total: None
+    viewers: Sequence[Observer] = ()
     artifacts: Artifacts = field(default_factory=Artifacts)
 
     def __post_init__(self) -> None:
@@ -196,19 +176,9 @@ class RunContext:
         steps = [self.phase(name).stop - 1 for name in self.cfg.gate.parity.states.values()]
         world = WorldRecorder()
         snapshots = Snapshots(steps)
-        shown = [] if "parity" in self.cfg.gates else self.viewers
+        shown = () if "parity" in self.cfg.gates else self.viewers
         episode = self.play(sim, NOMINAL, [*shown, world, snapshots])
         return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)
-
-    def report_progress(self, what: str, done: int, total: int) -> None:
-        """Report progress, if anyone listens."""
-        if self.advance is not None:
-            self.advance(what, done, total)
-
-    @property
-    def viewers(self) -> list[Observer]:
-        """Observers of the episode that is shown."""
-        return [] if self.on_step is None else [Hook(self.on_step)]
 
     def start(
         self,
@@ -241,8 +211,9 @@ class RunContext:
 
             return ClosedLoopDriver(env, self.planner.nominal)
         sources = source_xy(env).double().cpu().numpy()
-        planned = partial(self.report_progress, "planning", total=sim.nworld)
-        trajectory = self.planner.plan(sources, planned).to(sim.device, sim.ctrl.dtype)
+        trajectory = self.planner.plan(
+            sources, lambda done: self.advance("planning", done, sim.nworld)
+        ).to(sim.device, sim.ctrl.dtype)
         return OpenLoopDriver(trajectory, self.planner.phases)
 
     def play(

@@ -236,7 +236,7 @@ class Collection:
         """Commit the episodes of some worlds, and record it."""
         for count, (world, arrays) in enumerate(played.episodes(worlds), 1):
             self._writer.add([self._episode(played, world, arrays)])
-            self._context.report_progress(f"episodes of seed {played.seed}", count, len(worlds))
+            self._context.advance(f"episodes of seed {played.seed}", count, len(worlds))
         self._writer.flush()
         self._record()
 

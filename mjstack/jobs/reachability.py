@@ -164,7 +164,7 @@ def map_level(context: RunContext, name: str, height: float, gripper: str) -> Re
         found = reach.solve_upright(points[part], tolerance)
         residual[part] = found.distance
         tilt[part] = np.where(found.distance <= tolerance, np.degrees(found.tilt), np.nan)
-        context.report_progress("points", min(first + _SHARE, len(points)), len(points))
+        context.advance("points", min(first + _SHARE, len(points)), len(points))
     return ReachLevel(
         name=name,
         height=height,

@@ -20,7 +20,7 @@ from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Config
 from mjstack.episodes.context import Artifacts, RunContext
-from mjstack.episodes.observers import StepHook
+from mjstack.episodes.observers import Hook, StepHook
 from mjstack.errors import ConfigError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import log_error
@@ -121,7 +121,7 @@ class CheckedJob:
                     begin=bar.start,
                     record=record,
                     advance=bar.advance,
-                    on_step=_viewer(self.context) if cfg.view else None,
+                    viewers=[Hook(_viewer(self.context))] if cfg.view else [],
                     artifacts=Artifacts(),
                 )
                 self.work(context, folder)

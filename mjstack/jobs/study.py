@@ -132,7 +132,7 @@ def _measure(context: RunContext, base: HeldPhysics, steps: int) -> Row:
                 times[one].append(1e3 * one.play(steps) / (steps * base.decimation))
                 if problem := describe_lost(one.lost):
                     raise MjstackError(f"no time: {problem} (of {sim.nworld}).")
-            context.report_progress("repetitions", repetition + 1, job.repetitions)
+            context.advance("repetitions", repetition + 1, job.repetitions)
     finally:
         sim.close()
     ratios = [a / b for a, b in zip(times[ours], times[base], strict=True)]
