@@ -112,13 +112,7 @@ class Env:
         self._outputs = Outputs(
             self.reward_manager, self.termination_manager, self.observation_manager, self.success
         )
-        self._faults = FaultLatch(
-            sim,
-            self.action_manager,
-            self.reward_manager,
-            self.observation_manager,
-            cfg.termination,
-        )
+        self._faults = FaultLatch(self)
         self.graph = self.captured(self.advance, "env.step")
 
     @property
