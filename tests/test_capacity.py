@@ -582,8 +582,8 @@ def test_convex_pairs_and_whole_pools_are_held_against_their_keys() -> None:
     seen = peaks(nworld=4, contacts=20, pool_ccd_pairs=40)
     wanted = recommend_sizes(seen, 1.25, "")
     group = capacity_module._Group(
+        name="task",
         title="",
-        prefix="",
         runs={},
         peaks=seen,
         sizes=resolve_sizes(cfg),
