@@ -15,7 +15,7 @@ from mjstack.episodes.context import RunContext, needs_episode
 from mjstack.episodes.record import starts_name
 from mjstack.episodes.regions import find_regions, regions_table, save_regions
 from mjstack.episodes.rollout import CLOSED_LOOP, Observer
-from mjstack.episodes.seeds import play_seeds
+from mjstack.episodes.tally import play_seeds
 from mjstack.errors import MjstackError
 from mjstack.mdp.starts.starts_file import write_starts
 from mjstack.report.record import GateResult
