@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
 
 import mujoco
 
@@ -17,6 +16,7 @@ from mjstack.episodes.observers import Episode, Snapshots, WorldRecorder, play_e
 from mjstack.episodes.rollout import CLOSED_LOOP, NOMINAL, Observer, Reset, State, reset_worlds
 from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
+from mjstack.managers.view import offers
 from mjstack.mdp.geometry import source_xy
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import SceneIndex, build_model
@@ -26,7 +26,9 @@ from mjstack.sim.sizes import apply_configured
 from mjstack.tasks.check import EpisodeCheck, make_check
 
 TextHook = Callable[[str], None]
-AnyGate = TypeVar("AnyGate", bound=Callable)
+
+needs_episode = offers(needs_episode=True)
+"""Marks a gate that plays judged episodes. It is skipped for a task that has none."""
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -334,12 +336,6 @@ def lacks_episode(cfg: Config) -> str:
     if cfg.task.check is None:
         return f"task {cfg.task.name} has no check"
     return ""
-
-
-def needs_episode(gate: AnyGate) -> AnyGate:
-    """Mark a gate that plays judged episodes. It is skipped for a task that has none."""
-    gate.needs_episode = True  # type: ignore[attr-defined]
-    return gate
 
 
 def require_episode(cfg: Config) -> None:

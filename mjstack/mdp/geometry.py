@@ -2,10 +2,12 @@
 share.
 """
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
-from mjstack.errors import ParameterError, UnknownName
+from mjstack.errors import UnknownName
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, episode_draw
 from mjstack.math import lowest_point
@@ -18,19 +20,8 @@ def robot(env: EnvView) -> RobotTensors:
     return env.index.on(env.device, env.sim.qpos.dtype)
 
 
-POSES = ("home", "start")
+Pose = Literal["home", "start"]  # the robot's own commands
 LOADED = 1e-5  # N: a jaw that presses with more touches the object
-
-
-def named_pose(env: EnvView, pose: str) -> Tensor:
-    """One of the robot's own commands, `POSES`, shape ``(n,)``.
-
-    Raises:
-        ParameterError: There is no such pose.
-    """
-    if pose not in POSES:
-        raise ParameterError("pose", pose, " or ".join(POSES))
-    return getattr(robot(env), pose)
 
 
 def write_robot(env: EnvView, mask: Tensor, command: Tensor) -> None:

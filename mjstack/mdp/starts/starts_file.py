@@ -14,7 +14,7 @@ from torch import Tensor
 from mjstack.errors import ArgumentError, ConfigError, ParameterError, suggest
 from mjstack.files import to_csv, write_atomic
 from mjstack.managers.view import EnvView, offers, uses_fields
-from mjstack.mdp.geometry import named_pose, place_xy, pose_w, write_object, write_robot
+from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_object, write_robot
 from mjstack.mdp.observation import joint_pos
 from mjstack.mdp.starts.placement import world_boxes
 from mjstack.mdp.starts.randomization import (
@@ -140,7 +140,7 @@ class FromStartsFile:
         env: EnvView,
         *,
         path: str | None,
-        pose: str = "start",
+        pose: Pose = "start",
         mass: Sequence[float] = (0.7, 1.3),
         friction: Sequence[float] = (0.8, 1.4),
         gain: Sequence[float] = (0.9, 1.1),
@@ -207,7 +207,7 @@ class FromStartsFile:
             env.given_places[name] = _on(env, np.stack([table[column] for column in pair], axis=1))
 
         # Starts, which have to be free and within reach
-        command = np.tile(named_pose(env, pose).double().cpu().numpy(), (rows, 1))
+        command = np.tile(getattr(robot(env), pose).double().cpu().numpy(), (rows, 1))
         for number, column in enumerate(joints):
             command[:, number] = table.get(column, command[:, number])
         poses = np.zeros((rows, len(objects), 6))  # x, y and the quaternion
