@@ -53,7 +53,7 @@ class JointPosition(_Commands):
 
         Args:
             env: The environment.
-            joints: ``arm``, ``gripper``, ``all``, or names of joints.
+            joints: ``arm``, ``gripper``, ``all``, or one or more names of joints.
             mode: See the class.
             scale: Command for an action of 1 [rad, m]; not used by ``absolute``.
             pose: ``home`` or ``start``: what ``relative`` counts from.
@@ -65,12 +65,10 @@ class JointPosition(_Commands):
         n_arm = env.index.n_arm
         parts = {"arm": names[:n_arm], "gripper": names[n_arm:], "all": names}
         if isinstance(joints, str):
-            if joints not in parts:
-                raise UnknownName("action joints", joints, parts)
-            joints = parts[joints]
+            joints = parts.get(joints, [joints])
         for name in joints:
             if name not in names:
-                raise UnknownName("action joint", name, names)
+                raise UnknownName("action joint", name, [*parts, *names])
         chosen = [names.index(name) for name in joints]
         if not chosen or len(set(chosen)) < len(chosen):
             raise ParameterError("joints", joints, "at least one joint, each once")

@@ -254,7 +254,8 @@ def write_starts(env: EnvView, path: str | Path) -> None:
         path: The file. World k of the environment becomes world k of the file.
 
     Raises:
-        ArgumentError: The worlds have moved on, or the file cannot be written.
+        ArgumentError: The worlds have moved on.
+        OSError: The file cannot be written.
     """
     if bool((env.episode_step != 0).any()) or bool((env.episode < 0).any()):
         found = "worlds that have moved on, or not started"
@@ -282,11 +283,7 @@ def write_starts(env: EnvView, path: str | Path) -> None:
         add(_xy(name), place_xy(env, name))
     # Python's and numpy's shortest text of a number is read back to the same bits.
     rows = [dict(zip(table, cells, strict=True)) for cells in zip(*table.values(), strict=True)]
-    try:
-        write_atomic(Path(path), to_csv(rows))
-    except OSError as error:
-        found = f"{path} ({error.strerror})"
-        raise ArgumentError("path", found, "a file in a folder that can be written") from error
+    write_atomic(Path(path), to_csv(rows))
 
 
 def _drawn_places(env: EnvView) -> list[str]:
