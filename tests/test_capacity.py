@@ -676,7 +676,9 @@ def test_batch_uses_what_capacity_measured(new_context: NewContext) -> None:
     context.artifacts.sizes = BatchSizes(nconmax=40, njmax=184, source="batch=auto: somewhere")
     sim = context.batch_simulation(2)
     assert sim.sizes == BatchSizes(nconmax=48, njmax=184)  # type: ignore[attr-defined]
-    assert context.parity_simulation().sizes == BatchSizes(nconmax=48, njmax=300)  # type: ignore[attr-defined]
+    assert make_simulation(
+        context.model, context.cfg, 1, backend=Backend.mjwarp
+    ).sizes == BatchSizes(nconmax=48, njmax=300)  # type: ignore[attr-defined]
     assert context.env_sizes is None
     context.artifacts.env_sizes = BatchSizes(nconmax=64, njmax=400)
     assert context.env_sizes == BatchSizes(nconmax=48, njmax=400)

@@ -18,8 +18,7 @@ from mjstack.bench.timing import (
 )
 from mjstack.config.schema import Backend
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import CommandRecorder, Snapshots
-from mjstack.episodes.rollout import State, restore, rollout, snapshot
+from mjstack.episodes.rollout import CommandRecorder, Snapshots, State, restore, rollout, snapshot
 from mjstack.errors import MjstackError
 from mjstack.mdp.geometry import objects_in_hand
 from mjstack.sim import Simulation, resolve_device

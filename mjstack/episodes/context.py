@@ -12,8 +12,18 @@ from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, driven_config
 from mjstack.envs.buffers import Advance, Workload, measured_sizes, play_workload
-from mjstack.episodes.observers import Episode, Snapshots, WorldRecorder, play_episode
-from mjstack.episodes.rollout import CLOSED_LOOP, NOMINAL, Observer, Reset, State, reset_worlds
+from mjstack.episodes.rollout import (
+    CLOSED_LOOP,
+    NOMINAL,
+    Episode,
+    Observer,
+    Reset,
+    Snapshots,
+    State,
+    WorldRecorder,
+    play_episode,
+    reset_worlds,
+)
 from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
 from mjstack.managers.view import offers
@@ -319,10 +329,6 @@ class RunContext:
         """
         found = self.artifacts.env_sizes
         return apply_configured(self.cfg, found) if self.cfg.batch.auto and found else None
-
-    def parity_simulation(self) -> Simulation:
-        """One MJWarp world."""
-        return make_simulation(self.model, self.cfg, 1, backend=Backend.mjwarp)
 
     def phase(self, name: str) -> Phase:
         """A phase by its name."""

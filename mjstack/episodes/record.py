@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from mjstack.episodes.failures import FailureMonitor, Sign
-from mjstack.episodes.observers import Episode
+from mjstack.episodes.rollout import Episode
 from mjstack.errors import RunError
 from mjstack.files import reading, write_npz
 from mjstack.tasks.check import Rules

@@ -12,9 +12,8 @@ import numpy as np
 from mjstack.config.session import search_path_args
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor, describe_sign
-from mjstack.episodes.observers import Episode
 from mjstack.episodes.record import FAILING, SUCCESS_FAILING, Circumstances, EpisodeRecord
-from mjstack.episodes.rollout import Observer
+from mjstack.episodes.rollout import Episode, Observer
 from mjstack.errors import first_line, name_worlds
 from mjstack.files import to_csv, write_atomic
 from mjstack.interrupt import check_interrupt

@@ -19,8 +19,7 @@ from mjstack.datasets import DatasetSpec, Feature
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import play_episode
-from mjstack.episodes.rollout import Observer, reset_worlds
+from mjstack.episodes.rollout import Observer, play_episode, reset_worlds
 from mjstack.errors import ConfigError
 from mjstack.mdp.starts.placement import GAP, SCHEMA, may_meet
 from mjstack.sim import Simulation, resolve_backend

@@ -20,7 +20,7 @@ from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Config
 from mjstack.episodes.context import Artifacts, RunContext
-from mjstack.episodes.observers import Hook, StepHook
+from mjstack.episodes.rollout import Hook, StepHook
 from mjstack.errors import ConfigError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import log_error

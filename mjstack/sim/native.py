@@ -90,9 +90,8 @@ class _Visit:
             with suppress(Empty):
                 self.wake.get(timeout=_POLL)
             check_interrupt()
-        for error in self.ended:
-            if error is not None:
-                raise error
+        for error in filter(None, self.ended):
+            raise error
 
     def abandon(self) -> None:
         """Take the worlds away, and wait until no thread writes into the state or uses its data.
