@@ -259,15 +259,8 @@ def plan_in_parallel(
     processes: int,
     take: Callable[..., None],
 ) -> None:
-    """Plan worlds in processes, which are gone when this has ended in any way.
-
-    Args:
-        cfg: From which a process builds its planner.
-        worlds: Their numbers, ascending.
-        sources_xy: Position of each object and place of every world at the start [m], shape
-            ``(nworld, sources, 2)``.
-        processes: How many plan.
-        take: Gets each `Plan`, in the order of worlds.
+    """Plan worlds, their numbers ascending, in processes, which are gone when this has ended in any
+    way. ``take`` gets each `Plan`, in that order; ``sources_xy`` as of `OpenLoopPlanner.plan`.
 
     Raises:
         Unreachable: A target is out of reach; of several such worlds it names the first, as one

@@ -209,13 +209,8 @@ def describe_run_loss(run: Workload) -> str:
 
 
 def measured_sizes(cfg: Config, what: str, run: Workload, source: str) -> BatchSizes:
-    """Sizes for ``batch=auto`` from one run, with the configured margin.
-
-    Args:
-        cfg: The configuration.
-        what: What was run, such as ``the driven task``.
-        run: The run.
-        source: Where the sizes come from, in words.
+    """Sizes for ``batch=auto`` from one run, such as of ``the driven task``, with the configured
+    margin and their source in words.
 
     Raises:
         FaultError: A world lost physics; names the worlds and what to do.

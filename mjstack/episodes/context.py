@@ -237,14 +237,8 @@ class RunContext:
         seed: int | None = None,
         worlds: Sequence[int] | None = None,
     ) -> Episode:
-        """Roll out one judged episode.
-
-        Args:
-            sim: The worlds.
-            reset: How they start.
-            observers: Look on.
-            seed: Seed, if not the configured one.
-            worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start`.
+        """Roll out one judged episode, at which the observers look on; other arguments as of
+        `start`.
         """
         env = self.start(sim, reset, seed=seed, worlds=worlds)
         return play_episode(env, self.driver(env), observers, advance=self.advance)

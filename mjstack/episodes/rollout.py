@@ -235,14 +235,8 @@ def play_episode(
     advance: Advance | None = None,
     label: str = "steps",
 ) -> Episode:
-    """Roll out one whole episode, judged by the task's check.
-
-    Args:
-        env: The environment, its worlds at their start.
-        driver: Gives the actions.
-        observers: Look on after the check.
-        advance: Told about progress.
-        label: Name of the steps in the progress.
+    """Roll out one whole episode, judged by the task's check, which looks on before the observers.
+    Arguments as of `rollout`.
     """
     start = env.sim.qpos.cpu().numpy().copy()
     judge = Judge()

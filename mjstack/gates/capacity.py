@@ -168,17 +168,8 @@ def _compare(
     """Hold a run at exactly the recommended sizes against the first one.
 
     Nothing may be lost. Where runs repeat bit for bit, the outcome is to be the same too; where
-    they do not, a world near a threshold may fall on its other side, which is reported.
-
-    Args:
-        name: The workload.
-        first: The run with room to spare.
-        again: The second one.
-        result: Gets the figures.
-        exact: Whether runs repeat bit for bit, as they do on any CPU.
-
-    Returns:
-        The problem, if any.
+    they do not, a world near a threshold may fall on its other side, which is reported. Returns the
+    problem, if any.
     """
     assert again.sizes is not None, "native MuJoCo has no sizes to try"
     sizes = again.sizes.as_overrides()

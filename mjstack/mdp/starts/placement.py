@@ -28,12 +28,8 @@ _ARM_ROOM = 0.001
 
 
 def may_meet(scene: SceneCfg, region: Sequence[float], gap: float = GAP) -> bool:
-    """Whether free objects in a region around their nominal positions can be too close together.
-
-    Args:
-        scene: The scene.
-        region: Half-widths of the region in x and y [m].
-        gap: Free room between objects [m].
+    """Whether free objects in a region around their nominal positions, of these half-widths [m],
+    can be closer together than a gap [m].
     """
     return any(
         math.hypot(
