@@ -207,7 +207,7 @@ class Env:
 
         On CUDA it has fixed shapes and no host read, so that a larger graph may hold it.
         """
-        self._apply_action()
+        self.action_manager.apply()
         self._step_physics()
         self._evaluate()
         current_term.label = ""
@@ -238,7 +238,7 @@ class Env:
         """
 
         def managers() -> None:
-            self._apply_action()
+            self.action_manager.apply()
             self._evaluate()
 
         physics = self.captured(self._step_physics, "the physics")
@@ -280,10 +280,6 @@ class Env:
             self.reward_manager,
         )
         return "\n".join((head, *(str(manager) for manager in managers)))
-
-    def _apply_action(self) -> None:
-        current_term.label = ""
-        self.action_manager.apply()
 
     def _step_physics(self) -> None:
         current_term.label = ""
