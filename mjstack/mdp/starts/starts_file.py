@@ -100,6 +100,11 @@ class StartsTable:
         self.columns = {name: column[order] for name, column in table.items()}
         self.lines = np.array([line for line, _ in rows])[order]
 
+    def take(self, columns: Sequence[str]) -> np.ndarray:
+        """Columns side by side, NaN where the file has none, shape ``(worlds, n)``."""
+        missing = np.full(len(self.lines), math.nan)
+        return np.stack([self.columns.get(name, missing) for name in columns], axis=1)
+
     def misfit(self, world: int, columns: Sequence[str], expected: str, fix: str) -> ConfigError:
         """The error that some cells of a world's line cannot be used."""
         return self.wrong(expected, fix, self.lines[world], columns)
@@ -204,17 +209,17 @@ class FromStartsFile:
                 if column not in table:
                     raise file.misfit(0, pair, "both coordinates of a place", "Add a column")
                 file.require_range(column, at - width, at + width)
-            env.given_places[name] = _on(env, np.stack([table[column] for column in pair], axis=1))
+            env.given_places[name] = _on(env, file.take(pair))
 
         # Starts, which have to be free and within reach
-        command = np.tile(getattr(robot(env), pose).double().cpu().numpy(), (rows, 1))
-        for number, column in enumerate(joints):
-            command[:, number] = table.get(column, command[:, number])
+        given = file.take(joints)
+        command = np.where(np.isnan(given), getattr(robot(env), pose).double().cpu().numpy(), given)
         poses = np.zeros((rows, len(objects), 6))  # x, y and the quaternion
         for number, name in enumerate(objects):
             half = 0.5 * table[f"{name}_yaw_rad"]
-            stands = [*(table[column] for column in _xy(name)), np.cos(half), np.sin(half)]
-            poses[:, number, [0, 1, 2, 5]] = np.stack(stands, axis=1)
+            poses[:, number, :2] = file.take(_xy(name))
+            poses[:, number, 2] = np.cos(half)
+            poses[:, number, 5] = np.sin(half)
         _check_worlds(env, file, poses, command)
         for number, name in enumerate(objects):
             if found := out_of_reach(env, name, poses[:, number, :2]):
@@ -225,12 +230,11 @@ class FromStartsFile:
         # All of it on the device
         self._command = _on(env, command)
         self._poses = _on(env, poses)
-        missing = np.full(rows, np.nan)
-        self._given = []
-        for held in quantities.values():
-            if table.keys() & set(held.columns):
-                values = np.stack([table.get(column, missing) for column in held.columns], axis=1)
-                self._given.append((held, torch.from_numpy(values).to(env.device)))
+        self._given = [
+            (held, torch.from_numpy(file.take(held.columns)).to(env.device))
+            for held in quantities.values()
+            if table.keys() & set(held.columns)
+        ]
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos, ctrl and the model fields that the file has columns for."""
