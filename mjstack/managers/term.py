@@ -85,7 +85,7 @@ def _mismatch(value: Any, hint: Any) -> str:
         words = inner[1].describe(_WORDS.get(inner[0], "a value"))
         return "" if not _mismatch(value, inner[0]) and inner[1].holds(value) else words
     if get_origin(hint) is Literal:
-        return "" if value in inner else " or ".join(map(str, inner))
+        return "" if value in inner else f"one of {', '.join(map(str, inner))}"
     if get_origin(hint) in (Union, UnionType):
         problems = [_mismatch(value, option) for option in inner]
         return "" if "" in problems else " or ".join(problems)
