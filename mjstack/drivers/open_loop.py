@@ -90,7 +90,13 @@ class JointTrajectory:
 
 
 class OpenLoopPlanner:
-    """Plans joint trajectories for objects and places at given positions, with mink."""
+    """Plans joint trajectories for objects and places at given positions, with mink.
+
+    Attributes:
+        phases: The phases.
+        ik: Inverse kinematics of the robot alone.
+        nominal: Commands at the end of each phase of the nominal plan, shape ``(phases, nu)``.
+    """
 
     def __init__(self, cfg: Config) -> None:
         """Plan the nominal start, from which every other plan starts.
@@ -111,6 +117,7 @@ class OpenLoopPlanner:
         self._seed: np.ndarray | None = None
         self._last: tuple[np.ndarray, JointTrajectory] | None = None
         self._seed = self.plan_world(0, nominal_xy(cfg.scene))[0]
+        self.nominal = self._seed[len(self._nodes) - 1 :: len(self._nodes)]
 
     def plan(
         self, sources_xy: np.ndarray, progress: Callable[[int], None] | None = None
@@ -155,12 +162,6 @@ class OpenLoopPlanner:
         if nworld > 1:
             self._last = (sources_xy.copy(), trajectory)
         return trajectory
-
-    @property
-    def nominal(self) -> np.ndarray:
-        """Commands at the end of each phase of the nominal plan, shape ``(phases, nu)``."""
-        assert self._seed is not None
-        return self._seed[len(self._nodes) - 1 :: len(self._nodes)]
 
     def path_error(self) -> float:
         """Largest distance [m] of the grasp point from its straight path at any step of the nominal
