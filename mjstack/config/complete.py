@@ -72,12 +72,7 @@ def _typed_all(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
 
 
 def typed(key: str, node: Any, kind: type) -> Any:
-    """A mapping of a composed configuration as a dataclass.
-
-    Args:
-        key: Its dotted key, for errors.
-        node: The mapping.
-        kind: The dataclass.
+    """A mapping of a composed configuration, at a dotted key, as a dataclass.
 
     Raises:
         MjstackError: A key is unknown or missing, or its field does not accept a value.

@@ -128,11 +128,6 @@ def play_demonstrations(context: RunContext, sim: Simulation, seed: int) -> Play
     """Play the configured driver once from the starts of a seed, and judge it by the task's check.
 
     Nothing ends an episode: worlds go on to its end, so all have as many steps.
-
-    Args:
-        context: Configuration, scene and planner.
-        sim: The worlds.
-        seed: Seed of the starts.
     """
     cfg = demonstration_config(replace(context.cfg, seed=seed))
     env = Env(sim, context.index, cfg, check_faults=False)  # the check names lost worlds
@@ -186,12 +181,8 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]
 
 
 def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSpec:
-    """Describe the dataset of an environment's demonstrations.
-
-    Args:
-        env: An environment of `demonstration_config`, with any number of worlds.
-        cfg: The job's configuration.
-        provenance: Versions and hardware.
+    """Describe the dataset of demonstrations in an environment of `demonstration_config`, with any
+    number of worlds.
 
     Raises:
         ConfigError: An observation group has a name that is taken.

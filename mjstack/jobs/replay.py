@@ -95,20 +95,20 @@ def _plan(cfg: Config) -> ReplayPlan:
 
     # The world: [gate:][seed:]number
     *heads, tail = str(cfg.world).split(":")
+    world = int(tail)
     had = [gate for gate in ("batch", "success") if gate in run.cfg.gates]
     gate = heads.pop(0) if heads and not heads[0].isdigit() else (had or ["batch"])[0]
+    first = run.cfg.seed
+    last = first + run.cfg.gate[gate].seeds - 1
+    seed = int(heads[0]) if heads else first
+    expected = ""
     if gate not in had:
         expected = f"a world of a gate that run had, {' or '.join(had) or 'but it had none'}"
-        raise ConfigError("world", cfg.world, expected)
-    first = run.cfg.seed
-    seed = int(heads[0]) if heads else first
-    world = int(tail)
-    last = first + (run.cfg.gate.success if gate == "success" else run.cfg.gate.batch).seeds - 1
-    if not first <= seed <= last:
+    elif not first <= seed <= last:
         expected = f"a seed from {first} to {last}, as that run has (seed:world)"
-        raise ConfigError("world", cfg.world, expected)
-    if not world < run.cfg.nworld:
+    elif world >= run.cfg.nworld:
         expected = f"a world from 0 to {run.cfg.nworld - 1}, as that run has"
+    if expected:
         raise ConfigError("world", cfg.world, expected)
     record = run.record(seed, gate)
 

@@ -256,12 +256,8 @@ def describe_crossover(rows: Sequence[Row]) -> str:
 def save_scaling_curves(path: Path, rows: Sequence[Row], decimation: int, title: str) -> None:
     """Draw throughput and time per step over the number of worlds.
 
-    Args:
-        path: The picture.
-        rows: The table. A run that did not pass interrupts its curves, even with figures, and a
-            cross marks it.
-        decimation: Physics steps in an environment step: both are drawn as world-steps/s.
-        title: Above the panels.
+    A run that did not pass interrupts its curves, even with figures, and a cross marks it. Steps of
+    environments are drawn as world-steps/s too.
     """
     with figure(path, f"{title} (x: no figure)", 2, figsize=(12, 4.8)) as (_, (rate, cost)):
         for backend, (color, label, height) in _BACKENDS.items():
