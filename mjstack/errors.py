@@ -106,7 +106,13 @@ class TermError(KeyedError):
 
 
 class ParameterError(ConfigError):
-    """A value that a term cannot use, by the parameter's name; the manager puts its key before."""
+    """A value that a term cannot use, by the parameter's name; its manager raises a `ConfigError`
+    of the whole key.
+    """
+
+    def __init__(self, key: str, value: object, expected: str, fix: str = "") -> None:
+        super().__init__(key, value, expected, fix)
+        self.facts = (value, expected, fix)
 
 
 class FaultError(MjstackError):

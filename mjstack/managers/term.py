@@ -111,8 +111,7 @@ def blamed(label: str) -> Iterator[None]:
     try:
         yield
     except ParameterError as error:
-        error.move(f"{label}.params.{error.key}")
-        raise
+        raise ConfigError(f"{label}.params.{error.key}", *error.facts) from error
     except ConfigError:  # names its key itself
         raise
     except MjstackError as error:
