@@ -100,7 +100,7 @@ def check_task(context: RunContext) -> None:
     if phases[-1].stop > cfg.task.episode_steps:
         expected = f"at least the steps of the phases, {phases[-1].stop}"
         raise ConfigError("task.episode_steps", cfg.task.episode_steps, expected)
-    check_env(context, driven_config(cfg), action="controller.action")
+    check_env(context, driven_config(cfg, reset={}), action="controller.action")
     if cfg.controller.approach_gain > 0.0:
         turn_sign(context.model, cfg)
     if cfg.controller.name == CLOSED_LOOP or "success" in cfg.gates:

@@ -5,6 +5,7 @@ fixed.
 import itertools
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -120,16 +121,10 @@ class Placement:
             ParameterError: In some of them no candidate fits.
         """
         count = len(self._apart)
-        world = torch.arange(_TRIALS)
-        zero = torch.zeros_like(world)
-        draws = uniform(
-            seed=0, world=world, episode=zero, step=zero, stream=0, size=2 * count * candidates
-        ).double()
-        draws = draws.view(_TRIALS, count, candidates, 2)
-        hard = draws[
-            ~self.choose(draws[:, :, :_FIRST])[1]
-        ]  # the first few do for most worlds, which saves time
-        lacking = sum(int((~self.choose(share)[1]).sum()) for share in hard.split(_SHARE))
+        draws = _trials(2 * count * candidates).view(_TRIALS, count, candidates, 2)
+        # The first few do for most worlds, which saves time.
+        hard = draws[~self.choose(draws[:, :, :_FIRST].double())[1]]
+        lacking = sum(int((~self.choose(share.double())[1]).sum()) for share in hard.split(_SHARE))
         if lacking:
             raise ParameterError(
                 "xy",
@@ -175,6 +170,14 @@ class Placement:
         chosen = offsets[torch.arange(len(first), device=first.device), :, first]
         fits = good.any(1)
         return torch.where(fits[:, None, None], chosen, 0.0), fits
+
+
+@lru_cache(maxsize=2)
+def _trials(size: int) -> Tensor:
+    """Draws of the imaginary worlds, shape ``(_TRIALS, size)``: a check tries several regions."""
+    world = torch.arange(_TRIALS)
+    zero = torch.zeros_like(world)
+    return uniform(seed=0, world=world, episode=zero, step=zero, stream=0, size=size)
 
 
 def _around(
