@@ -263,12 +263,8 @@ def _preload() -> None:
         return copy.deepcopy(known[text])
 
     yaml.load = load
-    for args in (
-        ["nworld=-1"],
-        ["job=replay", "nworld=-1"],
-        ["job=collect", "task=box", "seed=-1"],
-    ):
-        mjstack.cli.run(args)
+    for args in ([], ["job=replay"], ["job=collect"], ["task=box"]):
+        mjstack.cli.run([*args, "nworld=-1"])
 
 
 if __name__ == "__main__":
