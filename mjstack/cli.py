@@ -187,11 +187,12 @@ def run_job(cfg: DictConfig) -> Report:
     overrides = list(own.overrides.task)
     with search_path(lacking_folders(own.runtime.config_sources)):
         checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
-        if own.output_subdir is not None:  # a replay reads values, no interpolations
-            saved = Path(own.runtime.output_dir) / own.output_subdir / "config.yaml"
-            with suppress(OSError):  # the job says so
-                write_atomic(saved, OmegaConf.to_yaml(cfg, resolve=True))
-        result = checked.run(Path(own.runtime.output_dir), overrides)
+        folder = Path(own.runtime.output_dir)
+        with suppress(OSError):  # the job says so
+            # A replay reads values, no interpolations.
+            saved = folder / ".hydra" / "config.yaml"
+            write_atomic(saved, OmegaConf.to_yaml(cfg, resolve=True))
+        result = checked.run(folder, overrides)
     _results.append(result)
     if result.status is Status.interrupted:
         raise KeyboardInterrupt
@@ -258,11 +259,11 @@ def _print_sweep(outcomes: list[Report], folder: Path) -> None:
     names = dict.fromkeys(gate.name for outcome in outcomes for gate in outcome.gates)
     columns = ["job", "overrides", *names, "status"]
     rows = [
-        {gate.name: f"{gate.status.value}: {gate.reason}" for gate in outcome.gates}
+        {gate.name: f"{gate.status}: {gate.reason}" for gate in outcome.gates}
         | {
             "job": str(job),
             "overrides": " ".join(outcome.overrides),
-            "status": outcome.status.value,
+            "status": outcome.status,
         }
         for job, outcome in enumerate(outcomes)
     ]

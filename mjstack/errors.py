@@ -9,6 +9,7 @@ import re
 import sysconfig
 import traceback
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 # As Python, C++, NumPy, torch, Warp and CUDA put it, each with another exception.
@@ -45,26 +46,25 @@ class MjstackError(Exception):
         super().__init__(f"{problem}{stop}{f' {fix}.' if fix else ''}")
 
 
-class ConfigError(MjstackError):
+class KeyedError(MjstackError):
+    """An error of a dotted configuration key, with which its message begins."""
+
+    def __init__(self, key: str, problem: str, fix: str = "") -> None:
+        super().__init__(f"{key}{problem}", fix)
+        self.key = key
+
+    def move(self, key: str) -> None:
+        """Name the key that the user has set instead."""
+        self.args = (key + str(self).removeprefix(self.key),)
+        self.key = key
+
+
+class ConfigError(KeyedError):
     """A value in the configuration cannot be used."""
 
     def __init__(self, key: str, value: object, expected: str, fix: str = "") -> None:
-        """Build the message.
-
-        Args:
-            key: Dotted configuration key, such as ``timing.decimation``.
-            value: The offending value.
-            expected: What would have been accepted.
-            fix: What to do about it, a sentence without its full stop.
-        """
         shown = json.dumps(value) if value is None or isinstance(value, bool) else value
-        super().__init__(f"{key}={shown}: expected {expected}", fix)
-        self.key = key
-        self._facts = (value, expected, fix)
-
-    def at(self, key: str) -> "ConfigError":
-        """The same error under the key that the user has set."""
-        return ConfigError(key, *self._facts)
+        super().__init__(key, f"={shown}: expected {expected}", fix)
 
 
 class CompositionError(MjstackError):
@@ -98,66 +98,52 @@ class UnsupportedModel(MjstackError):
     """MJWarp does not implement a feature of the model."""
 
 
-class TermError(MjstackError):
+class TermError(KeyedError):
     """A term of a manager that cannot be found, built or used."""
 
     def __init__(self, key: str, problem: str) -> None:
-        """Build the message from the term's dotted configuration key and what is wrong with it."""
-        super().__init__(f"{key}: {problem}")
-        self.key = key
-        self._problem = problem
-
-    def at(self, key: str) -> "TermError":
-        """The same error under the key that the user has set."""
-        return TermError(key, self._problem)
+        super().__init__(key, f": {problem}")
 
 
 class ParameterError(ConfigError):
-    """A value that a term cannot use, by the parameter's name. The manager raises it `at` the
-    term's key.
+    """A value that a term cannot use, by the parameter's name; its manager raises a `ConfigError`
+    of the whole key.
     """
+
+    def __init__(self, key: str, value: object, expected: str, fix: str = "") -> None:
+        super().__init__(key, value, expected, fix)
+        self.facts = (value, expected, fix)
 
 
 class FaultError(MjstackError):
     """Something went wrong while worlds were stepped."""
 
 
+@dataclass(eq=False)
 class Unreachable(MjstackError):
-    """The arm cannot bring its grasp point to a target."""
+    """The arm cannot bring its grasp point to a target; lengths in m."""
 
-    def __init__(
-        self,
-        world: int,
-        phase: str,
-        anchor: str | None,
-        target: Sequence[float],
-        distance: float,
-        tolerance: float,
-    ) -> None:
-        # `args` stays as Python has set it: a process hands them on.
-        self.world = world
-        self.phase = phase
-        self.distance = distance
+    world: int
+    phase: str
+    anchor: str | None
+    target: Sequence[float]
+    distance: float
+    tolerance: float
 
     def __str__(self) -> str:
-        world, phase, anchor, target, distance, tolerance = self.args
-        where = ", ".join(f"{x:.3f}" for x in target)
+        where = ", ".join(f"{x:.3f}" for x in self.target)
         return (
-            f"world {world}, phase {phase}: target ({where}) m is {1e3 * distance:.1f} mm out of"
-            f" reach of the grasp point, expected at most {1e3 * tolerance:.1f} mm. Move {anchor}"
-            f" closer, or change controller.phases.{phase}."
+            f"world {self.world}, phase {self.phase}: target ({where}) m is"
+            f" {1e3 * self.distance:.1f} mm out of reach of the grasp point, expected at most"
+            f" {1e3 * self.tolerance:.1f} mm. Move {self.anchor} closer, or change"
+            f" controller.phases.{self.phase}."
         )
 
 
 class RebindError(MjstackError):
-    """A view of a simulation was assigned to instead of written into."""
+    """A view of a simulation, such as ``sim.qpos``, was assigned to instead of written into."""
 
     def __init__(self, view: str) -> None:
-        """Build the message.
-
-        Args:
-            view: The view as the user writes it, such as ``sim.qpos``.
-        """
         super().__init__(
             f"{view} is a view of the simulation's memory and cannot be rebound: write {view}[:] ="
             " ... instead."
@@ -168,14 +154,6 @@ class ArgumentError(MjstackError):
     """An argument of a function cannot be used."""
 
     def __init__(self, name: str, found: object, expected: str, fix: str = "") -> None:
-        """Build the message.
-
-        Args:
-            name: The argument.
-            found: What was given.
-            expected: What would have been accepted.
-            fix: What to do about it, a sentence without its full stop.
-        """
         super().__init__(f"{name}: found {found}, expected {expected}", fix)
 
 
@@ -186,16 +164,11 @@ class DatasetError(MjstackError):
 
 
 class UnwrittenError(MjstackError):
-    """A dataset that could not be written any further, such as on a full disk."""
+    """A dataset that could not be written any further, such as on a full disk, and the number of
+    episodes that were committed before.
+    """
 
     def __init__(self, folder: str, error: OSError, kept: int) -> None:
-        """Build the message.
-
-        Args:
-            folder: The dataset.
-            error: What the system says.
-            kept: Episodes that were committed before.
-        """
         super().__init__(
             f"{folder}: cannot be written ({error.strerror or error}): {kept} committed episodes"
             " are kept, those added since are not. Make room or correct it, and do the same again:"

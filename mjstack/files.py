@@ -6,7 +6,6 @@ import io
 import itertools
 import json
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -84,14 +83,12 @@ def claim_folder(
 ) -> Iterator[Path]:
     """Make a run's folder, and keep other runs out of it until the block ends.
 
-    If the block fails before anything but Hydra's files was written, a folder that was made here is
-    gone again.
-
     Args:
         folder: The folder.
         job: As of `check_unused`.
         own: As of `check_unused`.
-        numbered: Where the folder is there, make another: its name and ``-2``, ``-3``, ...
+        numbered: Where the folder is there, make another: its name and ``-2``, ``-3``, ... One in
+            which nothing was written is gone again if the block fails.
 
     Yields:
         The folder.
@@ -100,26 +97,23 @@ def claim_folder(
         FolderError: It cannot be made, has another run, or another process is writing it.
     """
     name = folder.name
-    made: list[Path] = []
     handle = None
     try:
-        lacking = [path for path in folder.parents if not path.exists()]
-        folder.parent.mkdir(parents=True, exist_ok=True)
         for number in itertools.count(2):
-            with suppress(FileExistsError):
-                folder.mkdir()
-                made = [folder, *lacking]
-            if made or not numbered:
+            try:
+                folder.mkdir(parents=True, exist_ok=not numbered)
                 break
+            except FileExistsError:
+                if not numbered:  # it is a file
+                    raise
             folder = folder.with_name(f"{name}-{number}")
         handle = lock_folder(folder)
         check_unused(folder, job, own)
         yield folder
     except BaseException as error:
-        with suppress(OSError, MjstackError):
-            check_unused(folder)
-            for path in made:
-                shutil.rmtree(path) if path == folder else path.rmdir()
+        if numbered:
+            with suppress(OSError):  # something was written
+                os.removedirs(folder)
         if not isinstance(error, OSError):
             raise
         raise FolderError(

@@ -21,8 +21,7 @@ from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor
-from mjstack.episodes.observers import Episode
-from mjstack.episodes.rollout import Observer, Reset
+from mjstack.episodes.rollout import Episode, Observer, Reset
 from mjstack.sim import Simulation
 from mjstack.tasks.check import CheckResult, make_check
 

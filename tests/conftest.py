@@ -16,7 +16,7 @@ from compositions import load_config
 
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import Hook
+from mjstack.episodes.rollout import Hook
 from mjstack.sim import Simulation, make_simulation
 
 ROBOTS = ("so101", "rebot")

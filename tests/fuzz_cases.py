@@ -7,6 +7,7 @@ import os
 import random
 import re
 import shutil
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
@@ -17,6 +18,7 @@ import numpy as np
 import yaml
 from environments import configure, one_second_episode
 
+from mjstack import load_config
 from mjstack.cli import run
 
 Make = Callable[[int, Path], list[str]]
@@ -102,6 +104,8 @@ def command_lines(fixture: Path) -> Make:
     tiny = {"controller": short, "task": {"check": {"window": 5}}}
     path = fixture / "conf" / "experiment" / "tiny.yaml"
     path.write_text("# @package _global_\n" + yaml.dump(tiny))
+    load_config(["experiment=tiny"], config_dir=fixture / "conf")  # composed before the children
+    sys.path.remove(str(fixture))
     keys = {
         f"{kind}={name}": dict(_flat(asdict(configure(f"{kind}={name}"))))
         for kind, names in (("task", TASKS), ("job", JOBS))

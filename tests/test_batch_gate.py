@@ -21,8 +21,8 @@ from environments import at_double_speed
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import Episode, play_episode
 from mjstack.episodes.record import FAILING, EpisodeRecord
+from mjstack.episodes.rollout import Episode, play_episode
 from mjstack.errors import RunError
 from mjstack.files import write_atomic
 from mjstack.gates.batch import run_batch

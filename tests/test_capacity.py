@@ -22,11 +22,11 @@ from mjstack.envs.buffers import (
     Peaks,
     Workload,
     join_peaks,
+    measured_sizes,
     play_random_actions,
     play_workload,
     read_peaks,
     recommend_sizes,
-    require_physics,
 )
 from mjstack.episodes.context import RunContext
 from mjstack.errors import FaultError, MjstackError, Unreachable
@@ -194,7 +194,7 @@ def test_room_to_measure_in_grows_where_it_is_too_little(monkeypatch: pytest.Mon
     assert [(s.njmax, s.nconmax) for s in made] == [(768, 128), (1536, 256), (3072, 256)]
     assert not run.peaks.overflow.any()
     assert run.sizes == made[-1]
-    require_physics("it", run)
+    assert measured_sizes(load_config([]), "it", run, "").njmax == 16
 
 
 @pytest.mark.full
@@ -219,10 +219,9 @@ def test_room_to_measure_in_does_not_grow_for_ever(monkeypatch: pytest.MonkeyPat
 )
 def test_nothing_is_sized_from_motion_that_lost_physics(bits: Overflow, fix: str) -> None:
     lost = peaks(overflow=np.array([0, int(bits), 0, int(bits)]))
+    run = workload(peaks=lost, sizes=BatchSizes(nconmax=128, njmax=768))
     with pytest.raises(FaultError) as caught:
-        require_physics(
-            "the driven task", workload(peaks=lost, sizes=BatchSizes(nconmax=128, njmax=768))
-        )
+        measured_sizes(load_config([]), "the driven task", run, "")
     says = str(caught.value)
     assert says.startswith("batch=auto: what the driven task needs cannot be measured: ")
     assert "overflow in 2 of 4 worlds (1, 3) even with batch.nconmax=128 batch.njmax=768. " in says
@@ -583,8 +582,8 @@ def test_convex_pairs_and_whole_pools_are_held_against_their_keys() -> None:
     seen = peaks(nworld=4, contacts=20, pool_ccd_pairs=40)
     wanted = recommend_sizes(seen, 1.25, "")
     group = capacity_module._Group(
+        name="task",
         title="",
-        prefix="",
         runs={},
         peaks=seen,
         sizes=resolve_sizes(cfg),
@@ -677,7 +676,9 @@ def test_batch_uses_what_capacity_measured(new_context: NewContext) -> None:
     context.artifacts.sizes = BatchSizes(nconmax=40, njmax=184, source="batch=auto: somewhere")
     sim = context.batch_simulation(2)
     assert sim.sizes == BatchSizes(nconmax=48, njmax=184)  # type: ignore[attr-defined]
-    assert context.parity_simulation().sizes == BatchSizes(nconmax=48, njmax=300)  # type: ignore[attr-defined]
+    assert make_simulation(
+        context.model, context.cfg, 1, backend=Backend.mjwarp
+    ).sizes == BatchSizes(nconmax=48, njmax=300)  # type: ignore[attr-defined]
     assert context.env_sizes is None
     context.artifacts.env_sizes = BatchSizes(nconmax=64, njmax=400)
     assert context.env_sizes == BatchSizes(nconmax=48, njmax=400)

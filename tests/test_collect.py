@@ -33,7 +33,7 @@ from mjstack.config.schema import Backend, Config
 from mjstack.datasets import DatasetWriter, Feature
 from mjstack.envs import build_env, demonstration_config
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import CommandRecorder
+from mjstack.episodes.rollout import CommandRecorder
 from mjstack.errors import ConfigError
 from mjstack.jobs import CheckedJob, check_job, collection
 from mjstack.jobs.collect import LOADING, collect_folder, plan_collection, run_collect

@@ -14,7 +14,7 @@ from compositions import checked
 
 from mjstack.config import load_config
 from mjstack.config.help import list_keys
-from mjstack.config.schema import Backend, Config, RobotSource
+from mjstack.config.schema import Backend, Config
 from mjstack.config.session import CONFIG_FOLDER
 from mjstack.errors import MjstackError
 from mjstack.jobs.gates import check_machine
@@ -74,7 +74,7 @@ def test_walk_found_the_groups() -> None:
 def test_defaults(so101_cfg: Config) -> None:
     cfg = so101_cfg
     assert cfg.robot.name == "so101"
-    assert cfg.model.source is RobotSource.builtin
+    assert cfg.model.source == "builtin"
     assert cfg.sim.backend is Backend.auto
     assert cfg.nworld == 256
     assert cfg.seed == 0

@@ -21,7 +21,7 @@ from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import Episode, Hook, play_episode
+from mjstack.episodes.rollout import Episode, Hook, play_episode
 from mjstack.errors import ConfigError
 from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import run_capacity

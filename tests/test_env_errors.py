@@ -404,7 +404,7 @@ def test_parameters_of_functions_and_actions(cfg: Config) -> None:
             "action",
             "arm",
             {"joints": "arm", "mode": "absolut"},
-            ["action.arm", "'absolut' does not exist", "absolute"],
+            ["action.arm.params.mode=absolut", "one of relative, absolute, delta"],
         ),
         (
             "action",

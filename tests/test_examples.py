@@ -13,7 +13,7 @@ from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.schema import Config
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import play_episode
+from mjstack.episodes.rollout import play_episode
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

@@ -17,8 +17,7 @@ from mjstack.config.schema import Backend
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import play_episode
-from mjstack.episodes.rollout import Observer
+from mjstack.episodes.rollout import Observer, play_episode
 from mjstack.errors import ArgumentError
 from mjstack.managers import required_fields
 from mjstack.sim import Simulation, make_simulation

@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import pytest
 from fuzz_cases import Make, command_lines, damaged_folders, is_short
 
-COUNTS = {"commands": 500, "folders": 100}
+COUNTS = {"commands": 1000, "folders": 200}
 CASES = {"commands": command_lines, "folders": damaged_folders}
 PASSED = 77  # exit status of a child whose check has passed
 SECONDS = 40  # of processor time that a check may take; the slowest of them takes three
@@ -106,6 +106,8 @@ def main(kind: str, *numbers: str) -> int:
         fixture = Path(temporary)
         _preload()
         make = CASES[kind](fixture)
+        gc.collect()
+        gc.freeze()
         spans = [[int(end) for end in number.split("-")] for number in numbers]
         cases = [case for span in spans for case in range(span[0], span[-1] + 1)]
         cases = cases or list(range(COUNTS[kind]))
@@ -261,10 +263,8 @@ def _preload() -> None:
         return copy.deepcopy(known[text])
 
     yaml.load = load
-    for args in (["nworld=-1"], ["job=collect", "nworld=-1"], ["task=box", "nworld=-1"]):
-        mjstack.cli.run(args)
-    gc.collect()
-    gc.freeze()
+    for args in ([], ["job=replay"], ["job=collect"], ["task=box"]):
+        mjstack.cli.run([*args, "nworld=-1"])
 
 
 if __name__ == "__main__":

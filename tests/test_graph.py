@@ -12,7 +12,6 @@ import warp as wp
 from compositions import make_env
 from environments import actions, configure, returned
 
-from mjstack.config.schema import GraphMode
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
 from mjstack.managers.view import EnvView
@@ -179,7 +178,7 @@ def test_a_graph_warms_up_captures_and_replays(device: str) -> None:
         calls += 1
         wp.launch(_add_one, dim=3, inputs=[values], device=device)
 
-    graph = StepGraph(work, device, GraphMode.require, name="adding", version=lambda: version)
+    graph = StepGraph(work, device, "require", name="adding", version=lambda: version)
     for _ in range(5):
         graph()
     wp.synchronize_device(device)
@@ -199,7 +198,7 @@ def test_a_graph_warms_up_captures_and_replays(device: str) -> None:
 
 def test_without_capture_the_work_just_runs() -> None:
     calls = []
-    graph = StepGraph(lambda: calls.append(1), "cpu", GraphMode.off, name="counting")
+    graph = StepGraph(lambda: calls.append(1), "cpu", "off", name="counting")
     for _ in range(3):
         graph()
     assert len(calls) == 3
@@ -235,7 +234,7 @@ def test_what_failed_is_captured_anew_after_a_change() -> None:
         if calls == 2:
             raise RuntimeError("this cannot be captured")
 
-    graph = StepGraph(work, "cpu", GraphMode.auto, name="failing once", version=lambda: version)
+    graph = StepGraph(work, "cpu", "auto", name="failing once", version=lambda: version)
     for _ in range(4):
         graph()
     assert not graph.captured

@@ -21,7 +21,6 @@ PATHS: dict[str, list[str] | None] = {
         f"Env.{n}"
         for n in (
             "advance",
-            "_apply_action",
             "_step_physics",
             "_evaluate",
             "_reset_ended",

@@ -200,9 +200,12 @@ def test_processes_by_cores_and_distinct_worlds(
     made: list[int] = []
     plan = planner.plan_world(0, layouts(context, 1)[0])
 
-    def parallel(_: Config, worlds: list[int], __: np.ndarray, processes: int) -> Iterator[Plan]:
+    def parallel(
+        _: Config, worlds: list[int], __: np.ndarray, processes: int, take: Callable[..., None]
+    ) -> None:
         made.append(processes)
-        yield from ((world, *plan) for world in worlds)
+        for world in worlds:
+            take(world, *plan)
 
     monkeypatch.setattr(planner, "plan_world", lambda *_: plan)
     monkeypatch.setattr(open_loop, "plan_in_parallel", parallel)

@@ -28,7 +28,7 @@ from mjstack.jobs.reachability import ReachLevel, find_levels, find_region
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.kinematics.reach import PointReach
 from mjstack.mdp.starts.placement import Placement
-from mjstack.scene import SceneIndex, build_model, table_top
+from mjstack.scene import SceneIndex, build_model
 
 Stage = Callable[[str], RunContext]
 
@@ -40,7 +40,7 @@ def points_over(cfg: Config, n: int, seed: int = 0) -> np.ndarray:
     places = np.array([scene.objects["red"].xy, scene.objects["blue"].xy])[rng.integers(2, size=n)]
     xy = places + rng.uniform(-1, 1, (n, 2)) * scene.random_xy
     return np.column_stack(
-        (xy, table_top(scene) + scene.objects["red"].half_height + rng.uniform(0.0, 0.15, n))
+        (xy, scene.table_top + scene.objects["red"].half_height + rng.uniform(0.0, 0.15, n))
     )
 
 
@@ -177,7 +177,7 @@ def test_finger_room_is_what_the_open_jaws_need(stage: Stage, robot: str) -> Non
     blue = index.geoms["blue"][0]
     distance = 2.0 * math.sqrt(2.0) * scene.objects["red"].half_height + cfg.robot.finger_room
     ik = GraspIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
-    z = table_top(scene) + scene.objects["red"].half_height
+    z = scene.table_top + scene.objects["red"].half_height
 
     def touched(
         command: np.ndarray, at: np.ndarray, away: float, yaw: float, apart: float
@@ -222,7 +222,7 @@ def with_wall(
     from mjstack.scene import build_scene
 
     spec = robot_spec(cfg.robot, cfg.model)
-    z = table_top(cfg.scene) + 0.0275
+    z = cfg.scene.table_top + 0.0275
     quat = [math.cos(0.5 * euler), 0.0, 0.0, math.sin(0.5 * euler)]
     spec.worldbody.add_geom(
         name="box_wall",
@@ -475,7 +475,7 @@ def test_the_job_leaves_a_map(
                 [
                     float(row["x_m"]),
                     float(row["y_m"]),
-                    table_top(cfg.scene) + cfg.scene.objects["red"].half_height,
+                    cfg.scene.table_top + cfg.scene.objects["red"].half_height,
                 ]
             ]
         )

@@ -13,7 +13,7 @@ from compositions import load_config
 
 from mjstack.config.schema import Backend
 from mjstack.math import quat_from_yaw
-from mjstack.scene import SceneIndex, build_model, table_top
+from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import make_simulation
 
 pytestmark = pytest.mark.full
@@ -34,7 +34,7 @@ def moving_stacks(*, primitive: bool) -> int:
     draw = (2.0 * torch.rand((NWORLD, 4), generator=generator) - 1.0).to(sim.device)
     sim.reset()
     half = cfg.scene.objects["red"].half_height
-    top = table_top(cfg.scene)
+    top = cfg.scene.table_top
     red, blue = index.object_qpos
     spot = torch.tensor([0.42, 0.14], device=sim.device)
     sim.qpos[:, blue : blue + 2] = spot

@@ -15,7 +15,7 @@ from mjstack.config.schema import Backend
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError, RebindError, UnsupportedModel
 from mjstack.math import quat_angle
-from mjstack.scene import build_model, build_scene, table_top
+from mjstack.scene import build_model, build_scene
 from mjstack.sim import Simulation, SolverLimit, make_simulation
 
 N = 3
@@ -455,7 +455,7 @@ def test_random_stacks_come_to_rest_on_mjwarp() -> None:
     model = build_scene(mujoco.MjSpec(), cfg)
     sim = make_simulation(model, cfg, n, backend=Backend.mjwarp, device="cpu")
     rng = np.random.default_rng(7)
-    top = table_top(cfg.scene)
+    top = cfg.scene.table_top
     pose = np.zeros((n, 2, 7))
     for cube, height in ((0, 0.0665), (1, 0.0222)):
         yaw = rng.uniform(-np.pi, np.pi, n)

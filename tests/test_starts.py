@@ -18,7 +18,6 @@ import mjstack
 from mjstack.config.schema import Config
 from mjstack.envs import Env
 from mjstack.mdp.starts.placement import Placement, may_meet
-from mjstack.scene import table_top
 
 MANY = 200
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -59,7 +58,7 @@ def test_cubes_start_on_the_table_and_touch_nothing_else(robot: str, reset: str)
         mujoco.mj_forward(m, data)
         for a in env.index.object_qpos:
             at = corners(data.qpos[a : a + 7], scene.objects["red"].half_height)
-            assert at[:, 2].min() == pytest.approx(table_top(env.cfg.scene), abs=1e-9)
+            assert at[:, 2].min() == pytest.approx(env.cfg.scene.table_top, abs=1e-9)
             assert np.ptp(at[:, 2]) == pytest.approx(2.0 * scene.objects["red"].half_height)
             assert (np.abs(at[:, :2] - scene.table_center[:2]) <= scene.table_half[:2]).all()
         touching = {tuple(sorted(contact.geom)) for contact in data.contact}

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from environments import configure
 
-from mjstack.config.schema import Backend, StepMode
+from mjstack.config.schema import Backend
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import make_simulation
 from mjstack.sim.mjwarp import MjwarpSimulation
@@ -36,8 +36,8 @@ def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
     """Random commands, cubes thrown about: on the CPU device bit for bit, sensors included."""
     ours = worlds(robot, device)
     plain = worlds(robot, device)
-    ours.arrange(ARRANGEMENTS[StepMode.arranged])
-    plain.arrange(ARRANGEMENTS[StepMode.stock])
+    ours.arrange(ARRANGEMENTS["arranged"])
+    plain.arrange(ARRANGEMENTS["stock"])
     low, high = torch.from_numpy(ours.model.actuator_ctrlrange).float().unbind(1)
     generator = torch.Generator().manual_seed(0)
     most = 0
@@ -93,8 +93,8 @@ def test_branches_count_and_sense_what_one_after_the_other_does(robot: str) -> N
     """
     ours = worlds(robot, "cuda:0")
     plain = worlds(robot, "cuda:0")
-    ours.arrange(ARRANGEMENTS[StepMode.arranged])
-    plain.arrange(ARRANGEMENTS[StepMode.stock])
+    ours.arrange(ARRANGEMENTS["arranged"])
+    plain.arrange(ARRANGEMENTS["stock"])
     cfg = configure(robot=robot)
     index = SceneIndex(ours.model, cfg.robot, cfg.scene)
     home = torch.tensor(configure(robot=robot).robot.start, device="cuda:0")

@@ -25,9 +25,9 @@ from mjstack.config.schema import Config
 from mjstack.episodes import context as gate_module
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor, Sign
-from mjstack.episodes.observers import Episode, Hook, play_episode
 from mjstack.episodes.record import FAILING, PICTURE, REGIONS, EpisodeRecord
 from mjstack.episodes.regions import Region, find_regions, radial_yaw_deg, regions_table
+from mjstack.episodes.rollout import Episode, Hook, play_episode
 from mjstack.errors import ConfigError
 from mjstack.gates.success import run_success, success_config
 from mjstack.jobs import check_job

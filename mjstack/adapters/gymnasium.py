@@ -39,16 +39,11 @@ class GymnasiumVectorEnv(VectorEnv):
 
     Attributes:
         inner: The environment.
-        group: The observation group, or None for all.
+        group: The observation group that is returned, as one array; None for all, in a dict.
     """
 
     def __init__(self, env: Env, *, group: str | None = "policy") -> None:
         """Take over an environment, and close it when it is closed.
-
-        Args:
-            env: The environment.
-            group: Which observation group to return, as one array. None returns all of them in a
-                dict.
 
         Raises:
             UnknownName: There is no such observation group.
@@ -147,16 +142,11 @@ class GymnasiumEnv(gymnasium.Env):
 
     Attributes:
         inner: The environment.
-        group: The observation group, or None for all.
+        group: The observation group that is returned, as one array; None for all, in a dict.
     """
 
     def __init__(self, env: Env, *, group: str | None = "policy") -> None:
         """Take over an environment of one world, and close it when it is closed.
-
-        Args:
-            env: The environment.
-            group: Which observation group to return, as one array. None returns all of them in a
-                dict.
 
         Raises:
             MjstackError: It has more worlds than one, or no such observation group.

@@ -15,11 +15,9 @@ from mjstack.bench.timing import (
     Measurement,
     lost_worlds,
 )
-from mjstack.config.schema import GraphMode
 from mjstack.drivers.driver import Recorded
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import CommandRecorder, Episode
-from mjstack.episodes.rollout import CLOSED_LOOP, Observer, rollout
+from mjstack.episodes.rollout import CLOSED_LOOP, CommandRecorder, Episode, Observer, rollout
 from mjstack.errors import name_worlds
 from mjstack.sim import Simulation
 
@@ -48,7 +46,7 @@ def measure_episode(
         seconds: Time budget [s].
         repetitions: Most repetitions.
         meter: Measures the energy.
-        step_seconds: About how long a control step takes [s]; 0 if it is not known.
+        step_seconds: About how long a control step takes [s].
     """
     cfg = context.cfg
     mjwarp = sim.backend == "mjwarp"
@@ -76,7 +74,7 @@ def measure_episode(
         repetition_began = time.perf_counter()
         played.append(_play(context, sim, meter, out))
         estimate = time.perf_counter() - repetition_began
-        context.report_progress("episode, repetitions", len(played), repetitions)
+        context.advance("episode, repetitions", len(played), repetitions)
     if not played and before is not None:
         played = [before]
     if not played:
@@ -114,13 +112,9 @@ def play_bare(
 ) -> tuple[float, str]:
     """Play the same commands from the same start with bare steps.
 
-    Joint trajectories are evaluated in the loop, as in the episode. Overflow bits stay until a
-    reset, so that one look at the end has all.
-
-    Args:
-        context: Scene and planner.
-        sim: The worlds.
-        recorded: The commands, where the driver cannot give them again.
+    Joint trajectories are evaluated in the loop, as in the episode; ``recorded`` has the commands
+    of a driver that cannot give them again. Overflow bits stay until a reset, so that one look at
+    the end has all.
 
     Returns:
         Seconds, and why they do not count: empty where they do.
@@ -129,7 +123,7 @@ def play_bare(
     step = sim.bare_step()
     for _ in range(WARM_UP):  # none of it is timed
         step()
-    if sim.device.type == "cuda" and cfg.graph is not GraphMode.off and not step.captured:
+    if sim.device.type == "cuda" and cfg.graph != "off" and not step.captured:
         return math.nan, "the bare steps could not be captured"
     env = context.start(sim, cfg.reset)
     driver = context.driver(env) if recorded is None else recorded.rewind()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjstack.bench.timing import Measurement
-from mjstack.config.schema import Config, GraphMode
+from mjstack.config.schema import Config
 from mjstack.errors import MjstackError
 from mjstack.scene import build_model
 
@@ -32,16 +32,9 @@ def measure_solve(
     gain: float,
     repetitions: int,
 ) -> Measurement:
-    """Time one case.
+    """Time one case of the configuration's robot in its scene: repetitions of `SOLVES` solves each.
 
-    Args:
-        cfg: The configuration: its robot, in its scene.
-        device: ``"cpu"`` or ``"cuda:N"``.
-        nworld: Number of worlds.
-        iterations: Iterations per solve.
-        block_dim: CUDA threads per block.
-        gain: Of posture and approach; 0 where they do not count.
-        repetitions: Number of repetitions, each of `SOLVES` solves.
+    ``block_dim`` counts CUDA threads, ``gain`` is that of posture and approach.
 
     Returns:
         Samples ``eager_ms`` and, on CUDA, ``graph_ms`` per solve of all worlds; facts of the case,
@@ -73,7 +66,7 @@ def measure_solve(
     out = Measurement(name="ik")
     out.samples["eager_ms"] = _time(solves, ik.device, repetitions)
     if ik.device.startswith("cuda"):
-        graph = StepGraph(solves, ik.device, GraphMode.require, name="the solves")
+        graph = StepGraph(solves, ik.device, "require", name="the solves")
         for _ in range(2):  # warm-up and capture
             graph()
         out.samples["graph_ms"] = _time(graph, ik.device, repetitions)

@@ -16,10 +16,9 @@ from mjstack.bench.timing import (
     steps_that_fit,
     timed,
 )
-from mjstack.config.schema import Backend, StepMode
+from mjstack.config.schema import Backend
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import CommandRecorder, Snapshots
-from mjstack.episodes.rollout import State, restore, rollout, snapshot
+from mjstack.episodes.rollout import CommandRecorder, Snapshots, State, restore, rollout, snapshot
 from mjstack.errors import MjstackError
 from mjstack.mdp.geometry import objects_in_hand
 from mjstack.sim import Simulation, resolve_device
@@ -36,13 +35,7 @@ class HeldPhysics:
     """
 
     def __init__(self, sim: Simulation, state: State, decimation: int) -> None:
-        """Put the worlds into the state.
-
-        Args:
-            sim: The worlds.
-            state: Where every repetition starts.
-            decimation: Physics steps in a control step.
-        """
+        """Put the worlds into the state in which every repetition starts."""
         self.sim = sim
         self.state = state
         self.decimation = decimation
@@ -77,14 +70,8 @@ def measure_physics(
 
     A grasp may be empty at the start, about to be retried. The number of full ones is reported, and
     there is no figure if they are less than half. The figure includes the rest of a simulation's
-    step: counting contacts, latching overflow.
-
-    Args:
-        context: Scene and planner.
-        sim: The worlds.
-        seconds: Time budget [s]; fewer steps are made where it is short.
-        repetitions: Number of repetitions.
-        meter: Measures the energy.
+    step: counting contacts, latching overflow. Fewer steps are made where the time budget [s] is
+    short.
     """
     t = context.cfg.gate.throughput
     out = Measurement(name="physics")
@@ -103,7 +90,7 @@ def measure_physics(
     times = []
     for repetition in range(repetitions):
         times.append(held.play(steps, meter))
-        context.report_progress("physics, repetitions", repetition + 1, repetitions)
+        context.advance("physics, repetitions", repetition + 1, repetitions)
 
     # The result
     graph = sim.graph_of(held.decimation)
@@ -185,8 +172,8 @@ def measure_arrangements(
         "sensors in the last substep of a control step alone": Arrangement(
             branches=False, fused=False
         ),
-        "contacts beside smooth dynamics": ARRANGEMENTS[StepMode.arranged],
-        "contact rows and the solver as one kernel each": ARRANGEMENTS[StepMode.fused],
+        "contacts beside smooth dynamics": ARRANGEMENTS["arranged"],
+        "contact rows and the solver as one kernel each": ARRANGEMENTS["fused"],
     }
     # The trajectory
     sim = context.simulation(cfg.nworld, Backend.mjwarp, resolve_device(cfg.sim.device))
@@ -227,7 +214,7 @@ def measure_arrangements(
                 raise MjstackError(
                     f"{name}: physics was lost, and a figure would be void. Run gates=[capacity]."
                 )
-        context.report_progress("repetitions", repetition, repetitions)
+        context.advance("repetitions", repetition, repetitions)
     sim.close()
     return times
 

@@ -8,10 +8,11 @@ from functools import partial
 
 import torch
 
-from mjstack.config.schema import Config, GraphMode
+from mjstack.config.schema import Config
 from mjstack.episodes.rollout import Observer, RolloutTiming
 from mjstack.math import not_finite
-from mjstack.sim import LOST_PHYSICS, Simulation, cuda_uuid, device_memory
+from mjstack.sim import LOST_PHYSICS, Simulation
+from mjstack.sim.build import cuda_uuid, device_memory
 from mjstack.sim.graph import StepGraph
 
 WARM_UP = 3  # calls: eager, captured, replayed
@@ -28,11 +29,7 @@ class EnergyMeter:
     """
 
     def __init__(self, device: str) -> None:
-        """Open the counter.
-
-        Args:
-            device: ``cpu`` or ``cuda:N``.
-        """
+        """Open the counter of ``cpu`` or ``cuda:N``."""
         self._counter: Callable[[], float] = lambda: 0.0  # [mJ]
         self._began = self._first = 0.0
         self.clear()
@@ -95,7 +92,6 @@ class EnergyObserver(Observer):
     """Measures the energy of a rollout's steps from the third on, when all are replayed."""
 
     def __init__(self, meter: EnergyMeter) -> None:
-        """``meter`` adds it up."""
         self._meter = meter
 
     def after_step(self, step: int) -> None:
@@ -162,7 +158,7 @@ class Measurement:
             meter: Has measured their energy.
             work: The captured work, if any; the slowest counts.
             captured: Whether the steps were replayed from a graph.
-            whole: Whether the control steps were whole ones, not physics alone.
+            whole: Whether they were whole, not physics alone.
         """
         # Time and rate per physics step and per whole control step
         decimation = cfg.timing.decimation
@@ -194,7 +190,7 @@ class Measurement:
         graph = None if cuda else sim.graph_of(decimation, kinematics=True)
         if graph is not None:
             self.facts["physics_captured"] = graph.captured
-        if cuda and not captured and cfg.graph is not GraphMode.off:
+        if cuda and not captured and cfg.graph != "off":
             self.problem = self.problem or (
                 "it was not captured and ran eagerly (run.log says why); graph=off measures it like"
                 " that"

@@ -72,12 +72,7 @@ def _typed_all(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
 
 
 def typed(key: str, node: Any, kind: type) -> Any:
-    """A mapping of a composed configuration as a dataclass.
-
-    Args:
-        key: Its dotted key, for errors.
-        node: The mapping.
-        kind: The dataclass.
+    """A mapping of a composed configuration, at a dotted key, as a dataclass.
 
     Raises:
         MjstackError: A key is unknown or missing, or its field does not accept a value.
@@ -88,8 +83,10 @@ def typed(key: str, node: Any, kind: type) -> Any:
     for name in node:
         if name not in items:
             raise UnknownName(f"{key}: key", str(name), items)
+    # OmegaConf would copy what has no types, to and fro.
+    untyped = {k: v for k, v in node.items() if k in ("params", "terms") and _is_mapping(v)}
     try:
-        typed = OmegaConf.merge(_schema(kind), node)
+        typed = OmegaConf.merge(_schema(kind), {k: node[k] for k in node if k not in untyped})
     except OmegaConfBaseException as error:
         name = str(error.full_key).partition(".")[0]
         raise ConfigError(f"{key}.{name}", node[name], accepted(kind, items[name])) from error
@@ -97,8 +94,14 @@ def typed(key: str, node: Any, kind: type) -> Any:
     if missing:
         raise TermError(key, f"'{missing[0]}' is missing: set {key}.{missing[0]}")
     found = OmegaConf.to_object(typed)
+    for name, mapping in untyped.items():
+        setattr(found, name, mapping)
     check_fields(key, found)
     return found
+
+
+def _is_mapping(value: object) -> bool:
+    return isinstance(value, dict) and all(isinstance(name, str) for name in value)
 
 
 @cache

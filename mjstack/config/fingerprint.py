@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ def config_content(cfg: Config) -> dict[str, Any]:
     Raises:
         ConfigError: One of these files cannot be read.
     """
-    config: dict[str, Any] = json.loads(json.dumps(asdict(cfg), default=attrgetter("name")))
+    config: dict[str, Any] = json.loads(json.dumps(asdict(cfg)))
     if cfg.robot.file is not None:
         config["robot"]["file"] = _content("robot.file", cfg.robot.file)
     for name, term in cfg.reset.items():

@@ -79,12 +79,8 @@ def find_object(label: str, path: str) -> Any:
 
 
 def offered(path: str, name: str) -> Any:
-    """An attribute of a function or class, see `mjstack.managers.offers`; None if it has none, or
-    cannot be found: who uses it says why.
-
-    Args:
-        path: Dotted name of the function.
-        name: The attribute.
+    """An attribute of a function or class by its dotted name, see `mjstack.managers.offers`. None
+    if it has none, or cannot be found: the code that calls it says why.
     """
     try:
         return getattr(find_object("", path), name, None)

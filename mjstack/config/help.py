@@ -8,7 +8,6 @@ import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 from mjstack.config.complete import typed
@@ -58,12 +57,8 @@ _STATUSES = "Exit status: 0 passed, 1 a gate failed, 2 bad configuration or inpu
 
 
 class Group(NamedTuple):
-    """A configuration group.
-
-    Attributes:
-        name: Such as ``robot``.
-        choices: Its files, the default first. Of ``gate``, whose files are all there at once: all.
-        words: What it selects.
+    """A configuration group: its name, its choices with the default first, and what it selects. Of
+    ``gate``, all choices are in use at once.
     """
 
     name: str
@@ -72,14 +67,7 @@ class Group(NamedTuple):
 
 
 class Key(NamedTuple):
-    """A configuration key.
-
-    Attributes:
-        name: Dotted, such as ``gate.batch.seeds``.
-        value: Its value, as YAML has it.
-        accepts: Its type, range and unit.
-        words: Its meaning.
-    """
+    """A dotted configuration key, its value, its type with range and unit, and its meaning."""
 
     name: str
     value: str
@@ -102,13 +90,10 @@ def list_groups() -> list[Group]:
 
 
 def list_keys(value: object, name: str = "", *, named: bool = True) -> Iterator[Key]:
-    """Keys of a configuration at and below one of its parts.
+    """Keys of a configuration at and below one of its parts, whose dotted key is ``name``.
 
-    Args:
-        value: The part.
-        name: Its dotted key.
-        named: Whether entries that users name, such as terms, are listed each. Otherwise the first
-            one stands for all, as NAME and without values.
+    With ``named``, entries that users name, such as terms, are listed each. Otherwise the first one
+    stands for all, as NAME and without values.
     """
     docs = field_docs(type(value))
     for item in fields(value) if is_dataclass(value) else ():
@@ -204,7 +189,7 @@ def _yaml(value: object) -> str:
     """A value as a command line has it."""
     if isinstance(value, str):
         return value
-    return json.dumps(value, default=attrgetter("value")).replace(", ", ",").replace('"', "")
+    return json.dumps(value).replace(", ", ",").replace('"', "")
 
 
 def _table(rows: Sequence[tuple[str, str]], width: int) -> list[str]:

@@ -30,7 +30,7 @@ from hydra.core.singleton import Singleton
 from hydra.plugins.config_source import ConfigResult
 from hydra.types import RunMode
 from hydra.version import setbase
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 from omegaconf._utils import get_yaml_loader
 
 from mjstack.config.functions import find_object
@@ -233,10 +233,10 @@ def compose_raw(overrides: Sequence[str]) -> DictConfig:
 
 
 def without_hydra(cfg: DictConfig) -> DictConfig:
-    """A composition without Hydra's own part."""
-    own = copy.copy(cfg)
-    with open_dict(own):
-        own.pop("hydra", None)
+    """A composition without Hydra's own part. It shares the others."""
+    own = DictConfig({})
+    shared = {name: cfg._get_node(name) for name in cfg if name != "hydra"}
+    vars(own).update(vars(cfg) | {"_content": shared})
     return own
 
 
@@ -256,7 +256,7 @@ class _Repository(ConfigRepository):
     _parsed: ClassVar[dict[tuple, ConfigResult | None]] = {}
 
     def load_config(self, config_path: str) -> ConfigResult | None:
-        """Load a file, or copy what an earlier composition loaded, as long as it is unchanged."""
+        """Load a file, or return what an earlier composition loaded, as long as it is unchanged."""
         source = self._find_object_source(config_path, ObjectType.CONFIG)
         if source is None or source.scheme() == "structured":
             return super().load_config(config_path)
@@ -265,7 +265,7 @@ class _Repository(ConfigRepository):
         key = (source.provider, file, changed)
         if key not in self._parsed:
             self._parsed[key] = super().load_config(config_path)
-        return copy.deepcopy(self._parsed[key])
+        return self._parsed[key]
 
 
 class _Reader(get_yaml_loader()):  # type: ignore[misc]
@@ -278,6 +278,8 @@ class _Reader(get_yaml_loader()):  # type: ignore[misc]
 
 class _Loader(ConfigLoaderImpl):
     """Composes each list of overrides once: Hydra then runs the composition that was checked."""
+
+    _merged: ClassVar[dict[str, DictConfig]] = {}
 
     def __init__(self, config_search_path: ConfigSearchPath) -> None:
         super().__init__(config_search_path)
@@ -306,6 +308,14 @@ class _Loader(ConfigLoaderImpl):
             cfg.hydra.overrides.task = [override for override in said if override not in gates]
             self._composed[key] = cfg
         return self._composed[key]
+
+    def _compose_config_from_defaults_list(self, defaults: list, repo: Any) -> DictConfig:
+        """Merge files, or copy what an earlier composition merged of the same content."""
+        key = str([(default, repo.load_config(default.config_path)) for default in defaults])
+        if key not in self._merged:
+            repo.cache = copy.deepcopy(repo.cache)  # the composition takes its nodes over
+            self._merged[key] = super()._compose_config_from_defaults_list(defaults, repo)
+        return copy.deepcopy(self._merged[key])
 
 
 def _checked_folder(text: str) -> Path:

@@ -77,14 +77,8 @@ def make_info(
 ) -> dict[str, Any]:
     """The content of info.json. LeRobot does not read the block ``mjstack``.
 
-    Args:
-        spec: Names, units and types of the dataset.
-        provenance: Of each writer that differed from the one before, with its first episode.
-        file_mb: Size of a data file at which the next begins [MiB].
-        episodes: Number of episodes.
-        frames: Number of frames.
-        tasks: Number of tasks.
-        shards: Number of shards; files with higher numbers do not count.
+    ``provenance`` is that of each writer that differed from the one before, with its first episode.
+    Files with numbers from ``shards`` on do not count.
     """
     features: dict[str, Any] = {
         name: {"dtype": feature.dtype, "shape": [feature.dim], "names": list(feature.names)}
@@ -209,12 +203,8 @@ def merge_statistics(parts: Sequence[np.ndarray], counts: Sequence[int]) -> np.n
 def name_statistics(
     features: Mapping[str, Feature], statistics: np.ndarray, count: int
 ) -> dict[str, dict[str, list]]:
-    """Statistics by feature and name, and the frames that they are of: the content of stats.json.
-
-    Args:
-        features: Features of the dataset.
-        statistics: Shape ``(statistics, dim)``, over all features one after the other.
-        count: Frames.
+    """Statistics ``(statistics, dim)`` by feature and name, and the number of frames that they are
+    of: the content of stats.json.
     """
     named = {}
     start = 0

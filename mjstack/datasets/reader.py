@@ -200,12 +200,7 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def uncommitted(folder: Path, shards: int) -> list[Path]:
-    """Files that an interrupted writer left: shards that do not count, and hidden ones.
-
-    Args:
-        folder: The dataset.
-        shards: How many count.
-    """
+    """Files that an interrupted writer left: shards from this number on, and hidden ones."""
     counted = {
         lerobot.shard_path(folder, files, shard)
         for files in (lerobot.DATA, lerobot.EPISODES)

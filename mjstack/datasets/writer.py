@@ -109,14 +109,12 @@ class DatasetWriter:
                 kept.
         """
         self._check_open()
-        for episode in episodes:
-            typed_values(self.spec, episode)
-            typed_arrays(self.spec, episode)
-        for episode in episodes:
+        checked = [(typed_values(self.spec, e), typed_arrays(self.spec, e)) for e in episodes]
+        for episode, (facts, columns) in zip(episodes, checked, strict=True):
             with self._guarded():
                 if self._file is None:
                     self._begin_file()
-                self._write(episode)
+                self._write(episode.task, facts, columns)
             # One more like these is too much.
             if self._file.tell() * (1.0 + 1.0 / self.pending) > self._file_mb * 2**20:
                 self.flush()
@@ -183,9 +181,8 @@ class DatasetWriter:
             use_dictionary=list(INDICES),
         )
 
-    def _write(self, episode: EpisodeData) -> None:
+    def _write(self, task: str, facts: dict[str, Any], columns: dict[str, np.ndarray]) -> None:
         """Write an episode as a row group, so that it can be read without the others."""
-        columns = typed_arrays(self.spec, episode)
         number = len(self.committed) + self.pending
         start = self._rows[-1]["dataset_to_index"] if self._rows else self.frames
         length = len(next(iter(columns.values())))
@@ -195,7 +192,7 @@ class DatasetWriter:
             "frame_index": frame,
             "episode_index": np.full(length, number),
             "index": start + frame,
-            "task_index": np.full(length, self._tasks.setdefault(episode.task, len(self._tasks))),
+            "task_index": np.full(length, self._tasks.setdefault(task, len(self._tasks))),
         }
         columns |= {name: values[:, None] for name, values in indices.items()}
         table = lerobot.frames_table(self._frames_writer.schema, columns)
@@ -209,12 +206,12 @@ class DatasetWriter:
         self._rows.append(
             {
                 "episode_index": number,
-                "tasks": [episode.task],
+                "tasks": [task],
                 "length": length,
                 **{f"data/{name}": index for name, index in place.items()},
                 "dataset_from_index": start,
                 "dataset_to_index": start + length,
-                **typed_values(self.spec, episode),
+                **facts,
                 **{f"meta/episodes/{name}": index for name, index in place.items()},
                 **{
                     f"stats/{name}/{kind}": values

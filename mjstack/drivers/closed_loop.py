@@ -37,16 +37,10 @@ class ClosedLoopDriver:
     Where the robot has an ``approach_gain``, the gripper tilts at the grasp as it must where the
     object is let go (`CarryTilt`).
 
-    A world that the environment has reset starts over by itself.
+    A world that the environment has reset starts over by itself. The `Driver`'s ``error`` and
+    ``retries`` are those of the current episode.
 
     Attributes:
-        phases: The phases, laid out as a world without a retry goes through them.
-        steps: Length of the episode.
-        phase: Number of the phase that each world's last command belonged to, shape ``(nworld,)``,
-            int64.
-        retries: Grasps tried again in this episode, shape ``(nworld,)``, int32.
-        error: Largest distance that inverse kinematics left at the end of any phase [m], shape
-            ``(nworld,)``.
         unreachable: Whether a target was farther than ``controller.ik_tolerance``, shape
             ``(nworld,)``, bool.
     """

@@ -40,11 +40,8 @@ class Recorded:
     """
 
     def __init__(self, source: Driver, nu: int) -> None:
-        """Allocate for the worlds and steps of a driver; NaN until it is written.
-
-        Args:
-            source: The driver.
-            nu: Width of its commands.
+        """Allocate for the worlds and steps of a driver, whose commands are nu wide; NaN until they
+        are written.
         """
         self.phases = source.phases
         self.steps = source.steps

@@ -3,10 +3,10 @@
 import os
 import signal
 import sys
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import active_children, get_context, parent_process
 from threading import Thread
@@ -90,7 +90,13 @@ class JointTrajectory:
 
 
 class OpenLoopPlanner:
-    """Plans joint trajectories for objects and places at given positions, with mink."""
+    """Plans joint trajectories for objects and places at given positions, with mink.
+
+    Attributes:
+        phases: The phases.
+        ik: Inverse kinematics of the robot alone.
+        nominal: Commands at the end of each phase of the nominal plan, shape ``(phases, nu)``.
+    """
 
     def __init__(self, cfg: Config) -> None:
         """Plan the nominal start, from which every other plan starts.
@@ -111,6 +117,7 @@ class OpenLoopPlanner:
         self._seed: np.ndarray | None = None
         self._last: tuple[np.ndarray, JointTrajectory] | None = None
         self._seed = self.plan_world(0, nominal_xy(cfg.scene))[0]
+        self.nominal = self._seed[len(self._nodes) - 1 :: len(self._nodes)]
 
     def plan(
         self, sources_xy: np.ndarray, progress: Callable[[int], None] | None = None
@@ -133,15 +140,21 @@ class OpenLoopPlanner:
         flat = sources_xy.reshape(nworld, -1)
         _, first, kind = np.unique(flat, axis=0, return_index=True, return_inverse=True)
         twin = first[kind.reshape(-1)]
-        alike = np.bincount(twin)
-        done = 0
-        found = {}
-        with closing(self._plans(sorted(first.tolist()), sources_xy)) as plans:
-            for world, *plan in plans:
-                found[world] = plan
-                done += int(alike[world])
-                if progress is not None:
-                    progress(done)
+        worlds = sorted(first.tolist())
+        done = np.cumsum(np.bincount(twin)[worlds])
+        found: dict[int, tuple] = {}
+
+        def take(world: int, *plan: Any) -> None:
+            found[world] = plan
+            if progress is not None:
+                progress(int(done[len(found) - 1]))
+
+        processes = min(available_cores(), len(worlds) // WORLDS_PER_PROCESS)
+        if len(worlds) >= PARALLEL_FROM and processes > 1:
+            plan_in_parallel(self._cfg, worlds, sources_xy, processes, take)
+        else:
+            for world in worlds:
+                take(world, *self.plan_world(world, sources_xy[world]))
         knots, error = (
             np.array(parts) for parts in zip(*(found[world] for world in twin), strict=True)
         )
@@ -149,12 +162,6 @@ class OpenLoopPlanner:
         if nworld > 1:
             self._last = (sources_xy.copy(), trajectory)
         return trajectory
-
-    @property
-    def nominal(self) -> np.ndarray:
-        """Commands at the end of each phase of the nominal plan, shape ``(phases, nu)``."""
-        assert self._seed is not None
-        return self._seed[len(self._nodes) - 1 :: len(self._nodes)]
 
     def path_error(self) -> float:
         """Largest distance [m] of the grasp point from its straight path at any step of the nominal
@@ -204,17 +211,6 @@ class OpenLoopPlanner:
                 knots[k] = command
         return knots, worst
 
-    def _plans(self, worlds: list[int], sources_xy: np.ndarray) -> Generator[Plan]:
-        """The plans of some worlds, one after the other here, or shared out where there are
-        many.
-        """
-        processes = min(available_cores(), len(worlds) // WORLDS_PER_PROCESS)
-        if len(worlds) >= PARALLEL_FROM and processes > 1:
-            yield from plan_in_parallel(self._cfg, worlds, sources_xy, processes)
-            return
-        for world in worlds:
-            yield world, *self.plan_world(world, sources_xy[world])
-
     def _targets(self, xy: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Start and end of each phase: the grasp point [m] and then the gripper's command."""
         robot = self._cfg.robot
@@ -258,19 +254,14 @@ class OpenLoopPlanner:
 
 
 def plan_in_parallel(
-    cfg: Config, worlds: Sequence[int], sources_xy: np.ndarray, processes: int
-) -> Generator[Plan]:
-    """Plan worlds in processes, which are gone when this has ended in any way.
-
-    Args:
-        cfg: From which a process builds its planner.
-        worlds: Their numbers, ascending.
-        sources_xy: Position of each object and place of every world at the start [m], shape
-            ``(nworld, sources, 2)``.
-        processes: How many plan.
-
-    Yields:
-        A plan per world, in the order of worlds.
+    cfg: Config,
+    worlds: Sequence[int],
+    sources_xy: np.ndarray,
+    processes: int,
+    take: Callable[..., None],
+) -> None:
+    """Plan worlds, their numbers ascending, in processes, which are gone when this has ended in any
+    way. ``take`` gets each `Plan`, in that order; ``sources_xy`` as of `OpenLoopPlanner.plan`.
 
     Raises:
         Unreachable: A target is out of reach; of several such worlds it names the first, as one
@@ -288,11 +279,8 @@ def plan_in_parallel(
         for job in jobs:
             while not wait([job], _POLL).done:
                 check_interrupt()
-            yield from job.result()
-    except (KeyboardInterrupt, GeneratorExit):
-        for process in set(active_children()).difference(theirs):
-            process.kill()  # it may still be loading
-        raise
+            for plan in job.result():
+                take(*plan)
     except BrokenProcessPool:
         raise MjstackError(
             "a planning process was killed or ended before every world was planned",
@@ -300,6 +288,8 @@ def plan_in_parallel(
             " processes",
         ) from None
     finally:
+        for process in set(active_children()).difference(theirs):
+            process.kill()  # it may still be loading
         pool.shutdown(cancel_futures=True)
 
 

@@ -156,7 +156,7 @@ def play_workload(
     room wherever even that was too little.
 
     Peaks of a run that lost physics are those of another motion. Where the last run has lost some
-    too, its ``overflow`` tells: nothing may be sized from it (`require_physics`).
+    too, its ``overflow`` tells: nothing may be sized from it.
 
     Args:
         cfg: The configuration.
@@ -196,29 +196,29 @@ def play_workload(
     return done
 
 
-def describe_run_loss(run: Workload) -> tuple[str, str]:
-    """The physics that a run lost although there was room to spare, and what to do; both empty if
-    it lost none.
+def describe_run_loss(run: Workload) -> str:
+    """The physics that a run lost although there was room to spare, and what to do; empty if it
+    lost none.
     """
     loss, keys = describe_loss(run.peaks.overflow, run.sizes)
+    if not loss:
+        return ""
     fix = f"Set {' and '.join(f'batch.{key}' for key in keys)} higher still" if keys else NO_KEY
-    room = f" even with {run.sizes.as_overrides()}" if loss and run.sizes is not None else ""
-    return f"{loss}{room}", fix
+    room = f" even with {run.sizes.as_overrides()}" if run.sizes is not None else ""
+    return f"{loss}{room}. {fix}"
 
 
-def require_physics(what: str, run: Workload) -> None:
-    """Refuse to size anything from motion that lost physics.
-
-    Args:
-        what: What was run, such as ``the driven task``.
-        run: The run.
+def measured_sizes(cfg: Config, what: str, run: Workload, source: str) -> BatchSizes:
+    """Sizes for ``batch=auto`` from one run, such as of ``the driven task``, with the configured
+    margin and their source in words.
 
     Raises:
         FaultError: A world lost physics; names the worlds and what to do.
     """
-    loss, fix = describe_run_loss(run)
-    if loss:
-        raise FaultError(f"batch=auto: what {what} needs cannot be measured: {loss}", fix)
+    if loss := describe_run_loss(run):
+        raise FaultError(f"batch=auto: what {what} needs cannot be measured: {loss}")
+    margin = cfg.gate.capacity.margin
+    return recommend_sizes(run.peaks, margin, f"batch=auto: {source}, times {margin:g}")
 
 
 def play_random_actions(env: Env, steps: int, advance: Advance | None = None) -> None:
@@ -281,13 +281,10 @@ def probe_env_sizes(cfg: Config, model: mujoco.MjModel, nworld: int, device: str
 
     with torch.no_grad():
         probe = play_workload(cfg, make, random_actions(cfg, c.probe_steps))
-    require_physics(f"an environment of {worlds} worlds", probe)
-    source = (
-        f"batch=auto: {c.probe_steps} steps of random actions in {worlds} worlds, times"
-        f" {c.margin:g}"
-    )
-    sizes = apply_configured(cfg, recommend_sizes(probe.peaks, c.margin, source))
-    log.info("%s (%s)", sizes.as_overrides(), source)
+    source = f"{c.probe_steps} steps of random actions in {worlds} worlds"
+    found = measured_sizes(cfg, f"an environment of {worlds} worlds", probe, source)
+    sizes = apply_configured(cfg, found)
+    log.info("%s", sizes)
     return sizes
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import Config, GraphMode
+from mjstack.config.schema import Config
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
@@ -44,20 +44,9 @@ class Env:
     Values that derive from contacts (``sensordata``, ``contact_count``) are those of the last
     physics step before, and zero in a world that has just been reset.
 
+    It has the attributes of `EnvView`, and these.
+
     Attributes:
-        sim: The worlds.
-        index: Where names lie in their views.
-        cfg: The configuration.
-        nworld: Number of worlds.
-        device: Where tensors live.
-        seed: Seed of every random number; `reset` may set it.
-        key: The same on the device, shape ``(1,)``, int64.
-        world: Number of each world, shape ``(nworld,)``, int64.
-        episode: Episode of each world, shape ``(nworld,)``, int64.
-        episode_step: Steps since each world's last reset, shape ``(nworld,)``, int64.
-        success: Whether the task is achieved, shape ``(nworld,)``, bool.
-        action: The policy's last action, shape ``(nworld, action_dim)``.
-        previous_action: The one before.
         action_manager: Actions; ``action_dim`` is the policy's output.
         observation_manager: Observation groups; ``group_dims`` are the policy's inputs.
         reset_manager: How episodes start.
@@ -123,13 +112,7 @@ class Env:
         self._outputs = Outputs(
             self.reward_manager, self.termination_manager, self.observation_manager, self.success
         )
-        self._faults = FaultLatch(
-            sim,
-            self.action_manager,
-            self.reward_manager,
-            self.observation_manager,
-            cfg.termination,
-        )
+        self._faults = FaultLatch(self)
         self.graph = self.captured(self.advance, "env.step")
 
     @property
@@ -224,7 +207,7 @@ class Env:
 
         On CUDA it has fixed shapes and no host read, so that a larger graph may hold it.
         """
-        self._apply_action()
+        self.action_manager.apply()
         self._step_physics()
         self._evaluate()
         current_term.label = ""
@@ -239,7 +222,7 @@ class Env:
         return StepGraph(
             work,
             self.device,
-            self.cfg.graph if self.device.type == "cuda" else GraphMode.off,
+            self.cfg.graph if self.device.type == "cuda" else "off",
             name=name,
             version=lambda: self._version,
             culprit=lambda: current_term.label,
@@ -255,7 +238,7 @@ class Env:
         """
 
         def managers() -> None:
-            self._apply_action()
+            self.action_manager.apply()
             self._evaluate()
 
         physics = self.captured(self._step_physics, "the physics")
@@ -297,10 +280,6 @@ class Env:
             self.reward_manager,
         )
         return "\n".join((head, *(str(manager) for manager in managers)))
-
-    def _apply_action(self) -> None:
-        current_term.label = ""
-        self.action_manager.apply()
 
     def _step_physics(self) -> None:
         current_term.label = ""

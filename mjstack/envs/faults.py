@@ -1,19 +1,18 @@
 """Faults of a world while it is stepped: latched on the device until the host reads them."""
 
-from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from mjstack.config.functions import offered
-from mjstack.config.schema import TerminationTermCfg
 from mjstack.errors import FaultError, name_worlds
-from mjstack.managers.action import ActionManager
-from mjstack.managers.episode import RewardManager
-from mjstack.managers.observation import ObservationManager
 from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Overflow, Simulation, describe_overflow
+
+if TYPE_CHECKING:
+    from mjstack.envs.env import Env
 
 POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
 _HUGE = 1e18  # an action whose square may be more than a float32 holds
@@ -32,23 +31,14 @@ _FIXES = {
 class FaultLatch:
     """Keeps the faults of every world of an environment until it is cleared."""
 
-    def __init__(
-        self,
-        sim: Simulation,
-        actions: ActionManager,
-        rewards: RewardManager,
-        observations: ObservationManager,
-        termination: Mapping[str, TerminationTermCfg],
-    ) -> None:
-        """Allocate for the worlds of a simulation, whose managers are there."""
-        self._sim = sim
-        self._actions = actions
-        self._rewards = rewards
-        self._observations = observations
-        self._faults = torch.zeros((sim.nworld, len(_FIXES)), dtype=torch.bool, device=sim.device)
-        self._overflow = torch.zeros(sim.nworld, dtype=torch.int32, device=sim.device)
-        self._none = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
-        ends_on = {offered(term.func, "ends_on") for term in termination.values()}
+    def __init__(self, env: "Env") -> None:
+        """Allocate for the worlds of an environment whose managers are there."""
+        self._env = env
+        n = env.nworld
+        self._faults = torch.zeros((n, len(_FIXES)), dtype=torch.bool, device=env.device)
+        self._overflow = torch.zeros(n, dtype=torch.int32, device=env.device)
+        self._none = torch.zeros(n, dtype=torch.bool, device=env.device)
+        ends_on = {offered(term.func, "ends_on") for term in env.cfg.termination.values()}
         # A world's own overflow may end its episode; that of the shared pool voids the whole batch.
         self._lost = POOL if "overflow" in ends_on else LOST_PHYSICS
         self._state_ends = "non_finite" in ends_on
@@ -59,10 +49,11 @@ class FaultLatch:
         Args:
             broken: Worlds whose state is not finite, shape ``(nworld,)``, bool.
         """
-        self._overflow |= self._sim.overflow & self._lost
-        bad_action = self._actions.not_finite
-        reward = self._rewards.reward
-        groups = self._observations.groups.values()
+        env = self._env
+        self._overflow |= env.sim.overflow & self._lost
+        bad_action = env.action_manager.not_finite
+        reward = env.reward_manager.reward
+        groups = env.observation_manager.groups.values()
         seen = not_finite(*groups) if groups else self._none
         state = self._none if self._state_ends else broken
         self._faults |= torch.stack((bad_action, state, reward * 0.0 != 0.0, seen & ~broken), dim=1)
@@ -81,33 +72,33 @@ class FaultLatch:
         """
         if not bool(self._faults.any() | (self._overflow != 0).any()):
             return
-        nworld = self._sim.nworld
+        env = self._env
         if bool(self._overflow.any()):
-            overflow = self._overflow.cpu().numpy()
-            what, keys = describe_loss(overflow, self._sim.sizes)
-            raise FaultError(what, _capacity_hint(self._sim, keys))
+            what, keys = describe_loss(self._overflow.cpu().numpy(), env.sim.sizes)
+            raise FaultError(what, _capacity_hint(env.sim, keys))
         for column, (what, fix) in enumerate(_FIXES.items()):
             worlds = self._faults[:, column].nonzero()[:, 0].tolist()
             if worlds:
                 terms = self._terms(what, worlds[0])
                 culprits = f", from {', '.join(terms)}" if terms else ""
-                action = self._actions.action[worlds[0]].abs().tolist()
+                action = env.action[worlds[0]].abs().tolist()
                 if largest := max(filter(_HUGE.__lt__, action), default=0.0):
                     culprits += f", after an action of {largest:.3g}"
                     fix = _FIXES["actions were not finite"]
-                raise FaultError(f"{what} in {name_worlds(worlds, nworld)}{culprits}", fix)
+                raise FaultError(f"{what} in {name_worlds(worlds, env.nworld)}{culprits}", fix)
 
     def _terms(self, what: str, world: int) -> list[str]:
         """Names of the terms behind a number that is not finite, as far as their last values
         tell.
         """
-        rewards = self._rewards
+        rewards = self._env.reward_manager
         if "reward" in what:
             bad = (~torch.isfinite(rewards.values[world])).tolist()
             return [
                 f"reward.{name}" for name, is_bad in zip(rewards.names, bad, strict=True) if is_bad
             ]
-        return self._observations.not_finite_terms(world) if "observation" in what else []
+        observations = self._env.observation_manager
+        return observations.not_finite_terms(world) if "observation" in what else []
 
 
 def describe_loss(overflow: np.ndarray, sizes: BatchSizes | None) -> tuple[str, list[str]]:

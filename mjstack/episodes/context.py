@@ -2,9 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
 
 import mujoco
 
@@ -12,41 +11,34 @@ from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, driven_config
-from mjstack.envs.buffers import Advance, Workload, play_workload, recommend_sizes, require_physics
-from mjstack.episodes.observers import (
-    Episode,
-    Hook,
-    Snapshots,
-    StepHook,
-    WorldRecorder,
-    play_episode,
-)
+from mjstack.envs.buffers import Advance, Workload, measured_sizes, play_workload
 from mjstack.episodes.rollout import (
     CLOSED_LOOP,
     NOMINAL,
+    Episode,
     Observer,
     Reset,
+    Snapshots,
     State,
+    WorldRecorder,
+    play_episode,
     reset_worlds,
 )
 from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
+from mjstack.managers.view import offers
 from mjstack.mdp.geometry import source_xy
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import SceneIndex, build_model
 from mjstack.scene.phases import Phase
-from mjstack.sim import (
-    BatchSizes,
-    Simulation,
-    make_simulation,
-    resolve_backend,
-    resolve_sizes,
-)
+from mjstack.sim import BatchSizes, Simulation, make_simulation, resolve_backend, resolve_sizes
 from mjstack.sim.sizes import apply_configured
 from mjstack.tasks.check import EpisodeCheck, make_check
 
 TextHook = Callable[[str], None]
-AnyGate = TypeVar("AnyGate", bound=Callable)
+
+needs_episode = offers(needs_episode=True)
+"""Marks a gate that plays judged episodes. It is skipped for a task that has none."""
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -133,11 +125,11 @@ class RunContext:
         stage: Scene and plan; by default those of the configuration.
         folder: Where the run's files go, or None for none.
         overrides: The command line of the run.
-        print_line: Prints a line.
+        print_line: Prints a line, which has no markup.
         begin: Told the name of each part of the run as it begins.
         record: Gets each result as soon as there is one.
         advance: Told about progress.
-        on_step: Called after each step of the one-world episode that is shown (viewer).
+        viewers: Look on at the one-world episode that is shown.
         artifacts: Products of gates.
     """
 
@@ -148,8 +140,8 @@ class RunContext:
     print_line: TextHook = lambda line: None
     begin: TextHook = lambda name: None
     record: Callable[[GateResult], None] = lambda result: None
-    advance: Advance | None = None
-    on_step: StepHook | None = None
+    advance: Advance = lambda what, done, total: None
+    viewers: Sequence[Observer] = ()
     artifacts: Artifacts = field(default_factory=Artifacts)
 
     def __post_init__(self) -> None:
@@ -196,19 +188,9 @@ class RunContext:
         steps = [self.phase(name).stop - 1 for name in self.cfg.gate.parity.states.values()]
         world = WorldRecorder()
         snapshots = Snapshots(steps)
-        shown = [] if "parity" in self.cfg.gates else self.viewers
+        shown = () if "parity" in self.cfg.gates else self.viewers
         episode = self.play(sim, NOMINAL, [*shown, world, snapshots])
         return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)
-
-    def report_progress(self, what: str, done: int, total: int) -> None:
-        """Report progress, if anyone listens."""
-        if self.advance is not None:
-            self.advance(what, done, total)
-
-    @property
-    def viewers(self) -> list[Observer]:
-        """Observers of the episode that is shown."""
-        return [] if self.on_step is None else [Hook(self.on_step)]
 
     def start(
         self,
@@ -241,8 +223,9 @@ class RunContext:
 
             return ClosedLoopDriver(env, self.planner.nominal)
         sources = source_xy(env).double().cpu().numpy()
-        planned = partial(self.report_progress, "planning", total=sim.nworld)
-        trajectory = self.planner.plan(sources, planned).to(sim.device, sim.ctrl.dtype)
+        trajectory = self.planner.plan(
+            sources, lambda done: self.advance("planning", done, sim.nworld)
+        ).to(sim.device, sim.ctrl.dtype)
         return OpenLoopDriver(trajectory, self.planner.phases)
 
     def play(
@@ -254,14 +237,8 @@ class RunContext:
         seed: int | None = None,
         worlds: Sequence[int] | None = None,
     ) -> Episode:
-        """Roll out one judged episode.
-
-        Args:
-            sim: The worlds.
-            reset: How they start.
-            observers: Look on.
-            seed: Seed, if not the configured one.
-            worlds: Numbers of the worlds, if not 0 to nworld - 1; see `start`.
+        """Roll out one judged episode, at which the observers look on; other arguments as of
+        `start`.
         """
         env = self.start(sim, reset, seed=seed, worlds=worlds)
         return play_episode(env, self.driver(env), observers, advance=self.advance)
@@ -310,15 +287,11 @@ class RunContext:
             return resolve_sizes(self.cfg)
         found = self.artifacts.sizes
         if found is None:
+            what = "the driven task"
+            source = f"{what} in {self.measuring_nworld} worlds"
             task = self.play_task(self.cfg.reset)
-            require_physics("the driven task", task)
-            margin = self.cfg.gate.capacity.margin
-            source = (
-                f"batch=auto: the driven task in {self.measuring_nworld} worlds, times {margin:g}"
-            )
-            found = self.artifacts.sizes = recommend_sizes(task.peaks, margin, source)
-            sizes = apply_configured(self.cfg, found)
-            self.print_line(f"{sizes.as_overrides()} ({found.source})")
+            found = self.artifacts.sizes = measured_sizes(self.cfg, what, task, source)
+            self.print_line(str(apply_configured(self.cfg, found)))
         return apply_configured(self.cfg, found)
 
     @property
@@ -351,10 +324,6 @@ class RunContext:
         found = self.artifacts.env_sizes
         return apply_configured(self.cfg, found) if self.cfg.batch.auto and found else None
 
-    def parity_simulation(self) -> Simulation:
-        """One MJWarp world."""
-        return make_simulation(self.model, self.cfg, 1, backend=Backend.mjwarp)
-
     def phase(self, name: str) -> Phase:
         """A phase by its name."""
         return next(phase for phase in self.planner.phases if phase.name == name)
@@ -367,12 +336,6 @@ def lacks_episode(cfg: Config) -> str:
     if cfg.task.check is None:
         return f"task {cfg.task.name} has no check"
     return ""
-
-
-def needs_episode(gate: AnyGate) -> AnyGate:
-    """Mark a gate that plays judged episodes. It is skipped for a task that has none."""
-    gate.needs_episode = True  # type: ignore[attr-defined]
-    return gate
 
 
 def require_episode(cfg: Config) -> None:

@@ -10,7 +10,7 @@ from mjstack.config.check import reads_starts_file
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Config, TermCfg
 from mjstack.episodes.record import EpisodeRecord
-from mjstack.errors import ConfigError, MjstackError, RunError
+from mjstack.errors import MjstackError, RunError
 from mjstack.files import reading, write_atomic
 
 STEM = "starts_played"
@@ -91,17 +91,11 @@ def archive_starts(cfg: Config, folder: Path) -> Config:
         The configuration with the copies as its terms' files.
 
     Raises:
-        ConfigError: A file cannot be read.
-        OSError: A copy cannot be written.
+        OSError: A file cannot be read, or a copy cannot be written.
     """
     names = copy_names(cfg)
     for path, name in names.items():
-        try:
-            content = Path(path).read_bytes()
-        except OSError as error:
-            expected = f"a file that can be read ({error.strerror})"
-            raise ConfigError("starts", path, expected) from error
-        write_atomic(folder / name, content)
+        write_atomic(folder / name, Path(path).read_bytes())
     return _from_copies(cfg, folder, names)
 
 

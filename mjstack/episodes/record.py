@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from mjstack.episodes.failures import FailureMonitor, Sign
-from mjstack.episodes.observers import Episode
+from mjstack.episodes.rollout import Episode
 from mjstack.errors import RunError
 from mjstack.files import reading, write_npz
 from mjstack.tasks.check import Rules
@@ -122,15 +122,8 @@ class EpisodeRecord:
 
     @classmethod
     def read(cls, folder: Path, seed: int, gate: str = "batch") -> "EpisodeRecord | None":
-        """Read the record of a gate's seed, without circumstances.
-
-        Args:
-            folder: The run's.
-            seed: The seed.
-            gate: The gate.
-
-        Returns:
-            The record, or None if the gate did not get there.
+        """Read the record of a gate's seed in a run's folder, without circumstances; None if the
+        gate did not get there.
 
         Raises:
             RunError: The file cannot be read.

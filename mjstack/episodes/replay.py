@@ -11,8 +11,7 @@ from mjstack.config.schema import Backend
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import Episode, WorldRecorder
-from mjstack.episodes.rollout import Observer
+from mjstack.episodes.rollout import Episode, Observer, WorldRecorder
 from mjstack.sim import BatchSizes, Simulation, describe_overflow, resolve_sizes
 from mjstack.tasks.check import make_check
 from mjstack.tasks.view import TaskView

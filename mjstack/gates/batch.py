@@ -1,8 +1,8 @@
 """Gate *batch*: every world does the task, or is named with the rule it broke."""
 
 from mjstack.episodes.context import RunContext, needs_episode
-from mjstack.episodes.observers import Snapshots
-from mjstack.episodes.seeds import play_seeds
+from mjstack.episodes.rollout import Snapshots
+from mjstack.episodes.tally import play_seeds
 from mjstack.report.record import GateResult
 
 

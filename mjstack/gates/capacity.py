@@ -27,27 +27,16 @@ from mjstack.sim.sizes import apply_configured, resolve_env_sizes
 
 @dataclass(kw_only=True, slots=True)
 class _Group:
-    """Workloads whose worlds have the same buffer sizes.
+    """Workloads whose worlds have the same buffer sizes."""
 
-    Attributes:
-        title: The workloads in words.
-        prefix: Of the metrics of the recommended sizes.
-        runs: Each with room to spare, by name.
-        peaks: The most that any of them used.
-        sizes: In force.
-        wanted: Recommended.
-        lost: Physics that was lost with room to spare; nothing may be sized from it then.
-        broken: Problems of the same workloads at the recommended sizes.
-    """
-
+    name: str  # env or task
     title: str
-    prefix: str
-    runs: dict[str, Workload]
-    peaks: Peaks
-    sizes: BatchSizes
-    wanted: BatchSizes
-    lost: str
-    broken: list[str] = field(default_factory=list)
+    runs: dict[str, Workload]  # with room to spare
+    peaks: Peaks  # the most that any of them used
+    sizes: BatchSizes  # in force
+    wanted: BatchSizes  # recommended
+    lost: str  # physics that was lost with room to spare; nothing may be sized from it then
+    broken: list[str] = field(default_factory=list)  # problems at the recommended sizes
 
 
 @needs_episode
@@ -68,18 +57,18 @@ def run_capacity(context: RunContext) -> list[GateResult]:
     env = _measure(
         context,
         result,
-        title="environments (random actions, randomised starts)",
-        prefix="recommended_env",
-        configured=resolve_env_sizes(cfg),
+        "env",
+        "environments (random actions, randomised starts)",
+        resolve_env_sizes(cfg),
         random_actions=partial(play_random, context),
         randomized=partial(context.play_task, t.reset),
     )
     task = _measure(
         context,
         result,
-        title="driven task",
-        prefix="recommended",
-        configured=resolve_sizes(cfg),
+        "task",
+        "driven task",
+        resolve_sizes(cfg),
         task=partial(context.play_task, cfg.reset),
     )
     task_run = task.runs["task"]
@@ -135,9 +124,8 @@ def play_random(context: RunContext, sizes: BatchSizes | None = None) -> Workloa
 def _measure(
     context: RunContext,
     result: GateResult,
-    *,
+    group: str,
     title: str,
-    prefix: str,
     configured: BatchSizes,
     **plays: Callable[..., Workload],
 ) -> _Group:
@@ -156,22 +144,22 @@ def _measure(
     peaks = reduce(join_peaks, (run.peaks for run in runs.values()))
     how = f"batch=auto: gate capacity, {context.measuring_nworld} worlds, times {margin:g}"
     wanted = recommend_sizes(peaks, margin, how if cfg.batch.auto else "gate capacity")
-    losses = [describe_run_loss(run) for run in runs.values() if run.sizes]
-    group = _Group(
+    losses = (describe_run_loss(run) for run in runs.values() if run.sizes)
+    done = _Group(
+        name=group,
         title=title,
-        prefix=prefix,
         runs=runs,
         peaks=peaks,
         sizes=apply_configured(cfg, wanted) if cfg.batch.auto else configured,
         wanted=wanted,
-        lost="; ".join(f"{loss}. {fix}" for loss, fix in losses if loss),
+        lost="; ".join(filter(None, losses)),
     )
     exact = not context.backend[1].startswith("cuda")
     for name, first in reversed(runs.items()):
-        if first.sizes is not None and not group.lost:
+        if first.sizes is not None and not done.lost:
             problem = _compare(name, first, plays[name](wanted), result, exact=exact)
-            group.broken += [problem] if problem else []
-    return group
+            done.broken += [problem] if problem else []
+    return done
 
 
 def _compare(
@@ -180,17 +168,8 @@ def _compare(
     """Hold a run at exactly the recommended sizes against the first one.
 
     Nothing may be lost. Where runs repeat bit for bit, the outcome is to be the same too; where
-    they do not, a world near a threshold may fall on its other side, which is reported.
-
-    Args:
-        name: The workload.
-        first: The run with room to spare.
-        again: The second one.
-        result: Gets the figures.
-        exact: Whether runs repeat bit for bit, as they do on any CPU.
-
-    Returns:
-        The problem, if any.
+    they do not, a world near a threshold may fall on its other side, which is reported. Returns the
+    problem, if any.
     """
     assert again.sizes is not None, "native MuJoCo has no sizes to try"
     sizes = again.sizes.as_overrides()
@@ -246,7 +225,7 @@ def _report(context: RunContext, group: _Group, result: GateResult) -> None:
     line = f"{group.title}: {_overrides(cfg, wanted)}"
     if group.lost:
         line = f"{group.title}: not known, physics was lost"
-    elif native and "task" in group.runs:
+    elif native and group.name == "task":
         line += (
             " (contacts alone: native MuJoCo does not count the collision pairs that share their"
             " pool)"
@@ -261,14 +240,14 @@ def _report(context: RunContext, group: _Group, result: GateResult) -> None:
         "njmax": wanted.njmax,
         "nccdmax": wanted.nccdmax,
     }
-    result.metrics |= {f"{group.prefix}.{key}": n for key, n in sizes.items() if n is not None}
+    prefix = "recommended" if group.name == "task" else "recommended_env"
+    result.metrics |= {f"{prefix}.{key}": n for key, n in sizes.items() if n is not None}
     if not native:
         from mjstack.sim.usage import data_bytes  # loads Warp, which native runs do not need
 
-        key = "task" if "task" in group.runs else "env"
         for which, some in (("current", group.sizes), ("recommended", wanted)):
             size = data_bytes(context.model, cfg.nworld, some)
-            result.metrics[f"memory.{key}.{which}_mb"] = size / 1e6
+            result.metrics[f"memory.{group.name}.{which}_mb"] = size / 1e6
 
 
 def _shortages(cfg: Config, group: _Group) -> list[tuple[tuple[str, ...], str]]:

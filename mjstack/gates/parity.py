@@ -6,19 +6,19 @@ from contextlib import closing
 import torch
 
 from mjstack.config.check import PARITY_FIELDS
-from mjstack.config.schema import Config
+from mjstack.config.schema import Backend, Config
 from mjstack.episodes.context import RunContext, judge_one, needs_episode
-from mjstack.episodes.observers import WorldRecorder
-from mjstack.episodes.rollout import NOMINAL, State, restore
+from mjstack.episodes.rollout import NOMINAL, State, WorldRecorder, restore
 from mjstack.math import quat_angle
 from mjstack.report.record import GateResult, Status
-from mjstack.sim import Simulation, describe_overflow
+from mjstack.sim import Simulation, describe_overflow, make_simulation
 
 
 @needs_episode
 def run_parity(context: RunContext) -> list[GateResult]:
     """Compare steps from equal states, the options of each backend, and the whole task."""
-    with closing(context.parity_simulation()) as mjwarp:
+    one = make_simulation(context.model, context.cfg, 1, backend=Backend.mjwarp)
+    with closing(one) as mjwarp:
         return [_compare(context, mjwarp)]
 
 
@@ -145,7 +145,7 @@ def compare_options(
     requested: dict[str, float | int | str | None] = {
         "timestep": cfg.timing.physics_dt,
         "integrator": "mjINT_IMPLICITFAST",
-        "cone": f"mjCONE_{solver.cone.value.upper()}",
+        "cone": f"mjCONE_{solver.cone.upper()}",
         "box_box": "primitive",
         "iterations": solver.iterations,
         "ls_iterations": solver.ls_iterations,

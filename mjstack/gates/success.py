@@ -3,6 +3,7 @@ fails.
 """
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,10 @@ from mjstack.episodes.context import RunContext, needs_episode
 from mjstack.episodes.record import starts_name
 from mjstack.episodes.regions import find_regions, regions_table, save_regions
 from mjstack.episodes.rollout import CLOSED_LOOP, Observer
-from mjstack.episodes.seeds import play_seeds
-from mjstack.errors import MjstackError
+from mjstack.episodes.tally import play_seeds
 from mjstack.mdp.starts.starts_file import write_starts
 from mjstack.report.record import GateResult
-from mjstack.report.write import format_percent
+from mjstack.report.write import format_percent, safely_write
 
 
 def success_config(cfg: Config) -> Config:
@@ -107,10 +107,9 @@ class _StartsWriter(Observer):
         starts = env.cfg.starts
         if path is None or (starts is not None and path.resolve() == Path(starts).resolve()):
             return
-        try:
-            write_starts(env, path)
-        except MjstackError as error:  # a full disk, say: the episodes are played all the same
-            self._unwritten.append(f"{path.name} could not be written: {error}")
+        # Where the disk is full, the episodes are played all the same
+        if problem := safely_write(path, partial(write_starts, env)):
+            self._unwritten.append(problem)
 
 
 def _describe_start(cfg: Config) -> str:

@@ -30,7 +30,7 @@ def run_throughput(context: RunContext) -> list[GateResult]:
     """
     backend, device = context.backend
     if not device.startswith("cuda"):
-        cause = f"sim={backend.value} sim.device={device}"
+        cause = f"sim={backend} sim.device={device}"
         if not torch.cuda.is_available():
             cause = "this machine has none"
         reason = f"no CUDA device was used: {cause}"
@@ -124,8 +124,8 @@ def _on_driven_worlds(
         return {name: Measurement(name=name, problem=problem) for name in wanted}
     result.metrics["build_and_compile_s"] = time.perf_counter() - began
     result.notes["backend"] = sim.description
-    if (sizes := sim.sizes) is not None:
-        result.notes["sizes"] = f"{sizes.as_overrides()} ({sizes.source})"
+    if sim.sizes is not None:
+        result.notes["sizes"] = str(sim.sizes)
     found = {}
     step_seconds = 0.0
     if "physics" in wanted:
@@ -165,8 +165,8 @@ def _on_environment(
             env, steps=context.cfg.gate.throughput.env_steps, **limits, advance=context.advance
         )
         found.facts["build_and_compile_s"] = build_seconds
-        if (sizes := env.sim.sizes) is not None:
-            found.notes["sizes"] = f"{sizes.as_overrides()} ({sizes.source})"
+        if env.sim.sizes is not None:
+            found.notes["sizes"] = str(env.sim.sizes)
         return found
     finally:
         env.close()

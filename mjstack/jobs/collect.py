@@ -5,13 +5,11 @@ asked for are there.
 import json
 import os
 import time
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import cast
 
 import torch
-from rich.markup import escape
 
 from mjstack.config.fingerprint import config_hash
 from mjstack.config.schema import Backend, CollectJobCfg, Config
@@ -19,9 +17,9 @@ from mjstack.datasets import DatasetSpec, lerobot, require_pyarrow
 from mjstack.datasets.reader import check_same, read_info
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.context import RunContext, require_episode
-from mjstack.errors import ConfigError, DatasetError, UnwrittenError
+from mjstack.errors import ConfigError, DatasetError
 from mjstack.files import check_unused, lock_folder, write_atomic
-from mjstack.jobs.collection import DATASET, Collection, CollectPlan, read_batches
+from mjstack.jobs.collection import DATASET, FILE, Collection, CollectPlan, read_batches
 from mjstack.jobs.demonstration import ACTION, STATE, differences, episode_config
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
@@ -93,18 +91,14 @@ def run_collect(plan: CollectPlan, context: RunContext, folder: Path) -> None:
         result = collection.result(status, problem, time.perf_counter() - began)
         if collection.committed:
             _write_table(context.cfg, plan, folder, result)
-            line = f"dataset: {collection.path}, described in {folder}/dataset.md"
-            context.print_line(escape(line))
+            where = f"{collection.path}, described in {folder}/dataset.md"
+            context.print_line(f"dataset: {where}")
         context.record(result)
 
     try:
         problem = collection.play()
     except KeyboardInterrupt:
         conclude(Status.interrupted, "interrupted")
-        raise
-    except (UnwrittenError, OSError) as error:
-        with suppress(OSError):  # there may be room for a report
-            conclude(Status.failed, str(error))
         raise
     conclude(Status.failed if problem else Status.passed, problem)
 
@@ -177,7 +171,7 @@ def _check_folder(dataset: Path, spec: DatasetSpec) -> None:
             " job.folder to another folder, or these keys back"
         )
     check_same(dataset, info, spec)
-    read_batches(dataset.parent, [])
+    read_batches(dataset.parent / FILE)
 
 
 JOB = Job(check_collect)

@@ -5,7 +5,6 @@ until enough are there.
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -97,17 +96,12 @@ class CollectedBatch:
     broken: dict[str, int] = field(default_factory=dict)
 
 
-def read_batches(folder: Path, committed: Sequence[tuple[int, int]]) -> list[CollectedBatch]:
-    """The batches of earlier calls.
-
-    Args:
-        folder: The job's folder.
-        committed: Seed and world of every episode of the dataset.
+def read_batches(path: Path) -> list[CollectedBatch]:
+    """The batches of earlier calls, ``kept`` as it was then.
 
     Raises:
         DatasetError: The file cannot be read.
     """
-    path = folder / FILE
     if not path.exists():
         return []
     fix = (
@@ -120,14 +114,7 @@ def read_batches(folder: Path, committed: Sequence[tuple[int, int]]) -> list[Col
             del counts["broken"]
             if any(type(count) is not int or count < 0 for count in counts.values()):
                 raise ValueError(counts)
-    _count_kept(batches, committed)
     return batches
-
-
-def _count_kept(batches: Sequence[CollectedBatch], committed: Sequence[tuple[int, int]]) -> None:
-    counts = Counter(seed for seed, _ in committed)
-    for batch in batches:
-        batch.kept = counts[batch.seed]
 
 
 class Collection:
@@ -147,12 +134,7 @@ class Collection:
     """
 
     def __init__(self, plan: CollectPlan, context: RunContext) -> None:
-        """Open the dataset of a plan, in the run's context.
-
-        Raises:
-            DatasetError: The folder has another dataset.
-            UnwrittenError: The dataset cannot be written.
-        """
+        """Open the dataset of a plan; raises as `DatasetWriter` does."""
         self._context = context
         self._plan = plan
         self._job = cast(CollectJobCfg, context.cfg.job)
@@ -171,18 +153,19 @@ class Collection:
         return len(self._writer.committed)
 
     def play(self) -> str:
-        """Play and write until the episodes are there.
+        """Play and write until the episodes are there; what was committed is kept.
 
         Returns:
             Why that cannot be done; empty if it is done.
 
         Raises:
-            UnwrittenError: The dataset cannot be written any further; what was committed is kept.
-            OSError: The record of the batches cannot be written; what was committed is kept.
+            UnwrittenError: The dataset cannot be written any further.
+            OSError: The record of the batches cannot be written.
         """
         try:
             with self._writer:
-                self.batches = read_batches(self._plan.home, self._writer.committed)
+                self.batches = read_batches(self._record_path)
+                self._count_kept()
                 return self._play()
         finally:
             if self.batches:
@@ -253,13 +236,18 @@ class Collection:
         """Commit the episodes of some worlds, and record it."""
         for count, (world, arrays) in enumerate(played.episodes(worlds), 1):
             self._writer.add([self._episode(played, world, arrays)])
-            self._context.report_progress(f"episodes of seed {played.seed}", count, len(worlds))
+            self._context.advance(f"episodes of seed {played.seed}", count, len(worlds))
         self._writer.flush()
         self._record()
 
+    def _count_kept(self) -> None:
+        counts = Counter(seed for seed, _ in self._writer.committed)
+        for batch in self.batches:
+            batch.kept = counts[batch.seed]
+
     def _record(self) -> None:
         """Write the record of all batches."""
-        _count_kept(self.batches, self._writer.committed)
+        self._count_kept()
         records = [asdict(batch) for batch in self.batches]
         write_atomic(self._record_path, json.dumps(records, indent=1) + "\n")
 
@@ -293,10 +281,7 @@ class Collection:
     def result(self, status: Status, problem: str, seconds: float) -> GateResult:
         """The dataset and the expert's success, as a result of the report.
 
-        Args:
-            status: How it ended.
-            problem: Why, where it did not pass.
-            seconds: Wall time of this call [s].
+        ``problem`` says why it did not pass; ``seconds`` is the wall time of this call.
         """
         asked = self._job.episodes
         new = self.committed - self._before

@@ -14,12 +14,12 @@ from mjstack.config.check import places_objects
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import offered
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
+from mjstack.config.session import list_items
 from mjstack.datasets import DatasetSpec, Feature
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.observers import play_episode
-from mjstack.episodes.rollout import Observer, reset_worlds
+from mjstack.episodes.rollout import Observer, play_episode, reset_worlds
 from mjstack.errors import ConfigError
 from mjstack.mdp.starts.placement import GAP, SCHEMA, may_meet
 from mjstack.sim import Simulation, resolve_backend
@@ -34,8 +34,6 @@ _NO_MATTER = (
     "action",
     "termination",
     "batch",
-    "sim",
-    "job",
     "nworld",
     "gates",
     "graph",
@@ -130,11 +128,6 @@ def play_demonstrations(context: RunContext, sim: Simulation, seed: int) -> Play
     """Play the configured driver once from the starts of a seed, and judge it by the task's check.
 
     Nothing ends an episode: worlds go on to its end, so all have as many steps.
-
-    Args:
-        context: Configuration, scene and planner.
-        sim: The worlds.
-        seed: Seed of the starts.
     """
     cfg = demonstration_config(replace(context.cfg, seed=seed))
     env = Env(sim, context.index, cfg, check_faults=False)  # the check names lost worlds
@@ -166,7 +159,7 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     for key in _NO_MATTER:
         del config[key]
     backend, _ = resolve_backend(cfg)
-    config["sim"] = {"backend": backend.value}
+    config["sim"] = {"backend": backend}
     config["job"] = {"keep_failures": cast(CollectJobCfg, cfg.job).keep_failures}
     placed = [term.params for term in cfg.reset.values() if places_objects(term)]
     if any(may_meet(cfg.scene, params["xy"], params.get("gap", GAP)) for params in placed):
@@ -176,8 +169,10 @@ def episode_config(cfg: Config) -> dict[str, Any]:
 
 def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
     """Keys in which two configurations differ, such as ``seed=1, expected 2``."""
-    before = dict(_flat(theirs))
-    now = dict(_flat(ours))
+    before, now = (
+        {key: value for key, value in list_items(one) if value == {} or not isinstance(value, dict)}
+        for one in (theirs, ours)
+    )
     return [
         f"{key}={before.get(key, 'missing')}, expected {now.get(key, 'none')}"
         for key in before | now
@@ -185,22 +180,9 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]
     ]
 
 
-def _flat(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and their values."""
-    if isinstance(node, Mapping) and node:
-        for name, value in node.items():
-            yield from _flat(value, f"{key}.{name}" if key else name)
-    else:
-        yield key, node
-
-
 def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSpec:
-    """Describe the dataset of an environment's demonstrations.
-
-    Args:
-        env: An environment of `demonstration_config`, with any number of worlds.
-        cfg: The job's configuration.
-        provenance: Versions and hardware.
+    """Describe the dataset of demonstrations in an environment of `demonstration_config`, with any
+    number of worlds.
 
     Raises:
         ConfigError: An observation group has a name that is taken.
@@ -263,9 +245,7 @@ def _group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
 
 
 def _term_units(func: str, width: int, joints: tuple[str, ...]) -> Sequence[str]:
-    unit = offered(func, "unit")
-    if unit is None:
-        unit = "unknown"
+    unit = offered(func, "unit") or "unknown"
     if unit == "joint":
         return joints
     if unit == "joint/s":
@@ -275,11 +255,7 @@ def _term_units(func: str, width: int, joints: tuple[str, ...]) -> Sequence[str]
 
 def _scaled(units: Sequence[str], scale: float) -> list[str]:
     """Units of 1 after the scaling: ``10 rad/s`` where a speed is multiplied by 0.1."""
-    if scale == 1.0:
-        return list(units)
     if scale == 0.0:
         return ["unknown"] * len(units)
-    return [
-        unit if unit == "unknown" else f"{1.0 / scale:g} {unit}".removesuffix(" 1")
-        for unit in units
-    ]
+    factor = "" if scale == 1.0 else f"{1.0 / scale:g} "
+    return [u if u == "unknown" else f"{factor}{u}".removesuffix(" 1") for u in units]

@@ -1,8 +1,8 @@
 """Job *gates*: a configuration and a folder in, gates run, a report left behind."""
 
 import contextlib
-import os
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from mjstack.envs.build import driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.earlier_run import archive_starts
 from mjstack.episodes.rollout import CLOSED_LOOP
-from mjstack.errors import ConfigError, TermError, Unreachable
+from mjstack.errors import ConfigError, KeyedError, Unreachable
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
 from mjstack.jobs.runner import CheckedJob, Job, check_showing
@@ -24,14 +24,16 @@ from mjstack.sim.native import NativeSimulation
 # Bytes of a whole run (environment, plan, check) over those of its native worlds: measured 3.2 to
 # 4.6, for both drivers.
 _SHARE = 4
-_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+_LIMITS = (
+    "/proc/meminfo",
+    "/sys/fs/cgroup/memory.max",
+    "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+)
 
 
 def check_machine(cfg: Config) -> RunContext:
-    """Build scene and plan, and raise for what this machine cannot do, before anything is written.
-
-    Returns:
-        The context of the run.
+    """The context of a run, scene and plan built; raises for what this machine cannot do, before
+    anything is written.
     """
     find_gates(cfg)
     context = RunContext(cfg)
@@ -62,13 +64,9 @@ def _check_memory(context: RunContext) -> None:
 
 def available_memory() -> int:
     """Memory that this process may still take, in bytes: the system's, or its container's."""
-    found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
-    for path in ("/proc/meminfo", *_LIMITS):
-        with contextlib.suppress(OSError):
-            text = Path(path).read_text()
-            for number, kib in re.findall(r"(?m)(?:^|MemAvailable: +)(\d+)( kB)?$", text):
-                found.append(int(number) * (1024 if kib else 1))
-    return min(found)
+    text = "".join(path.read_text() for path in map(Path, _LIMITS) if path.exists())
+    found = re.findall(r"(?m)^(?:MemAvailable: +(\d+) kB|(\d+))$", text)
+    return min((1024 * int(kib or 0) or int(limit) for kib, limit in found), default=sys.maxsize)
 
 
 def _check_starts(context: RunContext) -> None:
@@ -85,7 +83,7 @@ def _check_starts(context: RunContext) -> None:
             check_env(context, own, reset=reset)
         except ConfigError as error:
             if cfg.gate.success.region is not None and error.key.endswith(".params.xy"):
-                raise error.at("gate.success.region") from error
+                error.move("gate.success.region")
             raise
 
 
@@ -102,7 +100,7 @@ def check_task(context: RunContext) -> None:
     if phases[-1].stop > cfg.task.episode_steps:
         expected = f"at least the steps of the phases, {phases[-1].stop}"
         raise ConfigError("task.episode_steps", cfg.task.episode_steps, expected)
-    check_env(context, driven_config(cfg), action="controller.action")
+    check_env(context, driven_config(cfg, reset={}), action="controller.action")
     if cfg.controller.approach_gain > 0.0:
         turn_sign(context.model, cfg)
     if cfg.controller.name == CLOSED_LOOP or "success" in cfg.gates:
@@ -113,20 +111,15 @@ def check_task(context: RunContext) -> None:
 
 
 def check_env(context: RunContext, cfg: Config, **keys: str) -> None:
-    """Build an environment in the context's scene, which checks every term.
-
-    Args:
-        context: The scene.
-        cfg: The configuration.
-        keys: The key of a group whose terms come from elsewhere, by the group.
+    """Build an environment in the context's scene, which checks every term. ``keys`` has the key of
+    each group whose terms come from elsewhere.
     """
     try:
         build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu").close()
-    except (ConfigError, TermError) as error:
+    except KeyedError as error:
         group, _, rest = error.key.partition(".")
-        if group not in keys:
-            raise
-        raise error.at(f"{keys[group]}.{rest}") from error
+        error.move(f"{keys.get(group, group)}.{rest}")
+        raise
 
 
 def check_gates(cfg: Config) -> CheckedJob:

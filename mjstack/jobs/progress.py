@@ -15,7 +15,7 @@ from rich.progress import (
 from mjstack.interrupt import check_interrupt
 from mjstack.report.record import GateResult, Status
 
-STATUS_COLOR = {
+STATUS_COLOR: dict[str, str] = {
     Status.passed: "green",
     Status.failed: "red",
     Status.skipped: "yellow",
@@ -54,8 +54,8 @@ class ProgressBar:
         self._progress.stop()
 
     def print_line(self, line: str) -> None:
-        """Print a line above the bar."""
-        self._progress.console.print(line, soft_wrap=True)
+        """Print a line of text above the bar."""
+        self._progress.console.print(line, markup=False)
 
     def start(self, gate: str) -> None:
         """Begin something with a name."""
@@ -84,8 +84,8 @@ class ProgressBar:
         """Print a gate's result."""
         self._progress.update(self._task, visible=False)
         color = STATUS_COLOR[result.status]
-        self.print_line(
-            f"[{color}]{result.status.value:>4}[/] {result.name} ({result.seconds:.1f} s):"
+        self._progress.console.print(
+            f"[{color}]{result.status:>4}[/] {result.name} ({result.seconds:.1f} s):"
             f" {escape(result.reason or 'ok')}"
         )
         check_interrupt()

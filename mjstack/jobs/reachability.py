@@ -20,7 +20,6 @@ from mjstack.kinematics.reach import PointReach
 from mjstack.report.picture import figure, outline
 from mjstack.report.record import GateResult, Status
 from mjstack.report.write import summarize
-from mjstack.scene import table_top
 from mjstack.scene.phases import object_targets
 from mjstack.sim import resolve_backend
 
@@ -52,12 +51,6 @@ class ReachLevel:
     def reached(self) -> np.ndarray:
         """Shape ``(ny, nx)``, bool."""
         return np.isfinite(self.tilt)
-
-    @property
-    def tilts(self) -> tuple[float, float]:
-        """Smallest and largest tilt [deg]; NaN where no point is reached."""
-        some = self.tilt[self.reached]
-        return (float(some.min()), float(some.max())) if len(some) else (np.nan, np.nan)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -132,7 +125,7 @@ def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
         )
     low, high = (end(targets, key=lambda pair: pair[1].z) for end in (min, max))
     first = targets[0]
-    top = table_top(cfg.scene)
+    top = cfg.scene.table_top
     # The jaws close where they grasp, but come there open, which reaches less far where one jaw
     # stays.
     return {
@@ -162,7 +155,7 @@ def map_level(context: RunContext, name: str, height: float, gripper: str) -> Re
     reach = PointReach(context.model, cfg.robot, command)
     tolerance = cfg.controller.ik_tolerance
     x, y = np.meshgrid(*axes(cfg))
-    level = np.full(x.size, table_top(cfg.scene) + height)
+    level = np.full(x.size, cfg.scene.table_top + height)
     points = np.stack([x.ravel(), y.ravel(), level], axis=1)
     residual = np.empty(len(points))
     tilt = np.empty(len(points))
@@ -171,7 +164,7 @@ def map_level(context: RunContext, name: str, height: float, gripper: str) -> Re
         found = reach.solve_upright(points[part], tolerance)
         residual[part] = found.distance
         tilt[part] = np.where(found.distance <= tolerance, np.degrees(found.tilt), np.nan)
-        context.report_progress("points", min(first + _SHARE, len(points)), len(points))
+        context.advance("points", min(first + _SHARE, len(points)), len(points))
     return ReachLevel(
         name=name,
         height=height,
@@ -240,7 +233,8 @@ def _level_result(level: ReachLevel, seconds: float) -> GateResult:
         " table reached"
     )
     if share:
-        low, high = level.tilts
+        low = float(np.nanmin(level.tilt))
+        high = float(np.nanmax(level.tilt))
         metrics |= {"smallest_tilt_deg": low, "largest_tilt_deg": high}
         reason += f", tilted by {low:.0f} to {high:.0f} degrees at least"
     return GateResult(
@@ -349,7 +343,7 @@ def _save_map(
     count = len(levels)
     size = ((3.6 * max(0.6, wide / deep) + 1.0) * count + 1.2, 5.6)
     with figure(path, title, count, figsize=size) as (drawn, panels):
-        top = np.nanmax([level.tilts[1] for level in levels] + [1.0])
+        top = np.nanmax([level.tilt for level in levels], initial=1.0)
         for panel, level in zip(np.atleast_1d(panels), levels, strict=True):
             panel.set_facecolor("0.92")
             center = (x[len(x) // 2], y[len(y) // 2])

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from omegaconf import OmegaConf
-from rich.markup import escape
 
 from mjstack.config.schema import Backend, Config, SimCfg
 from mjstack.envs import driven_config
@@ -81,9 +80,9 @@ def _replay_all(plan: ReplayPlan, context: RunContext, folder: Path) -> None:
     write_atomic(folder / "replayed_config.yaml", OmegaConf.to_yaml(played))
     changes = _changes(plan.run.provenance, run_provenance(context))
     for line in changes:
-        context.print_line(escape(line))
+        context.print_line(line)
     for number, (backend, _) in enumerate(plan.where):
-        run_guarded(context, f"replay_{backend.value}", partial(_replay, plan, number, changes))
+        run_guarded(context, f"replay_{backend}", partial(_replay, plan, number, changes))
 
 
 def _plan(cfg: Config) -> ReplayPlan:
@@ -96,20 +95,20 @@ def _plan(cfg: Config) -> ReplayPlan:
 
     # The world: [gate:][seed:]number
     *heads, tail = str(cfg.world).split(":")
+    world = int(tail)
     had = [gate for gate in ("batch", "success") if gate in run.cfg.gates]
     gate = heads.pop(0) if heads and not heads[0].isdigit() else (had or ["batch"])[0]
+    first = run.cfg.seed
+    last = first + run.cfg.gate[gate].seeds - 1
+    seed = int(heads[0]) if heads else first
+    expected = ""
     if gate not in had:
         expected = f"a world of a gate that run had, {' or '.join(had) or 'but it had none'}"
-        raise ConfigError("world", cfg.world, expected)
-    first = run.cfg.seed
-    seed = int(heads[0]) if heads else first
-    world = int(tail)
-    last = first + (run.cfg.gate.success if gate == "success" else run.cfg.gate.batch).seeds - 1
-    if not first <= seed <= last:
+    elif not first <= seed <= last:
         expected = f"a seed from {first} to {last}, as that run has (seed:world)"
-        raise ConfigError("world", cfg.world, expected)
-    if not world < run.cfg.nworld:
+    elif world >= run.cfg.nworld:
         expected = f"a world from 0 to {run.cfg.nworld - 1}, as that run has"
+    if expected:
         raise ConfigError("world", cfg.world, expected)
     record = run.record(seed, gate)
 
@@ -207,18 +206,18 @@ def _replay(
     if not kept:
         status = Status.failed
     if first:
-        title = f"world {plan.world} of seed {plan.seed}, replayed ({backend.value})"
+        title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})"
         context.artifacts.shown = (title, done.recorder)
     told = [*done.findings, *(_first_sign(monitor, done, context) for monitor in monitors)]
     for line in told:
-        context.print_line(escape(f"  {line}"))
-    name = "trajectory.npz" if first else f"trajectory_{backend.value}.npz"
+        context.print_line(f"  {line}")
+    name = "trajectory.npz" if first else f"trajectory_{backend}.npz"
     assert context.folder is not None
     write_npz(context.folder / name, done.arrays)
     recorded = rules.describe(int(plan.record.failed[plan.world])) or "succeeded"
     return [
         GateResult(
-            name=f"replay_{backend.value}",
+            name=f"replay_{backend}",
             status=status,
             reason=reason,
             thresholds=context.check.thresholds(),
@@ -255,7 +254,7 @@ def _compare(
     now = int(done.episode.failed[0])
     same = bits == now
     result = "the same result" if same else rules.describe(bits) or "succeeded"
-    if record.backend != backend.value:
+    if record.backend != backend:
         another = "" if same else "another result: "
         return True, f"that run's {record.backend} world had {another}{result}"
     ours = done.recorder.qpos[-1]

@@ -20,7 +20,7 @@ from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Config
 from mjstack.episodes.context import Artifacts, RunContext
-from mjstack.episodes.observers import StepHook
+from mjstack.episodes.rollout import Hook, StepHook
 from mjstack.errors import ConfigError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import log_error
@@ -32,7 +32,8 @@ from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
 from mjstack.report.table import Console, Table, to_document
 from mjstack.report.write import safely_write, summarize, write_report
-from mjstack.sim import Simulation, cuda_driver, cuda_name
+from mjstack.sim import Simulation
+from mjstack.sim.build import cuda_driver, cuda_name
 
 log = logging.getLogger(__name__)
 
@@ -88,11 +89,7 @@ class CheckedJob:
     resumes: str = ""
 
     def run(self, folder: Path, overrides: Sequence[str] = ()) -> Report:
-        """Do the work and write its report after each result.
-
-        Args:
-            folder: Where report.json, report.md, pictures and logs go.
-            overrides: The command line.
+        """Do the work and write its report after each result into the folder.
 
         Returns:
             How it ended. Ctrl-C is an outcome, not an exception: the finished results are in the
@@ -106,7 +103,7 @@ class CheckedJob:
         def record(result: GateResult) -> None:
             report.gates.append(result)
             write_report(report)
-            log.info("%s: %s %s", result.name, result.status.value, result.reason)
+            log.info("%s: %s %s", result.name, result.status, result.reason)
             bar.finish(result)
 
         # The work, and the pictures of its artifacts
@@ -124,7 +121,7 @@ class CheckedJob:
                     begin=bar.start,
                     record=record,
                     advance=bar.advance,
-                    on_step=_viewer(self.context) if cfg.view else None,
+                    viewers=[Hook(_viewer(self.context))] if cfg.view else [],
                     artifacts=Artifacts(),
                 )
                 self.work(context, folder)
@@ -155,11 +152,8 @@ class CheckedJob:
 
 
 def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
-    """Raise for what this machine cannot do, before anything is written.
-
-    Args:
-        cfg: The configuration.
-        overrides: Its command line, without Hydra's own keys.
+    """Raise for what this machine cannot do, before anything is written. The overrides are those of
+    the command line without Hydra's own.
     """
     job = find_object("job.func", cfg.job.func)
     if not isinstance(job, Job):
@@ -185,16 +179,8 @@ def write_tables(
     csv: str,
     draw: Callable[[Path], object] | None = None,
 ) -> None:
-    """Replace ``name.csv``, ``name.md`` and, where ``draw`` is given, ``name.png`` of a run.
-
-    Args:
-        context: The run. A picture that fails is reported.
-        name: Of the files.
-        title: Heading of the text.
-        table: Of the text.
-        notes: Of the text, a line each.
-        csv: All rows.
-        draw: Draws the picture, which may fail.
+    """Replace ``name.csv``, ``name.md`` and, where ``draw`` is given, ``name.png`` of a run. A
+    picture that fails is a printed line.
 
     Raises:
         OSError: A file cannot be written.
@@ -203,7 +189,7 @@ def write_tables(
     picture = folder / f"{name}.png"
     if draw is not None:
         if problem := safely_write(picture, draw):
-            context.print_line(escape(problem))
+            context.print_line(problem)
         else:
             context.artifacts.pictures.append(picture.name)
     write_atomic(folder / f"{name}.csv", csv)
@@ -217,7 +203,7 @@ def run_provenance(context: RunContext) -> Provenance:
     name = "Warp's CPU device"
     if device.startswith("cuda"):
         name = cuda_name(device)
-    elif backend.value == "native":
+    elif backend == "native":
         name = f"native MuJoCo on {os.cpu_count()} cores"
     # The numbers of the compiled model: the physics sees these, not the files
     buffer = np.empty(mujoco.mj_sizeModel(context.model), np.uint8)
@@ -248,13 +234,15 @@ def _draw(context: RunContext, console: Console) -> list[str]:
     }
     if cfg.video:
         drawn["episode.mp4"] = (save_video, (model, episode.qpos, cfg.timing.step_dt))
-    problems = {
-        name: safely_write(folder / name, draw, *args) for name, (draw, args) in drawn.items()
-    }
-    for name, problem in problems.items():
-        if problem or name == "episode.mp4":
-            console.print(escape(problem or f"video: {folder}/{name}"))
-    return [name for name, problem in problems.items() if not problem and name.endswith(".png")]
+    pictures = []
+    for name, (draw, args) in drawn.items():
+        if problem := safely_write(folder / name, draw, *args):
+            console.print(escape(problem))
+        elif name.endswith(".png"):
+            pictures.append(name)
+        else:
+            console.print(escape(f"video: {folder}/{name}"))
+    return pictures
 
 
 def _viewer(context: RunContext) -> StepHook:
@@ -280,7 +268,6 @@ def _viewer(context: RunContext) -> StepHook:
 
 
 def _print_summary(console: Console, report: Report) -> None:
-    colors = {status.value: color for status, color in STATUS_COLOR.items()}
-    console.print(summarize(report.gates).to_console(colors))
+    console.print(summarize(report.gates).to_console(STATUS_COLOR))
     console.print(f"report: {escape(str(report.folder))}/report.md")
-    console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status.value}[/]")
+    console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status}[/]")

@@ -3,12 +3,9 @@
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
-
-from rich.markup import escape
 
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.schema import Backend, Config, ScalingJobCfg
@@ -53,14 +50,13 @@ def check_scaling(cfg: Config) -> CheckedJob:
 
 def scaling_folder(cfg: Config) -> Path:
     """Where a configuration's runs are, so that another call finds them."""
-    job = asdict(_job(cfg))
-    for key in ("nworlds", "backends", "run_minutes", "max_minutes", "retry"):  # change no run
-        del job[key]
     config = config_content(cfg)
+    for key in ("nworlds", "backends", "run_minutes", "max_minutes", "retry"):  # change no run
+        del config["job"][key]
     for key in ("nworld", "gates", "view", "video"):
         del config[key]
-    config["sim"].pop("backend")
-    return Path("outputs") / "scaling" / config_hash(config | {"job": job})[:12]
+    del config["sim"]["backend"]
+    return Path("outputs/scaling") / config_hash(config)[:12]
 
 
 def run_scaling(context: RunContext, folder: Path) -> None:
@@ -76,7 +72,7 @@ def run_scaling(context: RunContext, folder: Path) -> None:
     ]
     for override in context.overrides:
         if override.lstrip("+~").partition("=")[0] in _UNUSED:
-            context.print_line(f"{escape(override)} is not used: each run of job=scaling sets it")
+            context.print_line(f"{override} is not used: each run of job=scaling sets it")
     _write(context, rows)
     left = _run_all(context, folder, rows)
 
@@ -87,7 +83,7 @@ def run_scaling(context: RunContext, folder: Path) -> None:
     if any(row["status"] not in (PASS, NOT_RUN) for row in rows):
         context.print_line("job.retry=true repeats the runs that failed")
     if missing:
-        counts = f"{len(missing)} of {len(rows)} runs have not run ({escape(left)})"
+        counts = f"{len(missing)} of {len(rows)} runs have not run ({left})"
         context.print_line(f"incomplete: {counts}. The same command goes on with them.")
     _write(context, rows, draw=True)
     context.print_line(describe_crossover(rows))
@@ -160,7 +156,7 @@ def _backends(cfg: Config) -> list[str]:
     if asked is not None:
         return asked
     if cfg.sim.backend is not Backend.auto:
-        return [cfg.sim.backend.value]
+        return [str(cfg.sim.backend)]
     return ["mjwarp", "native"] if resolve_device(cfg.sim.device).startswith("cuda") else ["native"]
 
 
@@ -260,12 +256,8 @@ def describe_crossover(rows: Sequence[Row]) -> str:
 def save_scaling_curves(path: Path, rows: Sequence[Row], decimation: int, title: str) -> None:
     """Draw throughput and time per step over the number of worlds.
 
-    Args:
-        path: The picture.
-        rows: The table. A run that did not pass interrupts its curves, even with figures, and a
-            cross marks it.
-        decimation: Physics steps in an environment step: both are drawn as world-steps/s.
-        title: Above the panels.
+    A run that did not pass interrupts its curves, even with figures, and a cross marks it. Steps of
+    environments are drawn as world-steps/s too.
     """
     with figure(path, f"{title} (x: no figure)", 2, figsize=(12, 4.8)) as (_, (rate, cost)):
         for backend, (color, label, height) in _BACKENDS.items():

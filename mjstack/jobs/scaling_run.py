@@ -59,15 +59,11 @@ def run_process(
     """Run the gates in a process and keep the row.
 
     Args:
-        folder: The run's folder; its report, log and output go there.
+        folder: The run's folder, made anew.
         row: The row so far: number of worlds and backend count.
         overrides: The run's command line.
         run_seconds: After that it has failed.
-        job_seconds: After that it is stopped; the next call of the job repeats it.
-
-    Returns:
-        The row, also for a run that failed. One that the job had no time for has not run, with the
-        reason.
+        job_seconds: After that it is stopped, and has not run: the next call of the job repeats it.
 
     Raises:
         KeyboardInterrupt: The command was interrupted; the process has been stopped.
@@ -109,13 +105,8 @@ def run_process(
 
 
 def read_report(folder: Path, nworld: int, backend: str, code: int | None) -> Row:
-    """The row of a run whose process has ended, from its report as far as it got.
-
-    Args:
-        folder: The run's folder.
-        nworld: Number of worlds.
-        backend: ``mjwarp`` or ``native``.
-        code: The process's exit status; None where it was stopped.
+    """The row of a run whose process has ended with an exit status (None: it was stopped), from its
+    report as far as it got.
     """
     try:
         report = json.loads((folder / "report.json").read_text())

@@ -6,9 +6,8 @@ It informs, and gates nothing.
 import statistics
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import closing
 from dataclasses import asdict, replace
-from enum import Enum
 from pathlib import Path
 from typing import Any, cast
 
@@ -59,27 +58,18 @@ def run_study(context: RunContext, folder: Path) -> None:
     job = cast(StudyJobCfg, cfg.job)
     rows: list[Row] = []
     context.begin("base")
-    with ExitStack() as worlds:
-        try:
-            # The configured solver's worlds are kept beside every variant, so that the repetitions
-            # of both are interleaved and start from one state.
-            sim = _simulation(context)
-            worlds.callback(sim.close)
-            state = play_to_phase(context, sim)
-            base = HeldPhysics(sim, state, cfg.timing.decimation)
-            steps = steps_that_fit(job.steps, job.max_seconds, base.warm_up())
-        except Exception as error:  # nothing can be compared with it
-            reason = f"the configured solver cannot be timed: {log_error(error)}"
-            context.record(GateResult(name="base", status=Status.failed, reason=reason))
-            return
+    # The configured solver's worlds are kept beside every variant, so that the repetitions of both
+    # are interleaved and start from one state.
+    with closing(_simulation(context)) as sim:
+        base = HeldPhysics(sim, play_to_phase(context, sim), cfg.timing.decimation)
+        steps = steps_that_fit(job.steps, job.max_seconds, base.warm_up())
         for name, solver in job.variants.items():
             context.begin(name)
             began = time.perf_counter()
             rows.append(_guarded(context, base, steps, name, solver))
             _write(context, rows)
             context.record(_as_result(rows[-1], time.perf_counter() - began))
-        measured = any(row["status"] == "pass" for row in rows)
-        if measured:
+        if any(row["status"] == "pass" for row in rows):
             _write(context, rows, draw=True)
 
 
@@ -142,7 +132,7 @@ def _measure(context: RunContext, base: HeldPhysics, steps: int) -> Row:
                 times[one].append(1e3 * one.play(steps) / (steps * base.decimation))
                 if problem := describe_lost(one.lost):
                     raise MjstackError(f"no time: {problem} (of {sim.nworld}).")
-            context.report_progress("repetitions", repetition + 1, job.repetitions)
+            context.advance("repetitions", repetition + 1, job.repetitions)
     finally:
         sim.close()
     ratios = [a / b for a, b in zip(times[ours], times[base], strict=True)]
@@ -164,8 +154,7 @@ def _simulation(context: RunContext) -> Simulation:
 
 def _text(settings: dict[str, object]) -> str:
     """Settings such as ``iterations=5, tolerance=1e-06``; null is the value of the robot's file."""
-    shown = {k: v.value if isinstance(v, Enum) else v for k, v in settings.items()}
-    return ", ".join(f"{key}={value}" for key, value in shown.items()) or "nothing"
+    return ", ".join(f"{key}={value}" for key, value in settings.items()) or "nothing"
 
 
 def _as_result(row: Row, seconds: float) -> GateResult:
@@ -195,13 +184,13 @@ def _write(context: RunContext, rows: list[Row], draw: bool = False) -> None:
     notes = [
         f"base: {_text(asdict(cfg.solver))}",
         (
-            f"{backend.value} on {device}. Times: object in hand, joint target held; medians of"
+            f"{backend} on {device}. Times: object in hand, joint target held; medians of"
             f" {cast(StudyJobCfg, cfg.job).repetitions} repetitions, interleaved with those of"
             " base. A ratio is that of two neighbouring repetitions."
         ),
         "base as a variant is a second copy of it: its ratio shows how far equal runs differ.",
     ]
-    if backend.value == "native":
+    if backend == "native":
         notes.append("Native MuJoCo does not tell which worlds stopped at a limit of the solver.")
     done = [row for row in rows if row["status"] == "pass"]
     picture = (lambda path: _draw(path, done, title)) if draw else None

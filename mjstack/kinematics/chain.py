@@ -5,7 +5,7 @@ import numpy as np
 import warp as wp
 
 from mjstack.config.schema import RobotCfg
-from mjstack.errors import ConfigError, MjstackError, UnknownName
+from mjstack.errors import ConfigError, MjstackError
 from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape
 from mjstack.scene.index import approach_body, find, joint_limits
 
@@ -28,9 +28,6 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     """
     # Columns of the joint targets: the joint of each, those that move, and their limits
     columns = {find(model, "joint", name): column for column, name in enumerate(robot.joints)}
-    for name in robot.ik_joints:
-        if name not in robot.arm_joints:
-            raise UnknownName("arm joint", name, robot.arm_joints)
     moved = [robot.arm_joints.index(name) for name in robot.ik_joints]
     limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(columns))
     for side, values in enumerate(joint_limits(model, robot.ik_joints)):

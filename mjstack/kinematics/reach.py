@@ -85,7 +85,7 @@ class PointReach:
             if (best.distance <= _CONVERGED).all():
                 break
             found = self._search(self._start(points, off), points)
-            best = _choose(found.distance < best.distance, found, best)
+            _replace(best, found, found.distance < best.distance)
         return best
 
     def solve_upright(self, points: np.ndarray, tolerance: float) -> Reached:
@@ -103,7 +103,7 @@ class PointReach:
             turned = self._descend(start, goals, _POINTING)
             found = self._search(turned, goals)
             better = (found.distance <= tolerance) & (found.tilt < upright.tilt)
-            upright = _choose(better, found, upright)
+            _replace(upright, found, better)
         for everywhere, there in zip(best, upright, strict=True):
             everywhere[reached] = there
         return best
@@ -196,13 +196,10 @@ class PointReach:
         return Reached(q, distance, np.arccos(np.clip(-pose[:, 5], -1.0, 1.0)))
 
 
-def _choose(first: np.ndarray, a: Reached, b: Reached) -> Reached:
-    """Points of a where ``first``, else those of b."""
-    return Reached(
-        np.where(first[:, None], a.q, b.q),
-        np.where(first, a.distance, b.distance),
-        np.where(first, a.tilt, b.tilt),
-    )
+def _replace(best: Reached, found: Reached, better: np.ndarray) -> None:
+    """Write the solutions of some points over those so far."""
+    for old, new in zip(best, found, strict=True):
+        old[better] = new[better]
 
 
 def _rotations(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import torch
 from rich.console import Console
@@ -84,6 +84,8 @@ def _mismatch(value: Any, hint: Any) -> str:
     if get_origin(hint) is Annotated and isinstance(inner[1], Range):
         words = inner[1].describe(_WORDS.get(inner[0], "a value"))
         return "" if not _mismatch(value, inner[0]) and inner[1].holds(value) else words
+    if get_origin(hint) is Literal:
+        return "" if value in inner else f"one of {', '.join(map(str, inner))}"
     if get_origin(hint) in (Union, UnionType):
         problems = [_mismatch(value, option) for option in inner]
         return "" if "" in problems else " or ".join(problems)
@@ -109,7 +111,7 @@ def blamed(label: str) -> Iterator[None]:
     try:
         yield
     except ParameterError as error:
-        raise error.at(f"{label}.params.{error.key}") from error
+        raise ConfigError(f"{label}.params.{error.key}", *error.facts) from error
     except ConfigError:  # names its key itself
         raise
     except MjstackError as error:

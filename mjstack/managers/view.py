@@ -22,7 +22,7 @@ class EnvView(Protocol):
         cfg: The configuration.
         nworld: Number of worlds.
         device: Where tensors live.
-        seed: Seed of every random number.
+        seed: Seed of every random number; `Env.reset` may set it.
         key: The same on the device, shape ``(1,)``, int64: what a captured step reads.
         world: Number of each world, shape ``(nworld,)``, int64.
         episode: Episode of each world, shape ``(nworld,)``, int64.
@@ -127,16 +127,6 @@ def episode_draw(
     env: EnvView, name: str, size: int, low: float = -1.0, high: float = 1.0
 ) -> torch.Tensor:
     """Random numbers of every world that stay the same all episode: every term that names them sees
-    the same, and the next episode has others.
-
-    Args:
-        env: The environment.
-        name: Whose numbers they are, such as ``goal``.
-        size: Numbers per world.
-        low: Smallest value.
-        high: Upper bound.
-
-    Returns:
-        Shape ``(nworld, size)``, in the type of the simulation's floats.
+    the same, and the next episode has others. Arguments and result as of `random_uniform`.
     """
     return random_uniform(env, f"episode.{name}", size, low, high)

@@ -1,6 +1,7 @@
 """Action terms: classes that turn a slice of the action into actuator commands."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -9,10 +10,8 @@ from mjstack.config.fields import Count, Positive
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
 from mjstack.managers.view import EnvView
-from mjstack.mdp.geometry import named_pose, robot, robot_joints
+from mjstack.mdp.geometry import Pose, robot
 from mjstack.scene.index import Columns
-
-MODES = ("relative", "absolute", "delta")
 
 
 class _Commands(ActionTerm):
@@ -46,41 +45,37 @@ class JointPosition(_Commands):
         env: EnvView,
         *,
         joints: str | list[str],
-        mode: str = "relative",
+        mode: Literal["relative", "absolute", "delta"] = "relative",
         scale: Positive = 1.0,
-        pose: str = "home",
+        pose: Pose = "home",
     ) -> None:
         """Choose joints.
 
         Args:
             env: The environment.
-            joints: ``arm``, ``gripper``, ``all``, or names of joints.
-            mode: One of `MODES`.
+            joints: ``arm``, ``gripper``, ``all``, or one or more names of joints.
+            mode: See the class.
             scale: Command for an action of 1 [rad, m]; not used by ``absolute``.
             pose: ``home`` or ``start``: what ``relative`` counts from.
 
         Raises:
-            MjstackError: A joint or mode does not exist.
+            MjstackError: A joint does not exist.
         """
-        if mode not in MODES:
-            raise UnknownName("action mode", mode, MODES)
-        names = robot_joints(env)
+        names = env.cfg.robot.joints
         n_arm = env.index.n_arm
         parts = {"arm": names[:n_arm], "gripper": names[n_arm:], "all": names}
         if isinstance(joints, str):
-            if joints not in parts:
-                raise UnknownName("action joints", joints, parts)
-            joints = parts[joints]
+            joints = parts.get(joints, [joints])
         for name in joints:
             if name not in names:
-                raise UnknownName("action joint", name, names)
+                raise UnknownName("action joint", name, [*parts, *names])
         chosen = [names.index(name) for name in joints]
         if not chosen or len(set(chosen)) < len(chosen):
             raise ParameterError("joints", joints, "at least one joint, each once")
         self._set_up(env, chosen, len(chosen))
         self._mode = mode
         self._scale = scale
-        self._pose = named_pose(env, pose)[chosen]
+        self._pose = getattr(robot(env), pose)[chosen]
         self.unit = "-1 to 1"
         if mode == "absolute":
             self.unit = "rad, m"

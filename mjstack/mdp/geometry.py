@@ -2,14 +2,15 @@
 share.
 """
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
-from mjstack.errors import ParameterError, UnknownName
+from mjstack.errors import UnknownName
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, episode_draw
 from mjstack.math import lowest_point
-from mjstack.scene import table_top
 from mjstack.scene.index import RobotTensors, SceneIndex
 from mjstack.sim.simulation import Simulation
 
@@ -19,24 +20,8 @@ def robot(env: EnvView) -> RobotTensors:
     return env.index.on(env.device, env.sim.qpos.dtype)
 
 
-def robot_joints(env: EnvView) -> list[str]:
-    """Names of the robot's joints: the arm's, then the gripper's."""
-    return env.cfg.robot.joints
-
-
-POSES = ("home", "start")
+Pose = Literal["home", "start"]  # the robot's own commands
 LOADED = 1e-5  # N: a jaw that presses with more touches the object
-
-
-def named_pose(env: EnvView, pose: str) -> Tensor:
-    """One of the robot's own commands, `POSES`, shape ``(n,)``.
-
-    Raises:
-        ParameterError: There is no such pose.
-    """
-    if pose not in POSES:
-        raise ParameterError("pose", pose, " or ".join(POSES))
-    return getattr(robot(env), pose)
 
 
 def write_robot(env: EnvView, mask: Tensor, command: Tensor) -> None:
@@ -46,30 +31,12 @@ def write_robot(env: EnvView, mask: Tensor, command: Tensor) -> None:
     tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
 
 
-def joint_positions(env: EnvView) -> Tensor:
-    """Arm joints [rad], then gripper joints [rad or m], shape ``(nworld, n)``. Not to be written
-    into.
-    """
-    return robot(env).qpos.read(env.sim.qpos)
-
-
-def joint_velocities(env: EnvView) -> Tensor:
-    """Joint velocities [rad/s, m/s], shape ``(nworld, n)``. Not to be written into."""
-    return robot(env).qvel.read(env.sim.qvel)
-
-
-def grasp_point(env: EnvView) -> Tensor:
-    """Midpoint between the jaws [m], world frame, shape ``(nworld, 3)``."""
-    first, second = env.index.grasp_sites
-    return 0.5 * (env.sim.site_xpos[:, first] + env.sim.site_xpos[:, second])
-
-
 def gripper_opening(env: EnvView) -> Tensor:
     """How far each gripper joint is open as measured, 0 closed to 1 open, shape ``(nworld,
     n_gripper)``.
     """
     tensors = robot(env)
-    q = joint_positions(env)[:, env.index.n_arm :]
+    q = tensors.qpos.read(env.sim.qpos)[:, env.index.n_arm :]
     return (q - tensors.gripper_closed) / (tensors.gripper_open - tensors.gripper_closed)
 
 
@@ -105,7 +72,7 @@ def above_table(env: EnvView, name: str) -> Tensor:
         pose = pose_w(env, name)
         thing = env.cfg.scene.objects[name]
         low = lowest_point(pose[:, :3], pose[:, 3:], thing.shape, thing.size)
-        return low - table_top(env.cfg.scene)
+        return low - env.cfg.scene.table_top
 
     return shared((id(env), above_table, name), compute)
 
@@ -143,22 +110,18 @@ def source_xy(env: EnvView) -> Tensor:
     return torch.stack([*objects, *places], dim=1)
 
 
-def jaw_forces(env: EnvView, name: str) -> Tensor:
-    """Size of the contact force [N] of each jaw on an object, at the last physics step, shape
-    ``(nworld, 2)``.
-    """
-    return _jaw_forces(env.index, env.sim, name)
-
-
 def objects_in_hand(index: SceneIndex, sim: Simulation) -> Tensor:
     """Whether all jaws press on each object of the scene, at the last physics step, shape
     ``(nworld, objects)``, bool.
     """
-    held = [(_jaw_forces(index, sim, name) > LOADED).all(1) for name in index.bodies]
+    held = [(jaw_forces(index, sim, name) > LOADED).all(1) for name in index.bodies]
     return torch.stack(held, dim=1)
 
 
-def _jaw_forces(index: SceneIndex, sim: Simulation, name: str) -> Tensor:
+def jaw_forces(index: SceneIndex, sim: Simulation, name: str) -> Tensor:
+    """Size of the contact force [N] of each jaw on an object, at the last physics step, shape
+    ``(nworld, 2)``.
+    """
     if name not in index.jaw_force:
         raise UnknownName("object", name, index.jaw_force)
     parts = [sim.sensordata[:, a : a + 3] for a in index.jaw_force[name]]

@@ -4,40 +4,32 @@ import torch
 from torch import Tensor
 
 from mjstack.managers.view import EnvView, offers
-from mjstack.mdp.geometry import (
-    grasp_point,
-    jaw_forces,
-    joint_positions,
-    joint_velocities,
-    place_xy,
-    pose_w,
-    robot,
-)
-from mjstack.scene import table_top
+from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot
 
 
 @offers(unit="joint")
 def joint_pos(env: EnvView) -> Tensor:
     """Joint positions [rad, m], arm then gripper, shape ``(nworld, n)``."""
-    return joint_positions(env)
+    return robot(env).qpos.read(env.sim.qpos)
 
 
 @offers(unit="joint")
 def joint_pos_relative(env: EnvView) -> Tensor:
     """Joint positions less home [rad, m], shape ``(nworld, n)``."""
-    return joint_positions(env) - robot(env).home
+    return joint_pos(env) - robot(env).home
 
 
 @offers(unit="joint/s")
 def joint_vel(env: EnvView) -> Tensor:
     """Joint velocities [rad/s, m/s], shape ``(nworld, n)``."""
-    return joint_velocities(env)
+    return robot(env).qvel.read(env.sim.qvel)
 
 
 @offers(unit="m")
 def grasp_point_pos(env: EnvView) -> Tensor:
-    """Grasp point [m], world frame, shape ``(nworld, 3)``."""
-    return grasp_point(env)
+    """Midpoint between the jaws [m], world frame, shape ``(nworld, 3)``."""
+    first, second = env.index.grasp_sites
+    return 0.5 * (env.sim.site_xpos[:, first] + env.sim.site_xpos[:, second])
 
 
 @offers(unit="m")
@@ -49,7 +41,7 @@ def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> 
         object: Scene object.
         height: How far above [m].
     """
-    offset = pose_w(env, object)[:, :3] - grasp_point(env)
+    offset = pose_w(env, object)[:, :3] - grasp_point_pos(env)
     offset[:, 2] += height
     return offset
 
@@ -66,7 +58,7 @@ def object_to_place(env: EnvView, *, object: str, place: str) -> Tensor:
     ``(nworld, 3)``.
     """
     at = pose_w(env, object)[:, :3]
-    height = table_top(env.cfg.scene) + env.cfg.scene.objects[object].half_height
+    height = env.cfg.scene.table_top + env.cfg.scene.objects[object].half_height
     return torch.cat((place_xy(env, place) - at[:, :2], height - at[:, 2:]), dim=1)
 
 
@@ -88,7 +80,7 @@ def jaw_force(env: EnvView, *, object: str) -> Tensor:
     """Size of each jaw's contact force on an object [N], at the last physics step, shape ``(nworld,
     2)``.
     """
-    return jaw_forces(env, object)
+    return jaw_forces(env.index, env.sim, object)
 
 
 @offers(unit="joint")

@@ -13,14 +13,7 @@ from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields
 from mjstack.math import quat_from_yaw
-from mjstack.mdp.geometry import (
-    named_pose,
-    pose_w,
-    robot,
-    robot_joints,
-    write_object,
-    write_robot,
-)
+from mjstack.mdp.geometry import Pose, pose_w, robot, write_object, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet
 from mjstack.mdp.starts.randomization import (
     ObjectMasses,
@@ -33,9 +26,9 @@ from mjstack.mdp.starts.reach import require_reach
 from mjstack.scene.index import joint_limits
 
 
-def home(env: EnvView, mask: Tensor, *, pose: str = "home") -> None:
+def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
     """Put the robot at its home, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
-    write_robot(env, mask, named_pose(env, pose).expand(env.nworld, -1))
+    write_robot(env, mask, getattr(robot(env), pose).expand(env.nworld, -1))
     env.sim.qvel.masked_fill_(mask[:, None], 0.0)
 
 
@@ -57,7 +50,7 @@ class JointNoise:
         """
         self._width = torch.full_like(robot(env).home, gripper)
         self._width[: env.index.n_arm] = arm
-        limits = joint_limits(env.sim.model, robot_joints(env))
+        limits = joint_limits(env.sim.model, env.cfg.robot.joints)
         self._low, self._high = (torch.from_numpy(each).to(self._width) for each in limits)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
@@ -116,7 +109,7 @@ class RandomizeObjects:
         yaw: NotNegative = math.pi,
         gap: NotNegative = GAP,
         candidates: Count = 16,
-        pose: str = "start",
+        pose: Pose = "start",
     ) -> None:
         """Check that the region has room.
 
@@ -149,7 +142,7 @@ class RandomizeObjects:
             env.index,
             region=region,
             gap=gap,
-            pose=named_pose(env, pose).tolist(),
+            pose=getattr(robot(env), pose).tolist(),
             noise=sum(noise),
         )
         self._placement.require_room(region, candidates + self._more)

@@ -5,15 +5,8 @@ from torch import Tensor
 
 from mjstack.config.fields import NotNegative, Positive
 from mjstack.managers.view import EnvView
-from mjstack.mdp.geometry import (
-    above_table,
-    jaw_forces,
-    joint_velocities,
-    nearness,
-    place_xy,
-    pose_w,
-)
-from mjstack.mdp.observation import grasp_point_to_object
+from mjstack.mdp.geometry import above_table, nearness, place_xy, pose_w, robot
+from mjstack.mdp.observation import grasp_point_to_object, jaw_force, object_to_object
 
 
 def reach(env: EnvView, *, object: str, scale: Positive, height: float = 0.0) -> Tensor:
@@ -30,7 +23,7 @@ def reach(env: EnvView, *, object: str, scale: Positive, height: float = 0.0) ->
 
 def grasp(env: EnvView, *, object: str, force: NotNegative = 0.05) -> Tensor:
     """1 while both jaws press on an object with more than ``force`` [N], else 0."""
-    return (jaw_forces(env, object) > force).all(1).to(torch.float32)
+    return (jaw_force(env, object=object) > force).all(1).to(torch.float32)
 
 
 def lift(env: EnvView, *, object: str, height: Positive) -> Tensor:
@@ -44,7 +37,7 @@ def place(env: EnvView, *, a: str, b: str, scale: Positive) -> Tensor:
     """Nearness of object ``a`` to its position on object ``b``, while it is off the table: ``1 -
     tanh(distance / scale)``.
     """
-    offset = pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
+    offset = object_to_object(env, a=a, b=b)
     objects = env.cfg.scene.objects
     offset[:, 2] += objects[a].half_height + objects[b].half_height
     return nearness(offset, scale) * (above_table(env, a) > 0.005)
@@ -67,4 +60,4 @@ def action_rate(env: EnvView) -> Tensor:
 
 def joint_vel(env: EnvView) -> Tensor:
     """Squared joint velocities [rad^2/s^2], summed."""
-    return joint_velocities(env).square().sum(1)
+    return robot(env).qvel.read(env.sim.qvel).square().sum(1)

@@ -6,8 +6,8 @@ from torch import Tensor
 from mjstack.config.fields import Count, NotNegative
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import not_finite
-from mjstack.mdp.geometry import joint_positions, pose_w, robot
-from mjstack.scene import table_top
+from mjstack.mdp.geometry import pose_w, robot
+from mjstack.mdp.observation import joint_pos
 from mjstack.sim import LOST_PHYSICS
 
 
@@ -29,7 +29,7 @@ class ObjectOffTable:
         scene = env.cfg.scene
         self._center = env.index.constant(scene.table_center[:2], env.sim.qpos)
         self._half = env.index.constant(scene.table_half[:2], env.sim.qpos)
-        self._top = table_top(scene)
+        self._top = scene.table_top
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with an object off the table, shape ``(nworld,)``."""
@@ -59,7 +59,7 @@ class JointLimit:
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with a joint outside, shape ``(nworld,)``."""
-        q = joint_positions(env)
+        q = joint_pos(env)
         return ((q < self._low) | (q > self._high)).any(1)
 
 

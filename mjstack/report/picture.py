@@ -24,13 +24,8 @@ Drawn = tuple[Sequence[float], Sequence[float]]
 
 @contextmanager
 def figure(path: Path, title: str, columns: int = 1, **options: Any) -> Iterator[tuple[Any, Any]]:
-    """Make a figure with panels side by side, and save it when the block ends.
-
-    Args:
-        path: The picture.
-        title: Above the panels.
-        columns: Number of panels.
-        options: Of ``plt.subplots``, such as ``figsize``.
+    """Make a figure with panels side by side by options of ``plt.subplots``, and save it when the
+    block ends.
 
     Yields:
         The figure, and its axes: an array unless there is one panel.
@@ -94,13 +89,8 @@ def save_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
 
 
 def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, step_dt: float) -> None:
-    """Write an mp4 of an episode in real time.
-
-    Args:
-        path: The file.
-        model: The scene with visuals.
-        qpos: States at the ends of steps, shape ``(steps, nq)``.
-        step_dt: Time between them [s].
+    """Write an mp4 of an episode in real time from its states at the ends of steps, shape
+    ``(steps, nq)``, which are ``step_dt`` [s] apart.
 
     Raises:
         MjstackError: This machine cannot draw offscreen, or lacks the extra ``video``.
@@ -130,13 +120,8 @@ def require_video() -> Callable[..., Any]:
 def save_trajectories(
     path: Path, positions: np.ndarray, objects: Mapping[str, Drawn], title: str
 ) -> None:
-    """Plot the objects' way.
-
-    Args:
-        path: The picture.
-        positions: Of each object over the episode [m], shape ``(steps, objects, 3)``.
-        objects: Half sizes [m] and color of each object, by name.
-        title: Above the panels.
+    """Plot the objects' way: positions [m], shape ``(steps, objects, 3)``, and the half sizes [m]
+    and the colour of each object by name.
     """
     with figure(path, title, 3, figsize=(13, 4)) as (_, (side, above, height)):
         for number, (name, (half, color)) in enumerate(objects.items()):

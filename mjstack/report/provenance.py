@@ -3,6 +3,7 @@
 import os
 import platform
 import subprocess
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -46,10 +47,8 @@ def _git_commit() -> str:
     root = Path(__file__).resolve().parents[2]
     mark = "--dirty= with changes"
     git = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--exclude=*", mark]
-    if not (root / ".git").exists():
-        return "no checkout"
-    try:
-        done = subprocess.run(git, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return "no checkout"
-    return done.stdout.strip()
+    found = ""
+    if (root / ".git").exists():
+        with suppress(OSError, subprocess.SubprocessError):
+            found = subprocess.run(git, capture_output=True, text=True, timeout=10).stdout.strip()
+    return found or "no checkout"

@@ -1,7 +1,7 @@
 """Results of a run as data: gates and provenance."""
 
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 
 from mjstack.report.table import Table
@@ -9,7 +9,7 @@ from mjstack.report.table import Table
 Provenance = dict[str, str | int | dict[str, str] | None]
 
 
-class Status(Enum):
+class Status(StrEnum):
     """How a gate or a run ended."""
 
     passed = "pass"
@@ -72,9 +72,8 @@ class Report:
         """0 pass, 1 a gate failed, 130 interrupted."""
         return {Status.passed: 0, Status.interrupted: 130}.get(self.status, 1)
 
-    def conclude(self) -> Status:
+    def conclude(self) -> None:
         """pass: no gate that was asked for failed, and at least one passed."""
         outcomes = [gate.status for gate in self.gates]
         good = Status.passed in outcomes and Status.failed not in outcomes
         self.status = Status.passed if good else Status.failed
-        return self.status

@@ -40,12 +40,8 @@ class Table:
     def of(
         cls, columns: Mapping[str, str], rows: Iterable[Mapping[str, object]], title: str = ""
     ) -> "Table":
-        """Make a table from records; "-" where a record has no value.
-
-        Args:
-            columns: By name of the column, the key of its values.
-            rows: The records.
-            title: Its heading; empty for none.
+        """Make a table from records, with the key of each column's values; "-" where a record has
+        none.
         """
         cells = [[format_value(row.get(key, "-")) for key in columns.values()] for row in rows]
         return cls(header=list(columns), rows=cells, title=title)
@@ -57,11 +53,7 @@ class Table:
         return [f"| {' | '.join(cells)} |" for cells in rows]
 
     def to_console(self, colors: Mapping[str, str] | None = None) -> rich.table.Table:
-        """The table for a terminal.
-
-        Args:
-            colors: Colours of whole cells, by their text.
-        """
+        """The table for a terminal, with colours of whole cells by their text."""
         known = colors or {}
         table = rich.table.Table(title=escape(self.title) or None)
         for name in self.header:
@@ -90,16 +82,7 @@ def to_document(
     text: str = "",
     level: int = 1,
 ) -> str:
-    """A Markdown file, or a section of one: heading, text, tables, pictures, and notes as a list.
-
-    Args:
-        title: The heading.
-        tables: With a heading each, except those without a title.
-        notes: A line each.
-        pictures: File names.
-        text: The first paragraph.
-        level: Of the heading.
-    """
+    """A Markdown file, or a section of one: heading, text, tables, pictures, notes as a list."""
     parts = [f"{'#' * level} {title}", *filter(None, [text])]
     for table in tables:
         parts += [f"{'#' * (level + 1)} {table.title}"] if table.title else []

@@ -37,13 +37,12 @@ def write_report(report: Report) -> None:
 
     Called after every result, so that nothing finished is lost.
     """
-    gates = [{**asdict(gate), "status": gate.status.value} for gate in report.gates]
     data = {
         "schema": SCHEMA,
-        "status": report.status.value,
+        "status": report.status,
         "resumes": report.resumes,
         "provenance": report.provenance,
-        "gates": gates,
+        "gates": [asdict(gate) for gate in report.gates],
         "pictures": report.pictures,
     }
     # A gate may return NumPy scalars. JSON has no NaN: a number that is not finite becomes its
@@ -56,12 +55,8 @@ def write_report(report: Report) -> None:
 
 
 def safely_write(path: Path, write: Callable[..., object], *args: object) -> str:
-    """Write a file beside the result, complete or not at all; a failure takes no result back.
-
-    Args:
-        path: The file.
-        write: Called with a path beside it, and ``args``.
-        args: Its content.
+    """Write a file by a call with a path beside it and ``args``, complete or not at all; a failure
+    takes no result back.
 
     Returns:
         Empty, or one line that says why there is no such file. run.log has the traceback.
@@ -83,10 +78,10 @@ def safely_write(path: Path, write: Callable[..., object], *args: object) -> str
 
 def to_markdown(report: Report) -> str:
     """Summary table, pictures, then every gate with its figures, and the provenance."""
-    title = f"mjstack run: {report.status.value}"
+    title = f"mjstack run: {report.status}"
     parts = [to_document(title, [summarize(report.gates)], pictures=report.pictures)]
     for gate in report.gates:
-        title = f"{gate.name}: {gate.status.value}"
+        title = f"{gate.name}: {gate.status}"
         tables = [*gate.tables, *_tables(gate)]
         parts.append(to_document(title, tables, gate.details, text=gate.reason, level=2))
     rows = [[key, _words(value)] for key, value in report.provenance.items()]
@@ -96,9 +91,7 @@ def to_markdown(report: Report) -> str:
 
 def summarize(gates: Iterable[GateResult]) -> Table:
     """A row per gate: its status, wall time, and result in a line."""
-    rows = [
-        [gate.name, gate.status.value, f"{gate.seconds:.1f}", gate.reason or "ok"] for gate in gates
-    ]
+    rows = [[gate.name, gate.status, f"{gate.seconds:.1f}", gate.reason or "ok"] for gate in gates]
     return Table(header=["gate", "status", "seconds", "result"], rows=rows)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from mjstack.config.schema import ModelCfg, RobotCfg, RobotSource
+from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError, SourceError, UnknownName, first_line
 
 BUILTIN = Path(__file__).parent
@@ -36,7 +36,7 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
         UnknownName: It lacks a joint, body or site of the profile.
         ConfigError: A joint has no range or no servo.
     """
-    menagerie = model.source is RobotSource.menagerie
+    menagerie = model.source == "menagerie"
     path = _menagerie_path(robot) if menagerie else _file_path(robot)
     try:
         spec = mujoco.MjSpec.from_file(str(path))

@@ -1,6 +1,6 @@
 """Scenes: a robot, a table and objects as one MjModel, and where each name lies in it."""
 
-from mjstack.scene.build import build_model, build_scene, table_top
+from mjstack.scene.build import build_model, build_scene
 from mjstack.scene.index import SceneIndex, lowest_height
 
-__all__ = ["SceneIndex", "build_model", "build_scene", "lowest_height", "table_top"]
+__all__ = ["SceneIndex", "build_model", "build_scene", "lowest_height"]

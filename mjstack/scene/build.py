@@ -7,7 +7,7 @@ import math
 
 import mujoco
 
-from mjstack.config.schema import BoxCfg, Config, ObjectCfg, SceneCfg
+from mjstack.config.schema import BoxCfg, Config, ObjectCfg
 from mjstack.errors import SourceError
 from mjstack.robots import robot_spec
 
@@ -57,7 +57,7 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
     option = spec.option
     option.timestep = cfg.timing.physics_dt
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{solver.cone.name.upper()}")
+    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{solver.cone.upper()}")
     for name in ("iterations", "ls_iterations", "impratio", "tolerance"):
         if (value := getattr(solver, name)) is not None:
             setattr(option, name, value)
@@ -85,9 +85,9 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         rgba=[0.72, 0.66, 0.58, 1],
     )
     if scene.box is not None:
-        _add_box(spec, scene.box, table_top(scene))
+        _add_box(spec, scene.box, scene.table_top)
     for name, thing in scene.objects.items():
-        _add_object(world, name, thing, table_top(scene))
+        _add_object(world, name, thing, scene.table_top)
 
     # Sensors
     pairs = [(jaw, name) for name in scene.objects for jaw in jaw_bodies]
@@ -171,8 +171,3 @@ def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
             solref=solref,
             rgba=[0.50, 0.55, 0.52, 1],
         )
-
-
-def table_top(scene: SceneCfg) -> float:
-    """Height [m] of the table's surface."""
-    return scene.table_center[2] + scene.table_half[2]

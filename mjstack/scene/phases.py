@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjstack.config.schema import Config, PhaseCfg, SceneCfg
-from mjstack.scene.build import table_top
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +91,7 @@ def build_phases(cfg: Config) -> list[Phase]:
             )
             toward = -1 if spec.toward is None else sources.index(spec.toward)
             offset = (spec.offset[0], spec.offset[1])
-            z = table_top(scene) + up + above
+            z = scene.table_top + up + above
             target = Target(sources.index(spec.anchor), toward, offset, z)
         stop = start + round(spec.seconds / cfg.timing.step_dt)
         grasped = -1 if spec.grasps is None else sources.index(spec.grasps)

@@ -78,20 +78,10 @@ def draw_uniform(
     low: float = -1.0,
     high: float = 1.0,
 ) -> torch.Tensor:
-    """Uniform numbers, one launch, nothing read by the host.
+    """The numbers of `mjstack.rng.uniform`, from low to high: one launch, nothing read by the host.
 
-    Args:
-        key: The seed, shape ``(1,)``, int64, on the device of everything else.
-        stream: Number of the consumer.
-        world: World indices, shape ``(n,)``, int64.
-        episode: Episode of each world, shape ``(n,)``, int64.
-        step: Step within the episode, shape ``(n,)``, int64; 0 if None.
-        size: Numbers per world.
-        low: Smallest value.
-        high: Upper bound.
-
-    Returns:
-        Shape ``(n, size)``, float32; the same numbers as `mjstack.rng.uniform`'s.
+    ``key`` is the seed, shape ``(1,)``, int64, on the device of everything else; ``step`` is 0 if
+    None.
     """
     n = world.shape[0]
     out = torch.empty((n, size), dtype=torch.float32, device=world.device)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from mjstack.config.schema import GraphMode
 from mjstack.errors import MjstackError, first_line
 from mjstack.interrupt import check_interrupt
 
@@ -69,7 +68,7 @@ class StepGraph:
         self,
         work: Callable[[], None],
         device: torch.device | str,
-        mode: GraphMode,
+        mode: str,
         *,
         name: str,
         version: Callable[[], int] = lambda: 0,
@@ -107,7 +106,7 @@ class StepGraph:
         check_interrupt()
         if self._version() != self._seen:
             self.drop()
-        if self._mode is GraphMode.off or self._failed:
+        if self._mode == "off" or self._failed:
             self._work()
             return
         if self._replay is not None:
@@ -163,7 +162,7 @@ class StepGraph:
             if device.is_cuda:
                 with suppress(RuntimeError):  # it reports the failed capture once more
                     torch.cuda.synchronize(wp.device_to_torch(device))
-            if self._mode is GraphMode.require:
+            if self._mode == "require":
                 raise failure from error
             self._failed = True
             log.warning("%s It runs eagerly.", failure)

@@ -8,7 +8,6 @@ from functools import cache, partial
 import mujoco
 import torch
 
-from mjstack.config.schema import GraphMode, StepMode
 from mjstack.errors import UnsupportedModel, first_line
 from mjstack.sim import fused
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
@@ -48,10 +47,10 @@ class MjwarpSimulation(Simulation):
         nworld: int,
         sizes: BatchSizes,
         device: str,
-        graph: GraphMode = GraphMode.auto,
+        graph: str = "auto",
         *,
         fields: Sequence[str] = (),
-        step: StepMode = StepMode.auto,
+        step: str = "auto",
     ) -> None:
         """Upload the model and allocate nworld worlds at qpos0.
 
@@ -98,7 +97,7 @@ class MjwarpSimulation(Simulation):
 
         self.arrangement = ARRANGEMENTS[step]
         self.description = (
-            f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}, {step.value} step{why}"
+            f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}, {step} step{why}"
         )
 
         # Views of state, fields and counters
@@ -260,25 +259,23 @@ class MjwarpSimulation(Simulation):
             branches=arrangement.branches,
         )
 
-    def _resolve(self, step: StepMode) -> tuple[StepMode, str]:
+    def _resolve(self, step: str) -> tuple[str, str]:
         """The step that is done, and why it is no better one."""
-        found = StepMode.fused
+        found = "fused"
         why = ""
         if not can_rearrange(self.model, self._m):
-            found = StepMode.stock
+            found = "stock"
             why = "the model has features that only mujoco_warp.step knows"
         elif why := fused.why_not(self._m, self._d):
-            found = StepMode.arranged
+            found = "arranged"
         order = list(ARRANGEMENTS)
-        if step is StepMode.auto:
+        if step == "auto":
             if why:
-                _tell(f"sim.step: {found.value}, because {why}.")
+                _tell(f"sim.step: {found}, because {why}.")
                 why = f" ({why})"
             return found, why
         if order.index(step) > order.index(found):
-            raise UnsupportedModel(
-                f"sim.step={step.value} does not apply: {why}", "Use sim.step=auto"
-            )
+            raise UnsupportedModel(f"sim.step={step} does not apply: {why}", "Use sim.step=auto")
         return step, ""
 
     def _pose(self) -> None:

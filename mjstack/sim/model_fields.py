@@ -1,6 +1,6 @@
 """Model fields that may differ from world to world, and what native MuJoCo derives from them."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 
 import mujoco
 import numpy as np
@@ -61,31 +61,20 @@ def check_fields(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-class Fields(Mapping[str, torch.Tensor]):
+class Fields(dict[str, torch.Tensor]):
     """Per-world model fields by MuJoCo's name. Write into a tensor; an item cannot be replaced."""
 
-    def __init__(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        self._tensors = dict(tensors)
-
-    def __getitem__(self, name: str) -> torch.Tensor:
-        if name not in self._tensors:
-            raise MjstackError(
-                f"sim.fields['{name}'] is not a per-world field of this simulation: make it with"
-                f" fields=['{name}'], or mark the reset term with uses_fields('{name}')"
-            )
-        return self._tensors[name]
+    def __missing__(self, name: str) -> torch.Tensor:
+        raise MjstackError(
+            f"sim.fields['{name}'] is not a per-world field of this simulation: make it with"
+            f" fields=['{name}'], or mark the reset term with uses_fields('{name}')"
+        )
 
     def __setitem__(self, name: str, value: torch.Tensor) -> None:
         # Python ends `fields[name] *= 2` by setting the item to the tensor that it has just changed
         # in place.
         if self[name] is not value:
             raise RebindError(f"sim.fields['{name}']")
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._tensors)
-
-    def __len__(self) -> int:
-        return len(self._tensors)
 
 
 class SimpleBodies:

@@ -90,9 +90,8 @@ class _Visit:
             with suppress(Empty):
                 self.wake.get(timeout=_POLL)
             check_interrupt()
-        for error in self.ended:
-            if error is not None:
-                raise error
+        for error in filter(None, self.ended):
+            raise error
 
     def abandon(self) -> None:
         """Take the worlds away, and wait until no thread writes into the state or uses its data.
@@ -208,28 +207,22 @@ class NativeSimulation(Simulation):
         self.reset()
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
-        """Advance every world by n physics steps under the current ctrl; the poses follow with
-        kinematics.
-        """
+        """See `Simulation`."""
         if n:
             self._compute(n, kinematics)
         elif kinematics:
             self.kinematics()
 
     def forward(self) -> None:
-        """Compute everything that derives from the state, without advancing time; warm starts stay
-        as they are.
-        """
+        """See `Simulation`; warm starts stay as they are."""
         self._compute(0, kinematics=False)
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
-        """Bring the poses of the masked worlds up to the current qpos; the other worlds are not
-        visited.
-        """
+        """See `Simulation`; the other worlds are not visited."""
         self._visit(self._pose, self._finite_worlds(self._poses, mask=mask))
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Put the masked worlds back to qpos0, at rest."""
+        """See `Simulation`."""
         rows = self._rows(mask)
         self._state[rows] = self._initial
         if "qpos0" in self._fields:

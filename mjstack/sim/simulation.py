@@ -100,12 +100,6 @@ class Simulation(ABC):
         peak_contacts: Largest contact_count of all physics steps since the world's last reset,
             shape ``(nworld,)``, int32.
         peak_constraints: Largest constraint_count over the same time, shape ``(nworld,)``, int32.
-        most_contacts: Largest contact_count since the last full reset (one without a mask), shape
-            ``(nworld,)``, int32. Masked resets leave it alone, so it is the peak of a run in which
-            worlds end and start anew. Computed when it is read.
-        most_constraints: Largest constraint_count over the same time, shape ``(nworld,)``, int32.
-        overflow_ever: Bits of `Overflow` raised since the last full reset, shape
-            ``(nworld,)``, int32.
         sizes: Sizes of fixed buffers; None where there are none, as in native MuJoCo.
         peak_pool: Most contacts, broad-phase pairs, and contacts of one kind of convex collision,
             of all worlds at once since the last full reset, shape ``(3,)``, int32; None where the
@@ -155,17 +149,19 @@ class Simulation(ABC):
 
     @property
     def most_contacts(self) -> torch.Tensor:
-        """Most contacts since the last full reset, shape ``(nworld,)``."""
+        """Largest contact_count since the last full reset (one without a mask), shape
+        ``(nworld,)``, int32: the peak of a run in which worlds end and start anew.
+        """
         return torch.maximum(self._erased[0], self.peak_contacts)
 
     @property
     def most_constraints(self) -> torch.Tensor:
-        """Most constraint rows since the last full reset, shape ``(nworld,)``."""
+        """Largest constraint_count over the same time, shape ``(nworld,)``, int32."""
         return torch.maximum(self._erased[1], self.peak_constraints)
 
     @property
     def overflow_ever(self) -> torch.Tensor:
-        """Bits of `Overflow` since the last full reset, shape ``(nworld,)``."""
+        """Bits of `Overflow` over the same time, shape ``(nworld,)``, int32."""
         return self._erased[2] | self.overflow
 
     @abstractmethod

@@ -61,6 +61,9 @@ class BatchSizes:
         """The same on the command line: ``batch.nconmax=40 batch.njmax=184``."""
         return " ".join(f"batch.{name}={value}" for name, value in _given(self).items())
 
+    def __str__(self) -> str:
+        return f"{self.as_overrides()} ({self.source})"
+
 
 def resolve_sizes(cfg: Config) -> BatchSizes:
     """The configured sizes, with the defaults of this robot and scene where they are null."""

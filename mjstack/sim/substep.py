@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import mujoco
 import torch
 
-from mjstack.config.schema import StepMode
 from mjstack.sim import fused
 from mjstack.sim.graph import side_by_side
 from mjstack.sim.warp_setup import mjw, wp
@@ -36,9 +35,9 @@ class Arrangement:
 
 
 ARRANGEMENTS = {
-    StepMode.stock: Arrangement(own_stages=False, fused=False),
-    StepMode.arranged: Arrangement(fused=False),
-    StepMode.fused: Arrangement(),
+    "stock": Arrangement(own_stages=False, fused=False),
+    "arranged": Arrangement(fused=False),
+    "fused": Arrangement(),
 }
 
 

@@ -17,14 +17,13 @@ class Usage:
     """The use of buffers by each world, now and at most, and the physics that was lost.
 
     Attributes:
-        contacts: Contacts of the last step or forward, shape ``(nworld,)``, int32.
-        peak_contacts: The most since the world's last reset, shape ``(nworld,)``, int32.
-        peak_rows: Most constraint rows since then, shape ``(nworld,)``, int32.
-        peak_pool: Most contacts, broad-phase pairs and contacts of one kind of convex collision, of
-            all worlds at once since the last full reset, shape ``(3,)``, int32.
-        overflow: Bits of `Overflow` since the world's last reset, shape ``(nworld,)``, int32.
-        limits: Bits of `SolverLimit`, the same.
-        steps: Physics steps since the world's last reset, shape ``(nworld,)``, int64.
+        contacts: ``contact_count`` of `Simulation`.
+        peak_contacts: Its ``peak_contacts``.
+        peak_rows: Its ``peak_constraints``.
+        peak_pool: Its ``peak_pool``.
+        overflow: Its ``overflow``.
+        limits: Its ``solver_limits``.
+        steps: Its ``step_count``.
     """
 
     def __init__(self, model: mujoco.MjModel, nworld: int, device: torch.device) -> None:

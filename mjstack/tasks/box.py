@@ -11,7 +11,7 @@ from mjstack.config.fields import Fraction, spec
 from mjstack.errors import ConfigError, UnknownName
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import gripper_opening
-from mjstack.scene import lowest_height, table_top
+from mjstack.scene import lowest_height
 from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
 from mjstack.tasks.parts import (
     AtLeast,
@@ -132,7 +132,7 @@ class BoxCheck(EpisodeCheck):
         box = scene.box
         if box is None:
             raise ConfigError("scene", scene.name, "a scene with a box", "Set scene=box")
-        top = table_top(scene)
+        top = scene.table_top
         self.box = box
         self.rim = top + box.height
         self._low = [*(box.center[i] - box.half[i] for i in (0, 1)), top + box.floor]

@@ -9,8 +9,8 @@ from mjstack.config.fields import NotNegative, Positive
 from mjstack.errors import UnknownName
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, offers
-from mjstack.mdp.geometry import above_table, grasp_point, jaw_forces, nearness, place_xy, pose_w
-from mjstack.scene import table_top
+from mjstack.mdp.geometry import above_table, nearness, place_xy, pose_w
+from mjstack.mdp.observation import grasp_point_pos, jaw_force
 from mjstack.tasks.box import BoxCheck
 
 
@@ -37,7 +37,7 @@ class ToSlot:
         self._place = check.slots[object]
         scene = env.cfg.scene
         self.floor = check.box.floor
-        self._height = table_top(scene) + self.floor + scene.objects[object].half_height
+        self._height = scene.table_top + self.floor + scene.objects[object].half_height
 
     def __call__(self, env: EnvView) -> Tensor:
         """The offset."""
@@ -75,7 +75,7 @@ class Place:
 
 
 class _ByObject:
-    """A term that asks which objects are in the box."""
+    """A term that asks which objects are in the box, and raises a `MjstackError` without one."""
 
     def __init__(self, env: EnvView) -> None:
         self._check = BoxCheck(env.cfg)
@@ -112,22 +112,14 @@ class ReachNext(_ByObject):
     """
 
     def __init__(self, env: EnvView, *, scale: Positive) -> None:
-        """Read the box's place.
-
-        Args:
-            env: The environment.
-            scale: Distance over which the reward falls [m].
-
-        Raises:
-            MjstackError: There is no box.
-        """
+        """Take the distance over which the reward falls [m]."""
         super().__init__(env)
         self._scale = scale
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
         aim = self._next(env, [pose_w(env, name)[:, :3] for name in self._check.objects])
-        near = nearness(aim - grasp_point(env), self._scale)
+        near = nearness(aim - grasp_point_pos(env), self._scale)
         return torch.where(self._inside(env).all(1), 1.0, near)
 
 
@@ -137,20 +129,12 @@ class GraspNext(_ByObject):
     """
 
     def __init__(self, env: EnvView, *, force: NotNegative = 0.05) -> None:
-        """Read the box's place.
-
-        Args:
-            env: The environment.
-            force: Force that each jaw must exceed [N].
-
-        Raises:
-            MjstackError: There is no box.
-        """
+        """Take the force that each jaw must exceed [N]."""
         super().__init__(env)
         self._force = force
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
-        held = [jaw_forces(env, name) > self._force for name in self._check.objects]
+        held = [jaw_force(env, object=name) > self._force for name in self._check.objects]
         grasped = self._next(env, held).all(1)
         return (grasped | self._inside(env).all(1)).to(torch.float32)

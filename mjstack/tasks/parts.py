@@ -113,15 +113,8 @@ class AtLeast(Rule):
         *,
         phases: PhaseNames,
     ) -> None:
-        """Describe the rule; see `Rule`.
-
-        Args:
-            name: Of the rule.
-            text: The failure in words.
-            objects: The objects.
-            value: Name of the number, with ``{}`` for the suffix of the object.
-            least: The threshold.
-            phases: For each object, the phases in which it counts.
+        """Describe the rule; see `Rule`. ``value`` is the name of the number, with ``{}`` for the
+        suffix of the object, and ``least`` the threshold.
         """
         super().__init__(name, text, objects)
         during = [" and ".join(each) for each in phases]
@@ -162,16 +155,9 @@ class Streak(AtLeast):
     ) -> None:
         """Describe the rule; see `Rule`.
 
-        Args:
-            name: Of the rule.
-            text: The failure in words.
-            objects: The objects.
-            condition: With a column for each.
-            steps: How many in a row.
-            phases: For each object, the phases in which it counts.
-            after: Without phases it counts once this one holds.
-            anew: For each object, phases that clear every counter of the check.
-            distance: Of `Carried` [m].
+        The condition has a column for each object. Without phases it counts once the rule ``after``
+        holds. Phases ``anew`` of an object clear every counter of the check. ``distance`` is that
+        of `Carried` [m].
         """
         value = f"{name.lower()}_steps{{}}" if distance is None else f"{name.lower()}{{}}_m"
         least = steps if distance is None else distance
@@ -240,14 +226,8 @@ class InWindow(Rule):
         *,
         measure: Callable[[Step], dict[str, Tensor]] = lambda end: {},
     ) -> None:
-        """Describe the rule; see `Rule`.
-
-        Args:
-            name: Of the rule.
-            text: The failure in words.
-            condition: If it has several columns, all have to hold.
-            window: How many steps.
-            measure: Values at the end of the episode, by name with unit.
+        """Describe the rule; see `Rule`. If the condition has several columns, all have to hold.
+        ``measure`` gives values at the end of the episode, by name with unit.
         """
         self._value = f"{name.lower()}_steps"
         super().__init__(name, text, wanted=f"at least {window}")

@@ -12,13 +12,11 @@ from torch import Tensor
 from mjstack.managers.view import EnvView
 from mjstack.math import lowest_point, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, pose_w
-from mjstack.scene import table_top
 from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
 
 PhaseNames = Sequence[Sequence[str]]
 """For each object, names of phases."""
-_ROWS = 16  # of a block of counters
 
 
 def once_per_step(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -73,13 +71,13 @@ class TaskView:
         self._phases = [phase.name for phase in phases]
         self._stop = stop
         self._table = torch.zeros((len(phases), 0), dtype=torch.bool, device=env.device)
-        self._blocks: list[tuple[Tensor, int]] = []
+        self._counters: list[Tensor] = []
         self._columns: dict[tuple[str, ...], Columns] = {}
 
         index = env.index
         scene = env.cfg.scene
         self.things = [scene.objects[name] for name in objects]
-        self.top = table_top(scene)
+        self.top = scene.table_top
         self.half = torch.tensor([each.half for each in self.things], device=env.device)
         self.radius = torch.tensor([each.radius for each in self.things], device=env.device)
         self.qvel = [
@@ -136,20 +134,15 @@ class TaskView:
 
     def counter(self, size: int) -> Tensor:
         """A buffer that `clear` clears, shape ``(nworld, size)``, float32."""
-        for place, (block, used) in enumerate(self._blocks):
-            if block.shape[2] == size and used < _ROWS:
-                self._blocks[place] = (block, used + 1)
-                return block[used]
-        shape = (_ROWS, self.env.nworld, size)
-        self._blocks.append((torch.zeros(shape, dtype=torch.float32, device=self.env.device), 0))
-        return self.counter(size)
+        self._counters.append(self.zeros(size))
+        return self._counters[-1]
 
     def clear(self, mask: Tensor) -> None:
         """Clear all counters of the masked columns, shape ``(nworld, size)``."""
-        for block, _ in self._blocks:
-            if block.shape[2] == mask.shape[1]:
+        for counter in self._counters:
+            if counter.shape == mask.shape:
                 # Not by a product: an earlier attempt may have left NaN.
-                block.masked_fill_(mask, 0.0)
+                counter.masked_fill_(mask, 0.0)
 
 
 class Step:

@@ -7,7 +7,6 @@ from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
 from mjstack.config.schema.run import (
     BatchCfg,
     GateCfg,
-    GraphMode,
     JobCfg,
     SimCfg,
     SolverCfg,
@@ -60,7 +59,7 @@ class Config:
     """Seed of every random number."""
     gates: list[str] = spec()
     """Gates that run; their order is fixed. There is also success."""
-    graph: GraphMode = spec()
+    graph: str = spec(choices=("auto", "require", "off"))
     """Capture the step as a CUDA graph: auto, require or off. Ignored on native MuJoCo; on Warp's
     CPU device, of physics alone."""
     view: bool = spec()

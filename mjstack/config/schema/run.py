@@ -1,42 +1,18 @@
 """A run: physics, the gates and their parameters, and the jobs."""
 
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 from typing import Any
 
 from mjstack.config.fields import MOST_WORLDS, spec
 
 
-class Backend(Enum):
+class Backend(StrEnum):
     """Which physics engine steps the worlds of batch and throughput."""
 
     auto = "auto"
     native = "native"
     mjwarp = "mjwarp"
-
-
-class GraphMode(Enum):
-    """Whether control steps are captured into a graph and replayed."""
-
-    auto = "auto"
-    require = "require"
-    off = "off"
-
-
-class StepMode(Enum):
-    """How MJWarp's physics step is done: see docs/performance.md."""
-
-    auto = "auto"
-    fused = "fused"
-    arranged = "arranged"
-    stock = "stock"
-
-
-class Cone(Enum):
-    """Shape of the friction cone."""
-
-    elliptic = "elliptic"
-    pyramidal = "pyramidal"
 
 
 @dataclass(slots=True)
@@ -66,7 +42,7 @@ class SolverCfg:
     """Ratio of frictional to normal constraint impedance."""
     tolerance: float | None = spec(None, gt=0.0)
     """Improvement below which the solver stops."""
-    cone: Cone = Cone.elliptic
+    cone: str = spec("elliptic", choices=("elliptic", "pyramidal"))
     """Shape of the friction cone."""
     gripper_condim: int | None = spec(None, choices=(1, 3, 4, 6))
     """Contact dimension of the geoms of ``robot.jaw_bodies``."""
@@ -100,9 +76,10 @@ class SimCfg:
     """Physics engine of batch and throughput: auto is MJWarp where there is CUDA."""
     device: str = spec()
     """auto, cpu or cuda:N."""
-    step: StepMode = spec()
+    step: str = spec(choices=("auto", "fused", "arranged", "stock"))
     """MJWarp's step. stock: ``mujoco_warp.step``; arranged: its stages as parallel branches; fused:
-    with the solver as one kernel too; auto: the last of these that does all that the model needs.
+    contact rows and the solver as one kernel each, too; auto: fused where it does all that the
+    model needs.
     """
 
 

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, field
-from enum import Enum
 
 from omegaconf import MISSING
 
@@ -134,19 +133,17 @@ class SceneCfg:
         """The objects that move."""
         return {name: thing for name, thing in self.objects.items() if not thing.fixed}
 
-
-class RobotSource(Enum):
-    """Where the robot's MJCF file comes from."""
-
-    builtin = "builtin"
-    menagerie = "menagerie"
+    @property
+    def table_top(self) -> float:
+        """Height [m] of the table's surface."""
+        return self.table_center[2] + self.table_half[2]
 
 
 @dataclass(slots=True)
 class ModelCfg:
     """Source of the robot's MJCF file."""
 
-    source: RobotSource = MISSING
+    source: str = spec(choices=("builtin", "menagerie"))
     """``builtin``: ``robot.file``, or mjstack's own file of the robot. ``menagerie``: MuJoCo
     Menagerie's."""
 

@@ -5,6 +5,7 @@ fixed.
 import itertools
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -14,7 +15,7 @@ from torch import Tensor
 from mjstack.config.schema import Config, ObjectCfg, SceneCfg
 from mjstack.errors import ParameterError
 from mjstack.rng import uniform
-from mjstack.scene import SceneIndex, table_top
+from mjstack.scene import SceneIndex
 
 SCHEMA = 2
 """How objects that may meet are placed: 1 was one after the other, 2 is all together."""
@@ -28,12 +29,8 @@ _ARM_ROOM = 0.001
 
 
 def may_meet(scene: SceneCfg, region: Sequence[float], gap: float = GAP) -> bool:
-    """Whether free objects in a region around their nominal positions can be too close together.
-
-    Args:
-        scene: The scene.
-        region: Half-widths of the region in x and y [m].
-        gap: Free room between objects [m].
+    """Whether free objects in a region around their nominal positions, of these half-widths [m],
+    can be closer together than a gap [m].
     """
     return any(
         math.hypot(
@@ -92,7 +89,7 @@ class Placement:
         fixed = world_boxes(data, np.flatnonzero(collides & bolted & ~ground))
 
         rectangles = []
-        top = table_top(scene)
+        top = scene.table_top
         for thing in objects:
             around = np.concatenate(
                 [_around(thing, top, arm, min(gap, _ARM_ROOM)), _around(thing, top, fixed, gap)]
@@ -124,16 +121,10 @@ class Placement:
             ParameterError: In some of them no candidate fits.
         """
         count = len(self._apart)
-        world = torch.arange(_TRIALS)
-        zero = torch.zeros_like(world)
-        draws = uniform(
-            seed=0, world=world, episode=zero, step=zero, stream=0, size=2 * count * candidates
-        ).double()
-        draws = draws.view(_TRIALS, count, candidates, 2)
-        hard = draws[
-            ~self.choose(draws[:, :, :_FIRST])[1]
-        ]  # the first few do for most worlds, which saves time
-        lacking = sum(int((~self.choose(share)[1]).sum()) for share in hard.split(_SHARE))
+        draws = _trials(2 * count * candidates).view(_TRIALS, count, candidates, 2)
+        # The first few do for most worlds, which saves time.
+        hard = draws[~self.choose(draws[:, :, :_FIRST].double())[1]]
+        lacking = sum(int((~self.choose(share.double())[1]).sum()) for share in hard.split(_SHARE))
         if lacking:
             raise ParameterError(
                 "xy",
@@ -179,6 +170,14 @@ class Placement:
         chosen = offsets[torch.arange(len(first), device=first.device), :, first]
         fits = good.any(1)
         return torch.where(fits[:, None, None], chosen, 0.0), fits
+
+
+@lru_cache(maxsize=2)
+def _trials(size: int) -> Tensor:
+    """Draws of the imaginary worlds, shape ``(_TRIALS, size)``: a check tries several regions."""
+    world = torch.arange(_TRIALS)
+    zero = torch.zeros_like(world)
+    return uniform(seed=0, world=world, episode=zero, step=zero, stream=0, size=size)
 
 
 def _around(

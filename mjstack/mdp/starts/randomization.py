@@ -15,7 +15,6 @@ from torch import Tensor
 
 from mjstack.errors import ParameterError
 from mjstack.managers.view import EnvView
-from mjstack.mdp.geometry import robot_joints
 from mjstack.scene.index import Columns
 
 
@@ -130,7 +129,7 @@ class ServoGains(Quantity):
         # A position servo's gain is kp and its bias (0, -kp, -kv): scaling all of them scales both.
         self._gain, self._bias = (_Elements(env, name, servos) for name in self.fields)
         self._kp = self._gain.nominal[:, 0]
-        self.columns = [f"gain_{name}" for name in robot_joints(env)]
+        self.columns = [f"gain_{name}" for name in env.cfg.robot.joints]
         self.nominal = torch.ones_like(self._kp)
 
     def read(self) -> Tensor:

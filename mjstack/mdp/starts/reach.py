@@ -8,7 +8,6 @@ import numpy as np
 from mjstack.errors import ParameterError
 from mjstack.kinematics.reach import PointReach
 from mjstack.managers.view import EnvView
-from mjstack.scene import table_top
 from mjstack.scene.phases import nominal_xy, object_targets, source_names, target_xy
 
 _GRID = 0.02  # [m] between the positions whose reach is tried
@@ -70,7 +69,7 @@ def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | N
     row, column = (int(k) for k in np.unravel_index(distances.argmax(), distances.shape))
     x, y = xy[row]
     phase, target = targets[column]
-    height = target.z - table_top(scene) - scene.objects[name].half_height
+    height = target.z - scene.table_top - scene.objects[name].half_height
     where = "at its centre" if abs(height) < 5e-4 else f"{1e3 * height:.0f} mm above its centre"
     return (
         row,

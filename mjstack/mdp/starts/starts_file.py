@@ -14,15 +14,8 @@ from torch import Tensor
 from mjstack.errors import ArgumentError, ConfigError, ParameterError, suggest
 from mjstack.files import to_csv, write_atomic
 from mjstack.managers.view import EnvView, offers, uses_fields
-from mjstack.mdp.geometry import (
-    joint_positions,
-    named_pose,
-    place_xy,
-    pose_w,
-    robot_joints,
-    write_object,
-    write_robot,
-)
+from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_object, write_robot
+from mjstack.mdp.observation import joint_pos
 from mjstack.mdp.starts.placement import world_boxes
 from mjstack.mdp.starts.randomization import (
     ObjectMasses,
@@ -107,6 +100,11 @@ class StartsTable:
         self.columns = {name: column[order] for name, column in table.items()}
         self.lines = np.array([line for line, _ in rows])[order]
 
+    def take(self, columns: Sequence[str]) -> np.ndarray:
+        """Columns side by side, NaN where the file has none, shape ``(worlds, n)``."""
+        missing = np.full(len(self.lines), math.nan)
+        return np.stack([self.columns.get(name, missing) for name in columns], axis=1)
+
     def misfit(self, world: int, columns: Sequence[str], expected: str, fix: str) -> ConfigError:
         """The error that some cells of a world's line cannot be used."""
         return self.wrong(expected, fix, self.lines[world], columns)
@@ -147,7 +145,7 @@ class FromStartsFile:
         env: EnvView,
         *,
         path: str | None,
-        pose: str = "start",
+        pose: Pose = "start",
         mass: Sequence[float] = (0.7, 1.3),
         friction: Sequence[float] = (0.8, 1.4),
         gain: Sequence[float] = (0.9, 1.1),
@@ -180,7 +178,8 @@ class FromStartsFile:
             "gain": ServoGains(env),
         }
         objects = list(env.index.objects)
-        joints = [f"joint_{name}" for name in robot_joints(env)]
+        names = env.cfg.robot.joints
+        joints = [f"joint_{name}" for name in names]
         drawn = {name: _xy(name) for name in _drawn_places(env)}
         columns = [column for held in quantities.values() for column in held.columns]
         required = [column for name in objects for column in (*_xy(name), f"{name}_yaw_rad")]
@@ -199,7 +198,7 @@ class FromStartsFile:
             fix = f"Correct it, or widen reset.starts.params.{name}"
             for column, nominal in zip(held.columns, held.nominal.tolist(), strict=True):
                 file.require_range(column, nominal * low, nominal * high, fix)
-        limits = joint_limits(env.sim.model, robot_joints(env))
+        limits = joint_limits(env.sim.model, names)
         for column, low, high in zip(joints, *limits, strict=True):
             file.require_range(column, low, high)
         for name, pair in drawn.items():
@@ -210,17 +209,17 @@ class FromStartsFile:
                 if column not in table:
                     raise file.misfit(0, pair, "both coordinates of a place", "Add a column")
                 file.require_range(column, at - width, at + width)
-            env.given_places[name] = _on(env, np.stack([table[column] for column in pair], axis=1))
+            env.given_places[name] = _on(env, file.take(pair))
 
         # Starts, which have to be free and within reach
-        command = np.tile(named_pose(env, pose).double().cpu().numpy(), (rows, 1))
-        for number, column in enumerate(joints):
-            command[:, number] = table.get(column, command[:, number])
+        given = file.take(joints)
+        command = np.where(np.isnan(given), getattr(robot(env), pose).double().cpu().numpy(), given)
         poses = np.zeros((rows, len(objects), 6))  # x, y and the quaternion
         for number, name in enumerate(objects):
             half = 0.5 * table[f"{name}_yaw_rad"]
-            stands = [*(table[column] for column in _xy(name)), np.cos(half), np.sin(half)]
-            poses[:, number, [0, 1, 2, 5]] = np.stack(stands, axis=1)
+            poses[:, number, :2] = file.take(_xy(name))
+            poses[:, number, 2] = np.cos(half)
+            poses[:, number, 5] = np.sin(half)
         _check_worlds(env, file, poses, command)
         for number, name in enumerate(objects):
             if found := out_of_reach(env, name, poses[:, number, :2]):
@@ -231,12 +230,11 @@ class FromStartsFile:
         # All of it on the device
         self._command = _on(env, command)
         self._poses = _on(env, poses)
-        missing = np.full(rows, np.nan)
-        self._given = []
-        for held in quantities.values():
-            if table.keys() & set(held.columns):
-                values = np.stack([table.get(column, missing) for column in held.columns], axis=1)
-                self._given.append((held, torch.from_numpy(values).to(env.device)))
+        self._given = [
+            (held, torch.from_numpy(file.take(held.columns)).to(env.device))
+            for held in quantities.values()
+            if table.keys() & set(held.columns)
+        ]
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos, ctrl and the model fields that the file has columns for."""
@@ -260,7 +258,8 @@ def write_starts(env: EnvView, path: str | Path) -> None:
         path: The file. World k of the environment becomes world k of the file.
 
     Raises:
-        ArgumentError: The worlds have moved on, or the file cannot be written.
+        ArgumentError: The worlds have moved on.
+        OSError: The file cannot be written.
     """
     if bool((env.episode_step != 0).any()) or bool((env.episode < 0).any()):
         found = "worlds that have moved on, or not started"
@@ -278,7 +277,7 @@ def write_starts(env: EnvView, path: str | Path) -> None:
             raise ArgumentError("env", found, "objects that stand flat on it")
         add(_xy(name), pose_w(env, name)[:, :2])
         table[f"{name}_yaw_rad"] = _yaw(pose[:, 3], pose[:, 6])
-    add([f"joint_{name}" for name in robot_joints(env)], joint_positions(env))
+    add([f"joint_{name}" for name in env.cfg.robot.joints], joint_pos(env))
     quantities: tuple[type[Quantity], ...] = (ObjectMasses, SlidingFriction, ServoGains)
     for quantity in quantities:
         if _varies(env, quantity.fields):
@@ -288,11 +287,7 @@ def write_starts(env: EnvView, path: str | Path) -> None:
         add(_xy(name), place_xy(env, name))
     # Python's and numpy's shortest text of a number is read back to the same bits.
     rows = [dict(zip(table, cells, strict=True)) for cells in zip(*table.values(), strict=True)]
-    try:
-        write_atomic(Path(path), to_csv(rows))
-    except OSError as error:
-        found = f"{path} ({error.strerror})"
-        raise ArgumentError("path", found, "a file in a folder that can be written") from error
+    write_atomic(Path(path), to_csv(rows))
 
 
 def _drawn_places(env: EnvView) -> list[str]:
