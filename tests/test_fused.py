@@ -159,7 +159,7 @@ def test_every_kind_of_row(cone: str, condim: int, boxes: int, device: str) -> N
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("njmax", [300, 60])
+@pytest.mark.parametrize("njmax", [300, 16])
 @pytest.mark.parametrize("condim", [1, 3, 6])
 def test_contact_rows(condim: int, njmax: int, device: str) -> None:
     """All that MJWarp writes of a row, also where the buffer ends within a contact. On CUDA the
@@ -191,13 +191,13 @@ def test_contact_rows(condim: int, njmax: int, device: str) -> None:
             found.append((worlds.d.nefc.numpy().copy(), len(rows), values))
         np.testing.assert_array_equal(found[0][0], found[1][0])
         most = max(most, int(found[0][0].max()))
-        if njmax == 60 and device != "cpu":
+        if njmax == 16 and device != "cpu":
             continue  # contacts that are left out differ
         assert found[0][1] == found[1][1]
         for name in names:
             a, b = (one[2][name].reshape(found[0][1], -1)[:, : worlds.m.nv] for one in found)
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * np.abs(a).max(), err_msg=name)
-    assert most > (60 if njmax == 60 and condim > 1 else 20)
+    assert most > 16
 
 
 @pytest.mark.parametrize("device", DEVICES)
