@@ -42,7 +42,7 @@ class Pipeline:
         self._scope = torch_stream_scope
         self._tensor = wp.to_torch
         self._solvers = {STOCK: mjw.solve, FUSED: newton.solve}
-        if reason := newton.covers(sim.model, self._m, self._d):
+        if reason := newton.why_not(self._m, self._d):
             raise MjstackError(f"the fused solver does not cover this model: {reason}")
 
     def array(self, name: str) -> torch.Tensor:
