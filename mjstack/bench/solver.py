@@ -4,10 +4,10 @@ MuJoCo.
 Both solvers get the same inputs, in place on the device. Native MuJoCo solves the same states in
 float64, to 1e-12.
 
-An error is the largest difference of a world's vector, over the largest element of the reference's
-vector or, where that is larger, of the smooth one (qacc_smooth, qfrc_smooth): in a world at rest
-the acceleration is next to nothing, a difference of terms as large as the smooth one, which are
-what float32 rounds. A cost is that of a solver's qacc in MJWarp's rows, computed in float64. Its
+An error is the largest difference of a world's vector over the largest element of the reference's
+vector. Where the reference's is next to nothing, as the acceleration of a world at rest, it is a
+difference of far larger terms, which float32 rounds. So the scale is at least a hundredth of the
+smooth vector's largest element (qacc_smooth, qfrc_smooth). A cost is that of a solver's qacc in MJWarp's rows, computed in float64. Its
 change is relative to the cost with ``mujoco_warp.solve``, or to the trace of the inertia where that
 is larger: the unit of the solver's tolerance.
 """
@@ -33,6 +33,7 @@ from mjstack.sim.sizes import resolve_env_sizes
 AGREEMENT = 1e-3  # relative difference of the two solvers
 _QUANTILES = (0.5, 0.99, 1.0)
 _ENDS = "median / 99 % / largest"
+_FLOOR = 0.01  # of an error's scale, of the smooth vector's
 _LISTED = 20  # states that differ by more
 _REFERENCE = {"tolerance": 1e-12, "ls_tolerance": 1e-10, "iterations": 1000, "ls_iterations": 200}
 Numbers = dict[str, np.ndarray]
@@ -95,12 +96,12 @@ def _compare(pipeline: Pipeline, native: NativeSimulation, sample: Sample) -> Nu
     stock, fused = found.values()
     between = [_distance(_float(fused[n]), _float(stock[n]), smooth[n]) for n in VECTORS]
     out["difference"] = np.maximum(*between)
-    most = pipeline.array("efc.state").shape[1]  # of rows; the forces' buffer may be longer
+    most = int(min(max(1, rows.max()), found[STOCK]["efc.force"].shape[1]))
     used = np.arange(most) < rows[:, None]
-    force, other = (np.where(used, _float(r["efc.force"])[:, :most], 0) for r in (fused, stock))
+    force, other = (np.where(used, _float(r["efc.force"][:, :most]), 0) for r in (fused, stock))
     out["efc.force"] = _distance(force, other, np.zeros_like(force))
     differ = (fused["efc.state"] != stock["efc.state"]).cpu().numpy()
-    out["efc.state"] = np.any(differ & used, axis=1)
+    out["efc.state"] = np.any(differ[:, :most] & used, axis=1)
     change = (costs[1] - costs[0]) / np.maximum(costs[0], trace)
     out["cost"] = np.nan_to_num(change, nan=np.inf)
 
@@ -143,9 +144,9 @@ def _float(values: torch.Tensor) -> np.ndarray:
     return values.double().cpu().numpy()
 
 
-def _distance(found: np.ndarray, expected: np.ndarray, floor: np.ndarray) -> np.ndarray:
+def _distance(found: np.ndarray, expected: np.ndarray, smooth: np.ndarray) -> np.ndarray:
     """Relative errors of each world's vector; infinite where it is not finite."""
-    scale = np.maximum(abs(expected), abs(floor)).max(1)
+    scale = np.maximum(abs(expected), _FLOOR * abs(smooth)).max(1)
     error = abs(found - expected).max(1) / np.maximum(scale, np.finfo(np.float32).tiny)
     return np.nan_to_num(error, nan=np.inf)
 
