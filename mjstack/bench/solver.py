@@ -7,9 +7,11 @@ float64, to 1e-12.
 An error is the largest difference of a world's vector over the largest element of the reference's
 vector. Where the reference's is next to nothing, as the acceleration of a world at rest, it is a
 difference of far larger terms, which float32 rounds. So the scale is at least a hundredth of the
-smooth vector's largest element (qacc_smooth, qfrc_smooth). A cost is that of a solver's qacc in MJWarp's rows, computed in float64. Its
-change is relative to the cost with ``mujoco_warp.solve``, or to the trace of the inertia where that
-is larger: the unit of the solver's tolerance.
+smooth vector's largest element (qacc_smooth, qfrc_smooth).
+
+A cost is that of a solver's qacc in MJWarp's rows, computed in float64. Its change is relative to
+the cost with ``mujoco_warp.solve``, or to the trace of the inertia where that is larger: the unit
+of the solver's tolerance.
 """
 
 import copy
