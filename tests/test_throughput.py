@@ -567,16 +567,17 @@ def test_bad_options_of_a_benchmark_are_one_line(
 def test_a_benchmark_prints_its_table(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def work(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
+    def work(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[Table]:
         advance("working", 1, 2)
         row = [str(args.steps), f"{cfg.robot.name}|{cfg.nworld}", str(args.many_numbers)]
-        return Table(title="T", header=["steps", "robot", "many"], rows=[row])
+        second = Table(header=["more"], rows=[["seven"]])
+        return [Table(title="T", header=["steps", "robot", "many"], rows=[row]), second]
 
     numbers: cli.Numbers = {"steps": (10, "steps"), "many-numbers": ([1, 2], "numbers")}
     monkeypatch.setitem(cli.BENCHMARKS, "mine", (work, "text", numbers))
     cli.main("mine", ["robot=rebot", "--steps", "3"])
     out = capsys.readouterr().out
-    for cell in ("3", "rebot|256", "[1, 2]"):
+    for cell in ("3", "rebot|256", "[1, 2]", "seven"):
         assert f" {cell} " in out
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mjstack.bench import env_step, ik, physics
+from mjstack.bench import env_step, ik, physics, solver
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import build_env
@@ -17,11 +17,11 @@ from mjstack.errors import ConfigError, MjstackError
 from mjstack.report.table import Console, Table
 from mjstack.sim import resolve_device
 
-Work = Callable[[argparse.Namespace, Config, Advance], Table]
+Work = Callable[[argparse.Namespace, Config, Advance], list[Table]]
 
 
 def main(name: str, argv: Sequence[str] | None = None) -> None:
-    """Run a benchmark from its command line, and print its table.
+    """Run a benchmark from its command line, and print its tables.
 
     Args:
         name: Of the benchmark in `BENCHMARKS`.
@@ -51,16 +51,17 @@ def main(name: str, argv: Sequence[str] | None = None) -> None:
             def advance(what: str, done: int, total: int) -> None:
                 status.update(f"{what}: {done} of {total}")
 
-            table = work(args, cfg, advance)
+            tables = work(args, cfg, advance)
     except MjstackError as error:
         Console(stderr=True, soft_wrap=True, markup=False).print(f"mjstack: {error}")
         raise SystemExit(error.exit_code) from error
     except KeyboardInterrupt:
         raise SystemExit(130) from None
-    console.print(table.to_console())
+    for table in tables:
+        console.print(table.to_console())
 
 
-def _env_step(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
+def _env_step(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[Table]:
     """``env.step`` on both backends."""
     results = {}
     for backend in (Backend.native, Backend.mjwarp):
@@ -81,19 +82,20 @@ def _env_step(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
         for name in result.samples
     ]
     ended = [str(found.facts["episodes_ended"]) for found in results.values()]
-    return Table(
+    table = Table(
         title=f"env.step: {cfg.task.name}, {cfg.robot.title}, random actions, with resets",
         header=["median (smallest to largest)", *results],
         rows=[*figures, ["episodes that ended and were reset", *ended]],
     )
+    return [table]
 
 
-def _physics(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
+def _physics(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[Table]:
     """The captured physics step in each arrangement."""
     context = RunContext(cfg=cfg, advance=advance)
     times = physics.measure_arrangements(context, steps=args.steps, repetitions=args.repetitions)
     bare = times[physics.BARE]
-    return Table(
+    table = Table(
         title=(
             f"a captured physics step: {cfg.robot.title}, {cfg.nworld:,} worlds, from"
             f" {cfg.gate.throughput.from_phase}"
@@ -104,9 +106,18 @@ def _physics(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
             for name, ms in times.items()
         ],
     )
+    return [table]
 
 
-def _ik(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
+def _solver(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[Table]:
+    """The fused solver beside ``mujoco_warp.solve``."""
+    numbers = solver.compare_solvers(RunContext(cfg=cfg, advance=advance), states=args.states)
+    tables = solver.report(numbers)
+    tables[0].title = f"solvers: {cfg.task.name}, {cfg.robot.title}, {cfg.nworld:,} worlds"
+    return tables
+
+
+def _ik(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[Table]:
     """Batched inverse kinematics, in every combination of the options."""
     device = resolve_device(cfg.sim.device)
     cases = list(itertools.product(args.nworld, args.iterations, args.block_dim, (0.0, _GAIN)))
@@ -133,7 +144,7 @@ def _ik(args: argparse.Namespace, cfg: Config, advance: Advance) -> Table:
         "share within 0.5 mm": "reached",
         "gains": "gain",
     }
-    return Table.of(columns, rows, f"BatchedIk.solve: {cfg.robot.title}, {device}")
+    return [Table.of(columns, rows, f"BatchedIk.solve: {cfg.robot.title}, {device}")]
 
 
 def _spread(values: list[float] | None) -> str:
@@ -162,6 +173,7 @@ BENCHMARKS: dict[str, tuple[Work, str | None, Numbers]] = {
         physics.measure_arrangements.__doc__,
         {"steps": (20, _STEPS), "repetitions": (5, _REPETITIONS)},
     ),
+    "solver": (_solver, solver.__doc__, {"states": (20_000, "states to record at least")}),
     "ik": (
         _ik,
         ik.__doc__,

@@ -1,0 +1,155 @@
+"""MJWarp's worlds brought to just before the solver, the two solvers, and the cost that they
+minimise.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import torch
+
+from mjstack.bench.states import Sample
+from mjstack.errors import MjstackError
+from mjstack.math import not_finite
+from mjstack.sim import LOST_PHYSICS
+
+if TYPE_CHECKING:
+    from mjstack.sim.mjwarp import MjwarpSimulation
+
+STOCK = "mujoco_warp"
+FUSED = "fused"
+SOLVERS = (STOCK, FUSED)
+VECTORS = {"qacc": "qacc_smooth", "qfrc_constraint": "qfrc_smooth"}
+"""Outputs of a solver, and the vectors of the smooth dynamics that are in their units."""
+_ELLIPTIC = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
+
+
+class Pipeline:
+    """MJWarp's worlds, brought to just before the solver, and both solvers."""
+
+    def __init__(self, sim: "MjwarpSimulation") -> None:
+        """Take the worlds.
+
+        Raises:
+            MjstackError: The fused solver does not cover the model.
+        """
+        from mjstack.sim import newton  # they load Warp
+        from mjstack.sim.warp_setup import mjw, torch_stream_scope, wp
+
+        self.sim = sim
+        self._m: Any = sim._m
+        self._d: Any = sim._d
+        self._mjw = mjw
+        self._scope = torch_stream_scope
+        self._tensor = wp.to_torch
+        self._solvers = {STOCK: mjw.solve, FUSED: newton.solve}
+        if reason := newton.why_not(self._m, self._d):
+            raise MjstackError(f"the fused solver does not cover this model: {reason}")
+
+    def array(self, name: str) -> torch.Tensor:
+        """A view of an array of MJWarp's data, such as ``efc.J``."""
+        owner: Any = self._d
+        for part in name.split("."):
+            owner = getattr(owner, part)
+        return self._tensor(owner)
+
+    def prepare(self, sample: Sample) -> torch.Tensor:
+        """Load a sample, and compute all that a solver reads.
+
+        Returns:
+            Worlds that lost physics to a buffer, or whose state is not finite, shape ``(nworld,)``.
+        """
+        for name, values in sample.state.items():
+            self.array(name).copy_(values)
+        for name, values in sample.fields.items():
+            self.sim.fields[name].copy_(values)
+        d = self._d
+        lost = self.array("overflow").zero_()
+        with self._scope(self.sim._device):
+            self.sim._place()
+            self._mjw.fwd_position(self._m, d)
+            self._mjw.fwd_velocity(self._m, d)
+            self._mjw.fwd_actuation(self._m, d)
+            self._mjw.fwd_acceleration(self._m, d, factorize=True)
+        pool = torch.maximum(self.array("nacon"), self.array("ncollision"))
+        void = ((lost & LOST_PHYSICS) != 0) | (self.array("nefc") > d.njmax) | (pool > d.naconmax)
+        return void | not_finite(*sample.state.values())
+
+    def solve(self, solver: str) -> dict[str, torch.Tensor]:
+        """Outputs of a solver, by name; NaN or -1 where it has written none."""
+        names = (*VECTORS, "efc.Ma", "efc.force", "efc.state", "solver_niter")
+        for name in names:
+            output = self.array(name)
+            output.fill_(torch.nan if output.is_floating_point() else -1)
+        self.array("overflow").zero_()
+        with self._scope(self.sim._device):
+            self._solvers[solver](self._m, self._d)
+        return {name: self.array(name).clone() for name in (*names, "overflow")}
+
+    def inertia(self) -> torch.Tensor:
+        """The mass matrix in float64, shape ``(nworld, nv, nv)``."""
+        rows, columns = (self._tensor(i).long() for i in (self._m.M_hinit_i, self._m.M_colind))
+        values = self.array("M")[:, : len(columns)].double()
+        inertia = values.new_zeros((len(values), self._m.nv, self._m.nv))
+        inertia[:, rows, columns] = values
+        inertia[:, columns, rows] = values
+        return inertia
+
+    def cost(self, qacc: torch.Tensor) -> torch.Tensor:
+        """Cost of an acceleration in the prepared rows, in float64, shape ``(nworld,)``: what both
+        solvers minimise.
+        """
+        # Inertia, about the acceleration of qfrc_smooth alone
+        inertia = self.inertia()
+        away = qacc.double() - torch.linalg.solve(inertia, self.array("qfrc_smooth").double())
+        cost = 0.5 * torch.einsum("wi,wij,wj->w", away, inertia, away)
+
+        # Rows by themselves: equalities, then friction loss, then what pushes one way
+        ne, nf, nefc = (self.array(name).long()[:, None] for name in ("ne", "nf", "nefc"))
+        most = max(1, min(self._d.njmax, int(nefc.max())))
+        weight, aref, loss = (
+            self.array(f"efc.{name}")[:, :most].double() for name in ("D", "aref", "frictionloss")
+        )
+        jacobian = self.array("efc.J")[:, :most, : self._m.nv].double()
+        x = torch.einsum("wri,wi->wr", jacobian, qacc.double()) - aref
+        quadratic = 0.5 * weight * x**2
+        friction = torch.where(
+            x.abs() < loss / weight, quadratic, loss * (x.abs() - 0.5 * loss / weight)
+        )
+        row = torch.arange(most, device=x.device)
+        each = torch.where(row < ne + nf, friction, torch.where(x < 0, quadratic, 0.0))
+        each = torch.where(row < ne, quadratic, each)
+        elliptic = self.array("efc.type")[:, :most] == _ELLIPTIC
+        each = torch.where((row < nefc) & ~elliptic, each, 0.0)
+        return (cost + each.sum(1)).index_add_(0, *self._cone_costs(x, weight, elliptic))
+
+    def _cone_costs(
+        self, x: torch.Tensor, weight: torch.Tensor, elliptic: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """World and cost of each contact with an elliptic cone, from the residuals and weights of
+        all rows.
+        """
+        # The contacts that have rows, and their residuals
+        count = min(int(self.array("nacon")), self._d.naconmax)
+        world, first, dim = (
+            self.array(f"contact.{name}")[:count].long()
+            for name in ("worldid", "efc_address", "dim")
+        )
+        first = first[:, 0]
+        used = (first >= 0) & (first + dim <= x.shape[1])
+        used &= elliptic[world, first.clamp(0, x.shape[1] - 1)]
+        world, first, dim = (numbers[used] for numbers in (world, first, dim))
+        rows = first[:, None] + torch.arange(6, device=x.device)
+        within = rows < (first + dim)[:, None]
+        at = (world[:, None], rows.clamp(max=x.shape[1] - 1))
+        residual = torch.where(within, x[at], 0.0)
+
+        # Below the cone, in its middle, above it
+        friction = self.array("contact.friction")[:count][used].double()
+        invsqrt = self._tensor(self._m.opt.impratio_invsqrt).double()
+        mu = friction[:, 0] * invsqrt[world % len(invsqrt)]
+        normal = residual[:, 0] * mu
+        tangent = (residual[:, 1:] * friction).norm(dim=1)
+        below = 0.5 * torch.where(within, weight[at] * residual**2, 0.0).sum(1)
+        middle = 0.5 * weight[at][:, 0] / (mu**2 * (1 + mu**2)) * (normal - mu * tangent) ** 2
+        cost = torch.where(mu * normal + tangent <= 0, below, middle)
+        return world, torch.where(normal >= mu * tangent, 0.0, cost)
