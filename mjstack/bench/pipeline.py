@@ -32,7 +32,7 @@ class Pipeline:
         Raises:
             MjstackError: The fused solver does not cover the model.
         """
-        from mjstack.sim import newton  # they load Warp
+        from mjstack.sim import fused  # they load Warp
         from mjstack.sim.warp_setup import mjw, torch_stream_scope, wp
 
         self.sim = sim
@@ -41,8 +41,8 @@ class Pipeline:
         self._mjw = mjw
         self._scope = torch_stream_scope
         self._tensor = wp.to_torch
-        self._solvers = {STOCK: mjw.solve, FUSED: newton.solve}
-        if reason := newton.why_not(self._m, self._d):
+        self._solvers = {STOCK: mjw.solve, FUSED: fused.solve}
+        if reason := fused.why_not(self._m, self._d):
             raise MjstackError(f"the fused solver does not cover this model: {reason}")
 
     def array(self, name: str) -> torch.Tensor:

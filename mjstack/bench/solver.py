@@ -72,7 +72,7 @@ def compare_solvers(context: RunContext, *, states: int) -> Numbers:
     for number, sample in enumerate(samples):
         part = _compare(pipeline, native, sample)
         parts.append({"sample": np.full(sim.nworld, number), **part})
-        context.report_progress("samples", number + 1, len(samples))
+        context.advance("samples", number + 1, len(samples))
     native.close()
     sim.close()
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

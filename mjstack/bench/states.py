@@ -82,7 +82,7 @@ def record_states(context: RunContext, sim: "MjwarpSimulation", states: int) -> 
             if substep == sampled:
                 samples.append(Sample.of(sim, kind))
             sim.step(1)
-        context.report_progress("steps of random actions", step + 1, steps)
+        context.advance("steps of random actions", step + 1, steps)
     return samples
 
 
