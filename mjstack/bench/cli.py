@@ -91,22 +91,25 @@ def _env_step(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[T
 
 
 def _physics(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[Table]:
-    """The captured physics step in each arrangement."""
+    """The captured physics step in each arrangement: in the task, and under random actions."""
     context = RunContext(cfg=cfg, advance=advance)
-    times = physics.measure_arrangements(context, steps=args.steps, repetitions=args.repetitions)
-    bare = times[physics.BARE]
-    table = Table(
-        title=(
-            f"a captured physics step: {cfg.robot.title}, {cfg.nworld:,} worlds, from"
-            f" {cfg.gate.throughput.from_phase}"
-        ),
-        header=["arrangement, each with all above it", "ms per step", "over bare"],
-        rows=[
-            [name, _spread(ms), _spread([a / b for a, b in zip(ms, bare, strict=True)])]
-            for name, ms in times.items()
-        ],
-    )
-    return [table]
+    tables = []
+    for random in (False, True):
+        times = physics.measure_arrangements(
+            context, steps=args.steps, repetitions=args.repetitions, random=random
+        )
+        bare = times[physics.BARE]
+        moving = "random actions" if random else f"from {cfg.gate.throughput.from_phase}"
+        table = Table(
+            title=f"a captured step: {cfg.robot.title}, {cfg.nworld:,} worlds, {moving}",
+            header=["arrangement, each with all above it", "ms per step", "bare over it"],
+            rows=[
+                [name, _spread(ms), _spread([b / a for a, b in zip(ms, bare, strict=True)])]
+                for name, ms in times.items()
+            ],
+        )
+        tables.append(table)
+    return tables
 
 
 def _solver(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[Table]:

@@ -140,17 +140,20 @@ def play_to_phase(context: RunContext, sim: Simulation) -> State:
 
 
 def measure_arrangements(
-    context: RunContext, *, steps: int, repetitions: int
+    context: RunContext, *, steps: int, repetitions: int, random: bool = False
 ) -> dict[str, list[float]]:
     """Time the captured step in each arrangement, beside a bare replayed ``mujoco_warp.step``.
 
-    Every repetition plays the same control steps of the task, object in hand, from the same states,
-    for one arrangement after the other. So the ratios are of one run and one trajectory.
+    Every repetition plays the same control steps from the same states, for one arrangement after
+    the other. So the ratios are of one run and one trajectory.
 
     Args:
         context: The configuration; its worlds run on MJWarp.
-        steps: Control steps per repetition, from the phase ``gate.throughput.from_phase``.
+        steps: Control steps per repetition.
         repetitions: Measured repetitions; one before them warms up.
+        random: Whether the joint targets are random, over their full range, from worlds with room
+            for that; else the task's, object in hand, from the phase
+            ``gate.throughput.from_phase``.
 
     Returns:
         Milliseconds per batched physics step, one number per repetition, by arrangement.
@@ -175,17 +178,12 @@ def measure_arrangements(
         "contacts beside smooth dynamics": ARRANGEMENTS["arranged"],
         "contact rows and the solver as one kernel each": ARRANGEMENTS["fused"],
     }
-    # The trajectory
-    sim = context.simulation(cfg.nworld, Backend.mjwarp, resolve_device(cfg.sim.device))
+    device = resolve_device(cfg.sim.device)
+    sizes = context.env_sizes if random else None
+    sim = context.simulation(cfg.nworld, Backend.mjwarp, device, sizes=sizes)
     assert isinstance(sim, MjwarpSimulation)
-    first = context.phase(cfg.gate.throughput.from_phase).start
-    snapshots = Snapshots([first - 1])
-    recorder = CommandRecorder()
-    context.play(sim, cfg.reset, [snapshots, recorder])
-    state = snapshots.states[first - 1]
-    recorded = recorder.recorded.rewind()
+    state, targets = (_random_targets if random else _task_targets)(context, sim, steps)
     columns = torch.as_tensor(context.index.ctrl, device=sim.device)
-    targets = [recorded.command() for _ in range(min(first + steps, recorded.steps))][first:]
     bare = sim.bare_step()
 
     def bare_steps() -> None:
@@ -217,6 +215,39 @@ def measure_arrangements(
         context.advance("repetitions", repetition, repetitions)
     sim.close()
     return times
+
+
+def _task_targets(
+    context: RunContext, sim: Simulation, steps: int
+) -> tuple[State, list[torch.Tensor]]:
+    """State and joint targets of the task from the measured phase on."""
+    first = context.phase(context.cfg.gate.throughput.from_phase).start
+    snapshots = Snapshots([first - 1])
+    recorder = CommandRecorder()
+    context.play(sim, context.cfg.reset, [snapshots, recorder])
+    recorded = recorder.recorded.rewind()
+    targets = [recorded.command() for _ in range(min(first + steps, recorded.steps))][first:]
+    return snapshots.states[first - 1], targets
+
+
+def _random_targets(
+    context: RunContext, sim: Simulation, steps: int
+) -> tuple[State, list[torch.Tensor]]:
+    """Random joint targets over their full range, and the state after a second of such."""
+    columns = torch.as_tensor(context.index.ctrl, device=sim.device)
+    limits = torch.as_tensor(sim.model.actuator_ctrlrange).float().to(sim.device)
+    low, high = limits[columns].unbind(1)
+    generator = torch.Generator(sim.device).manual_seed(context.cfg.seed)
+    before = round(1.0 / context.cfg.timing.step_dt)
+    targets = []
+    for _ in range(before + steps):
+        noise = torch.rand((sim.nworld, len(columns)), generator=generator, device=sim.device)
+        targets.append(low + (high - low) * noise)
+    context.start(sim, context.cfg.reset)
+    for target in targets[:before]:
+        sim.ctrl[:, columns] = target
+        sim.step(context.cfg.timing.decimation)
+    return snapshot(sim), targets[before:]
 
 
 def _in_hand(context: RunContext, sim: Simulation) -> int | None:
