@@ -124,6 +124,7 @@ def test_the_report_has_figures_and_a_list() -> None:
         "void": np.array([False, True, False, False]),
         "other rows": np.array([False, False, False, True]),
         "difference": np.array([1e-5, np.inf, 2e-3, 1e-3]),
+        solver.TOLERANCES: np.array([0.0, 9.0, -0.9, 3.0]),
         "efc.force": np.zeros(count),
         "efc.state": np.array([True, True, False, True]),
         "cost": np.array([-1.0, 5.0, 1e-7, 2e-6]),
@@ -132,6 +133,7 @@ def test_the_report_has_figures_and_a_list() -> None:
         numbers |= {f"{name}, {s}": np.full(count, stock) for s in SOLVERS}
     numbers[f"LS_ITERATIONS, {FUSED}"] = np.array([True, False, False, True])
     for name in solver.VECTORS:
+        numbers[f"{name}, difference"] = numbers["difference"]
         numbers[f"{name}, {STOCK}"] = np.array([1.0, 9.0, 2.0, 9.0])
         numbers[f"{name}, {FUSED}"] = np.array([1.0, 9.0, 3.0, 9.0])
     figures, listed = solver.report(numbers)
@@ -141,7 +143,8 @@ def test_the_report_has_figures_and_a_list() -> None:
     assert rows["void: not finite, or a buffer too small"] == ["1", "0", "1"]
     assert rows["not compared with native: other rows there"] == ["0", "1", "1"]
     assert rows["qacc, ratio of the errors"] == ["1 / 1 / 1", "1.5 / 1.5 / 1.5", "1.5 / 1.5 / 1.5"]
-    assert rows["agree within 0.001"] == ["100.000 %", "50.000 %", "66.667 %"]
+    assert rows["qacc agrees within 0.001"] == ["100.000 %", "50.000 %", "66.667 %"]
+    assert rows["do not agree / costs within the tolerance"] == ["0 / 0", "1 / 1", "1 / 1"]
     assert rows["efc.state of a row differs"] == ["1", "1", "2"]
     assert rows["cost, worst change"] == ["-1", "+2e-06", "+2e-06"]
     assert rows[f"limit LS_ITERATIONS: {STOCK} / {FUSED} / differ"] == [
@@ -153,9 +156,12 @@ def test_the_report_has_figures_and_a_list() -> None:
 
 
 @pytest.mark.full
-def test_the_benchmark_compares_the_solvers(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_benchmark_compares_the_solvers(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "400")
     small = ["sim.device=cpu", "nworld=4", "batch.njmax=200", *one_second_episode()]
     cli.main("solver", [*small, "--states", "80"])
     out = " ".join(capsys.readouterr().out.split())
-    assert "agree within 0.001" in out
+    assert "qacc agrees within 0.001" in out
     assert "100.000 %" in out

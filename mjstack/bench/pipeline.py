@@ -52,6 +52,11 @@ class Pipeline:
             owner = getattr(owner, part)
         return self._tensor(owner)
 
+    @property
+    def tolerance(self) -> torch.Tensor:
+        """The solvers' tolerance, of each world or of all."""
+        return self._tensor(self._m.opt.tolerance)
+
     def prepare(self, sample: Sample) -> torch.Tensor:
         """Load a sample, and compute all that a solver reads.
 
