@@ -99,6 +99,15 @@ class Pipeline:
         inertia[:, columns, rows] = values
         return inertia
 
+    def residuals(self, qacc: torch.Tensor) -> torch.Tensor:
+        """J qacc - aref in float64, shape ``(nworld, rows)``, rows as many as a world has at
+        most.
+        """
+        most = max(1, min(self._d.njmax, int(self.array("nefc").max())))
+        jacobian = self.array("efc.J")[:, :most, : self._m.nv].double()
+        product = torch.einsum("wri,wi->wr", jacobian, qacc.double())
+        return product - self.array("efc.aref")[:, :most].double()
+
     def cost(self, qacc: torch.Tensor) -> torch.Tensor:
         """Cost of an acceleration in the prepared rows, in float64, shape ``(nworld,)``: what both
         solvers minimise.
@@ -110,12 +119,11 @@ class Pipeline:
 
         # Rows by themselves: equalities, then friction loss, then what pushes one way
         ne, nf, nefc = (self.array(name).long()[:, None] for name in ("ne", "nf", "nefc"))
-        most = max(1, min(self._d.njmax, int(nefc.max())))
-        weight, aref, loss = (
-            self.array(f"efc.{name}")[:, :most].double() for name in ("D", "aref", "frictionloss")
+        x = self.residuals(qacc)
+        most = x.shape[1]
+        weight, loss = (
+            self.array(f"efc.{name}")[:, :most].double() for name in ("D", "frictionloss")
         )
-        jacobian = self.array("efc.J")[:, :most, : self._m.nv].double()
-        x = torch.einsum("wri,wi->wr", jacobian, qacc.double()) - aref
         quadratic = 0.5 * weight * x**2
         friction = torch.where(
             x.abs() < loss / weight, quadratic, loss * (x.abs() - 0.5 * loss / weight)
