@@ -30,6 +30,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import mjstack.cli  # before mujoco, which decides at its import how it draws
+
+# isort: split
 import pytest
 from fuzz_cases import Make, command_lines, damaged_folders, is_short
 
@@ -243,8 +246,6 @@ def _preload() -> None:
     """Load what a command line loads, and keep what it reads of YAML."""
     import matplotlib
     import yaml
-
-    import mjstack.cli
 
     matplotlib.use("Agg")
     for module in pkgutil.walk_packages(mjstack.__path__, "mjstack."):
