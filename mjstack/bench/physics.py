@@ -22,6 +22,7 @@ from mjstack.episodes.rollout import CommandRecorder, Snapshots, State, restore,
 from mjstack.errors import MjstackError
 from mjstack.mdp.geometry import objects_in_hand
 from mjstack.sim import Simulation, resolve_device
+from mjstack.sim.sizes import resolve_env_sizes
 
 BARE = "bare mujoco_warp.step"
 
@@ -179,7 +180,7 @@ def measure_arrangements(
         "contact rows and the solver as one kernel each": ARRANGEMENTS["fused"],
     }
     device = resolve_device(cfg.sim.device)
-    sizes = context.env_sizes if random else None
+    sizes = resolve_env_sizes(cfg) if random else None
     sim = context.simulation(cfg.nworld, Backend.mjwarp, device, sizes=sizes)
     assert isinstance(sim, MjwarpSimulation)
     state, targets = (_random_targets if random else _task_targets)(context, sim, steps)
