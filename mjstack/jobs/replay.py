@@ -118,7 +118,7 @@ def _plan(cfg: Config) -> ReplayPlan:
         played = success_config(played)
     where = _choose(cfg.sim, record)
     backend, device = where[0]
-    sim = SimCfg(backend=backend, device=device)
+    sim = SimCfg(backend=backend, device=device, step=cfg.sim.step)
     return ReplayPlan(
         run=run,
         gate=gate,
