@@ -230,12 +230,80 @@ def test_a_world_that_is_not_finite_is_alone(device: str) -> None:
     worlds = Worlds(every_row("elliptic", 3, 2), device, njmax=128)
     worlds.step(150)
     before = worlds.solve(fused.solve)
-    for array, value in ((worlds.d.qfrc_smooth, math.nan), (worlds.d.efc.J, math.inf)):
-        wp.to_torch(array)[1] = value
+    tangent = int(np.flatnonzero(worlds.d.efc.type.numpy()[1] == 7)[1])  # the first contact's
+    spoilt = (
+        (worlds.d.qfrc_smooth, slice(None), math.nan),
+        (worlds.d.efc.J, slice(None), math.inf),
+        (worlds.d.efc.aref, tangent, math.nan),
+    )
+    for array, where, value in spoilt:
+        view = wp.to_torch(array)
+        kept = view.clone()
+        view[1, where] = value
         after = worlds.solve(fused.solve)
+        view.copy_(kept)
         assert not np.isfinite(after["qacc"][1]).all()
         for name in RESULTS:
             np.testing.assert_array_equal(after[name][[0, 2, 3]], before[name][[0, 2, 3]])
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("boxes", "slides"), [(0, 1), (5, 1), (5, 2), (5, 3), (8, 0), (9, 6)])
+def test_sizes(boxes: int, slides: int, device: str) -> None:
+    """On CUDA a row of the Hessian is a thread's up to 31 degrees of freedom; columns of J are
+    padded to 4, and above 32 to 16.
+    """
+    bodies = [BOX.format(k, 0.06 * (k % 3), 0.3, 0.05 + 0.07 * k, 10 * k, 3) for k in range(boxes)]
+    arms = [
+        f"<body pos='{k} 1 .15'><joint type='slide' axis='0 0 1'/><geom size='.1'/></body>"
+        for k in range(slides)
+    ]
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><option cone='elliptic' jacobian='dense'/><worldbody>"
+        f"<geom type='plane' size='9 9 .1'/>{''.join(bodies + arms)}</worldbody></mujoco>"
+    )
+    worlds = Worlds(model, device, njmax=256)
+    assert fused.why_not(worlds.m, worlds.d) == ""
+    generator = torch.Generator().manual_seed(0)
+    rows = 0
+    for _ in range(4):
+        worlds.qvel += 0.5 * torch.randn(worlds.qvel.shape, generator=generator).to(device)
+        worlds.step(30)
+        agree(worlds.solve(fused.solve), worlds.solve(mjw.solve), 5e-3)
+        rows = max(rows, int(worlds.d.nefc.numpy().max()))
+    assert rows > boxes
+
+
+def test_sizes_that_do_not_fit() -> None:
+    """A row of J at 48 degrees of freedom has 64 columns."""
+    assert fused.shared_bytes(48, 64, 1152) > 48 * 1024 - 256 > fused.shared_bytes(18, 20, 1152)
+    bodies = "".join(BOX.format(k, 0.1 * k, 0, 0.5, 0, 3) for k in range(8))
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><option cone='elliptic' jacobian='dense'/><worldbody>"
+        f"{bodies}</worldbody></mujoco>"
+    )
+    worlds = Worlds(model, "cpu", njmax=1152)
+    assert "1152 rows need 51,332 bytes of shared memory" in fused.why_not(worlds.m, worlds.d)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_more_equalities_than_room(device: str) -> None:
+    """MJWarp counts them all: such a world is lost, and nothing is read beyond the buffer."""
+    pairs = "".join(f"<joint joint1='j{k}'/>" for k in range(40))
+    bodies = "".join(
+        f"<body pos='{k} 0 1'><joint name='j{k}' axis='0 1 0'/><geom size='.1'/></body>"
+        for k in range(40)
+    )
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><option cone='elliptic' jacobian='dense'/><worldbody>"
+        f"{bodies}</worldbody><equality>{pairs}</equality></mujoco>"
+    )
+    worlds = Worlds(model, device, njmax=16)
+    worlds.step(1)
+    assert worlds.d.ne.numpy().tolist() == [40] * N
+    ours = worlds.solve(fused.solve)
+    assert np.isfinite(ours["qacc"]).all()
 
 
 @pytest.mark.parametrize("device", DEVICES)

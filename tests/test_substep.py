@@ -83,6 +83,43 @@ def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
         assert torch.equal(ours.peak_pool, plain.peak_pool)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("robot", ["so101", "rebot"])
+def test_a_fused_step_ends_where_mjwarps_own_does(robot: str, device: str) -> None:
+    """Steps from equal states, sensors included: a cube between the jaws, then random commands."""
+    ours = worlds(robot, device)
+    plain = worlds(robot, device)
+    assert ours.arrangement == ARRANGEMENTS["fused"]
+    plain.arrange(ARRANGEMENTS["stock"])
+    low, high = torch.from_numpy(ours.model.actuator_ctrlrange).float().to(device).unbind(1)
+    generator = torch.Generator(device).manual_seed(0)
+    cfg = configure(robot=robot)
+    index = SceneIndex(ours.model, cfg.robot, cfg.scene)
+    red = index.object_qpos[0]
+    sensed = torch.zeros(ours.sensordata.shape[1], device=device)
+    for step in range(12):
+        if step == 4:
+            plain.qpos[:, red : red + 3] = plain.site_xpos[:, index.grasp_sites].mean(1)
+        command = low + (high - low) * torch.rand((3, len(low)), generator=generator, device=device)
+        ours.qpos[:] = plain.qpos
+        ours.qvel[:] = plain.qvel
+        wp.copy(ours._d.qacc_warmstart, plain._d.qacc_warmstart)
+        for sim in (ours, plain):
+            sim.ctrl[:] = command
+            sim.step(1 + step % 3, kinematics=True)
+            sim.synchronize()
+        for name in ("contact_count", "constraint_count", "step_count", "solver_limits"):
+            assert torch.equal(getattr(ours, name), getattr(plain, name)), (step, name)
+        for name, size in (("qpos", 1e-5), ("site_xpos", 1e-5), ("qvel", 5e-3)):
+            torch.testing.assert_close(
+                getattr(ours, name), getattr(plain, name), rtol=0.0, atol=size
+            )
+        scale = float(plain.sensordata.abs().max()) + 1.0
+        torch.testing.assert_close(ours.sensordata, plain.sensordata, rtol=0.0, atol=0.01 * scale)
+        sensed += plain.sensordata.abs().sum(0)
+    assert bool((sensed > 0.0).any())
+
+
 @pytest.mark.full
 @pytest.mark.gpu
 @CUDA

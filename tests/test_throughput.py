@@ -29,6 +29,7 @@ from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
 from mjstack.sim import Simulation
 from mjstack.sim.native import NativeSimulation
+from mjstack.sim.substep import ARRANGEMENTS
 
 SHORT = (
     "gates=[throughput]",
@@ -205,11 +206,12 @@ def test_bare_steps_play_the_same_trajectory(
     make_sim: Callable[..., Simulation],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Warp's CPU device is bit-reproducible: whatever else a step does, the physics of both is the
-    same.
+    """Warp's CPU device is bit-reproducible: whatever else an arranged step does, the physics of
+    both is the same.
     """
     context = new_context("nworld=1", *at_double_speed())
     sim = make_sim("mjwarp", 1)
+    sim.arrange(ARRANGEMENTS["arranged"])
     context.play(sim, context.cfg.reset)
     final = sim.qpos.clone()
     seconds, problem = episode.play_bare(context, sim)  # type: ignore[arg-type]

@@ -168,8 +168,10 @@ def measure_arrangements(
     cfg = context.cfg
     decimation = cfg.timing.decimation
     arrangements = {
-        "and counted, its overflow latched": Arrangement(own_stages=False, scratch=False),
-        "temporaries at fixed addresses": Arrangement(own_stages=False),
+        "and counted, its overflow latched": Arrangement(
+            own_stages=False, scratch=False, fused=False
+        ),
+        "temporaries at fixed addresses": Arrangement(own_stages=False, fused=False),
         "only the stages that are needed": Arrangement(
             branches=False, sensors_once=False, fused=False
         ),
@@ -183,6 +185,7 @@ def measure_arrangements(
     sizes = resolve_env_sizes(cfg) if random else None
     sim = context.simulation(cfg.nworld, Backend.mjwarp, device, sizes=sizes)
     assert isinstance(sim, MjwarpSimulation)
+    arrangements = {name: one for name, one in arrangements.items() if sim.allows(one)}
     state, targets = (_random_targets if random else _task_targets)(context, sim, steps)
     columns = torch.as_tensor(context.index.ctrl, device=sim.device)
     bare = sim.bare_step()

@@ -146,10 +146,11 @@ def _unknown_key(key: str, known: Sequence[str], overrides: Sequence[str]) -> Co
     keys = [name for name in keys if not f"{key}.".startswith(f"{name}.")]
 
     def likeness(name: str) -> tuple[float, float]:
-        return (
-            SequenceMatcher(None, leaf, name.rpartition(".")[2]).ratio(),
-            SequenceMatcher(None, key, name).ratio(),
-        )
+        group, _, last = name.rpartition(".")
+        alike = SequenceMatcher(None, leaf, last).ratio()
+        # A key beside this one is likelier meant than its namesake elsewhere.
+        beside = 0.25 if group == parent and alike >= 0.6 else 0.0
+        return alike + beside, SequenceMatcher(None, key, name).ratio()
 
     nearest = max(keys, key=likeness)
     near = likeness(nearest)[0] >= 0.6

@@ -315,7 +315,9 @@ class _Loader(ConfigLoaderImpl):
         if key not in self._merged:
             repo.cache = copy.deepcopy(repo.cache)  # the composition takes its nodes over
             self._merged[key] = super()._compose_config_from_defaults_list(defaults, repo)
-        return copy.deepcopy(self._merged[key])
+        merged = copy.deepcopy(self._merged[key])
+        OmegaConf.clear_cache(merged)  # of ${now:...}
+        return merged
 
 
 def _checked_folder(text: str) -> Path:

@@ -117,8 +117,8 @@ def check_env(context: RunContext, cfg: Config, **keys: str) -> None:
     try:
         build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu").close()
     except KeyedError as error:
-        group, _, rest = error.key.partition(".")
-        error.move(f"{keys.get(group, group)}.{rest}")
+        group, dot, rest = error.key.partition(".")
+        error.move(f"{keys.get(group, group)}{dot}{rest}")
         raise
 
 

@@ -82,6 +82,7 @@ class BatchedIk:
         Raises:
             UnknownName: The model lacks a joint, actuator, site or body of the robot.
             MjstackError: A joint is neither hinge nor slide.
+            ArgumentError: Fewer than 4 iterations with a gain.
         """
         # Device and settings
         self.nworld = nworld
@@ -89,6 +90,8 @@ class BatchedIk:
         self.device = wp.device_to_torch(self._device)
         self._block_dim = block_dim
         gained = posture_gain > 0.0 or approach_gain > 0.0
+        if gained and iterations < 4:
+            raise ArgumentError("iterations", iterations, "at least 4 where a gain is not 0")
         # In the last iterations no gain counts, so they undo what it cost in distance: measured, 2
         # of 4, 3 of 8, 10 of 40.
         guided = iterations - max(min(3, iterations // 2), iterations // 4) if gained else 0

@@ -13,7 +13,7 @@ import mujoco
 from mjstack.sim.warp_setup import mjw, wp
 
 MAX_NV = 64
-_SHARED = 48 * 1024  # bytes of shared memory that every block may have
+_SHARED = 48 * 1024 - 256  # bytes of shared memory that every block may have, less Warp's own
 _ELLIPTIC = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
 _vec5 = wp.types.vector(length=5, dtype=float)
 
@@ -107,7 +107,7 @@ class Problem:
 def why_not(m: mjw.Model, d: mjw.Data) -> str:
     """Why `solve` does not apply to a model; empty if it does."""
     opt = m.opt
-    needed = shared_bytes(m.nv, _rows(d.njmax))
+    needed = shared_bytes(m.nv, d.efc.J.shape[2], _rows(d.njmax))
     reasons = {
         "the solver is not Newton's": opt.solver != mjw.SolverType.NEWTON,
         "the Jacobian is sparse": m.is_sparse,
@@ -127,11 +127,10 @@ def _rows(njmax: int) -> int:
     return -(-njmax // 64) * 64
 
 
-def shared_bytes(nv: int, njmax: int) -> int:
-    """Shared memory of a world, at most [bytes]: the arrays at the head of fused_newton.cpp."""
-    row = -(-nv // 16) * 16
-    floats = (nv + 1) * (nv | 1) + 32 * row + 2 * row + 4 * nv + 5 * njmax
-    return 4 * floats + 6 * njmax
+def shared_bytes(nv: int, row: int, njmax: int) -> int:
+    """Shared memory of a world [bytes]: the arrays at the head of fused_newton.cpp."""
+    floats = (nv + 1) * (nv | 1) + 34 * row + 4 * nv + 5 * njmax
+    return 4 * floats + 8 * njmax
 
 
 def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
@@ -141,16 +140,18 @@ def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
         m: The uploaded model, dense.
         d: The worlds.
     """
-    without = int(m.opt.disableflags) | int(mjw.DisableBit.CONTACT)
-    if m.opt.cone != mjw.ConeType.ELLIPTIC or m.flg_surfacevel or m.opt.disableflags == without:
+    flags = int(m.opt.disableflags)
+    contact = int(mjw.DisableBit.CONTACT)
+    none = flags & (contact | int(mjw.DisableBit.CONSTRAINT))
+    if none or m.opt.cone != mjw.ConeType.ELLIPTIC or m.flg_surfacevel:
         mjw.make_constraint(m, d)
         return
-    opt = dataclasses.replace(m.opt, disableflags=without)
+    opt = dataclasses.replace(m.opt, disableflags=flags | contact)
     mjw.make_constraint(dataclasses.replace(m, opt=opt), d)
     device = d.qvel.device
     warps = 64 * device.sm_count if device.is_cuda else 1
     rows = _fill(Rows(), m, d)
-    rows.disableflags = int(m.opt.disableflags)
+    rows.disableflags = flags
     kernel = _rows_kernel(m.nv, warps)
     wp.launch_tiled(kernel, dim=warps, inputs=[rows], block_dim=32, device=device)
 
@@ -240,7 +241,8 @@ def _newton_kernel(
     @wp.func_native(_source("newton", numbers))
     def newton(world: int, lane: int, io: Problem) -> None: ...
 
-    # Fast on CUDA: division and roots to the last two bits. Of a CPU it would drop NaN.
+    # On CUDA division and roots are then good to the last two bits. On a CPU fast math would assume
+    # that there is no NaN.
     options = {"fast_math": cuda}
 
     @wp.kernel(module="unique", module_options=options, enable_backward=False, grid_stride=False)

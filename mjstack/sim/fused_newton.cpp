@@ -40,11 +40,12 @@ SHARED float ma[NV], mv[NV], smooth[NV], qfrc[NV];
 SHARED float jaref[NJ], jv[NJ];
 // Of a row: in the update weight, direction and force; in the line search three coefficients.
 SHARED float qa[NJ], qb[NJ], qc[NJ];
-SHARED unsigned short head[NJ], item[NJ];  // a row's first row of its contact; contacts' first rows
+// A row's first row of its contact; contacts' first rows; rows with a weight
+SHARED unsigned short head[NJ], item[NJ], active[NJ];
 SHARED unsigned char state[NJ], dims[NJ];  // dims: rows of a row's contact, or 0
 
 const int nefc = wp::min(io.efc_aref.shape[1], io.nefc.data[world]);
-const int ne = io.ne.data[world];
+const int ne = wp::min(nefc, io.ne.data[world]);
 const int nf = io.nf.data[world];
 const int contacts = wp::min(nefc, ne + nf + io.nl.data[world]);  // where their rows begin
 const float *J = &wp::index(io.efc_J, world, 0, 0);
@@ -100,13 +101,14 @@ auto row_dot = [&](int r, const float *x) {
   const float4 *row = reinterpret_cast<const float4 *>(J + r * NVP);
   const float4 *y = reinterpret_cast<const float4 *>(x);
   float total = 0.0f;
-  for (int k = 0; k < NVP / 4; ++k) {
+  for (int k = 0; k < NV / 4; ++k) {
     const float4 a = row[k], b = y[k];
     total += a.x * b.x;
     total += a.y * b.y;
     total += a.z * b.z;
     total += a.w * b.w;
   }
+  for (int c = NV / 4 * 4; c < NV; ++c) total += J[r * NVP + c] * x[c];  // not the padding
   return total;
 };
 
@@ -168,7 +170,7 @@ auto update = [&]() {
         const float u = jaref[r + k] * friction[k - 1];
         tt += u * u;
       }
-      const float t = tt > 0.0f ? sqrtf(tt) : 0.0f;
+      const float t = tt <= 0.0f ? 0.0f : sqrtf(tt);  // NaN stays NaN
       if (n >= mu * t || (t <= 0.0f && n >= 0.0f)) {
         for (int k = 0; k < dim; ++k) {
           state[r + k] = SATISFIED;
@@ -276,8 +278,6 @@ for (int o = 0; o < OWN; ++o) {
 // The Newton direction: search = -H^-1 gradient; its square, and the gradient's decrement.
 float search_square = 0.0f;
 auto direction = [&]() {
-  // Rows with a weight; `item` keeps the contacts, and theirs come behind them.
-  unsigned short *active = reinterpret_cast<unsigned short *>(jv);
   const int rows = compact(0, nefc, [&](int r) {
     if (state[r] == CONE) return !(r == head[r] + 2 && dims[r] == 3);
     return qa[r] != 0.0f;
@@ -454,7 +454,7 @@ auto contact_at = [&](int r) {
   c.speed = qb[r + 2];
   c.dm = qc[r + 2];
   const float uu = c.along * c.along + c.across;
-  c.t0 = uu > 0.0f ? sqrtf(uu) : 0.0f;
+  c.t0 = uu <= 0.0f ? 0.0f : sqrtf(uu);
   c.r0 = c.cost0 = 0.0f;
   if (uu <= 0.0f) {
     c.state0 = c.u0 < 0.0f ? QUADRATIC : SATISFIED;
@@ -475,8 +475,8 @@ auto contact_point = [&](const Contact &c, float a) {
   const float n = c.u0 + a * c.v0;
   const float w = c.along + a * c.speed;
   const float tt = w * w + c.across;
-  const float t = tt > 0.0f ? sqrtf(tt) : 0.0f;
-  if (tt > 0.0f ? n >= c.mu * t : n >= 0.0f) return Point{-c.cost0, 0.0f, 0.0f};
+  const float t = tt <= 0.0f ? 0.0f : sqrtf(tt);  // NaN stays NaN
+  if (tt <= 0.0f ? n >= 0.0f : n >= c.mu * t) return Point{-c.cost0, 0.0f, 0.0f};
   const float a_q2 = a * c.q2;
   if (tt <= 0.0f || c.mu * n + t <= 0.0f) {
     float cost = a * (a_q2 + c.q1);
@@ -559,7 +559,7 @@ for (;; ++iteration) {
   const float decrement = direction();
   if (iteration > 0 && scale * 0.5f * decrement < tolerance) break;
   if (iteration == ITERATIONS) {
-    bits |= LIMIT;
+    if (ITERATIONS > 0) bits |= LIMIT;
     break;
   }
 
@@ -677,6 +677,7 @@ for (;; ++iteration) {
     acc[i] += alpha * search[i];
     ma[i] += alpha * mv[i];
   }
+  // All have read the rows by now: alpha came from every thread's sum.
   for (int r = lane; r < nefc; r += T) jaref[r] += alpha * jv[r];
   SYNC();
 }

@@ -93,6 +93,7 @@ for (int con = warp; con < count; con += STRIDE) {
     if (power != 1.0f)
       y = depth <= middle ? powf(depth, power) / powf(middle, power - 1.0f)
                           : 1.0f - powf(1.0f - depth, power) / powf(1.0f - middle, power - 1.0f);
+    // Of a dmin above dmax MJWarp would always make dmax; MuJoCo does this.
     impedance = wp::min(wp::max(low + y * (high - low), wp::min(low, high)), wp::max(low, high));
   }
   const auto &normal_ref = io.contact_solref.data[con];

@@ -92,13 +92,17 @@ class MjwarpSimulation(Simulation):
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
-            step, why = self._resolve(step)
+            self._best, self._why = self._best_step()
+            step = self._resolve(step)
             self._usage = usage = Usage(model, nworld, self.device)
 
         self.arrangement = ARRANGEMENTS[step]
         self.description = (
-            f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}, {step} step{why}"
+            f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}, {step} step"
         )
+
+        if self._why and step == self._best:
+            self.description += f" ({self._why})"
 
         # Views of state, fields and counters
         for name in (
@@ -213,11 +217,20 @@ class MjwarpSimulation(Simulation):
             self._usage.count(self._m, self._d, steps=0)
 
     def arrange(self, arrangement: Arrangement) -> None:
-        """Choose how a captured step is arranged; for measurements, because the numbers stay the
-        same.
+        """Choose how a captured step is arranged, for measurements.
+
+        Raises:
+            UnsupportedModel: The arrangement leaves out something that the model needs.
         """
+        if not self.allows(arrangement):
+            raise UnsupportedModel(f"this step does not apply: {self._why}", "Choose another")
         self.arrangement = arrangement
         self._graphs.clear()
+
+    def allows(self, arrangement: Arrangement) -> bool:
+        """Whether an arrangement does all that the model needs."""
+        best = ARRANGEMENTS[self._best]
+        return arrangement.own_stages <= best.own_stages and arrangement.fused <= best.fused
 
     def synchronize(self) -> None:
         """Wait for the device."""
@@ -259,24 +272,24 @@ class MjwarpSimulation(Simulation):
             branches=arrangement.branches,
         )
 
-    def _resolve(self, step: str) -> tuple[str, str]:
-        """The step that is done, and why it is no better one."""
-        found = "fused"
-        why = ""
+    def _best_step(self) -> tuple[str, str]:
+        """The fastest step that does all that the model needs, and why there is no faster one."""
         if not can_rearrange(self.model, self._m):
-            found = "stock"
-            why = "the model has features that only mujoco_warp.step knows"
-        elif why := fused.why_not(self._m, self._d):
-            found = "arranged"
-        order = list(ARRANGEMENTS)
-        if step == "auto":
-            if why:
-                _tell(f"sim.step: {found}, because {why}.")
-                why = f" ({why})"
-            return found, why
-        if order.index(step) > order.index(found):
-            raise UnsupportedModel(f"sim.step={step} does not apply: {why}", "Use sim.step=auto")
-        return step, ""
+            return "stock", "the model has features that only mujoco_warp.step knows"
+        why = fused.why_not(self._m, self._d)
+        return ("arranged", why) if why else ("fused", "")
+
+    def _resolve(self, asked: str) -> str:
+        """The step that is done."""
+        if asked == "auto":
+            if self._why:
+                _tell(f"sim.step: {self._best}, because {self._why}.")
+            return self._best
+        if not self.allows(ARRANGEMENTS[asked]):
+            raise UnsupportedModel(
+                f"sim.step={asked} does not apply: {self._why}", "Use sim.step=auto"
+            )
+        return asked
 
     def _pose(self) -> None:
         """Poses of the current qpos, and nothing that a later step would start from: its forward
