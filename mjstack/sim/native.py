@@ -199,10 +199,6 @@ class NativeSimulation(Simulation):
 
     def _visit(self, worlds: np.ndarray, n: int) -> Iterator[np.ndarray]:
         """Worlds in parts that take n steps in one call of MuJoCo's."""
-        if self._simple is not None:
-            self._simple.update()
-        for own, values in self._single:
-            own[:] = values
         size = self.nthread * max(1, _STEPS // n)
         for first in range(0, len(worlds), size):
             check_interrupt()
@@ -211,6 +207,10 @@ class NativeSimulation(Simulation):
     def _compute(self, n: int, kinematics: bool) -> None:
         """Step every world n times, 0 meaning forward."""
         batch = self._batch
+        if self._simple is not None:
+            self._simple.update()
+        for own, values in self._single:
+            own[:] = values
         finite = self._finite_worlds([*self._poses, *self._others.values()])
         for worlds in self._visit(finite, max(n, 1)):
             self._flags[worlds] = self.model.opt.disableflags
