@@ -467,6 +467,14 @@ def test_native_threads_do_not_matter(make_sim: Make, stage: Stage) -> None:
     assert torch.equal(*finals)
 
 
+def test_a_model_that_sleeps_is_refused() -> None:
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_body().add_geom(size=[0.1, 0, 0])
+    spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    with pytest.raises(UnsupportedModel, match=r"many worlds of this model: sleep and IPC .*\.$"):
+        make_simulation(spec.compile(), load_config([]), 1, backend=Backend.native)
+
+
 @pytest.mark.full
 def test_unsupported_model_says_so_in_one_line() -> None:
     spec = mujoco.MjSpec()

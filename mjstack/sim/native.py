@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from mujoco.batch import Batch
 
+from mjstack.errors import UnsupportedModel, first_line
 from mjstack.interrupt import check_interrupt
 from mjstack.sim.model_fields import Fields, SimpleBodies, check_fields
 from mjstack.sim.simulation import Overflow, Simulation, named_options
@@ -71,6 +72,8 @@ class NativeSimulation(Simulation):
 
         Raises:
             UnknownName: A field does not exist, or cannot differ.
+            UnsupportedModel: The model sleeps, or has IPC contacts: what MuJoCo keeps of these from
+                step to step is not in the state.
         """
         names = check_fields(fields)
         self.model = m = copy.copy(model)
@@ -86,7 +89,13 @@ class NativeSimulation(Simulation):
         for kind, offsets in _SAMEFRAME.items():
             if not offsets.isdisjoint(names):
                 getattr(own, kind)[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
-        self._batch = batch = Batch(own, nworld, nthread)
+        try:
+            self._batch = batch = Batch(own, nworld, nthread)
+        except ValueError as error:
+            raise UnsupportedModel(
+                f"MuJoCo cannot step many worlds of this model: {first_line(error)}",
+                "Remove the feature from the model",
+            ) from error
 
         # The state
         self._initial = batch.state[0].copy()
