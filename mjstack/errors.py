@@ -95,7 +95,7 @@ class FolderError(MjstackError):
 
 
 class UnsupportedModel(MjstackError):
-    """MJWarp does not implement a feature of the model."""
+    """A backend does not implement a feature of the model."""
 
 
 class TermError(KeyedError):

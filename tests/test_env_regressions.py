@@ -16,7 +16,7 @@ import mjstack
 from mjstack.config.schema import ObservationTermCfg, TermCfg
 from mjstack.envs import Env, build_env
 from mjstack.episodes.context import RunContext
-from mjstack.errors import ConfigError, FaultError, MjstackError, TermError
+from mjstack.errors import ArgumentError, ConfigError, FaultError, MjstackError, TermError
 
 pytestmark = pytest.mark.full
 
@@ -93,6 +93,28 @@ def test_ctrl_c_leaves_no_thread_at_work(stage: Callable[[str], RunContext]) -> 
         timer.join()
         signal.signal(signal.SIGINT, before)
     sim.close()
+
+
+def test_torch_has_its_threads_back_after_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = native()
+    env.reset(seed=0)
+    inside = []
+    step = env.sim.step
+
+    def watched(n: int = 1, *, kinematics: bool = False) -> None:
+        inside.append(torch.get_num_threads())
+        step(n, kinematics=kinematics)
+
+    monkeypatch.setattr(env.sim, "step", watched)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        env.step(zeros(env))
+        with pytest.raises(ArgumentError):
+            env.step(zeros(env)[:1])
+        assert (inside, torch.get_num_threads()) == ([1], 3)
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("robot", ["so101", "rebot"])

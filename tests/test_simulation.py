@@ -416,6 +416,44 @@ def test_native_does_not_reset_a_diverged_world(make_sim: Make, stage: Stage) ->
     assert not mujoco.mjtDisableBit.mjDSBL_AUTORESET & stage("so101").model.opt.disableflags
 
 
+# 435 pairs of balls, all of which MuJoCo calls contacts, in memory for some 170.
+CROWD = """
+<mujoco>
+  <size memory="150K"/>
+  <default><geom size="0.02" condim="1" gap="10"/></default>
+  <worldbody>
+    <replicate count="30" offset="0 0 0.1"><body><freejoint/><geom/></body></replicate>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("most", [4096, 4])
+def test_native_worlds_that_mujoco_warns_of_take_every_step(
+    most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Many steps in one call of MuJoCo's, and in calls of few worlds each, are as many single ones,
+    also for worlds that overflow or diverge.
+    """
+    from mjstack.sim import native
+
+    monkeypatch.setattr(native, "_STEPS", most)
+    finals = []
+    for calls in (1, 20):
+        sim = native.NativeSimulation(mujoco.MjModel.from_xml_string(CROWD), 5, nthread=2)
+        sim.qpos[2, ::7] += 1e3 * torch.arange(30)
+        sim.qvel[1, 0] = 1e12
+        for _ in range(3):
+            for _ in range(calls):
+                sim.step(20 // calls, kinematics=calls == 1)
+        sim.kinematics()
+        finals.append([getattr(sim, name) for name in (*VIEWS, *COUNTS, "step_count")])
+        assert sim.overflow.tolist() == [8, 8, 0, 8, 8]
+        assert sim.step_count.tolist()[2:] == [60, 60, 60]
+    for one, other in zip(*finals, strict=True):
+        assert torch.equal(one.nan_to_num(7.0), other.nan_to_num(7.0))
+
+
 def test_native_threads_do_not_matter(make_sim: Make, stage: Stage) -> None:
     from mjstack.sim.native import NativeSimulation
 
@@ -427,6 +465,14 @@ def test_native_threads_do_not_matter(make_sim: Make, stage: Stage) -> None:
         finals.append(sim.qpos.clone())
         sim.close()
     assert torch.equal(*finals)
+
+
+def test_a_model_that_sleeps_is_refused() -> None:
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_body().add_geom(size=[0.1, 0, 0])
+    spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    with pytest.raises(UnsupportedModel, match=r"many worlds of this model: sleep and IPC .*\.$"):
+        make_simulation(spec.compile(), load_config([]), 1, backend=Backend.native)
 
 
 @pytest.mark.full

@@ -1,6 +1,7 @@
 """The environment: one step order over any simulation."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -22,6 +23,7 @@ from mjstack.sim import Simulation
 from mjstack.sim.graph import StepGraph, side_by_side
 
 FAULT_WINDOW = 200  # steps between two reads of the faults on CUDA; on the CPU each step reads
+_WORLDS_PER_THREAD = 2048  # of torch, on the CPU
 
 
 class Env:
@@ -194,12 +196,13 @@ class Env:
         if not self._started:
             found = "step() before reset(), or after close()"
             raise ArgumentError("env", found, "reset() first", "Call env.reset()")
-        self.action_manager.process(action)
-        self.graph()
-        self._steps += 1
-        if self._check_faults and self._all_worlds.is_cuda and self._steps % FAULT_WINDOW == 0:
-            self.raise_faults()
-        return self._outputs.returned()
+        with self._few_threads():
+            self.action_manager.process(action)
+            self.graph()
+            self._steps += 1
+            if self._check_faults and self._all_worlds.is_cuda and self._steps % FAULT_WINDOW == 0:
+                self.raise_faults()
+            return self._outputs.returned()
 
     def advance(self) -> None:
         """The part of `step` that is the same at every step: it acts on the action that was
@@ -220,7 +223,7 @@ class Env:
             name: Its name in messages.
         """
         return StepGraph(
-            work,
+            self._few_threads()(work),
             self.device,
             self.cfg.graph if self.device.type == "cuda" else "off",
             name=name,
@@ -280,6 +283,23 @@ class Env:
             self.reward_manager,
         )
         return "\n".join((head, *(str(manager) for manager in managers)))
+
+    @contextmanager
+    def _few_threads(self) -> Iterator[None]:
+        """Torch on few threads inside, on the CPU: the numbers of some thousand worlds are too few
+        to share out, and threads that wait for more take cores from the physics.
+        """
+        before = threads = torch.get_num_threads()
+        if self.device.type == "cpu":
+            threads = max(1, min(before, self.nworld // _WORLDS_PER_THREAD))
+        if threads == before:
+            yield
+            return
+        torch.set_num_threads(threads)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
 
     def _step_physics(self) -> None:
         current_term.label = ""

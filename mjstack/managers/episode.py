@@ -102,7 +102,7 @@ class RewardManager(_ValueManager):
         """
         if self._terms:
             torch.mul(
-                torch.stack([term(self._env).float() for term in self._terms.values()], 1),
+                torch.stack([term(self._env) for term in self._terms.values()], 1).float(),
                 self.weights,
                 out=self.values,
             )

@@ -92,10 +92,8 @@ class _Group:
     def compute(self) -> torch.Tensor:
         """One step of every world, shape ``(nworld, sum of widths)``."""
         n = self._env.nworld
-        values = [
-            part.term(self._env).float().reshape(n, part.width) for part in self.parts.values()
-        ]
-        step = torch.cat(values, dim=1)
+        values = [part.term(self._env).reshape(n, part.width) for part in self.parts.values()]
+        step = torch.cat(values, dim=1).float()
         if len(self._noise_columns):
             size = len(self._noise_columns)
             draw = random_uniform(

@@ -86,6 +86,7 @@ def random_uniform(
     low: float = -1.0,
     high: float = 1.0,
     step: torch.Tensor | None = None,
+    mask: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Random numbers of every world's current episode, which depend neither on nworld nor on which
     worlds reset.
@@ -97,6 +98,8 @@ def random_uniform(
         low: Smallest value.
         high: Upper bound.
         step: Step within the episode, shape ``(nworld,)``; 0 if None, which is right for resets.
+        mask: Worlds whose numbers are read, shape ``(nworld,)``, bool, all if None: the others'
+            may be any.
 
     Returns:
         Shape ``(nworld, size)``, in the type of the simulation's floats.
@@ -117,10 +120,31 @@ def random_uniform(
             high=high,
         )
     step = torch.zeros_like(env.world) if step is None else step
+    at = rows_of(mask)
     draw = uniform(
-        seed=env.seed, world=env.world, episode=env.episode, step=step, stream=stream, size=size
+        seed=env.seed,
+        world=env.world[at],
+        episode=env.episode[at],
+        step=step[at],
+        stream=stream,
+        size=size,
     )
-    return low + 0.5 * (high - low) * (draw.to(env.sim.qpos.dtype) + 1.0)
+    numbers = low + 0.5 * (high - low) * (draw.to(env.sim.qpos.dtype) + 1.0)
+    return spread(numbers, at, env.nworld)
+
+
+def rows_of(mask: torch.Tensor | None) -> torch.Tensor | slice:
+    """The worlds of a mask where the host can look at it, and all of them on CUDA: an index for
+    what costs by the world.
+    """
+    return slice(None) if mask is None or mask.is_cuda else mask.nonzero().squeeze(1)
+
+
+def spread(part: torch.Tensor, at: torch.Tensor | slice, nworld: int) -> torch.Tensor:
+    """What was computed for the worlds of `rows_of`, and 0 for the others."""
+    if isinstance(at, slice):
+        return part
+    return part.new_zeros((nworld, *part.shape[1:])).index_copy_(0, at, part)
 
 
 def episode_draw(

@@ -11,7 +11,14 @@ from torch import Tensor
 from mjstack.config.fields import Count, NotNegative
 from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
-from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields
+from mjstack.managers.view import (
+    EnvView,
+    offers,
+    random_uniform,
+    rows_of,
+    spread,
+    uses_fields,
+)
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import Pose, pose_w, robot, write_object, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet
@@ -55,7 +62,7 @@ class JointNoise:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos and ctrl."""
-        noise = random_uniform(env, self.label, self._width.shape[0])
+        noise = random_uniform(env, self.label, self._width.shape[0], mask=mask)
         command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
         write_robot(env, mask, torch.clamp(command, self._low, self._high))
 
@@ -82,7 +89,8 @@ class JitterObjects:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos."""
-        draws = random_uniform(env, self.label, 3 * len(env.index.objects)).view(env.nworld, -1, 3)
+        count = 3 * len(env.index.objects)
+        draws = random_uniform(env, self.label, count, mask=mask).view(env.nworld, -1, 3)
         for number, name in enumerate(env.index.objects):
             xy, yaw = draws[:, number].split((2, 1), dim=1)
             _write_object(env, mask, name, self._xy * xy, self._yaw * yaw[:, 0])
@@ -153,13 +161,16 @@ class RandomizeObjects:
         """Write qpos."""
         count = len(env.index.objects)
         some = count * (2 * self._candidates + 1)
-        draws = random_uniform(env, self.label, some + 2 * count * self._more)
-        first = draws[:, :some].reshape(env.nworld, count, -1)
-        more = draws[:, some:].reshape(env.nworld, count, -1)
+        at = rows_of(mask)
+        draws = random_uniform(env, self.label, some + 2 * count * self._more, mask=mask)[at]
+        first = draws[:, :some].reshape(len(draws), count, -1)
+        more = draws[:, some:].reshape(len(draws), count, -1)
         candidates = torch.cat((first[..., 1:], more), dim=2)
-        offsets, _ = self._placement.choose(candidates.reshape(env.nworld, count, -1, 2))
+        offsets, _ = self._placement.choose(candidates.reshape(len(draws), count, -1, 2))
+        offsets = spread(offsets, at, env.nworld)
+        yaw = spread(self._yaw * first[..., 0], at, env.nworld)
         for number, name in enumerate(env.index.objects):
-            _write_object(env, mask, name, offsets[:, number], self._yaw * first[:, number, 0])
+            _write_object(env, mask, name, offsets[:, number], yaw[:, number])
 
 
 class _Randomized:
@@ -174,7 +185,7 @@ class _Randomized:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write the model fields."""
-        factors = random_uniform(env, self.label, len(self._nominal), *self._ends)
+        factors = random_uniform(env, self.label, len(self._nominal), *self._ends, mask=mask)
         self._quantity.write(mask, self._nominal * factors)
 
 

@@ -79,7 +79,7 @@ def make_simulation(
 
     Raises:
         UnknownName: A field does not exist, or cannot differ.
-        UnsupportedModel: MJWarp, or ``sim.step``, does not implement a feature of the model.
+        UnsupportedModel: The backend, or ``sim.step``, does not implement a feature of the model.
     """
     backend, device = resolve_backend(cfg, backend, device)
     if backend is Backend.native:

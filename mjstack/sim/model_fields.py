@@ -85,22 +85,23 @@ class SimpleBodies:
     mass is changed would weigh more and resist no more, so ``dof_M0`` has to follow.
 
     Attributes:
-        dof_M0: Diagonal of the mass matrix at qpos0 [kg, kg m2], shape ``(nworld, nv)``.
+        dof_M0: Diagonal of the mass matrix at qpos0 [kg, kg m2], shape ``(nworld, nv)``, written
+            in place.
     """
 
     FIELDS = ("body_mass", "body_inertia", "dof_armature")
 
     def __init__(
-        self, model: mujoco.MjModel, fields: Mapping[str, np.ndarray], nworld: int
+        self, model: mujoco.MjModel, fields: Mapping[str, np.ndarray], dof_M0: np.ndarray
     ) -> None:
         """Find the degrees of freedom and what their inertia is made of.
 
         Args:
             model: The compiled model.
             fields: Every world's values of the fields that differ.
-            nworld: Number of worlds.
+            dof_M0: The attribute.
         """
-        self.dof_M0 = np.repeat(model.dof_M0[None], nworld, axis=0)
+        self.dof_M0 = dof_M0
         self._dofs = np.flatnonzero(model.dof_simplenum)
         self._bodies = model.dof_bodyid[self._dofs]
         self._sources = [fields.get(name, getattr(model, name)[None]) for name in self.FIELDS]
