@@ -141,23 +141,25 @@ def solve_natively(native: NativeSimulation, sample: Sample, most: int) -> Numbe
         getattr(native, name).copy_(values)
     for name, values in sample.fields.items():
         native.fields[name].copy_(values)
-    size = native.model.nv
-    names = dict.fromkeys((*VECTORS, *VECTORS.values()), size) | {"nefc": 1}
+    native.forward()  # derives from the fields what a simple body's inertia needs
+    nv = native.model.nv
+    names = dict.fromkeys((*VECTORS, *VECTORS.values()), nv) | {"nefc": 1}
     out = {name: np.full((native.nworld, size), np.nan) for name, size in names.items()}
     residuals = np.full((native.nworld, most), np.inf)
-
-    def work(worker: Any, worlds: Iterable[int]) -> None:
-        for world in worlds:
-            native._load(worker, world)
-            mujoco.mj_forward(worker.model, worker.data)
-            for name, values in out.items():
-                values[world] = getattr(worker.data, name)
-            product = np.empty(worker.data.nefc)
-            mujoco.mj_mulJacVec(worker.model, worker.data, product, worker.data.qacc_smooth)
-            product -= worker.data.efc_aref
-            residuals[world, : len(product)] = product[:most]
-
-    native._visit(work, native._finite_worlds())
+    batch = native.batch
+    model = copy.copy(native.model)
+    data = mujoco.MjData(model)
+    finite = torch.cat([native.qpos, native.qvel, native.act], dim=1).isfinite().all(1)
+    for world in finite.nonzero().ravel().tolist():
+        batch.get_model(world, model)
+        batch.get_data(world, data)
+        mujoco.mj_forward(model, data)
+        for name, found in out.items():
+            found[world] = getattr(data, name)
+        product = np.empty(data.nefc)
+        mujoco.mj_mulJacVec(model, data, product, data.qacc_smooth)
+        product -= data.efc_aref
+        residuals[world, : len(product)] = product[:most]
     return {**out, "residuals": residuals}
 
 

@@ -50,6 +50,9 @@ class NativeSimulation(Simulation):
     which thread it gets. MuJoCo's automatic reset of a diverged world is switched off, because it
     would hide the divergence; a world whose state is not finite is not stepped any more, and its
     derived arrays are NaN.
+
+    Attributes:
+        batch: The worlds in MuJoCo's hands.
     """
 
     backend = "native"
@@ -90,7 +93,7 @@ class NativeSimulation(Simulation):
             if not offsets.isdisjoint(names):
                 getattr(own, kind)[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
         try:
-            self._batch = batch = Batch(own, nworld, nthread)
+            self.batch = batch = Batch(own, nworld, nthread)
         except ValueError as error:
             raise UnsupportedModel(
                 f"MuJoCo cannot step many worlds of this model: {first_line(error)}",
@@ -159,7 +162,7 @@ class NativeSimulation(Simulation):
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """See `Simulation`."""
         rows = self._rows(mask)
-        self._batch.state[rows] = self._initial
+        self.batch.state[rows] = self._initial
         if "qpos0" in self._fields:
             self.qpos.numpy()[rows] = self._fields["qpos0"][rows]
         self._others["sensordata"][rows] = 0
@@ -170,7 +173,7 @@ class NativeSimulation(Simulation):
     @property
     def world_bytes(self) -> int:
         """Memory that a world takes."""
-        arrays = (self._batch.state, *self._poses, *self._others.values())
+        arrays = (self.batch.state, *self._poses, *self._others.values())
         return sum(a.nbytes for a in (*arrays, *self._fields.values())) // self.nworld
 
     def option_values(self) -> dict[str, float | int | str]:
@@ -215,7 +218,7 @@ class NativeSimulation(Simulation):
 
     def _compute(self, n: int, kinematics: bool) -> None:
         """Step every world n times, 0 meaning forward."""
-        batch = self._batch
+        batch = self.batch
         if self._simple is not None:
             self._simple.update()
         for own, values in self._single:
@@ -245,7 +248,7 @@ class NativeSimulation(Simulation):
 
     def _integrate(self, worlds: np.ndarray, n: int) -> np.ndarray:
         """Step worlds n times; their largest numbers of contacts and rows on the way."""
-        batch = self._batch
+        batch = self.batch
         begun = batch.bind("time")[worlds]
         found = batch.rollout(n, record=_COUNTS, ids=worlds)
         most = np.stack([found[name].max(axis=1) for name in _COUNTS], axis=1)
@@ -264,4 +267,4 @@ class NativeSimulation(Simulation):
     def _pose(self, worlds: np.ndarray) -> None:
         """Bring the poses of worlds up to date."""
         self._flags[worlds] = self.model.opt.disableflags | _POSES_ONLY
-        self._batch.forward(worlds, mujoco.mjtStage.mjSTAGE_POS)
+        self.batch.forward(worlds, mujoco.mjtStage.mjSTAGE_POS)
