@@ -2,6 +2,18 @@
 verified in gates.
 """
 
+import os
+import sys
+
+# With -m, Python puts the working folder first, which may be a stranger's, where any module of
+# Python's own may be another one. A checkout's own stays.
+if (
+    sys.argv[:1] == ["-m"]
+    and not sys.flags.safe_path
+    and os.path.realpath(sys.path[0]) != os.path.realpath(f"{os.path.dirname(__file__)}/..")
+):
+    del sys.path[0]
+
 from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any

@@ -1,7 +1,6 @@
 """The command: ``mjstack``, ``python -m mjstack`` and ``python scripts/run.py``."""
 
 import sys
-from pathlib import Path
 
 from mjstack.interrupt import EXIT_CODE, handle_interrupts, interrupted
 
@@ -16,7 +15,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    # Python puts the working folder first, which may be a stranger's; a checkout's own stays.
-    if not sys.flags.safe_path and sys.path[0] != str(Path(__file__).parents[1]):
-        del sys.path[0]
     main()

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from mjstack.jobs import CheckedJob
 
 # mjstack runs its own configuration.
-_OTHER_CONFIG = {"--config-name", "-cn", "--config-path", "-cp"}
+_OTHER_CONFIG = {"--config-name", "-cn", "--config-path", "-cp", "--experimental-rerun"}
 
 _checked: dict[tuple[str, ...], "CheckedJob"] = {}  # by their overrides, until Hydra runs them
 _results: list[Report] = []  # of the jobs that ran in this process
@@ -139,6 +139,11 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     jobs = _expand(overrides)
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
     master = compose(hydra, overrides, RunMode.MULTIRUN)
+    if jobs and master.hydra.sweeper.get("params"):
+        raise CompositionError(
+            "hydra.sweeper.params: expected none. Give the values on the command line, as in"
+            " -m nworld=1,2."
+        )
     folder = _hydra_path(master, "sweep.dir")
     taken: dict[Path, int] = {}
     for number, job in enumerate(jobs):
@@ -251,7 +256,7 @@ def _hydra_path(cfg: DictConfig, key: str) -> Path:
     """A path below ``hydra``, as Hydra will find it."""
     HydraConfig.instance().set_config(cfg)  # for what is interpolated
     OmegaConf.set_readonly(cfg.hydra, None)
-    return Path(str(OmegaConf.select(cfg, f"hydra.{key}")))
+    return Path(str(OmegaConf.select(cfg, f"hydra.{key}", throw_on_missing=True)))
 
 
 def _print_sweep(outcomes: list[Report], folder: Path) -> None:

@@ -136,8 +136,16 @@ def check_unused(folder: Path, job: str = "", own: str = "") -> None:
         own: A file by which the job knows its folder even without the report.
 
     Raises:
-        FolderError: It has another run, or other files.
+        FolderError: It has another run, or other files, or links in place of files to be written.
     """
+    for path in (*folder.glob("*"), *folder.glob(".hydra/*")):
+        # A folder for data may be on another disk.
+        data = path.parent == folder and path.name != ".hydra" and path.is_dir()
+        if path.is_symlink() and not data:
+            raise FolderError(
+                f"{path} is a link, and what it leads to would be overwritten",
+                "Remove it, or set hydra.run.dir (job=collect: job.folder) to another folder",
+            )
     names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     used = sorted(name for name in names if name != ".hydra" and not name.endswith(".log"))
     if not used or own in names:

@@ -15,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from environments import has_gl
+from environments import at_double_speed, has_gl
 
 import mjstack
 from mjstack import cli
@@ -425,3 +425,19 @@ def test_ctrl_c_leaves_the_finished_gates_and_a_kill_would_too(folder: Path) -> 
         assert report["status"] == "interrupted"
         gates = [(gate["name"], gate["status"]) for gate in report["gates"]]
         assert gates == [("baseline", "pass")]
+
+
+@pytest.mark.full
+def test_a_reader_that_goes_away_fails_nothing(tmp_path: Path) -> None:
+    """As in ``mjstack ... | head -1``: the run goes on without an output."""
+    args = ["sim=native", "nworld=2", "gates=[baseline,batch]", f"hydra.run.dir={tmp_path}/run"]
+    command = [sys.executable, "scripts/run.py", *args, *at_double_speed()]
+    done = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=Path(__file__).parents[1]
+    )
+    assert done.stdout is not None
+    done.stdout.read(1)
+    done.stdout.close()
+    assert done.wait() == 0, done.stderr and done.stderr.read()
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert [gate["status"] for gate in report["gates"]] == ["pass", "pass"]

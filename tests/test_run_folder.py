@@ -148,6 +148,35 @@ def test_jobs_of_a_sweep_may_not_share_a_folder(
     assert contents(Path()) == {}
 
 
+def test_a_sweeper_with_parameters_is_refused(
+    begin: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its jobs would not be known before."""
+    text = "# @package _global_\nhydra: {sweeper: {params: {seed: '1,2'}}, sweep: {subdir: same}}\n"
+    put(Path(), {"conf/experiment/two.yaml": text})
+    before = contents(Path())
+    assert begin("-m", "--config-dir", "conf", "experiment=two") == 2
+    assert "hydra.sweeper.params: expected none" in capsys.readouterr().err
+    assert contents(Path()) == before
+
+
+@pytest.mark.parametrize("link", [".hydra", ".hydra/overrides.yaml", "run.log"])
+def test_a_folder_with_links_is_refused(
+    link: str, begin: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    precious = Path("precious")
+    (precious if link == ".hydra" else Path("elsewhere")).mkdir()
+    if link != ".hydra":
+        precious.write_text("precious")
+    place = Path("given") / link
+    place.parent.mkdir(parents=True)
+    place.symlink_to(precious.resolve())
+    before = contents(Path())
+    assert begin("hydra.run.dir=given") == 2
+    assert f"given/{link} is a link" in capsys.readouterr().err
+    assert contents(Path()) == before
+
+
 @pytest.mark.full
 def test_jobs_of_a_sweep_may_be_named(begin: Callable[..., int]) -> None:
     assert begin("-m", "seed=1,2", "hydra.sweep.subdir=s${seed}", "hydra.sweep.dir=x") == 0

@@ -145,12 +145,39 @@ def test_no_module_of_the_folder_is_imported(
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("way", ["link", "two places"])
+def test_a_package_that_the_folder_lies_in_is_not_trusted(
+    way: str, stranger: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor where its configuration is a link that leads elsewhere, or where the package has a second
+    place beside the search path.
+    """
+    home = Path("home")
+    (home / "conf" / "task").mkdir(parents=True)
+    (home / "outputs").mkdir()
+    saved = stranger / ".hydra" / "config.yaml"
+    if way == "link":
+        inside = home / "outputs" / "run" / ".hydra"
+        inside.mkdir(parents=True)
+        (inside / "config.yaml").symlink_to(saved.resolve())
+        saved = inside / "config.yaml"
+    else:
+        saved = Path("outputs") / "run" / "config.yaml"
+        saved.parent.mkdir(parents=True)
+        saved.touch()
+        sys.path.insert(0, str(Path.cwd()))
+    sys.path.insert(0, str(home.resolve()))
+    with search_path([str(home / "conf")]):
+        assert not is_trusted("outputs.run.payload.f", saved)
+
+
+@pytest.mark.full
 @pytest.mark.parametrize("start", ["-m mjstack", "scaling"])
 def test_the_working_folder_is_not_imported_from(
     start: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("hydra", "omegaconf", "rich"):
+    for name in ("hydra", "omegaconf", "rich", "json", "difflib", "pathlib", "platform"):
         Path(f"{name}.py").write_text(PAYLOAD)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     if start == "scaling":

@@ -159,7 +159,7 @@ def _unknown_key(key: str, known: Sequence[str], overrides: Sequence[str]) -> Co
         return CompositionError(
             f"'{key}' is not in the configuration.{hint} To add it, write +{key}=..."
         )
-    beside = [name for name in keys if name.rpartition(".")[0] == parent]
+    beside = {name for name in keys if name.rpartition(".")[0] == parent}
     return CompositionError(
         f"configuration key '{key}' does not exist.{hint or ' ' + suggest(key, beside)}"
     )

@@ -170,13 +170,19 @@ def is_trusted(dotted: str, saved: Path) -> bool:
         found = find_spec(package)
     except ValueError:  # no name of a module, or __main__
         return False
-    # The origin of a module of Python's own is a word, such as frozen.
-    places = [*(found.submodule_search_locations or ()), found.origin or ""] if found else []
+    # A package may have several places, and a module of them may come from any. The origin of a
+    # module of Python's own is a word, such as frozen.
+    places = [*(found.submodule_search_locations or (found.origin or "",))] if found else []
     beside = [folder.parent for folder in _added.get()]
-    return any(
+    own = {saved.resolve(), Path(os.path.abspath(saved))}  # it may be a link
+    return bool(places) and all(
         Path(place).is_absolute()
         and Path(place).resolve().parent in beside
-        and not saved.resolve().is_relative_to(Path(place).resolve())
+        and not any(
+            file.is_relative_to(folder)
+            for file in own
+            for folder in (Path(place), Path(place).resolve())
+        )
         for place in places
     )
 

@@ -142,6 +142,13 @@ class DatasetWriter:
 
     def _resume(self) -> None:
         """Count what is committed, and clear away what is not."""
+        for pattern in ("data", "data/*", "meta", "meta/*", "meta/episodes/*"):
+            for path in self.folder.glob(pattern):
+                if path.is_symlink():
+                    raise DatasetError(
+                        f"{path} is a link, expected a folder or file of the dataset's own",
+                        "Write into another folder",
+                    )
         info = read_info(self.folder)
         if info is not None:
             check_same(self.folder, info, self.spec)

@@ -1,6 +1,7 @@
 """Tables of text cells, as Markdown and on a terminal."""
 
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +17,10 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 class Console(rich.console.Console):
     """A terminal that gets no control characters from texts: a text may be a stranger's."""
+
+    def on_broken_pipe(self) -> None:
+        """Go on without an output: a reader that has gone is no failure of a run."""
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
 
     def render_str(self, text: str, **options: Any) -> Text:
         """See `rich.console.Console`."""
