@@ -214,14 +214,7 @@ def uncommitted(folder: Path, shards: int) -> list[Path]:
     places += [
         f"meta/.{Path(name).name}.*" for name in (lerobot.INFO, lerobot.STATS, lerobot.TASKS)
     ]
-    home = folder.resolve()
-    return [
-        path
-        for place in places
-        for path in folder.glob(place)
-        # A link out of the dataset is not followed.
-        if path not in counted and path.parent.resolve().is_relative_to(home)
-    ]
+    return [path for place in places for path in folder.glob(place) if path not in counted]
 
 
 def _read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
