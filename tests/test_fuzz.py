@@ -34,6 +34,7 @@ import mjstack.cli  # before mujoco, which decides at its import how it draws
 
 # isort: split
 import pytest
+import torch
 from fuzz_cases import Make, command_lines, damaged_folders, is_short
 
 COUNTS = {"commands": 1000, "folders": 200}
@@ -248,6 +249,7 @@ def _preload() -> None:
     import yaml
 
     matplotlib.use("Agg")
+    torch.set_num_threads(1)  # a forked child waits for ever for OpenMP's threads of its parent
     for module in pkgutil.walk_packages(mjstack.__path__, "mjstack."):
         if not re.search(r"__main__|adapters|bench", module.name):
             importlib.import_module(module.name)

@@ -103,7 +103,7 @@ class _Recorder(Observer):
 
 
 def name_kinds(phases: list[Phase]) -> list[str]:
-    """What the arm does with the objects in each phase."""
+    """The arm's work on the objects in each phase, in a word."""
     kinds = []
     kind = "before contact"
     for phase in phases:

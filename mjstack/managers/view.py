@@ -141,7 +141,7 @@ def rows_of(mask: torch.Tensor | None) -> torch.Tensor | slice:
 
 
 def spread(part: torch.Tensor, at: torch.Tensor | slice, nworld: int) -> torch.Tensor:
-    """What was computed for the worlds of `rows_of`, and 0 for the others."""
+    """Values of the worlds of `rows_of`, in all worlds: 0 for the others."""
     if isinstance(at, slice):
         return part
     return part.new_zeros((nworld, *part.shape[1:])).index_copy_(0, at, part)

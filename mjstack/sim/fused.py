@@ -20,7 +20,7 @@ _vec5 = wp.types.vector(length=5, dtype=float)
 
 @wp.struct
 class Rows:
-    """What fused_rows.cpp reads and writes, by MJWarp's names."""
+    """Arrays that fused_rows.cpp reads and writes, by MJWarp's names."""
 
     # Model
     geom_bodyid: wp.array[int]
@@ -63,7 +63,7 @@ class Rows:
 
 @wp.struct
 class Problem:
-    """What fused_newton.cpp reads and writes, by MJWarp's names."""
+    """Arrays that fused_newton.cpp reads and writes, by MJWarp's names."""
 
     # Model
     M_rownnz: wp.array[int]

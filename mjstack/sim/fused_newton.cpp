@@ -2,8 +2,8 @@
 // function.
 //
 // J stays where it is and is read through the L1 cache; all else of a world lies in shared memory.
-// A warp needs no barrier, and with more threads a world would not be done sooner. On Warp's CPU
-// device a block has one thread, and the same text is plain C++.
+// A warp needs no barrier. On Warp's CPU device a block has one thread, and the same text is plain
+// C++.
 //
 // Constants that fused.py puts before it: NV degrees of freedom, NVP columns of J with padding, NJ
 // rows at most, ITERATIONS and LS_ITERATIONS, WARMSTART, and MuJoCo's numbers of the constraint type
