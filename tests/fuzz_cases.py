@@ -30,8 +30,8 @@ def _words(text: str) -> list[str]:
 
 
 QUICK = ["nworld=2", "sim=native", "gates=[baseline]"]
-TASKS = ("stack", "box", "reach")
-JOBS = ("gates", "collect", "replay", "scaling", "study", "reachability")
+JOBS = _words("gates collect replay scaling study reachability")
+CHOSEN = [*_words("task=stack task=box task=reach"), *(f"job={job}" for job in JOBS)]
 GROUPS = _words("""
 robot model scene timing solver batch sim action observation reset termination reward
 controller phases gate job task experiment
@@ -106,11 +106,7 @@ def command_lines(fixture: Path) -> Make:
     path.write_text("# @package _global_\n" + yaml.dump(tiny))
     load_config(["experiment=tiny"], config_dir=fixture / "conf")  # composed before the children
     sys.path.remove(str(fixture))
-    keys = {
-        f"{kind}={name}": dict(_flat(asdict(configure(f"{kind}={name}"))))
-        for kind, names in (("task", TASKS), ("job", JOBS))
-        for name in names
-    }
+    keys = {chosen: dict(_flat(asdict(configure(chosen)))) for chosen in CHOSEN}
 
     def make(case: int, cwd: Path) -> list[str]:
         draw = random.Random(f"command {case}")

@@ -35,7 +35,10 @@ import mjstack.cli  # before mujoco, which decides at its import how it draws
 # isort: split
 import pytest
 import torch
-from fuzz_cases import Make, command_lines, damaged_folders, is_short
+from fuzz_cases import CHOSEN, QUICK, Make, command_lines, damaged_folders, is_short
+
+from mjstack.config.load import compose
+from mjstack.config.session import hydra_session
 
 COUNTS = {"commands": 1000, "folders": 200}
 CASES = {"commands": command_lines, "folders": damaged_folders}
@@ -244,9 +247,10 @@ def _content(folder: Path) -> dict[str, str]:
 
 
 def _preload() -> None:
-    """Load what a command line loads, and keep what it reads of YAML."""
+    """Load what a command line loads, and keep what it reads of YAML and what Hydra looks up."""
     import matplotlib
     import yaml
+    from hydra._internal import defaults_list
 
     matplotlib.use("Agg")
     torch.set_num_threads(1)  # a forked child waits for ever for OpenMP's threads of its parent
@@ -266,8 +270,20 @@ def _preload() -> None:
         return copy.deepcopy(known[text])
 
     yaml.load = load
-    for args in ([], ["job=replay"], ["job=collect"], ["task=box"]):
-        mjstack.cli.run([*args, "nworld=-1"])
+    choices_of = defaults_list._create_interpolation_map
+    choices: dict[str, Any] = {}
+
+    def known_choices(overrides: Any, defaults: list, self_added: bool) -> Any:
+        key = f"{overrides.known_choices} {defaults} {self_added}"
+        if key not in choices:
+            choices[key] = choices_of(overrides, defaults, self_added)
+        return choices[key]
+
+    defaults_list._create_interpolation_map = known_choices
+    with hydra_session() as hydra:
+        for chosen in [[], *([choice] for choice in CHOSEN)]:
+            for more in [[], QUICK[1:2]]:
+                compose(hydra, chosen + more)
 
 
 if __name__ == "__main__":
