@@ -69,8 +69,17 @@ for (int group = warp * GROUP; group < count; group += STRIDE * GROUP) {
     for (int k = 0; k < 6; ++k) o[k] = FROM(offset[k], i);
     for (int c = lane; c < NV; c += T) {
       float motion[6];  // angular, then linear
+#ifdef __CUDA_ARCH__
+      const float2 *pairs = reinterpret_cast<const float2 *>(&wp::index(io.cdof, its_world, c));
       WP_PRAGMA_UNROLL
-      for (int k = 0; k < 6; ++k) motion[k] = READ(wp::index(io.cdof, its_world, c).c[k]);
+      for (int k = 0; k < 3; ++k) {
+        const float2 pair = __ldg(pairs + k);
+        motion[2 * k] = pair.x;
+        motion[2 * k + 1] = pair.y;
+      }
+#else
+      for (int k = 0; k < 6; ++k) motion[k] = wp::index(io.cdof, its_world, c)[k];
+#endif
       const float speed = READ(wp::index(io.qvel, its_world, c));
       float x[6] = {};  // of the bodies against each other, linear, then angular
       WP_PRAGMA_UNROLL
@@ -120,7 +129,10 @@ for (int group = warp * GROUP; group < count; group += STRIDE * GROUP) {
     impedance = high;
   } else {
     float y = depth;
-    if (power != 1.0f)
+    if (power == 2.0f)  // MuJoCo's default
+      y = depth <= middle ? depth * depth / middle
+                          : 1.0f - (1.0f - depth) * (1.0f - depth) / (1.0f - middle);
+    else if (power != 1.0f)
       y = depth <= middle ? powf(depth, power) / powf(middle, power - 1.0f)
                           : 1.0f - powf(1.0f - depth, power) / powf(1.0f - middle, power - 1.0f);
     // Of a dmin above dmax MJWarp would always make dmax; MuJoCo does this.
