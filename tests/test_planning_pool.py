@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from multiprocessing import active_children
 from pathlib import Path
 
@@ -79,6 +80,25 @@ def test_the_first_unreachable_world_is_named(stage: Stage) -> None:
     assert str(shared.value) == str(alone.value)
     assert (shared.value.world, shared.value.phase) == (5, "above_red")
     assert shared.value.distance == alone.value.distance
+
+
+@pytest.mark.usefixtures("two_processes")
+def test_kept_processes_serve_every_plan(stage: Stage) -> None:
+    """They start before the first plan, and an error in it leaves them at work for the next."""
+    context = stage("so101")
+    xy = layouts(context, 32)
+    planner = OpenLoopPlanner(context.cfg)
+    with planner.processes(len(xy)):
+        started = {child.pid for child in active_children()}
+        far = xy.copy()
+        far[0, 0] = FAR
+        with pytest.raises(Unreachable):
+            planner.plan(far)
+        shared = planner.plan(xy)
+        assert {child.pid for child in active_children()} == started
+    assert len(started) == 2
+    knots = [plan for _, plan, _ in plan_alone(context.cfg, xy)]
+    assert shared.knots.numpy().tobytes() == np.array(knots).tobytes()
 
 
 @pytest.mark.usefixtures("two_processes")
@@ -200,14 +220,17 @@ def test_processes_by_cores_and_distinct_worlds(
     made: list[int] = []
     plan = planner.plan_world(0, layouts(context, 1)[0])
 
-    def parallel(
-        _: Config, worlds: list[int], __: np.ndarray, processes: int, take: Callable[..., None]
-    ) -> None:
-        made.append(processes)
+    @contextmanager
+    def start(_: Config, count: int) -> Iterator[object]:
+        made.append(count)
+        yield object()
+
+    def parallel(_: object, worlds: list[int], __: np.ndarray, take: Callable[..., None]) -> None:
         for world in worlds:
             take(world, *plan)
 
     monkeypatch.setattr(planner, "plan_world", lambda *_: plan)
+    monkeypatch.setattr(open_loop, "_start_processes", start)
     monkeypatch.setattr(open_loop, "plan_in_parallel", parallel)
     monkeypatch.setattr(open_loop, "available_cores", lambda: cores)
     xy = layouts(context, distinct)[np.arange(nworld) % distinct]

@@ -6,6 +6,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,7 +23,7 @@ from mjstack.config.schema import Config
 from mjstack.envs import Env, build_env
 from mjstack.envs.buffers import Advance
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.rollout import State
+from mjstack.episodes.rollout import Episode, RolloutTiming, State
 from mjstack.gates import throughput
 from mjstack.gates.throughput import run_throughput
 from mjstack.report.record import GateResult, Status
@@ -129,6 +130,45 @@ def test_native_measurements(new_context: Callable[..., RunContext]) -> None:
     assert f"managers {100.0 * over:+.1f} % (alone {100.0 * alone:.1f} %)" in result.reason
     assert "(eager)" not in result.reason
     assert not any("bare" in name for name in m)
+
+
+@pytest.mark.parametrize(
+    ("backend", "repetitions", "played"),
+    [("mjwarp", 3, 2), ("mjwarp", 1, 1), ("native", 3, 2), ("native", 1, 0)],
+)
+def test_the_batch_gates_episode_is_the_first_repetition(
+    backend: str,
+    repetitions: int,
+    played: int,
+    new_context: Callable[..., RunContext],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    context = new_context("sim=native", "nworld=4")
+    sim, _ = worlds(monkeypatch, "cpu")
+    sim.backend = backend
+    sim.description = "some"
+    spent = RolloutTiming(
+        steps=5, seconds=1.0, warm_up_seconds=0.0, capture_seconds=0.0, captured=False
+    )
+    result: Any = SimpleNamespace(failed=torch.zeros(4), values={})
+    zeros = np.zeros(4)
+    first = Episode(
+        result=result,
+        start=zeros,
+        waypoint_error=zeros,
+        retries=zeros,
+        timing=spent,
+        description="some",
+    )
+    context.artifacts.timed_episode = first
+    more = [replace(first, timing=replace(spent, seconds=2.0)) for _ in range(played)]
+    monkeypatch.setattr(episode, "_play", lambda *_: more.pop())
+    measured = episode.measure_episode(
+        context, sim, seconds=100.0, repetitions=repetitions, meter=EnergyMeter("cpu")
+    )
+    assert not more
+    assert measured.samples["seconds"] == [1.0] + [2.0] * played
+    assert measured.facts["of_the_batch_gate"] == 1
 
 
 @pytest.mark.full

@@ -36,9 +36,9 @@ def measure_episode(
 ) -> Measurement:
     """Measure whole episodes with their check, alternating with bare steps on MJWarp.
 
-    Native MuJoCo takes the batch gate's episode as its first repetition. There an episode of
-    thousands of worlds lasts minutes, so it is played only as often as the time allows, and not at
-    all where even one would not fit.
+    The batch gate's episode is the first repetition; on MJWarp at least one more is played, beside
+    bare steps. On native MuJoCo an episode of thousands of worlds lasts minutes, so it is played
+    only as often as the time allows, and not at all where even one would not fit.
 
     Args:
         context: Scene and planner.
@@ -67,16 +67,19 @@ def measure_episode(
         estimate *= 2
 
     # The repetitions
-    played = [before] if before is not None and not mjwarp else []
+    played = [before] if before is not None else []
+    rounds = repetitions - len(played)
+    if mjwarp:  # bare steps are measured once at least
+        rounds = max(1, rounds)
     began = time.perf_counter()
     meter.clear()
-    while len(played) < repetitions and time.perf_counter() - began + estimate <= seconds:
+    for number in range(rounds):
+        if time.perf_counter() - began + estimate > seconds:
+            break
         repetition_began = time.perf_counter()
         played.append(_play(context, sim, meter, out))
         estimate = time.perf_counter() - repetition_began
-        context.advance("episode, repetitions", len(played), repetitions)
-    if not played and before is not None:
-        played = [before]
+        context.advance("episode, repetitions", number + 1, rounds)
     if not played:
         key = "max_seconds" if sim.device.type == "cuda" else "cpu_max_seconds"
         out.missing = (

@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -116,6 +116,7 @@ class OpenLoopPlanner:
         self._weights, self._numbers = self._step_weights()
         self._seed: np.ndarray | None = None
         self._last: tuple[np.ndarray, JointTrajectory] | None = None
+        self._pool: ProcessPoolExecutor | None = None
         self._seed = self.plan_world(0, nominal_xy(cfg.scene))[0]
         self.nominal = self._seed[len(self._nodes) - 1 :: len(self._nodes)]
 
@@ -149,12 +150,12 @@ class OpenLoopPlanner:
             if progress is not None:
                 progress(int(done[len(found) - 1]))
 
-        processes = min(available_cores(), len(worlds) // WORLDS_PER_PROCESS)
-        if len(worlds) >= PARALLEL_FROM and processes > 1:
-            plan_in_parallel(self._cfg, worlds, sources_xy, processes, take)
-        else:
-            for world in worlds:
-                take(world, *self.plan_world(world, sources_xy[world]))
+        with self.processes(len(worlds)):
+            if self._pool is not None:
+                plan_in_parallel(self._pool, worlds, sources_xy, take)
+            else:
+                for world in worlds:
+                    take(world, *self.plan_world(world, sources_xy[world]))
         knots, error = (
             np.array(parts) for parts in zip(*(found[world] for world in twin), strict=True)
         )
@@ -162,6 +163,21 @@ class OpenLoopPlanner:
         if nworld > 1:
             self._last = (sources_xy.copy(), trajectory)
         return trajectory
+
+    @contextmanager
+    def processes(self, worlds: int) -> Iterator[None]:
+        """Keep processes for every `plan` inside, if so many distinct worlds pay for them. They
+        load beside whatever comes before the first plan.
+        """
+        count = min(available_cores(), worlds // WORLDS_PER_PROCESS)
+        if self._pool is not None or worlds < PARALLEL_FROM or count < 2:
+            yield
+            return
+        with _start_processes(self._cfg, count) as self._pool:
+            try:
+                yield
+            finally:
+                self._pool = None
 
     def path_error(self) -> float:
         """Largest distance [m] of the grasp point from its straight path at any step of the nominal
@@ -254,28 +270,24 @@ class OpenLoopPlanner:
 
 
 def plan_in_parallel(
-    cfg: Config,
+    pool: ProcessPoolExecutor,
     worlds: Sequence[int],
     sources_xy: np.ndarray,
-    processes: int,
     take: Callable[..., None],
 ) -> None:
-    """Plan worlds, their numbers ascending, in processes, which are gone when this has ended in any
-    way. ``take`` gets each `Plan`, in that order; ``sources_xy`` as of `OpenLoopPlanner.plan`.
+    """Plan worlds, their numbers ascending, in processes. ``take`` gets each `Plan`, in that order;
+    ``sources_xy`` as of `OpenLoopPlanner.plan`.
 
     Raises:
         Unreachable: A target is out of reach; of several such worlds it names the first, as one
             process would.
         MjstackError: A process has ended by itself.
     """
-    # Processes are not forks: this one may hold a CUDA context and threads.
-    with _as_programs():
-        pool = ProcessPoolExecutor(processes, get_context("spawn"), _start_process, (cfg,))
-    theirs = active_children()
+    jobs: list[Future[list[Plan]]] = []
     try:
         with _as_programs():
             chunks = [worlds[first : first + _CHUNK] for first in range(0, len(worlds), _CHUNK)]
-            jobs = [pool.submit(_plan, chunk, sources_xy[list(chunk)]) for chunk in chunks]
+            jobs += [pool.submit(_plan, chunk, sources_xy[list(chunk)]) for chunk in chunks]
         for job in jobs:
             while not wait([job], _POLL).done:
                 check_interrupt()
@@ -287,6 +299,23 @@ def plan_in_parallel(
             "Run again with more free memory, or on one core (taskset -c 0), which starts no"
             " processes",
         ) from None
+    finally:
+        for job in jobs:  # after an error the rest is not wanted
+            job.cancel()
+
+
+@contextmanager
+def _start_processes(cfg: Config, count: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that plan, which are gone when this has ended in any way."""
+    theirs = active_children()
+    # Processes are not forks: this one may hold a CUDA context and threads.
+    with _as_programs():
+        pool = ProcessPoolExecutor(count, get_context("spawn"), _start_process, (cfg,))
+    try:
+        with _as_programs():
+            for _ in range(count):  # a process starts where a job finds none idle
+                pool.submit(int)
+        yield pool
     finally:
         for process in set(active_children()).difference(theirs):
             process.kill()  # it may still be loading

@@ -310,10 +310,18 @@ class Snapshots(Observer):
         self._steps = steps
         self.states: dict[int, State] = {}
 
+    def start(self, env: Env, driver: Driver) -> None:
+        """See `Observer`."""
+        super().start(env, driver)
+        self.aside = 0.0
+
     def after_step(self, step: int) -> None:
         """See `Observer`."""
         if step in self._steps:
+            self.env.sim.synchronize()
+            began = time.perf_counter()
             self.states[step] = snapshot(self.env.sim)
+            self.aside += time.perf_counter() - began
 
 
 class CommandRecorder(Observer):

@@ -19,6 +19,7 @@ from mjstack.envs.buffers import (
     recommend_sizes,
 )
 from mjstack.episodes.context import RunContext, needs_episode
+from mjstack.episodes.rollout import CLOSED_LOOP
 from mjstack.errors import Unreachable, name_worlds
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, resolve_sizes
@@ -53,24 +54,25 @@ def run_capacity(context: RunContext) -> list[GateResult]:
     result = GateResult(name="capacity", status=Status.passed, metrics={"worlds": nworld})
 
     # Environments first: each start is planned once, for both of its runs, and the plan of the
-    # task's is kept for the gates that follow.
-    env = _measure(
-        context,
-        result,
-        "env",
-        "environments (random actions, randomised starts)",
-        resolve_env_sizes(cfg),
-        random_actions=partial(play_random, context),
-        randomized=partial(context.play_task, t.reset),
-    )
-    task = _measure(
-        context,
-        result,
-        "task",
-        "driven task",
-        resolve_sizes(cfg),
-        task=partial(context.play_task, cfg.reset),
-    )
+    # task's is kept for the gates that follow. Planning processes load during random actions.
+    with context.planner.processes(0 if cfg.controller.name == CLOSED_LOOP else nworld):
+        env = _measure(
+            context,
+            result,
+            "env",
+            "environments (random actions, randomised starts)",
+            resolve_env_sizes(cfg),
+            random_actions=partial(play_random, context),
+            randomized=partial(context.play_task, t.reset),
+        )
+        task = _measure(
+            context,
+            result,
+            "task",
+            "driven task",
+            resolve_sizes(cfg),
+            task=partial(context.play_task, cfg.reset),
+        )
     task_run = task.runs["task"]
 
     # Problems. Motion that lost physics sizes nothing that follows.

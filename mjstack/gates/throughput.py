@@ -134,6 +134,7 @@ def _on_driven_worlds(
             step_ms = found["physics"].median("ms_per_batched_step")
             step_seconds = 1e-3 * step_ms * context.cfg.timing.decimation
     if "episode" in wanted:
+        limits = limits | {"repetitions": min(t.repetitions, t.episodes)}
         found["episode"] = _guarded(
             "episode", measure_episode, context, sim, step_seconds=step_seconds, **limits
         )

@@ -1,5 +1,6 @@
 """Jobs: how they are checked and run, and the report that is written after each result."""
 
+import gc
 import hashlib
 import logging
 import os
@@ -99,6 +100,9 @@ class CheckedJob:
         errors = Console(stderr=True, soft_wrap=True, markup=False)
         report = Report(folder=folder, overrides=list(overrides), resumes=self.resumes)
         cfg = self.context.cfg
+        # The collector need not look at all that was loaded each time it frees a gate's worlds.
+        gc.collect()
+        gc.freeze()
 
         def record(result: GateResult) -> None:
             report.gates.append(result)
@@ -148,6 +152,7 @@ class CheckedJob:
                 finish(report)
             except Exception as error:
                 log_error(error)
+        gc.unfreeze()
         return report
 
 

@@ -148,6 +148,8 @@ class ThroughputCfg(GateFuncCfg):
     """Measurements that are made."""
     repetitions: int = spec(ge=1)
     """Repetitions of each measurement."""
+    episodes: int = spec(ge=1)
+    """episode: repetitions at most."""
     steps: int = spec(unit="steps", ge=1)
     """physics: control steps per repetition."""
     env_steps: int = spec(unit="steps", ge=1)
