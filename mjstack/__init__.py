@@ -18,14 +18,14 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from mjstack.errors import MjstackError
-from mjstack.report.gl import choose_gl
+from mjstack.report.gl import BeforeMujoco
 
 if TYPE_CHECKING:
     from mjstack.config import Config, load_config
     from mjstack.envs import Env, make_env
+    from mjstack.errors import MjstackError
 
-choose_gl()
+sys.meta_path.insert(0, BeforeMujoco())
 
 __all__ = ["Config", "Env", "MjstackError", "load_config", "make_env"]
 __version__ = "0.1.0"
@@ -35,6 +35,7 @@ _HOMES = {
     "load_config": "mjstack.config",
     "Env": "mjstack.envs",
     "make_env": "mjstack.envs",
+    "MjstackError": "mjstack.errors",
 }
 
 if not TYPE_CHECKING:  # a type checker would take any name for one of these

@@ -1,17 +1,20 @@
 """The command: ``mjstack``, ``python -m mjstack`` and ``python scripts/run.py``."""
 
+import os
 import sys
 
-from mjstack.interrupt import EXIT_CODE, handle_interrupts, interrupted
+from mjstack.interrupt import handle_interrupts
 
 
 def main() -> None:
     """Entry point of the console script; leaves with the exit status of the run."""
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed; a file opened later would take its place
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "r+"))
     with handle_interrupts():
         from mjstack.cli import run  # takes seconds
 
-        status = run(sys.argv[1:])
-        raise SystemExit(EXIT_CODE if interrupted() else status)
+        raise SystemExit(run(sys.argv[1:]))
 
 
 if __name__ == "__main__":

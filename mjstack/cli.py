@@ -95,6 +95,8 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
             compose(hydra, overrides)
             hydra.show_info(flags.info, CONFIG_NAME, overrides)
         elif flags.shell_completion:
+            if not " ".join(overrides).startswith(("install=", "query=", "uninstall=")):
+                raise CompositionError("-sc: expected install=SHELL or uninstall=SHELL alone.")
             hydra.shell_completion(CONFIG_NAME, overrides)
         elif flags.cfg:
             _show(hydra, flags, overrides)
@@ -119,6 +121,8 @@ def _show(hydra: Hydra, flags: Namespace, overrides: list[str]) -> None:
 def _run_one(hydra: Hydra, overrides: list[str]) -> int:
     """Compose, check and run one job."""
     cfg = compose(hydra, overrides)
+    if cfg.hydra.mode is RunMode.MULTIRUN:
+        raise CompositionError("hydra.mode=MULTIRUN: expected RUN without -m. Replace it by -m.")
     checked = _check(cfg, overrides)
     given = _is_set("hydra.run.dir", overrides)
     resumed = None if given else checked.folder
@@ -137,13 +141,16 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
     """
     jobs = _expand(overrides)
+    refused = CompositionError(
+        "hydra.sweeper.params: expected none. Give the values on the command line, as in"
+        " -m nworld=1,2."
+    )
+    if jobs and any("hydra.sweeper.params" in override for override in overrides):
+        raise refused
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
     master = compose(hydra, overrides, RunMode.MULTIRUN)
-    if jobs and master.hydra.sweeper.get("params"):
-        raise CompositionError(
-            "hydra.sweeper.params: expected none. Give the values on the command line, as in"
-            " -m nworld=1,2."
-        )
+    if jobs and OmegaConf.select(master, "hydra.sweeper.params"):
+        raise refused
     folder = _hydra_path(master, "sweep.dir")
     taken: dict[Path, int] = {}
     for number, job in enumerate(jobs):
@@ -154,22 +161,27 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
             cfg.hydra.job.id = str(number)
         one = Path(os.path.normpath(folder / _hydra_path(cfg, "sweep.subdir")))
         if not one.is_relative_to(folder):
-            check_unused(one)
+            check_unused(one, key="hydra.sweep.subdir")
         if taken.setdefault(one, number) != number:
             raise CompositionError(
                 f"hydra.sweep.subdir: jobs {taken[one]} and {number} would both write into {one},"
                 " expected a folder for each job. Leave it out, or let it name what differs."
             )
     begin_job()
-    with claim_folder(folder, numbered=not _is_set("hydra.sweep.dir", overrides)) as claimed:
+    numbered = not _is_set("hydra.sweep.dir", overrides)
+    with claim_folder(folder, numbered=numbered, key="hydra.sweep.dir") as claimed:
         if claimed != folder:
             master.hydra.sweep.dir = str(claimed)
             master.hydra.overrides.hydra.append(f"hydra.sweep.dir='{claimed}'")  # of its jobs
-        returned = hydra.multirun(CONFIG_NAME, run_job, overrides)
-    batches = returned if isinstance(returned, list) else []  # a launcher's own processes return
-    results = _results or [job.return_value for batch in batches for job in batch]
-    _print_sweep(results, claimed)
-    return max(result.exit_code for result in results)
+        try:
+            returned = hydra.multirun(CONFIG_NAME, run_job, overrides)
+            batches = returned if isinstance(returned, list) else []
+            # A launcher's own processes return theirs.
+            _results[:] = _results or [job.return_value for batch in batches for job in batch]
+        finally:
+            if _results:
+                _print_sweep(claimed, len(jobs))
+    return max(result.exit_code for result in _results)
 
 
 def _print_help(hydra: Hydra, args: list[str]) -> None:
@@ -259,22 +271,22 @@ def _hydra_path(cfg: DictConfig, key: str) -> Path:
     return Path(str(OmegaConf.select(cfg, f"hydra.{key}", throw_on_missing=True)))
 
 
-def _print_sweep(outcomes: list[Report], folder: Path) -> None:
-    """One row per job, also written beside the jobs as summary.md."""
-    names = dict.fromkeys(gate.name for outcome in outcomes for gate in outcome.gates)
+def _print_sweep(folder: Path, count: int) -> None:
+    """One row per job that has begun, also written beside the jobs as summary.md."""
+    names = dict.fromkeys(gate.name for result in _results for gate in result.gates)
     columns = ["job", "overrides", *names, "status"]
     rows = [
-        {gate.name: f"{gate.status}: {gate.reason}" for gate in outcome.gates}
+        {gate.name: f"{gate.status}: {gate.reason}" for gate in result.gates}
         | {
             "job": str(job),
-            "overrides": " ".join(outcome.overrides),
-            "status": outcome.status,
+            "overrides": " ".join(result.overrides),
+            "status": result.status,
         }
-        for job, outcome in enumerate(outcomes)
+        for job, result in enumerate(_results)
     ]
-    title = f"sweep of {len(outcomes)} jobs"
+    title = f"sweep of {max(count, len(rows))} jobs"
     table = Table.of({name: name for name in columns}, rows, title)
     Console().print(table.to_console())
-    if len(outcomes) > 1:
+    if len(rows) > 1:
         write_atomic(folder / "summary.md", "\n".join(table.to_markdown()) + "\n")
         Console(soft_wrap=True).print(f"summary: {folder}/summary.md")

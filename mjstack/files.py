@@ -6,6 +6,7 @@ import io
 import itertools
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -15,6 +16,8 @@ from typing import Any
 import numpy as np
 
 from mjstack.errors import FolderError, MjstackError, first_line
+
+_KEY = "hydra.run.dir (job=collect: job.folder)"
 
 
 @contextmanager
@@ -79,16 +82,22 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
 @contextmanager
 def claim_folder(
-    folder: Path, job: str = "", own: str = "", *, numbered: bool = False
+    folder: Path,
+    job: str = "",
+    own: str = "",
+    *,
+    numbered: bool = False,
+    key: str = _KEY,
 ) -> Iterator[Path]:
-    """Make a run's folder, and keep other runs out of it until the block ends.
+    """Make a run's folder, and keep other runs out of it until the block ends. If that fails before
+    the run has written anything, the folder is as it was, or gone again.
 
     Args:
         folder: The folder.
         job: As of `check_unused`.
         own: As of `check_unused`.
-        numbered: Where the folder is there, make another: its name and ``-2``, ``-3``, ... One in
-            which nothing was written is gone again if the block fails.
+        numbered: Where the folder is there, make another: its name and ``-2``, ``-3``, ...
+        key: As of `check_unused`.
 
     Yields:
         The folder.
@@ -98,6 +107,8 @@ def claim_folder(
     """
     name = folder.name
     handle = None
+    made = numbered or not folder.exists()
+    before = None
     try:
         for number in itertools.count(2):
             try:
@@ -108,24 +119,28 @@ def claim_folder(
                     raise
             folder = folder.with_name(f"{name}-{number}")
         handle = lock_folder(folder)
-        check_unused(folder, job, own)
+        check_unused(folder, job, own, key)
+        before = {*folder.iterdir()}
         yield folder
     except BaseException as error:
-        if numbered:
-            with suppress(OSError):  # something was written
+        with suppress(OSError):
+            if before is not None and not any(folder.rglob("report.json")):
+                for path in {*folder.iterdir()} - before:  # Hydra's
+                    (shutil.rmtree if path.is_dir() else os.remove)(path)
+            if made:
                 os.removedirs(folder)
         if not isinstance(error, OSError):
             raise
         raise FolderError(
-            f"{folder} cannot be written ({error.strerror or error}). Make room, or set"
-            " hydra.run.dir (a sweep: hydra.sweep.dir) to a folder that can"
+            f"{folder} cannot be written ({error.strerror or error}). Make room, or set {key} to"
+            " another"
         ) from error
     finally:
         if handle is not None:
             os.close(handle)
 
 
-def check_unused(folder: Path, job: str = "", own: str = "") -> None:
+def check_unused(folder: Path, job: str = "", own: str = "", key: str = _KEY) -> None:
     """Check that no run has begun in a folder, or one that a job goes on with.
 
     Before a run begins there are only logs and Hydra's files, perhaps half-written.
@@ -134,6 +149,7 @@ def check_unused(folder: Path, job: str = "", own: str = "") -> None:
         folder: The folder, which need not be there.
         job: As report.json names a job that goes on with the run; empty if none may.
         own: A file by which the job knows its folder even without the report.
+        key: Configuration key that names another folder.
 
     Raises:
         FolderError: It has another run, or other files, or links in place of files to be written.
@@ -144,7 +160,7 @@ def check_unused(folder: Path, job: str = "", own: str = "") -> None:
         if path.is_symlink() and not data:
             raise FolderError(
                 f"{path} is a link, and what it leads to would be overwritten",
-                "Remove it, or set hydra.run.dir (job=collect: job.folder) to another folder",
+                f"Remove it, or set {key} to another folder",
             )
     names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     used = sorted(name for name in names if name != ".hydra" and not name.endswith(".log"))
@@ -155,7 +171,7 @@ def check_unused(folder: Path, job: str = "", own: str = "") -> None:
             return
     raise FolderError(
         f"{folder} has {used[0]}, expected a new or an empty folder, or one with which this job can"
-        " go on. Set hydra.run.dir (job=collect: job.folder) to another"
+        f" go on. Set {key} to another"
     )
 
 

@@ -115,6 +115,32 @@ def test_flags_that_cannot_be_used_are_a_line(
     assert everything(folder) == []
 
 
+TOLD = [
+    ("+foo=1", "configuration key 'foo' does not exist. Did you mean 'robot'? Available: action"),
+    ("++robot.hoem=1", "configuration key 'robot.hoem' does not exist. Did you mean 'robot.home'?"),
+    ("+gate.batch.seds=1", "'gate.batch.seds' does not exist. Did you mean 'gate.batch.seeds'?"),
+    ("task.check.dz_max=inf", "task.check.dz_max=inf: expected a finite number."),
+    ("task.check.dz_max=nan", "task.check.dz_max=nan: expected a finite number."),
+    ("gate.parity.step1.qpos=inf", "gate.parity.step1.qpos=inf: expected a number of at least 0"),
+    ("task.check=3", "task.check=3: expected keys and values or null."),
+    ("hydra.mode=MULTIRUN", "hydra.mode=MULTIRUN: expected RUN without -m. Replace it by -m."),
+    ("-m hydra.sweeper.params={seed:1}", "hydra.sweeper.params: expected none. Give the values"),
+    ("-m seed=1 +hydra.sweeper.params.nworld=2", "hydra.sweeper.params: expected none."),
+    ("hydra/launcher=nope", "Available: basic. Others are plugins of Hydra, which pip installs"),
+    ("-sc", "-sc: expected install=SHELL or uninstall=SHELL alone."),
+]
+
+
+@pytest.mark.parametrize(("args", "says"), TOLD, ids=[args for args, _ in TOLD])
+def test_the_line_says_how_to_go_on(
+    args: str, says: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(args.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line
+    assert everything(folder) == []
+
+
 UNEXPECTED = (
     ValueError("one\ntwo"),
     MemoryError("5 GiB"),
@@ -208,7 +234,7 @@ def starting(folder: Path, module: str, before: str, *args: str) -> subprocess.C
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("module", ["hydra", "torch"])
+@pytest.mark.parametrize("module", ["mjstack.errors", "ctypes.util", "torch"])
 def test_ctrl_c_while_modules_load_is_a_line(module: str, folder: Path) -> None:
     done = starting(folder, module, "default_int_handler", "gates=[baseline]")
     assert (done.returncode, done.stdout, done.stderr) == (

@@ -123,7 +123,7 @@ def interrupt_command(kind: str, fixture: Path, delay: float | None) -> tuple[st
     seconds = usage.ru_utime + usage.ru_stime - before
     try:
         # An interrupt that is lost is one that the command goes on after.
-        if before == math.inf or (status in (0, 256) and seconds < 0.1):
+        if before == math.inf or (status in (0, 256) and seconds < 0.3):
             return "ended by itself", 0.0
         return describe_end(child.home, os.waitstatus_to_exitcode(status)), seconds
     finally:

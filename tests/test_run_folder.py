@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import signal
 import sys
 import tempfile
 import traceback
@@ -21,10 +22,11 @@ import pytest
 from compositions import load_config
 
 from mjstack import cli
+from mjstack.__main__ import main
 from mjstack.config.explain import own_overrides
 from mjstack.errors import FolderError
 from mjstack.files import claim_folder
-from mjstack.jobs import CheckedJob, check_job
+from mjstack.jobs import CheckedJob, check_job, runner
 from mjstack.report.record import GateResult, Status
 
 NOON = "outputs/2026-11-21/12-00-00"
@@ -160,6 +162,37 @@ def test_a_sweeper_with_parameters_is_refused(
     assert contents(Path()) == before
 
 
+def test_an_interrupted_sweep_leaves_a_summary(begin: Callable[..., int]) -> None:
+    def work(context: object, folder: Path) -> None:
+        if folder.name == "1":
+            raise KeyboardInterrupt
+        context.record(GateResult(name="nothing", status=Status.passed))  # type: ignore[attr-defined]
+
+    assert begin("-m", "seed=1,2,3", work=work) == 130
+    _, _, *rows = Path(SWEEP, "summary.md").read_text().splitlines()
+    assert [row.split("|")[-2].strip() for row in rows] == ["pass", "interrupted"]
+
+
+@pytest.mark.parametrize("what", ["a closed output", "a signal after the last step"])
+def test_a_run_that_is_done_ends_with_its_status(
+    what: str, begin: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def whole_command(_: int) -> int:
+        if what == "a closed output":
+            os.close(1)
+            sys.stdout = None  # type: ignore[assignment]  # as Python has it
+        else:
+            monkeypatch.setattr(runner, "_print_summary", lambda *_: signal.raise_signal(2))
+        with pytest.raises(SystemExit) as stop:
+            main()
+        return stop.value.code  # type: ignore[return-value]
+
+    monkeypatch.setattr(sys, "argv", ["mjstack"])
+    begin("--version")  # the job of the fixture from here on
+    assert in_children(1, whole_command) == [0]
+    assert json.loads(Path(NOON, "report.json").read_text())["status"] == "pass"
+
+
 @pytest.mark.parametrize("link", [".hydra", ".hydra/overrides.yaml", "run.log"])
 def test_a_folder_with_links_is_refused(
     link: str, begin: Callable[..., int], capsys: pytest.CaptureFixture[str]
@@ -224,6 +257,7 @@ def test_a_given_folder_of_another_run_is_refused(
     assert begin(*args, **changes) == 2
     err = capsys.readouterr().err
     assert err.startswith("mjstack: given has ")
+    assert f"Set hydra.{'sweep' if '-m' in args else 'run'}." in err
     assert len(err.splitlines()) == 1
     assert contents(Path()) == before
 
@@ -300,6 +334,9 @@ def test_a_full_disk_is_a_line_and_the_same_command_goes_on(
     lines = told.read_text().splitlines()
     assert "Traceback" not in " ".join(lines)
     problems = [line for line in lines if line.startswith("mjstack: ")]
+    assert any("report: " in line for line in lines) == Path("given", "report.md").exists()
+    if status == 2:
+        assert contents(Path()) == {}
     if status:
         assert status in (1, 2)
         assert len(problems) == 1

@@ -12,10 +12,11 @@ from difflib import SequenceMatcher
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, MissingConfigException
+from omegaconf import DictConfig
 from omegaconf.errors import ConfigKeyError
 
 from mjstack.config.fields import accepted, find_field
-from mjstack.config.schema import JOB_SCHEMAS, Config, JobCfg
+from mjstack.config.schema import JOB_SCHEMAS, Config, GateCfg, JobCfg
 from mjstack.config.session import (
     CONFIG_NAME,
     compose_raw,
@@ -72,6 +73,19 @@ def parse(override: str) -> Override:
         ) from error
 
 
+def check_added(section: DictConfig, overrides: Sequence[str], parent: str = "") -> None:
+    """Raise a `CompositionError` for a key that a ``+`` has added to a dataclass."""
+    owner = section._metadata.object_type
+    known = [field.name for field in fields(owner)] if is_dataclass(owner) else []
+    for name in section:
+        key = parent + str(name)
+        if known and name not in known and owner is not GateCfg:  # gates of the search path
+            raise _unknown_key(key, known, overrides)
+        node = section._get_node(name)
+        if isinstance(node, DictConfig) and not node._is_none():
+            check_added(node, overrides, f"{key}.")
+
+
 def own_overrides(overrides: Iterable[str]) -> list[str]:
     """The overrides that are not Hydra's."""
     return [o for o in overrides if not o.lstrip("+~").startswith(("hydra.", "hydra/"))]
@@ -83,7 +97,7 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     """
     found = _explain(error, overrides)
     inside = re.match(r"In '([^']+)': ", str(error))
-    if inside is None or inside[1] == CONFIG_NAME:  # mjstack's own: an override does not fit
+    if inside is None or inside[1] in (CONFIG_NAME, "hydra/config"):  # an override does not fit
         return found
     name = f"{inside[1]}.yaml"
     paths = [folder / name for folder in config_folders() if (folder / name).is_file()]
@@ -93,8 +107,10 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
 def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        unknown = UnknownName(f"{group}={name}:", name, list_choices().get(group, ()))
+        unknown = UnknownName(f"{group}={name}:", name, error.options or ())
         own = "" if config_folders() else " A choice of your own needs --config-dir DIR."
+        if group.startswith("hydra/"):
+            own = " Others are plugins of Hydra, which pip installs, such as hydra-joblib-launcher."
         return CompositionError(f"{unknown}{own}")
     # Hydra raises its own inside of the handler of one of OmegaConf's, which knows the key.
     cause = error.__cause__ or (error.__context__ if str(error).startswith("In '") else None)

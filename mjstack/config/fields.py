@@ -109,10 +109,10 @@ def find_field(owner: type, key: str) -> tuple[type, Field] | None:
     item = next((item for item in fields(owner) if item.name == name), None)
     if item is None:
         return None
-    kind, several = _kind(_hints(owner)[name])
+    kind, holders = _kind(_hints(owner)[name])
     if not (isinstance(kind, type) and is_dataclass(kind)) or not rest:
         return owner, item
-    below = rest.partition(".")[2] if several else rest  # several are by name
+    below = rest.partition(".")[2] if holders else rest  # several are by name
     return find_field(kind, below) if below else (owner, item)
 
 
@@ -137,38 +137,42 @@ def check_fields(key: str, value: Any) -> None:
                 raise ConfigError(path, bounds[0], f"at most {high}={bounds[1]}")
 
 
-def _check(path: str, value: object, owner: type, item: Field) -> None:
-    """Hold a field's value, or what a list or mapping in it holds, against the field's range."""
+def _check(path: str, value: object, owner: type, item: Field, *, inside: bool = False) -> None:
+    """Hold a field's value, or one inside of its mapping, against the field's range."""
     limits = field_range(item)
     if is_dataclass(value):
         check_fields(path, value)
     elif isinstance(value, Mapping):
         for name, part in value.items():
-            _check(f"{path}.{name}", part, owner, item)
+            _check(f"{path}.{name}", part, owner, item, inside=True)
     elif isinstance(value, list | tuple):
         if limits.length not in (None, len(value)) or not all(map(limits.holds, value)):
-            raise ConfigError(path, value, accepted(owner, item))
+            raise ConfigError(path, value, accepted(owner, item, inside=inside))
     elif value is not None and not limits.holds(value):
-        raise ConfigError(path, value, accepted(owner, item))
+        raise ConfigError(path, value, accepted(owner, item, inside=inside))
 
 
-def accepted(owner: type, item: Field) -> str:
-    """Values that a field accepts, in words: ``a number above 0 [s]``."""
+def accepted(owner: type, item: Field, *, inside: bool = False) -> str:
+    """Values that a field accepts, or one inside of its mapping, in words: ``a number above 0
+    [s]``.
+    """
     hint = _hints(owner)[item.name]
-    kind, several = _kind(hint)
+    kind, holders = _kind(hint)
+    holders = holders[inside:]
     limits = field_range(item)
     if limits.choices or isinstance(kind, EnumMeta):
         choices = limits.choices or kind.__members__
-        words = f"{'some' if several else 'one'} of {', '.join(map(str, choices))}"
-    elif several or is_dataclass(kind):
-        mapping = get_origin(hint) is dict or is_dataclass(kind)
+        words = f"{'some' if holders else 'one'} of {', '.join(map(str, choices))}"
+    elif holders or is_dataclass(kind):
+        mapping = holders[:1] == [dict] or is_dataclass(kind)
         count = "" if limits.length is None else f"{limits.length} "
         words = f"{'keys and' if mapping else 'a list of'} {count}{_PLURALS.get(kind, 'values')}"
-    elif kind is float and limits == Range(unit=limits.unit):
+    elif (kind is float or inside) and limits == Range(unit=limits.unit):
         words = "a finite number"
     else:
         words = _NOUNS.get(kind, "a value")
-    return limits.describe(words) + (" or null" if NoneType in get_args(hint) else "")
+    null = " or null" if NoneType in get_args(hint) and not inside else ""
+    return limits.describe(words) + null
 
 
 def field_docs(owner: type) -> dict[str, str]:
@@ -196,13 +200,13 @@ def _hints(owner: type) -> dict[str, Any]:
     return get_type_hints(owner)
 
 
-def _kind(hint: Any) -> tuple[Any, bool]:
-    """The type of a field's single values, and whether it holds several."""
-    several = False
+def _kind(hint: Any) -> tuple[Any, list[Any]]:
+    """The type of a field's single values, and the types that hold them, from the outside in."""
+    holders = []
     while get_args(hint):
         if get_origin(hint) in (Union, UnionType):
             hint = next(kind for kind in get_args(hint) if kind is not NoneType)
         else:
-            several = True
+            holders.append(get_origin(hint))
             hint = get_args(hint)[-1]
-    return hint, several
+    return hint, holders

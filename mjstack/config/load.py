@@ -17,7 +17,7 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 
 from mjstack.config.check import validate
 from mjstack.config.complete import complete
-from mjstack.config.explain import check_overrides, explain, parse
+from mjstack.config.explain import check_added, check_overrides, explain, parse
 from mjstack.config.schema import JOB_SCHEMAS, Config
 from mjstack.config.session import (
     CONFIG_NAME,
@@ -102,6 +102,7 @@ def compose(
         else:
             cfg = hydra.config_loader.load_sweep_config(sweep, list(overrides))
         if run_mode is RunMode.RUN:
+            check_added(without_hydra(cfg), overrides)
             _drop_inherited(hydra, cfg, overrides)
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error

@@ -274,5 +274,6 @@ def _viewer(context: RunContext) -> StepHook:
 
 def _print_summary(console: Console, report: Report) -> None:
     console.print(summarize(report.gates).to_console(STATUS_COLOR))
-    console.print(f"report: {escape(str(report.folder))}/report.md")
+    if (report.folder / "report.md").exists():  # the disk may be full
+        console.print(f"report: {escape(str(report.folder))}/report.md")
     console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status}[/]")

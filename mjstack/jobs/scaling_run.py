@@ -18,9 +18,11 @@ PASS = "pass"
 NOT_RUN = "not run"
 RESULT = "run.json"
 _POLL = 0.1  # s, between two looks at the process
-# The working folder is not imported from (-P), only the folder that has this mjstack.
+# The working folder is not imported from (-P), only the folder that has this mjstack. On Linux the
+# process ends with this one (PR_SET_PDEATHSIG), which a second Ctrl-C ends at once.
 _START = (
-    f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r});"
+    "import ctypes, sys; sys.platform == 'linux' and ctypes.CDLL(None).prctl(1, 9);"
+    f" sys.path.insert(0, {str(Path(__file__).parents[2])!r});"
     " from mjstack.__main__ import main; main()"
 )
 

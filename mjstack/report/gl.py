@@ -1,10 +1,21 @@
-"""Chooses how MuJoCo draws offscreen. Import before mujoco, which decides at its own import."""
+"""Chooses how MuJoCo draws offscreen, when mujoco is imported: it decides then."""
 
-import ctypes.util
 import os
 import sys
 
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
+
+
+class BeforeMujoco:
+    """Chooses at the import of mujoco: the search takes a while, and Ctrl-C is not handled yet when
+    the command imports mjstack.
+    """
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+        """Find nothing."""
+        if name == "mujoco":
+            sys.meta_path.remove(self)
+            choose_gl()
 
 
 def choose_gl() -> None:
@@ -14,10 +25,12 @@ def choose_gl() -> None:
     A choice whose library is missing would break the import of mujoco itself; then the scene is not
     drawn.
     """
+    from ctypes.util import find_library
+
     if not sys.platform.startswith("linux"):
         return
     asked = os.environ.get("MUJOCO_GL", "").lower()
-    found = [name for name, library in _LIBRARIES.items() if ctypes.util.find_library(library)]
+    found = [name for name, library in _LIBRARIES.items() if find_library(library)]
     if asked in _LIBRARIES and asked not in found:
         os.environ["MUJOCO_GL"] = "disable"
     elif not asked and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
