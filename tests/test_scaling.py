@@ -366,7 +366,9 @@ def alive(marker: str) -> list[str]:
 
 @pytest.mark.full
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="no /proc here")
-def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
+def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path, sent: int) -> None:
+    """Also where it is ended at once, as by a second Ctrl-C."""
     args = [*TINY, "sim=native", "job.native_steps=20000"]
     done = scaling_folder(load_config(args)) / "runs" / "native-1" / RESULT
     done.parent.mkdir(parents=True)
@@ -394,13 +396,16 @@ def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
             assert time.monotonic() < until
             time.sleep(0.1)
         assert len(alive(marker)) == 2
-        os.kill(
-            process.pid, signal.SIGINT
-        )  # this process alone: a terminal would tell its child too
+        os.kill(process.pid, sent)  # this process alone: a terminal would tell its child too
         out, err = process.communicate(timeout=60)
+        while sent == signal.SIGKILL and alive(marker):
+            assert time.monotonic() < until
+            time.sleep(0.1)
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
+    if sent == signal.SIGKILL:
+        return
     assert process.returncode == 130
     assert "Traceback" not in err
     assert "interrupted; the finished gates are in the report" in out
