@@ -106,6 +106,7 @@ def recorded(
             pose = []
             velocity = []
             force = []
+            gripper = []
 
             def keep(_: int, sim: Simulation) -> None:
                 pose.append(
@@ -121,12 +122,15 @@ def recorded(
                     )
                 )
                 force.append(sim.sensordata.numpy().copy())
+                fingers = context.index.robot_qpos[context.index.n_arm :]
+                gripper.append(sim.qpos[:, fingers].numpy().copy())
 
             episode = context.play(sim, context.cfg.reset, [Hook(keep)])
             made[robot] = SimpleNamespace(
                 pose=np.stack(pose, 1),
                 velocity=np.stack(velocity, 1),
                 force=np.stack(force, 1),
+                gripper=np.stack(gripper, 1),
                 jaw_force=context.index.jaw_force,
                 result=episode.result,
                 step_count=sim.step_count.numpy().copy(),

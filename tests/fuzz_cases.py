@@ -55,7 +55,8 @@ mjstack.mdp.reward.reach mjstack.mdp.reward.nope mjstack.mdp.reward mjstack.mdp
 mjstack.mdp.observation.joint_pos mjstack.mdp.reset.home mjstack.mdp.reset.RandomizeObjects
 mjstack.mdp.termination.time_out mjstack.mdp.action.JointPosition mjstack.tasks.stack
 mjstack.tasks.stack.StackCheck mjstack.tasks.box.BoxCheck mjstack.tasks.check.EpisodeCheck
-mjstack.tasks.stack.StackSuccess mjstack.cli.run mjstack.cli.os.getcwd mjstack.cli.Path
+mjstack.tasks.stack.StackSuccess mjstack.tasks.progress.Progress
+mjstack.cli.run mjstack.cli.os.getcwd mjstack.cli.Path
 mjstack.jobs.gates.JOB mjstack.jobs.collect.JOB mjstack.gates.batch.run_batch
 mjstack.rng.uniform mjstack.errors.ConfigError mjstack.__main__.main mjstack.envs.Env
 builtins.max builtins.dict builtins.type builtins.print builtins.None builtins.object sys.exit

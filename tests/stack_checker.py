@@ -58,12 +58,18 @@ def rotation_between(a: np.ndarray, b: np.ndarray) -> float:
     return 4.0 * math.asin(min(1.0, 0.5 * chord)) if math.isfinite(chord) else math.nan
 
 
+def _in(step: int, span: tuple[int, int]) -> bool:
+    return span[0] <= step < span[1]
+
+
 def check_world(
     pose: np.ndarray,
     velocity: np.ndarray,
     cfg: Config,
     phases: list,
     *,
+    jaw_force: np.ndarray,
+    gripper: np.ndarray,
     step_count: int,
     overflow: bool = False,
     finite_elsewhere: bool = True,
@@ -74,7 +80,9 @@ def check_world(
         pose: Red's and blue's pose at every step end, shape ``(steps, 2, 7)``.
         velocity: Their velocity, shape ``(steps, 2, 6)``.
         cfg: Thresholds, table and cubes.
-        phases: Names with first and last (exclusive) step.
+        phases: Names with first and last (exclusive) step; empty for a driver without phases.
+        jaw_force: Of each jaw on red [N], shape ``(steps, jaws, 3)``.
+        gripper: Positions of its joints, shape ``(steps, n)``.
         step_count: Physics steps the world has made.
         overflow: Whether it lost contacts or constraint rows.
         finite_elsewhere: Whether the rest of its state stayed finite.
@@ -89,24 +97,37 @@ def check_world(
 
     if not (np.isfinite(pose).all() and np.isfinite(velocity).all() and finite_elsewhere):
         failed.add("FINITE")
-    if step_count != steps * cfg.timing.decimation or steps != phases[-1].stop:
+    whole = phases[-1].stop if phases else cfg.task.episode_steps
+    if step_count != steps * cfg.timing.decimation or steps != whole:
         failed.add("STEPS")
     if overflow:
         failed.add("OVERFLOW")
 
     airborne = [lowest_corner(p[RED], half) - top > rules.airborne_height for p in pose]
 
-    run = longest = 0
-    for step in range(steps):
-        if any(span[name][0] <= step < span[name][1] for name in rules.lift_phases):
-            run = run + 1 if airborne[step] else 0
-            longest = max(longest, run)
-    if longest < rules.lift_steps:
+    pressed = np.linalg.norm(jaw_force, axis=-1) > 1e-5
+    before = range(steps - rules.window)
+    if phases:
+        lifting = [f for f in range(steps) if any(_in(f, span[n]) for n in rules.lift_phases)]
+        carrying = list(range(*span[rules.carry_phase]))
+    else:
+        airborne = [up and pressed[f].all() for f, up in enumerate(airborne)]
+        lifting = list(before)
+
+    run = 0
+    lifted_at = None
+    for step in lifting:
+        run = run + 1 if airborne[step] else 0
+        if run == rules.lift_steps and lifted_at is None:
+            lifted_at = step
+    if lifted_at is None:
         failed.add("LIFT")
 
+    if not phases:  # the lift comes first
+        carrying = [f for f in before if lifted_at is not None and f >= lifted_at]
     carried = False
     run_steps: list[int] = []
-    for step in range(*span[rules.carry_phase]):
+    for step in carrying:
         run_steps = [*run_steps, step] if airborne[step] else []
         if run_steps:
             start = pose[run_steps[0], RED, :2]
@@ -131,6 +152,12 @@ def check_world(
         )
         if not (gap <= rules.support_gap and inside):
             failed.add("SUPPORTED")
+
+    closed = np.array(cfg.robot.gripper_closed)
+    opening = (gripper - closed) / (np.array(cfg.robot.gripper_open) - closed)
+    for step in window:
+        if pressed[step].any() or not (opening[step] >= rules.open_fraction).all():
+            failed.add("RELEASED")
 
     rms = []
     peaks = []

@@ -19,11 +19,13 @@ from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
 from mjstack.math import quat_to_matrix
+from mjstack.mdp.geometry import above_table
 from mjstack.scene import SceneIndex, build_model, lowest_height
 from mjstack.scene.phases import nominal_xy
 from mjstack.tasks.box import BoxSuccess
-from mjstack.tasks.box_terms import GraspNext, InBox, Place, ReachNext, ToSlot
+from mjstack.tasks.box_terms import ToSlot
 from mjstack.tasks.check import make_check
+from mjstack.tasks.progress import Progress
 
 X0 = {"so101": 0.305, "rebot": 0.47}
 RED = "red"
@@ -227,7 +229,6 @@ def test_terms_know_the_box(robot: str) -> None:
     np.testing.assert_allclose(ToSlot(env, object=RED)(env)[1:3], 0.0, atol=1e-6)
     wanted = np.subtract(places[BLUE], env.sim.model.body(BLUE).pos)
     np.testing.assert_allclose(ToSlot(env, object=BLUE)(env)[0], wanted, atol=1e-6)
-    assert InBox(env)(env).tolist() == [0.0, 0.5, 1.0, 0.0]
     check = make_check(env.cfg)
     assert check.placed(check.view(env).step()).tolist() == [
         [False, False],
@@ -235,46 +236,29 @@ def test_terms_know_the_box(robot: str) -> None:
         [True, True],
         [False, False],
     ]
-    place = Place(env, object=RED, scale=0.1)(env)
-    assert place.tolist() == pytest.approx([0.0, 1.0, 1.0, 1.0 - math.tanh(1.0)], abs=1e-6)
-    reach = ReachNext(env, scale=0.1)(env)
+    progress = Progress(env)
     grasp_point = 0.5 * sum(env.sim.site_xpos[0, s] for s in env.index.grasp_sites)
-    for world, name in ((0, RED), (1, BLUE), (3, RED)):
+    value = progress(env).tolist()
+    for world, name, start in ((0, RED, 0.0), (1, BLUE, 0.5)):
         address, _ = env.index.object_address(name)
         distance = float((env.sim.qpos[world, address : address + 3] - grasp_point).norm())
-        assert float(reach[world]) == pytest.approx(1.0 - math.tanh(distance / 0.1), abs=1e-6)
-    assert float(reach[2]) == 1.0
-    grasp = GraspNext(env)
-    assert grasp(env).tolist() == [0.0, 0.0, 1.0, 0.0]
-    for cube, worlds in (
-        (RED, [0, 1]),
-        (BLUE, [3]),
-    ):  # in world 1 red is in the box: pressing on it pays nothing
-        for address in env.index.jaw_force[cube]:
-            env.sim.sensordata[worlds, address] = 1.0
-    assert grasp(env).tolist() == [1.0, 0.0, 1.0, 0.0]
+        part = (1.0 - math.tanh(distance / 0.2)) / 5.0
+        assert value[world] == pytest.approx(start + 0.5 * part, abs=1e-6)
+    assert value[2] == pytest.approx(1.0)  # the gripper is open at home
+    assert value[3] == pytest.approx(0.5 * (3.0 + 1.0 - math.tanh(0.1 / 0.2)) / 5.0, abs=1e-6)
+    for address in env.index.jaw_force[RED]:
+        env.sim.sensordata[1, address] = 1.0
+    # Held in the box, red is not let go of: nothing of blue counts.
+    assert float(progress(env)[1]) == pytest.approx(0.5 * 5.0 / 5.0, abs=1e-6)
+    between = grasp_point.numpy()
+    put(env, RED, between, [1])
+    low = float(above_table(env, RED)[1])
+    across = np.linalg.norm(places[RED][:2] - between[:2])
+    part = 1.0 + low / 0.04 if low < 0.04 else 3.0 - math.tanh(across / 0.2)
+    assert float(progress(env)[1]) == pytest.approx(0.5 * part / 5.0, abs=1e-6)
+    put(env, RED, between - [0.0, 0.0, 0.026], [1])
+    assert float(progress(env)[1]) < 0.1  # closed jaws on its top are no grasp
     env.close()
-
-
-@pytest.mark.full
-def test_a_place_counts_off_the_table_whatever_the_boxs_floor() -> None:
-    """Red over its place, its lowest corner 0.5 mm below and above half the floor, and at rest on
-    the floor; all else alike.
-    """
-    for floor in (0.004, 0.006):
-        env = small_env("reset=nominal", f"scene.box.floor={floor}")
-        for world, height in enumerate((0.5 * floor - 0.0005, 0.5 * floor + 0.0005, floor)):
-            put(
-                env,
-                RED,
-                [*env.cfg.scene.places["red_slot"].xy, TOP["so101"] + height + 0.022],
-                [world],
-            )
-        below, above, resting = Place(env, object=RED, scale=0.1)(env).tolist()
-        assert below == 0.0
-        assert above == pytest.approx(1.0 - math.tanh((0.5 * floor - 0.0005) / 0.1), abs=1e-6)
-        assert resting == pytest.approx(1.0, abs=1e-6)
-        env.close()
 
 
 def test_success_needs_rest_in_the_box_an_open_gripper_and_the_whole_window(robot: str) -> None:
@@ -282,7 +266,7 @@ def test_success_needs_rest_in_the_box_an_open_gripper_and_the_whole_window(robo
     now and then, in 4 a jaw touches blue in the first step, in 5 a corner of red is above the
     rim."""
     env = small_env("reset=nominal", robot=robot, nworld=6)
-    success = BoxSuccess(env, open_fraction=0.8)
+    success = BoxSuccess(env)
     places = rests(env)
     window = limits(env.cfg).window
     put(env, RED, places[RED], [0, 1, 2, 3, 4])
@@ -453,9 +437,8 @@ def test_bad_input_is_one_line(overrides: list[str], parts: list[str]) -> None:
 @pytest.mark.parametrize(
     ("override", "parts"),
     [
-        ("reward.place_red.params.object=red_cub", ["reward.place_red", "red_cub", "red"]),
-        ("reward.reach.params.scale=0", ["reward.reach.params.scale=0", "above 0"]),
-        ("task.success.params.open_fraction=2", ["task.success.params.open_fraction=2", "0 to 1"]),
+        ("observation.policy.terms.red_to_slot.params.object=red_cub", ["red_to_slot", "red_cub"]),
+        ("reward.progress.params.scale=0", ["reward.progress.params.scale=0", "above 0"]),
     ],
 )
 def test_bad_terms_are_named(override: str, parts: list[str]) -> None:
@@ -468,4 +451,4 @@ def test_bad_terms_are_named(override: str, parts: list[str]) -> None:
 @pytest.mark.full
 def test_terms_of_the_box_need_a_box() -> None:
     with pytest.raises(MjstackError, match="box"):
-        make_env(["task=stack", "sim=native", "reward=box"], nworld=1)
+        make_env(["task=stack", "sim=native", "observation=box"], nworld=1)

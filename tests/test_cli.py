@@ -77,7 +77,7 @@ BAD = [
     ["reset.cubes.params.xy=0.5"],
     ["~reset.cubes.params.xy"],
     ["reset.cubes.func=mjstack.mdp.reset.JiterObjects"],
-    ["reward.reach.params.object=green_cube"],
+    ["reward.progress.params.scale=wide"],
     ["action.arm.params.mode=sideways"],
     ["observation.policy.terms.joint_pos.history=0"],
     ["reset=randomized", "reset.cubes.params.xy=[0.0,0.001]", "reset.cubes.params.gap=0.5"],

@@ -316,11 +316,11 @@ def test_another_configuration_is_refused(
 ) -> None:
     monkeypatch.chdir(demos.cwd)
     before = contents(demos.cwd)
-    assert run([*demos.args, "job.episodes=5", "reward.lift.weight=2.5"]) == 2
+    assert run([*demos.args, "job.episodes=5", "reward.progress.weight=2.5"]) == 2
     err = capsys.readouterr().err.strip()
     assert (
         err == "mjstack: outputs/demos/dataset has episodes of another configuration:"
-        " reward.lift.weight=2.0, expected 2.5. Set job.folder to another folder, or these keys"
+        " reward.progress.weight=5.0, expected 2.5. Set job.folder to another folder, or these keys"
         " back."
     )
     assert contents(demos.cwd) == before
@@ -402,7 +402,7 @@ def test_what_the_hash_is_of() -> None:
     values = [
         "seed=1",
         "observation.policy.noise=false",
-        "reward.lift.weight=3",
+        "reward.progress.weight=3",
         "task.check.xy_err=0.01",
     ]
     values += ["job.keep_failures=true", "controller.phases.done.seconds=2.0"]

@@ -261,7 +261,10 @@ BAD = [
     ),
     (["=3"], "=3: "),
     (["nworld"], "override 'nworld' cannot be read: expected key=value"),
-    (["~reward.grap"], "~reward.grap: there is none to leave out. Did you mean 'reward.grasp'?"),
+    (
+        ["~reward.progres"],
+        "~reward.progres: there is none to leave out. Did you mean 'reward.progress'?",
+    ),
     (["robot=so100"], "Did you mean 'so101'?"),
     (["robots=so101"], "Did you mean 'robot'?"),
     (["phase=stack"], "Did you mean 'phases'?"),
@@ -273,7 +276,7 @@ BAD = [
     (["nworld=2.5"], "nworld"),
     (["sim.nworlds=3"], "nworld'?"),
     (["nworlds=3"], "nworld'?"),
-    (["reward.lift.wait=1"], "wait"),
+    (["reward.progress.wait=1"], "wait"),
     (
         ["scene.objects.red.fixed=true", "scene.objects.blue.fixed=true"],
         "expected at least one object that is not fixed",
@@ -350,13 +353,15 @@ def test_the_whole_job_is_checked_before_its_folder_exists(overrides: list[str],
 def test_a_swapped_function_does_not_inherit_parameters() -> None:
     reach = "reward.reach.func=mjstack.mdp.reward.reach"
     swap = "reward.reach.func=mjstack.mdp.reward.action_rate"
-    kept = load_config([reach]).reward["reach"]
+    task = "task=reach"
+    kept = load_config([task, reach]).reward["reach"]
     assert kept.params
-    assert load_config([swap, "reward.reach.weight=3.0"]).reward["reach"].params == {}
-    given = load_config([swap, "+reward.reach.params.mine=2", "reward.reach.params={scale: 1}"])
+    assert load_config([task, swap, "reward.reach.weight=3.0"]).reward["reach"].params == {}
+    mine = ["+reward.reach.params.mine=2", "reward.reach.params={scale: 1}"]
+    given = load_config([task, swap, *mine])
     assert given.reward["reach"].params == {"mine": 2, "scale": 1}
     term = "{func: mjstack.mdp.reward.action_rate, params: {mine: 3}}"
-    assert load_config([f"+reward.reach={term}"]).reward["reach"].params == {"mine": 3}
+    assert load_config([task, f"+reward.reach={term}"]).reward["reach"].params == {"mine": 3}
     home = "gate.success.reset.joint_noise.func=mjstack.mdp.reset.home"
     assert load_config([home]).gate.success.reset["joint_noise"].params == {}
     check = load_config(["task.check.func=mine.Check", "task.check.window=7"]).task.check

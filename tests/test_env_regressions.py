@@ -223,14 +223,17 @@ def test_episode_length_is_the_time_out_terms() -> None:
             ["reset=randomized", "reset.mass.params.scale=2"],
             "reset.mass.params.scale=2: expected a list",
         ),
-        (["reward.reach.params.scale=abc"], "reward.reach.params.scale=abc: expected a number"),
         (
-            ["reward.reach.params.scale=0"],
-            "reward.reach.params.scale=0: expected a number above 0",
+            ["reward.progress.params.scale=abc"],
+            "reward.progress.params.scale=abc: expected a number",
         ),
         (
-            ["reward.lift.params.height=-1"],
-            "reward.lift.params.height=-1: expected a number above 0",
+            ["reward.progress.params.scale=0"],
+            "reward.progress.params.scale=0: expected a number above 0",
+        ),
+        (
+            ["reward.progress.params.height=-1"],
+            "reward.progress.params.height=-1: expected a number above 0",
         ),
         (
             ["termination.time_out.params.steps=0"],
@@ -240,7 +243,10 @@ def test_episode_length_is_the_time_out_terms() -> None:
             ["action=ee_delta", "action.arm.params.iterations=2.5"],
             "action.arm.params.iterations=2.5: expected an integer",
         ),
-        (["task.success.params.open_fraction=2"], "open_fraction=2: expected a number from 0 to 1"),
+        (
+            ["reward.progress.params.open_fraction=2"],
+            "open_fraction=2: expected a number from 0 to 1",
+        ),
         (["action.arm.params.joints=[shoulder_pan,shoulder_pan]"], "action.arm.params.joints"),
     ],
 )
@@ -270,9 +276,9 @@ def test_a_value_function_is_no_reset_term() -> None:
 
 def test_keys_that_can_be_added_say_how() -> None:
     with pytest.raises(
-        mjstack.MjstackError, match=r"To add it, write \+reward\.grasp\.params\.force=\.\.\."
+        mjstack.MjstackError, match=r"To add it, write \+reward\.success\.params\.force=\.\.\."
     ):
-        native("reward.grasp.params.force=0.5")
+        native("reward.success.params.force=0.5")
 
 
 def test_a_closed_environment_and_a_missing_field_say_so() -> None:

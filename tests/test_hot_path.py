@@ -89,7 +89,16 @@ PATHS: dict[str, list[str] | None] = {
             f"Step.{n}"
             for n in (
                 *("pose", "pos", "velocity", "turn", "height", "bounds", "speed"),
-                *("pressed", "in_hand", "untouched", "supported", "judged", "_judged", "_sensed"),
+                *(
+                    "pressed",
+                    "in_hand",
+                    "untouched",
+                    "opening",
+                    "supported",
+                    "judged",
+                    "_judged",
+                    "_sensed",
+                ),
             )
         ),
     ],
@@ -98,20 +107,24 @@ PATHS: dict[str, list[str] | None] = {
         *(f"{n}.update" for n in ("Streak", "Carried", "InWindow", "AtRest")),
         "AtLeast.held",
         "Streak._counts",
-        *("HeldSuccess.__call__", "HeldSuccess.reset", "ReleasedSuccess.__call__"),
+        *("HeldSuccess.__call__", "HeldSuccess.reset", "released", "on_top_of"),
     ],
     "tasks/stack.py": [
-        *("StackCheck.placed", "StackSuccess._stands", "StackSuccess.__call__"),
+        *("StackCheck.placed", "StackCheck.goals", "StackSuccess._stands", "StackSuccess.__call__"),
     ],
     "tasks/box.py": [
         *(f"BoxCheck.{n}" for n in ("airborne", "resting", "outside", "over", "placed")),
         *(f"_{n}.update" for n in ("CarriedOver", "Drop", "Release", "Settled", "Order")),
-        *("_Drop.held", "corner_speed"),
+        *(
+            "_Drop.held",
+            "corner_speed",
+            "BoxCheck.goals",
+            "BoxCheck.at_slot",
+            "BoxSuccess.__init__",
+        ),
     ],
-    "tasks/box_terms.py": [
-        *(f"{n}.__call__" for n in ("ToSlot", "Place", "InBox", "ReachNext", "GraspNext")),
-        *("_ByObject._inside", "_ByObject._next"),
-    ],
+    "tasks/box_terms.py": ["ToSlot.__call__"],
+    "tasks/progress.py": ["Progress.__call__", "Progress._nearness"],
     "tasks/reach.py": ["ReachSuccess.__init__"],
     "drivers/open_loop.py": ["JointTrajectory.command"],
     "drivers/driver.py": ["Recorded.append", "Recorded.command", "OpenLoopDriver.command"],

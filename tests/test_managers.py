@@ -129,15 +129,21 @@ def test_tables_show_settings_and_the_environment_shows_all_tables() -> None:
         env.observation_manager,
     ):
         assert str(manager) in shown
-    (row,) = [line for line in str(env.reward_manager).splitlines() if "│ lift " in line]
-    assert "2.0" in row
-    assert "height=0.05" in row
+    (row,) = [line for line in str(env.reward_manager).splitlines() if "│ progress " in line]
+    assert "5.0" in row
+    assert "height=0.04" in row
 
 
 @pytest.mark.full
 def test_overrides_change_exactly_what_they_name() -> None:
     env = make_env(
-        ["sim=native", "action=ee_delta", "reset=nominal", "~reward.grasp", "reward.lift.weight=3"],
+        [
+            "sim=native",
+            "action=ee_delta",
+            "reset=nominal",
+            "~reward.joint_vel",
+            "reward.progress.weight=3",
+        ],
         nworld=2,
         seed=5,
     )
@@ -146,29 +152,26 @@ def test_overrides_change_exactly_what_they_name() -> None:
     expected.seed = 5
     expected.action = configure("action=ee_delta").action
     expected.reset = configure("reset=nominal").reset
-    expected.reward.pop("grasp")
-    expected.reward["lift"].weight = 3.0
+    expected.reward.pop("joint_vel")
+    expected.reward["progress"].weight = 3.0
     assert env.cfg == expected
     assert env.cfg.action != configure("sim=native").action
     assert list(env.action_manager.terms) == ["arm", "gripper"]
     assert type(env.action_manager.terms["arm"]).__name__ == "EndEffectorDelta"
     assert env.action_manager.action_dim == 4
-    assert env.reward_manager.names == [
-        "reach",
-        "lift",
-        "place",
-        "success",
-        "action_rate",
-        "joint_vel",
-    ]
-    assert "3.0" in next(line for line in str(env.reward_manager).splitlines() if "lift" in line)
+    assert env.reward_manager.names == ["progress", "success", "action_rate"]
+    assert "3.0" in next(
+        line for line in str(env.reward_manager).splitlines() if "progress" in line
+    )
     assert (env.nworld, env.seed) == (2, 5)
     env.reset()
     env.step(torch.zeros(2, 4))
-    # Lift is worth three instead of two per second.
-    env.sim.qpos[:, env.index.object_qpos[0] + 2] += 0.2
+    # A stack that the open gripper has let go of is worth three instead of five per second.
+    red, blue = env.index.object_qpos
+    env.sim.qpos[:, red : red + 3] = env.sim.qpos[:, blue : blue + 3]
+    env.sim.qpos[:, red + 2] += 0.044
     env.step(torch.zeros(2, 4))
-    column = env.reward_manager.values[:, 1]
+    column = env.reward_manager.values[:, 0]
     torch.testing.assert_close(column, torch.full_like(column, 3.0 * env.cfg.timing.step_dt))
     env.close()
 

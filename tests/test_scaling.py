@@ -424,7 +424,7 @@ def test_folder_depends_on_what_a_run_depends_on() -> None:
     assert same.startswith("outputs/scaling/")
     unused = ("job.nworlds=[5]", "job.max_minutes=3", "job.retry=true", "nworld=3")
     assert name(*unused, choices=["sim=native", "job.backends=[native]"]) == same
-    for choice in ("robot=rebot", "~reward.grasp"):
+    for choice in ("robot=rebot", "~reward.success"):
         assert name(choices=[choice]) != same, choice
     for value in ("job.repetitions=2", "batch.njmax=99", "seed=1", "sim.device=cpu"):
         assert name(value) != same, value

@@ -148,7 +148,9 @@ def test_a_sweep_and_a_replay(
 ) -> None:
     flags = ["--config-dir", str(lean), "-m", "task=stack", "gates=[upright]"]
     reset = "+reset.lean={func: lean.lean}"
-    swapped = "reward.reach.func=mjstack.mdp.reward.action_rate"  # without the other's parameters
+    swapped = (
+        "reward.progress.func=mjstack.mdp.reward.action_rate"  # without the other's parameters
+    )
     assert run([*flags, reset, swapped, "seed=1,2"]) == 0
     first, _ = sorted(tmp_path.rglob("report.json"))
     assert json.loads(first.read_text())["status"] == "pass"

@@ -14,6 +14,7 @@ import torch
 from check_cases import STOPPED_EARLY, Altered, Cases, limits, rules_of
 from stack_checker import BLUE, RED, Outcome, check_world
 
+from mjstack.scene.index import Columns
 from mjstack.tasks.check import CheckResult, make_check
 
 RULES = rules_of("stack")
@@ -36,10 +37,21 @@ class World:
     pose: np.ndarray
     velocity: np.ndarray
     force: np.ndarray
+    gripper: np.ndarray
     step_count: int
     rec: SimpleNamespace
     overflow: int = 0
     arm: float = 0.0
+
+    @classmethod
+    def of(cls, rec: SimpleNamespace, k: int = 0) -> World:
+        arrays = (getattr(rec, n)[k].copy() for n in ("pose", "velocity", "force", "gripper"))
+        return cls(*arrays, int(rec.step_count[k]), rec)
+
+    def jaw(self, number: int) -> np.ndarray:
+        """A view of a jaw's force on red, shape ``(steps, 3)``."""
+        first = self.rec.jaw_force["red"][number]
+        return self.force[:, first : first + 3]
 
     def steps(self, name: str) -> slice:
         phase = next(p for p in self.rec.phases if p.name == name)
@@ -62,7 +74,7 @@ def feed(
     phased: bool = True,
 ) -> CheckResult:
     """Plays recordings through the check, as of a driver with phases or without; the state also has
-    one coordinate of an arm.
+    one coordinate of an arm, and the gripper's.
     """
     index = SimpleNamespace(
         object_address={"red": (1, 1), "blue": (8, 7)}.__getitem__,
@@ -70,6 +82,12 @@ def feed(
         support_force={},
         constant=lambda values, like: torch.tensor(values, dtype=like.dtype),
         fixed={},
+        n_arm=1,
+        on=lambda device, dtype: SimpleNamespace(
+            qpos=Columns([0, *range(15, 15 + worlds[0].gripper.shape[1])], device),
+            gripper_closed=torch.tensor(rec.cfg.robot.gripper_closed, dtype=dtype),
+            gripper_open=torch.tensor(rec.cfg.robot.gripper_open, dtype=dtype),
+        ),
     )
     n = len(worlds)
     phase_at = torch.tensor([i for i, p in enumerate(rec.phases) for _ in range(p.start, p.stop)])
@@ -77,15 +95,17 @@ def feed(
     pose = np.stack([w.pose.reshape(len(w.pose), 14) for w in worlds])
     velocity = np.stack([w.velocity.reshape(len(w.velocity), 12) for w in worlds])
     force = np.stack([w.force for w in worlds])
+    gripper = np.stack([w.gripper for w in worlds])
     sim = SimpleNamespace(
         step_count=torch.tensor([w.step_count for w in worlds]),
         overflow=torch.tensor([w.overflow for w in worlds], dtype=torch.int32),
     )
     env = SimpleNamespace(sim=sim, cfg=rec.cfg, index=index, nworld=n, device=torch.device("cpu"))
     check = make_check(rec.cfg)
+    sim.qpos = torch.zeros((n, 1), dtype=dtype)
     check.start(env, len(phase_at), rec.phases if phased else ())
     for step in range(pose.shape[1]):
-        sim.qpos = torch.tensor(np.hstack([arm, pose[:, step]]), dtype=dtype)
+        sim.qpos = torch.tensor(np.hstack([arm, pose[:, step], gripper[:, step]]), dtype=dtype)
         sim.qvel = torch.tensor(np.hstack([arm, velocity[:, step]]), dtype=dtype)
         sim.sensordata = torch.tensor(force[:, step], dtype=dtype)
         phase = phase_at[min(step, len(phase_at) - 1)].expand(n)
@@ -93,12 +113,14 @@ def feed(
     return check.result()
 
 
-def reference(w: World) -> Outcome:
+def reference(w: World, *, phased: bool = True) -> Outcome:
     return check_world(
         w.pose,
         w.velocity,
         w.rec.cfg,
-        w.rec.phases,
+        w.rec.phases if phased else [],
+        jaw_force=np.stack([w.jaw(number) for number in (0, 1)], axis=1),
+        gripper=w.gripper,
         step_count=w.step_count,
         overflow=bool(w.overflow & ~STOPPED_EARLY),
         finite_elsewhere=math.isfinite(w.arm),
@@ -122,10 +144,7 @@ def test_recorded_episodes(
     robot: str, recorded: Callable[[str], SimpleNamespace], dtype: torch.dtype
 ) -> None:
     rec = recorded(robot)
-    worlds = [
-        World(rec.pose[k], rec.velocity[k], rec.force[k], int(rec.step_count[k]), rec)
-        for k in range(len(rec.pose))
-    ]
+    worlds = [World.of(rec, k) for k in range(len(rec.pose))]
     result = feed(worlds, rec, dtype)
     for k, world in enumerate(worlds):
         expected = reference(world)
@@ -286,6 +305,28 @@ def arm_not_a_number(w: World) -> None:
     w.arm = math.nan
 
 
+@CASES.case("RELEASED")
+def touched_by_a_jaw_in_the_windows_first_step(w: World) -> None:
+    w.jaw(1)[-w.t.window] = [0.0, 2e-5, 0.0]
+
+
+@CASES.case()
+def touched_by_a_jaw_just_before_the_window(w: World) -> None:
+    w.jaw(1)[-w.t.window - 1] = 1.0
+
+
+@CASES.case()
+def touched_by_less_than_the_threshold(w: World) -> None:
+    w.jaw(0)[w.window, 2] = 9e-6
+
+
+@CASES.case("RELEASED")
+def held_to_the_end(w: World) -> None:
+    w.gripper[w.steps("release").start :] = w.gripper[w.steps("place_stack").stop - 1]
+    for jaw in (0, 1):
+        w.jaw(jaw)[w.steps("release").start :] = w.jaw(jaw)[w.steps("place_stack").stop - 1]
+
+
 def hair(name: str, amount: Callable[[World, float], None], *broken: str) -> None:
     """Registers both sides of a threshold."""
     CASES.add(f"{name}_inside", set(), lambda w: amount(w, -HAIR))
@@ -337,6 +378,12 @@ def _carry_distance(w: World, by: float) -> None:
     w.pose[w.steps("above_blue").stop - 1, RED, 0] += w.t.carry_distance - by
 
 
+def _opening(w: World, by: float) -> None:
+    closed, opened = (w.rec.cfg.robot.gripper_closed[0], w.rec.cfg.robot.gripper_open[0])
+    w.gripper[-7] = closed + w.t.open_fraction * (opened - closed) - by
+
+
+hair("open_fraction", _opening, "RELEASED")
 hair("xy_err", _xy, "STACKED")
 hair("dz_min", _dz_min, "STACKED")
 hair("dz_max", _dz_max, "STACKED")
@@ -354,13 +401,7 @@ def altered(recorded: Callable[[str], SimpleNamespace]) -> Altered:
     rec = recorded("so101")
 
     def fresh() -> World:
-        world = World(
-            rec.pose[0].copy(),
-            rec.velocity[0].copy(),
-            rec.force[0].copy(),
-            int(rec.step_count[0]),
-            rec,
-        )
+        world = World.of(rec)
         _make_ideal(world)
         return world
 
@@ -389,9 +430,9 @@ def test_episode_cut_short_fails_whatever_came_before(
     recorded: Callable[[str], SimpleNamespace],
 ) -> None:
     rec = recorded("so101")
-    world = World(
-        rec.pose[0][:-1], rec.velocity[0][:-1], rec.force[0][:-1], int(rec.step_count[0]), rec
-    )
+    world = World.of(rec)
+    for name in ("pose", "velocity", "force", "gripper"):
+        setattr(world, name, getattr(world, name)[:-1])
     assert {"STEPS", "STACKED", "SUPPORTED"} <= CASES.broken(feed([world], rec))
 
 

@@ -52,9 +52,7 @@ OBSERVATIONS = {
 }
 REWARDS = {  # whether it is a fraction, from 0 to 1
     "reach": ({**OBJECT, "scale": 0.1}, True),
-    "grasp": (OBJECT, True),
     "lift": ({**OBJECT, "height": 0.05}, True),
-    "place": ({"a": "red", "b": "blue", "scale": 0.1}, True),
     "success": ({}, True),
     "action_rate": ({}, False),
     "joint_vel": ({}, False),
@@ -213,6 +211,7 @@ def record(env: Env, stage: Stage, steps: int = 600) -> SimpleNamespace:
             "qpos": env.sim.qpos.clone(),
             "qvel": env.sim.qvel.clone(),
             "ctrl": env.sim.ctrl.clone(),
+            "sensordata": env.sim.sensordata.clone(),
             "grasp_point": env.sim.site_xpos[:, env.index.grasp_sites].mean(1),
             "values": env.reward_manager.values.clone(),
             "action": env.action.clone(),
@@ -257,6 +256,43 @@ def cubes_of(
     return torch.stack(pose, -2).numpy(), torch.stack(velocity, -2).numpy()
 
 
+def jaw_forces_of(rec: SimpleNamespace, sensordata: torch.Tensor) -> np.ndarray:
+    """Force of each jaw on red [N], shape ``(..., jaws)``."""
+    forces = [sensordata[..., a : a + 3].numpy() for a in rec.index.jaw_force["red"]]
+    return np.linalg.norm(np.stack(forces, axis=-2), axis=-1)
+
+
+def progress_of(rec: SimpleNamespace, pose: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """The stages of one object in plain loops, from the reward's docstring."""
+    cfg = rec.cfg
+    half = cfg.scene.objects["red"].half_height
+    t = limits(cfg)
+    closed, opened = (np.array(v) for v in (cfg.robot.gripper_closed, cfg.robot.gripper_open))
+    out = np.zeros(low.shape)
+    for step, world in np.ndindex(*low.shape):
+        red, blue = pose[step, world, :, :3]
+        fingers = rec.qpos[step, world].numpy()[rec.index.robot_qpos[rec.index.n_arm :]]
+        opening = ((fingers - closed) / (opened - closed)).min()
+        away = np.linalg.norm(rec.grasp_point[step, world].numpy() - red)
+        offset = blue + np.array([0.0, 0.0, 2.0 * half]) - red
+        across = np.linalg.norm(offset[:2])
+        forces = jaw_forces_of(rec, rec.sensordata[step, world])
+        held = (forces > 1e-5).all() and away <= 0.02
+        dz = red[2] - blue[2]
+        if np.linalg.norm(red[:2] - blue[:2]) <= t.xy_err and t.dz_min <= dz <= t.dz_max:
+            stage, part = 4, opening / 0.8
+        elif across <= 0.03 and offset[2] <= 0.005:
+            stage, part = 3, 1.0 - math.tanh(abs(offset[2]) / 0.2)
+        elif held and low[step, world] >= 0.04:
+            stage, part = 2, 1.0 - math.tanh(across / 0.2)
+        elif held:
+            stage, part = 1, low[step, world] / 0.04
+        else:
+            stage, part = 0, 1.0 - math.tanh(away / 0.2)
+        out[step, world] = (stage + np.clip(part, 0.0, 1.0)) / 5.0
+    return out
+
+
 @pytest.mark.full
 def test_rewards_of_a_scripted_episode(
     robot: str, scripted: Callable[[str], SimpleNamespace]
@@ -273,33 +309,27 @@ def test_rewards_of_a_scripted_episode(
     half = cfg.scene.objects["red"].half_height
     top = table_top(cfg)
     low = np.array([[lowest_corner(p[RED], half) - top for p in step] for step in pose])
-    red = pose[..., RED, :3]
-    blue = pose[..., BLUE, :3]
-    above_blue = blue + np.array([0.0, 0.0, 2.0 * half])
     action = rec.action.double().numpy()
     change = np.diff(action, axis=0, prepend=np.zeros_like(action[:1]))
     qvel = rec.qvel[..., torch.from_numpy(rec.index.robot_qvel)].numpy()
     expected = {
-        "reach": 1.0 - np.tanh(np.linalg.norm(red - rec.grasp_point.numpy(), axis=-1) / 0.1),
-        "lift": np.clip(low / 0.05, 0.0, 1.0),
-        "place": (1.0 - np.tanh(np.linalg.norm(above_blue - red, axis=-1) / 0.1)) * (low > 0.005),
+        "progress": progress_of(rec, pose, low),
         "success": rec.success.numpy(),
         "action_rate": np.square(change).sum(-1),
         "joint_vel": np.square(qvel).sum(-1),
     }
-    assert {*expected, "grasp"} == set(names)
+    assert set(expected) == set(names)
     for name, value in expected.items():
         np.testing.assert_allclose(got[name], value, rtol=1e-4, atol=1e-5, err_msg=name)
     np.testing.assert_allclose(rec.reward.numpy(), rec.values.sum(-1).numpy(), rtol=1e-5, atol=1e-7)
 
     span = {p.name: slice(p.start, p.stop) for p in rec.phases}
-    assert set(np.unique(got["grasp"].round(5))) == {0.0, 1.0}
-    assert not got["grasp"][span["above_red"]].any()
-    np.testing.assert_allclose(got["grasp"][span["above_blue"]], 1.0, rtol=1e-5)  # held all the way
-    assert not got["grasp"][span["done"]].any()
-    assert got["lift"][span["lift_red"].stop - 1].min() == pytest.approx(1.0, rel=1e-5)
-    assert got["lift"][span["descend_red"]].max() < 0.05
-    assert got["place"][-1].min() > 0.8
+    stage = np.floor(5.0 * got["progress"] + 1e-4)
+    assert (stage[span["above_red"]] == 0.0).all()
+    assert (stage[span["lift_red"].stop - 1] == 2.0).all()
+    assert (stage[span["above_blue"].stop - 1] == 3.0).all()
+    assert (stage[span["release"].start] == 4.0).all()
+    assert (stage[span["done"]] == 5.0).all()
     assert got["success"][-1].min() == pytest.approx(1.0, rel=1e-5)
 
 
@@ -324,8 +354,8 @@ def test_jaw_force_is_mujocos_contact_force(
             obs = env.step(rec.action[step + t].to(env.device).float())[0]["privileged"]
         column = sum(width for width in (*[len(cfg.robot.home)] * 2, 3, 3, 7, 6, 7))
         force = 10.0 * obs[:, column : column + 2].double().cpu().numpy()  # its scale is 0.1
-        grasp = env.reward_manager.values[:, list(cfg.reward).index("grasp")]
-        assert (grasp > 0).tolist() == [grasped] * 3
+        stage = env.reward_manager.values[:, 0] / env.reward_manager.weights[0] * 5.0
+        assert (stage >= 1.0).tolist() == [grasped] * 3
         for k in range(3):
             expected = jaw_forces(env, k)
             if not grasped:
@@ -348,17 +378,6 @@ def test_jaw_force_has_a_column_for_each_jaw(robot: str) -> None:
                 expected = torch.zeros(3, 2).double()
                 expected[1, column] = 13.0 * (other == cube)
                 assert torch.equal(observation_terms.jaw_force(env, object=other), expected)
-    env.sim.sensordata[:] = 1.0  # both jaws of both cubes
-    assert reward_terms.grasp(env, object="red", force=1.7).tolist() == [1.0] * 3
-    assert reward_terms.grasp(env, object="red", force=1.8).tolist() == [0.0] * 3
-    env.sim.sensordata[2, int(env.sim.model.sensor(f"{env.cfg.robot.jaw_bodies[1]}/red").adr[0]) :][
-        :3
-    ] = 0.0
-    assert reward_terms.grasp(env, object="red").tolist() == [
-        1.0,
-        1.0,
-        0.0,
-    ]  # one jaw is no grasp
 
 
 def jaw_forces(env: Env, world: int) -> list[float]:
@@ -420,14 +439,20 @@ def test_success_ends_a_scripted_episode(
 
 
 def rested(
-    pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray, cfg: Config, since: np.ndarray
+    pose: np.ndarray,
+    velocity: np.ndarray,
+    opening: np.ndarray,
+    touched: np.ndarray,
+    cfg: Config,
+    since: np.ndarray,
 ) -> np.ndarray:
-    """Rules 4 and 5 over the window that ends at each step, and an open gripper in that step.
+    """Rules 4 to 6 over the window that ends at each step.
 
     Args:
         pose: Shape ``(steps, 2, 7)``.
         velocity: Shape ``(steps, 2, 6)``.
         opening: Of every finger, shape ``(steps, n)``.
+        touched: Whether a jaw presses on red, shape ``(steps,)``.
         cfg: Thresholds, table and cubes.
         since: First frame of the episode that each step belongs to, shape ``(steps,)``.
     """
@@ -450,7 +475,9 @@ def rested(
     out = np.zeros(len(pose), dtype=bool)
     for step in range(t.window - 1, len(pose)):
         part = slice(step - t.window + 1, step + 1)
-        if part.start < since[step] or not good[part].all() or not (opening[step] >= 0.8).all():
+        if part.start < since[step] or not good[part].all():
+            continue
+        if touched[part].any() or not (opening[part] >= 0.8).all():
             continue
         rms = np.sqrt(np.square(speed[part]).mean(0))
         places = pose[part, :, :3]
@@ -563,6 +590,11 @@ def closing_and_opening(pose: np.ndarray, velocity: np.ndarray, opening: np.ndar
     opening[FROM : FROM + 10, -1] = 0.7
 
 
+@variant(recovers=True)
+def touched_for_one_step(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
+    pass  # a jaw presses on red at FROM
+
+
 @variant(recovers=False)
 def swapped(pose: np.ndarray, velocity: np.ndarray, opening: np.ndarray) -> None:
     pose[FROM:] = pose[FROM:, ::-1].copy()
@@ -585,13 +617,13 @@ def broken_and_started_anew(pose: np.ndarray, velocity: np.ndarray, opening: np.
 
 
 def assert_success(
-    rec: SimpleNamespace, worlds: list[tuple[str, torch.Tensor, torch.Tensor]], expected: np.ndarray
+    rec: SimpleNamespace, worlds: list[tuple[str, *tuple[torch.Tensor, ...]]], expected: np.ndarray
 ) -> None:
     """The term says what is expected, shape ``(worlds, steps)``; some worlds start anew when their
     trajectory is altered.
     """
-    names, qpos, qvel = zip(*worlds, strict=True)
-    state = torch.stack(qpos, 1), torch.stack(qvel, 1)
+    names, *views = zip(*worlds, strict=True)
+    state = [torch.stack(view, 1) for view in views]
     env = SimpleNamespace(
         nworld=len(names),
         device=torch.device("cpu"),
@@ -599,15 +631,13 @@ def assert_success(
         index=rec.index,
         sim=SimpleNamespace(),
     )
-    env.sim.qpos = state[0][0]
-    env.sim.qvel = state[1][0]
-    term = StackSuccess(env, open_fraction=0.8)
+    env.sim.qpos, env.sim.qvel, env.sim.sensordata = (view[0] for view in state)
+    term = StackSuccess(env)
     anew = torch.tensor(["anew" in name for name in names])
     for step, want in enumerate(expected.T.tolist()):
         if step == FROM:
             term.reset(anew)
-        env.sim.qpos = state[0][step]
-        env.sim.qvel = state[1][step]
+        env.sim.qpos, env.sim.qvel, env.sim.sensordata = (view[step] for view in state)
         got = term(env).tolist()
         assert got == want, (
             f"step {step}: {[name for name, a, b in zip(names, got, want, strict=True) if a != b]}"
@@ -615,7 +645,7 @@ def assert_success(
 
 
 @pytest.mark.full
-def test_stack_success_is_rules_four_and_five(
+def test_stack_success_is_rules_four_to_six(
     scripted: Callable[[str], SimpleNamespace],
 ) -> None:
     """Step by step, over the recorded episodes and altered ends of the first, some of whose worlds
@@ -635,10 +665,11 @@ def test_stack_success_is_rules_four_and_five(
     for k in range(3):
         qpos = rec.qpos[:, k]
         qvel = rec.qvel[:, k]
-        whole.append((f"world {k}", qpos, qvel))
-        expected.append(
-            rested(*cubes_of(rec, qpos, qvel), opening(qpos), rec.cfg, np.zeros(len(qpos)))
-        )
+        force = rec.sensordata[:, k]
+        whole.append((f"world {k}", qpos, qvel, force))
+        touched = (jaw_forces_of(rec, force) > 1e-5).any(1)
+        cubes = cubes_of(rec, qpos, qvel)
+        expected.append(rested(*cubes, opening(qpos), touched, rec.cfg, np.zeros(len(qpos))))
         assert expected[-1][-1]
         assert not expected[-1][:480].any()
         assert rec.success[:, k].tolist() == expected[-1].tolist()  # what the environment said
@@ -647,6 +678,7 @@ def test_stack_success_is_rules_four_and_five(
     # The last 170 steps, and then the cubes just stand there for another 75.
     qpos = torch.cat((rec.qpos[430:, 0], rec.qpos[-1:, 0].expand(75, -1)))
     qvel = torch.cat((rec.qvel[430:, 0], torch.zeros_like(rec.qvel[-1:, 0]).expand(75, -1)))
+    force = torch.cat((rec.sensordata[430:, 0], rec.sensordata[-1:, 0].expand(75, -1)))
     altered = []
     expected = []
     for name, (alter, recovers) in VARIANTS.items():
@@ -661,12 +693,16 @@ def test_stack_success_is_rules_four_and_five(
             v[:, b : b + 6] = torch.from_numpy(velocity[:, i])
         q[:, gripper] = torch.from_numpy(closed + fingers * (opened - closed))
         since = np.where(np.arange(len(q)) >= FROM, FROM, 0) if "anew" in name else np.zeros(len(q))
-        want = rested(pose, velocity, fingers, rec.cfg, since)
-        unharmed = name in ("untouched", "other_sign", "kicked_gently", "closing_and_opening")
+        pressed = force.clone()
+        if name == "touched_for_one_step":
+            pressed[FROM, rec.index.jaw_force["red"][1]] = 1.0
+        touched = (jaw_forces_of(rec, pressed) > 1e-5).any(1)
+        want = rested(pose, velocity, fingers, touched, rec.cfg, since)
+        unharmed = name in ("untouched", "other_sign", "kicked_gently")
         assert want[FROM - 2], name
         assert want[FROM + 44 : FROM + 48].tolist() == [unharmed] * 4, name
         assert want[-1] == recovers, name
-        altered.append((name, q, v))
+        altered.append((name, q, v, pressed))
         expected.append(want)
     assert_success(rec, altered, np.array(expected))
     for world, want in zip(

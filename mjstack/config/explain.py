@@ -48,7 +48,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
         if parsed.is_delete():
             if "." not in key and key not in (*TERM_GROUPS, "experiment"):
                 raise CompositionError(
-                    f"~{key}: expected a term of {', '.join(TERM_GROUPS)}, such as ~reward.lift."
+                    f"~{key}: expected a term of {', '.join(TERM_GROUPS)}, such as ~reward.success."
                     f" Keys and groups at the top are always there: set {key}=VALUE."
                 )
         elif isinstance(parsed.value(), list) and key in list_choices() and key != "experiment":

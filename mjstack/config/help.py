@@ -174,7 +174,7 @@ def help_text(cfg: Config, width: int) -> str:
         ],
         ["Keys, to be set as key=value, and their defaults:", *_table(keys, width)],
         [
-            "Keys below a group can be set too: gate.batch.seeds=10. ~reward.grasp leaves a term"
+            "Keys below a group can be set too: gate.batch.seeds=10. ~reward.success leaves a term"
             " out, +reward.mine=... adds one."
         ],
         ["Flags:", *_table(_FLAGS, width)],

@@ -1,5 +1,6 @@
 """Drivers give the joint targets of every world, step by step, and the phase of each world."""
 
+from abc import ABC, abstractmethod
 from typing import Protocol
 
 import torch
@@ -30,6 +31,24 @@ class Driver(Protocol):
 
     def command(self) -> torch.Tensor:
         """Commands of the next step, shape ``(nworld, nu)``."""
+
+
+class PhaselessDriver(ABC):
+    """A driver without phases, such as a policy: a check judges every step of its episode. See
+    `Driver` for the attributes.
+    """
+
+    def __init__(self, nworld: int, steps: int, device: torch.device) -> None:
+        """Take the worlds and the length of the episode."""
+        self.phases: list[Phase] = []
+        self.steps = steps
+        self.phase = torch.zeros(nworld, dtype=torch.int64, device=device)
+        self.error = torch.zeros(nworld, device=device)
+        self.retries = torch.zeros(nworld, dtype=torch.int32, device=device)
+
+    @abstractmethod
+    def command(self) -> torch.Tensor:
+        """See `Driver`."""
 
 
 class Recorded:

@@ -61,7 +61,8 @@ class FailureMonitor(Observer):
 
     Attributes:
         sign: Number of the `Sign`, shape ``(nworld,)``, int64.
-        phase: Number of the phase in which it was seen, -1 without one, shape ``(nworld,)``, int64.
+        phase: Number of the phase in which it was seen, -1 without one or without phases, shape
+            ``(nworld,)``, int64.
         step: The step in whose end it was seen, -1 without one, shape ``(nworld,)``, int64; where a
             phase ended with it, the first one after that phase.
     """
@@ -129,7 +130,8 @@ class FailureMonitor(Observer):
         first = (self.sign == 0) & (seen > 0)
         ended = (seen == Sign.EMPTY) | (seen == Sign.MISSED)  # what the phase before has left
         self.sign.copy_(torch.where(first, seen, self.sign))
-        self.phase.copy_(torch.where(first, torch.where(ended, self._at, phase), self.phase))
+        if self.driver.phases:
+            self.phase.copy_(torch.where(first, torch.where(ended, self._at, phase), self.phase))
         self.step.copy_(torch.where(first, self._now, self.step))
         self._at.copy_(phase)
         self._loaded.copy_(loaded)

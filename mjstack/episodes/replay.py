@@ -64,7 +64,7 @@ def replay_world(
         recorder = WorldRecorder()
         looking = [trace, *observers, recorder]
         episode = context.play(sim, cfg.reset, looking, seed=seed, worlds=[world])
-        names = np.array([phase.name for phase in context.planner.phases])
+        names = np.array([phase.name for phase in recorder.driver.phases] or [""])
         steps = {name: np.stack(values) for name, values in trace.steps.items()}
         steps["time_s"] = np.arange(1, len(recorder.phase) + 1) * cfg.timing.step_dt
         steps["phase"] = names[recorder.phase]

@@ -233,7 +233,8 @@ def _first_sign(monitor: FailureMonitor, done: ReplayedWorld, context: RunContex
     sign = int(monitor.sign[0])
     seen = "none"
     if sign:
-        phase = context.planner.phases[int(monitor.phase[0])].name
+        names = [phase.name for phase in monitor.driver.phases] or [""]
+        phase = names[int(monitor.phase[0])]
         seen = f"{describe_sign(sign, phase)}, seen in step {int(monitor.step[0])}"
     retries = int(done.episode.retries[0])
     return f"first sign of failure: {seen}; grasps tried again: {retries}"

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from mjstack.config.fields import NotNegative, Positive
+from mjstack.config.fields import Positive
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import above_table, nearness, place_xy, pose_w, robot
-from mjstack.mdp.observation import grasp_point_to_object, jaw_force, object_to_object
+from mjstack.mdp.observation import grasp_point_to_object
 
 
 def reach(env: EnvView, *, object: str, scale: Positive, height: float = 0.0) -> Tensor:
@@ -21,26 +21,11 @@ def reach(env: EnvView, *, object: str, scale: Positive, height: float = 0.0) ->
     return nearness(grasp_point_to_object(env, object=object, height=height), scale)
 
 
-def grasp(env: EnvView, *, object: str, force: NotNegative = 0.05) -> Tensor:
-    """1 while both jaws press on an object with more than ``force`` [N], else 0."""
-    return (jaw_force(env, object=object) > force).all(1).to(torch.float32)
-
-
 def lift(env: EnvView, *, object: str, height: Positive) -> Tensor:
     """Height of an object's lowest point above the table as a fraction of ``height`` [m], from 0 to
     1.
     """
     return (above_table(env, object) / height).clamp(0.0, 1.0)
-
-
-def place(env: EnvView, *, a: str, b: str, scale: Positive) -> Tensor:
-    """Nearness of object ``a`` to its position on object ``b``, while it is off the table: ``1 -
-    tanh(distance / scale)``.
-    """
-    offset = object_to_object(env, a=a, b=b)
-    objects = env.cfg.scene.objects
-    offset[:, 2] += objects[a].half_height + objects[b].half_height
-    return nearness(offset, scale) * (above_table(env, a) > 0.005)
 
 
 def near_place(env: EnvView, *, object: str, place: str, scale: Positive) -> Tensor:

@@ -7,20 +7,21 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mjstack.config.fields import Fraction, spec
+from mjstack.config.fields import spec
 from mjstack.errors import ConfigError, UnknownName
 from mjstack.managers.view import EnvView
-from mjstack.mdp.geometry import gripper_opening
+from mjstack.mdp.geometry import place_xy
 from mjstack.scene import lowest_height
 from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
 from mjstack.tasks.parts import (
     AtLeast,
     Carried,
+    HeldSuccess,
     InWindow,
-    ReleasedSuccess,
     Streak,
     away,
     in_hand,
+    released,
 )
 from mjstack.tasks.view import Step, TaskView, once_per_step
 
@@ -186,6 +187,16 @@ class BoxCheck(EpisodeCheck):
         """Whether each object is in the box."""
         return self.outside(step).amax(-1) <= self.t.inside
 
+    def goals(self, step: Step) -> dict[str, Tensor]:
+        """See `EpisodeCheck`."""
+        return {name: self.at_slot(step.view.env, name).float() for name in self.objects}
+
+    def at_slot(self, env: EnvView, name: str) -> Tensor:
+        """Centre of an object that rests at its place in the box [m], shape ``(nworld, 3)``."""
+        xy = place_xy(env, self.slots[name])
+        height = self._low[2] + self.cfg.scene.objects[name].half_height
+        return torch.cat((xy, torch.full_like(xy[:, :1], height)), dim=1)
+
     def trace(self, step: Step) -> dict[str, Tensor]:
         """See `EpisodeCheck`."""
         return {
@@ -293,7 +304,7 @@ class _Release(AtLeast):
 
     def update(self, step: Step) -> None:
         opens = step.judged(self.key) if step.view.phased else self._carry.held()
-        opening = gripper_opening(step.view.env).amin(1).float()[:, None]
+        opening = step.opening.amin(1, keepdim=True)
         wide = torch.where(opens & step.untouched, opening, 0.0)
         torch.maximum(self.best, wide, out=self.best)
 
@@ -364,16 +375,23 @@ class _JawClear(Rule):
         return clearance >= self._check.t.jaw_clearance, {"jaw_clearance_m": clearance}
 
 
-class BoxSuccess(ReleasedSuccess):
-    """Achieved while all objects have been at rest in the box, out of the jaws, for the whole
-    window, and the gripper is open. It shares the thresholds of the task's check.
+class BoxSuccess(HeldSuccess):
+    """Achieved while all objects have been at rest in the box, let go of, for the whole window. It
+    shares the thresholds of the task's check.
     """
 
-    def __init__(self, env: EnvView, *, open_fraction: Fraction) -> None:
-        """Allocate the streak; see `ReleasedSuccess`.
+    def __init__(self, env: EnvView) -> None:
+        """Allocate the streak.
 
         Raises:
-            MjstackError: The fraction is out of range, or the task has another check.
+            MjstackError: The task has another check.
         """
         check = BoxCheck(env.cfg)
-        super().__init__(env, check, lambda step: check.resting(step).all(1), open_fraction)
+        view = check.view(env)
+        let_go = released(*check.objects, open_fraction=check.t.open_fraction)
+
+        def done() -> Tensor:
+            step = view.step()
+            return (check.resting(step) & let_go(step)).all(1)
+
+        super().__init__(env, done, check.settle_steps)

@@ -97,11 +97,13 @@ class CheckResult:
         failed: Bits of the task's rules, shape ``(nworld,)``, int32.
         values: Measured values, by name with unit, each ``(nworld,)``.
         shown: Names of those that tell about each rule, by its name.
+        phased: Whether the driver had phases, so that rules counted in those that they name.
     """
 
     failed: Tensor
     values: dict[str, Tensor]
     shown: dict[str, list[str]]
+    phased: bool
 
 
 class Rule(ABC):
@@ -295,13 +297,19 @@ class EpisodeCheck(ABC):
         failed = torch.zeros_like(self._finite, dtype=torch.int32)
         for name, bit in self.rules.items():
             failed |= bit * (~held[name]).to(failed.dtype)
-        return CheckResult(failed, values, shown)
+        return CheckResult(failed, values, shown, self._view.phased)
 
     @abstractmethod
     def placed(self, step: Step) -> Tensor:
         """Whether each object is where it belongs, in the order of ``objects``, shape ``(nworld,
         objects)``, bool. No host read.
         """
+
+    def goals(self, step: Step) -> dict[str, Tensor]:
+        """Where the centre of each object that is carried belongs [m], each ``(nworld, 3)``, by
+        name in their order; for `mjstack.tasks.progress.Progress`. No host read.
+        """
+        return {}
 
     def trace(self, step: Step) -> dict[str, Tensor]:
         """Values that a replay keeps at every step end, by name with unit, each ``(nworld,)``."""
@@ -324,11 +332,13 @@ class EpisodeCheck(ABC):
         task's rules.
         """
         told = {name: f"{name} {float(value[0]):.4g}" for name, value in result.values.items()}
-        return {
-            name: (", ".join(told[each] for each in result.shown[name]) or "see the values", wanted)
-            for rule in self._rules
-            for name, wanted in zip(rule.texts, rule.wanted, strict=True)
-        }
+        report = {}
+        for rule in self._rules:
+            phases = rule.phases if result.phased and rule.phases else [()] * len(rule.texts)
+            for name, wanted, names in zip(rule.texts, rule.wanted, phases, strict=True):
+                found = ", ".join(told[each] for each in result.shown[name]) or "see the values"
+                report[name] = (found, f"{wanted} in {' and '.join(names)}" if names else wanted)
+        return report
 
     def headline(self, values: Mapping[str, float]) -> str:
         """A world's values in a few words."""

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from mjstack.managers.view import EnvView
 from mjstack.math import quat_angle
-from mjstack.mdp.geometry import gripper_opening, place_xy
-from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
+from mjstack.mdp.geometry import place_xy
+from mjstack.tasks.check import Judgement, Rule
 from mjstack.tasks.view import PhaseNames, Step, TaskView
 
 Condition = Callable[[Step], Tensor]
@@ -40,6 +40,18 @@ def in_hand(*objects: str) -> Condition:
     return lambda step: step.view.columns(objects).read(step.in_hand)
 
 
+def released(*objects: str, open_fraction: float) -> Condition:
+    """Objects that no jaw touches while the gripper is open by at least that fraction as measured,
+    from 0 (closed) to 1 (open).
+    """
+
+    def condition(step: Step) -> Tensor:
+        open_wide = (step.opening >= open_fraction).all(1, keepdim=True)
+        return step.view.columns(objects).read(step.untouched) & open_wide
+
+    return condition
+
+
 def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: float) -> Condition:
     """An object above another one: horizontal distance of the centres and difference of their
     heights [m].
@@ -58,6 +70,13 @@ def offset(step: Step, object: str, onto: str) -> tuple[Tensor, Tensor]:
     """
     apart = step.pos[:, step.view.column(object)] - step.pos[:, step.view.column(onto)]
     return torch.linalg.vector_norm(apart[:, :2], dim=1), apart[:, 2]
+
+
+def on_top_of(step: Step, onto: str, object: str) -> Tensor:
+    """Centre of an object that stands on the middle of another one [m], shape ``(nworld, 3)``."""
+    objects = step.view.env.cfg.scene.objects
+    height = objects[onto].half_height + objects[object].half_height
+    return step.pos[:, step.view.column(onto)] + step.view.constant(0.0, 0.0, height)
 
 
 def at_place(object: str, place: str, *, distance: float) -> Condition:
@@ -117,8 +136,7 @@ class AtLeast(Rule):
         suffix of the object, and ``least`` the threshold.
         """
         super().__init__(name, text, objects)
-        during = [" and ".join(each) for each in phases]
-        self.wanted = [f"at least {least:g}{each and f' in {each}'}" for each in during]
+        self.wanted = [f"at least {least:g}"] * len(phases)
         self.least = least
         self._value = value
         self.phases = phases
@@ -339,27 +357,3 @@ class HeldSuccess:
     def reset(self, mask: Tensor) -> None:
         """Forget the masked worlds."""
         self._length.masked_fill_(mask, 0)
-
-
-class ReleasedSuccess(HeldSuccess):
-    """Achieved while a condition has held for the window of a check, and the gripper is open."""
-
-    def __init__(
-        self, env: EnvView, check: EpisodeCheck, condition: Condition, open_fraction: float
-    ) -> None:
-        """Allocate the streaks.
-
-        Args:
-            env: The environment.
-            check: The task's check.
-            condition: A condition of a step.
-            open_fraction: How far the gripper must be open, from 0 (closed) to 1 (open), as
-                measured.
-        """
-        view = check.view(env)
-        super().__init__(env, lambda: condition(view.step()), check.settle_steps)
-        self._open = open_fraction
-
-    def __call__(self, env: EnvView) -> Tensor:
-        """Process a step; shape ``(nworld,)``, bool."""
-        return super().__call__(env) & (gripper_opening(env) >= self._open).all(1)

@@ -1,9 +1,12 @@
 """Success of any task that has a check: every object is where it belongs."""
 
-from mjstack.config.fields import Count
+import torch
+from torch import Tensor
+
+from mjstack.config.fields import Count, Fraction
 from mjstack.managers.view import EnvView
 from mjstack.tasks.check import make_check
-from mjstack.tasks.parts import HeldSuccess
+from mjstack.tasks.parts import Condition, HeldSuccess, released
 
 
 class Placed(HeldSuccess):
@@ -11,16 +14,28 @@ class Placed(HeldSuccess):
     `EpisodeCheck.placed`, for some steps in a row.
     """
 
-    def __init__(self, env: EnvView, *, steps: Count = 1) -> None:
+    def __init__(
+        self, env: EnvView, *, steps: Count = 1, open_fraction: Fraction | None = None
+    ) -> None:
         """Allocate the streaks.
 
         Args:
             env: The environment, its task with a check.
             steps: How many steps in a row.
+            open_fraction: How far the gripper must be open, as measured, while no jaw touches an
+                object; by default nothing has to be let go of.
 
         Raises:
             MjstackError: The task has no check, or the number is out of range.
         """
         check = make_check(env.cfg)
         view = check.view(env)
-        super().__init__(env, lambda: check.placed(view.step()).all(1), steps)
+        asked: list[Condition] = [check.placed]
+        if open_fraction is not None:
+            asked.append(released(*check.objects, open_fraction=open_fraction))
+
+        def holds() -> Tensor:
+            step = view.step()
+            return torch.cat([condition(step) for condition in asked], dim=1).all(1)
+
+        super().__init__(env, holds, steps)

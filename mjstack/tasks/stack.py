@@ -7,26 +7,31 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mjstack.config.fields import Fraction, spec
+from mjstack.config.fields import spec
 from mjstack.managers.view import EnvView
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import (
     AtRest,
     Carried,
+    HeldSuccess,
     InWindow,
-    ReleasedSuccess,
     Streak,
     airborne,
     offset,
     on_table,
     on_top,
+    on_top_of,
+    released,
 )
 from mjstack.tasks.view import Step
 
 
 class StackCheck(EpisodeCheck):
-    """One object has been lifted, carried, and stands at rest on another one, which stands on the
-    table.
+    """One object has been lifted, carried and let go of, and stands at rest on another one, which
+    stands on the table.
+
+    Without phases, lift and carry count at any time before the settled window, the carry once the
+    lift holds, and only while all jaws press on the object.
     """
 
     @dataclass(kw_only=True, slots=True)
@@ -65,6 +70,8 @@ class StackCheck(EpisodeCheck):
         """Largest distance of an object between any two steps of the window."""
         rest_rotation_deg: float = spec(unit="deg", gt=0.0)
         """Largest rotation of an object between any two steps of the window."""
+        open_fraction: float = spec(gt=0.0, le=1.0)
+        """Share of the gripper's opening, as measured, while no jaw touches the object."""
 
     t: Thresholds
     summaries = {  # noqa: RUF012
@@ -85,6 +92,7 @@ class StackCheck(EpisodeCheck):
         up = airborne(t.object, height=t.airborne_height)
         self.stacked = on_top(t.object, t.onto, xy_err=t.xy_err, dz_min=t.dz_min, dz_max=t.dz_max)
         self.supported = on_table(t.onto, gap=t.support_gap)
+        self.released = released(t.object, open_fraction=t.open_fraction)
         lift = Streak(
             "LIFT",
             "{object} not lifted",
@@ -120,11 +128,16 @@ class StackCheck(EpisodeCheck):
                 position=t.rest_position,
                 rotation_deg=t.rest_rotation_deg,
             ),
+            InWindow("RELEASED", f"{t.object} not released", self.released, t.window),
         ]
 
     def placed(self, step: Step) -> Tensor:
         """Whether the object is on the other one, and that one on the table."""
         return torch.stack((self.stacked(step), self.supported(step)), dim=1)
+
+    def goals(self, step: Step) -> dict[str, Tensor]:
+        """See `EpisodeCheck`."""
+        return {self.t.object: on_top_of(step, self.t.onto, self.t.object)}
 
     def trace(self, step: Step) -> dict[str, Tensor]:
         """See `EpisodeCheck`."""
@@ -136,25 +149,25 @@ class StackCheck(EpisodeCheck):
         return f"xy_err {1e3 * values['xy_err_m']:.1f} mm, dz {1e3 * values['dz_m']:.1f} mm"
 
 
-class StackSuccess(ReleasedSuccess):
-    """Achieved while an object has stood at rest on another one through the whole window, and the
-    gripper is open: rules 4 and 5 of the check, whose thresholds it shares.
+class StackSuccess(HeldSuccess):
+    """Achieved while an object has stood at rest on another one, let go of, through the whole
+    window: rules 4 to 6 of the check, whose thresholds it shares.
 
     For the largest distance between any two steps of the window, each step keeps its largest
     distance to the later ones: a new step updates all of them at once, and the one that leaves
     takes its own along. Distances stay squared, and angles stay cosines, until they are judged.
     """
 
-    def __init__(self, env: EnvView, *, open_fraction: Fraction) -> None:
-        """Allocate a ring of the last steps; see `ReleasedSuccess`.
+    def __init__(self, env: EnvView) -> None:
+        """Allocate a ring of the last steps.
 
         Raises:
-            MjstackError: The fraction is out of range, or the task has another check.
+            MjstackError: The task has another check.
         """
         check = StackCheck(env.cfg)
-        super().__init__(env, check, self._stands, open_fraction)
-        self._check = check
         view = check.view(env)
+        super().__init__(env, lambda: self._stands(view.step()), check.settle_steps)
+        self._check = check
         ring = (check.t.window, len(view.objects))
         # Where the oldest step is, in every world.
         self._slot = torch.zeros(1, dtype=torch.int64, device=env.device)
@@ -175,7 +188,7 @@ class StackSuccess(ReleasedSuccess):
         self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
         for ring in (self._far, self._turned):
             ring.index_fill_(1, self._slot, 0.0)
-        return self._check.placed(step).all(1)
+        return self._check.placed(step).all(1) & self._check.released(step)[:, 0]
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""

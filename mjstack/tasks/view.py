@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mjstack.managers.view import EnvView
 from mjstack.math import lowest_point, quat_to_matrix
-from mjstack.mdp.geometry import LOADED, pose_w
+from mjstack.mdp.geometry import LOADED, gripper_opening, pose_w
 from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
 
@@ -231,6 +231,13 @@ class Step:
     def untouched(self) -> Tensor:
         """Whether no jaw presses on each object, shape ``(nworld, objects)``, bool."""
         return ~self.pressed.any(-1)
+
+    @cached_property
+    def opening(self) -> Tensor:
+        """How far each gripper joint is open as measured, 0 closed to 1 open, shape ``(nworld,
+        n_gripper)``, float32.
+        """
+        return gripper_opening(self.view.env).float()
 
     @cached_property
     def supported(self) -> Tensor:
