@@ -430,6 +430,7 @@ os._exit(130)
     assert (done.returncode, done.stderr) == (130, b"")
 
 
+@pytest.mark.full
 def test_folder_depends_on_what_a_run_depends_on() -> None:
     def name(*values: str, choices: Sequence[str] = ()) -> str:
         return str(scaling_folder(put(load_config(["job=scaling", *choices]), *values)))
