@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 
+from mjstack.managers.view import rows_of
 from mjstack.math import lowest_point, not_finite, quat_angle, quat_from_yaw, quat_mul, quat_z_row
 from mjstack.rng import philox, uniform
+from mjstack.scene.index import Columns
 
 KNOWN = [
     (
@@ -169,3 +172,28 @@ def test_lowest_corner_against_eight_corners(quats: np.ndarray) -> None:
         expected.append(min(heights))
     got = lowest_point(torch.from_numpy(pos), torch.from_numpy(quats), "box", [0.022] * 3)
     np.testing.assert_allclose(got.numpy(), expected, atol=1e-14)
+
+
+def test_not_finite_asks_row_by_row_where_a_sum_is_not_finite() -> None:
+    """A sum of finite numbers may overflow, and two infinities may cancel to NaN."""
+    huge = torch.full((4, 3), 3e38)
+    assert not not_finite(huge).any()
+    odd = huge.clone()
+    odd[1, 0] = math.nan
+    odd[2, :2] = torch.tensor([math.inf, -math.inf])
+    assert not_finite(torch.zeros(4, 2), odd).tolist() == [False, True, True, False]
+    assert not_finite(torch.ones(4, 0)).tolist() == [False] * 4
+
+
+@pytest.mark.parametrize("indices", [(1, 2), (3, 0)])
+def test_masked_writes_of_all_rows_and_of_some_agree(indices: tuple[int, ...]) -> None:
+    columns = Columns(indices, torch.device("cpu"))
+    mask = torch.tensor([True, False, True, False, True])
+    value = torch.rand(5, 2, dtype=torch.float64)
+    whole, some = torch.zeros(2, 5, 4)
+    columns.write_masked(whole, mask, value)
+    at = rows_of(mask)
+    columns.write_masked(some, mask, value[at], at)
+    assert torch.equal(whole, some)
+    assert whole[mask][:, list(indices)].equal(value[mask].float())
+    assert not whole[~mask].any()

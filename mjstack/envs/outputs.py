@@ -63,8 +63,12 @@ class Outputs:
                 observation is 0 where it is NaN, which a value times 0 would hand on.
         """
         self.tensors["success"].copy_(success)
+        whole = not broken.is_cuda and not bool(broken.any())
         for name in self._groups:
             group = self.tensors[f"obs/{name}"]
+            if whole:
+                self.tensors[f"final/{name}"].copy_(group)
+                continue
             finite = group.nan_to_num(0.0, 0.0, 0.0)
             torch.where(broken[:, None], finite, group, out=self.tensors[f"final/{name}"])
 

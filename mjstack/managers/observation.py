@@ -10,7 +10,8 @@ import torch
 from mjstack.config.schema import ObservationGroupCfg, ObservationTermCfg
 from mjstack.errors import TermError
 from mjstack.managers.term import Term, first_value, render_table
-from mjstack.managers.view import EnvView, random_uniform
+from mjstack.managers.view import EnvView, random_uniform, rows_of
+from mjstack.scene.index import ALL, Rows
 
 
 class _Part:
@@ -89,15 +90,16 @@ class _Group:
         self._repeat = indices(repeat)
         self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
 
-    def compute(self) -> torch.Tensor:
-        """One step of every world, shape ``(nworld, sum of widths)``."""
-        n = self._env.nworld
-        values = [part.term(self._env).reshape(n, part.width) for part in self.parts.values()]
+    def compute(self, at: Rows = ALL) -> torch.Tensor:
+        """One step of some worlds, shape ``(n, sum of widths)``."""
+        env = self._env
+        parts = self.parts.values()
+        values = [part.term(env).reshape(env.nworld, part.width)[at] for part in parts]
         step = torch.cat(values, dim=1).float()
         if len(self._noise_columns):
             size = len(self._noise_columns)
             draw = random_uniform(
-                self._env, f"observation.{self.name}", size, step=self._env.episode_step
+                env, f"observation.{self.name}", size, step=env.episode_step, at=at
             ).float()
             step.index_add_(1, self._noise_columns, self._noise * draw)
         if self._clips:
@@ -116,12 +118,17 @@ class _Group:
 
     def restart(self, out: torch.Tensor, mask: torch.Tensor) -> None:
         """The whole history of the masked worlds becomes the current step."""
-        step = self.compute()
-        if not self._has_history:
-            torch.where(mask[:, None], step, out, out=out)
-            return
-        torch.where(mask[:, None], step.index_select(1, self._repeat), self._past, out=self._past)
-        out.copy_(self._past)
+        at = rows_of(mask)
+        step = self.compute(at)
+        kept = self._past if self._has_history else out
+        if self._has_history:
+            step = step.index_select(1, self._repeat)
+        if isinstance(at, torch.Tensor):
+            kept.index_copy_(0, at, step)
+        else:
+            torch.where(mask[:, None], step, kept, out=kept)
+        if self._has_history:
+            out.copy_(self._past)
 
 
 class ObservationManager:

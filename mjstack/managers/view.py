@@ -9,6 +9,7 @@ import torch
 from mjstack.config.schema import Config
 from mjstack.rng import uniform
 from mjstack.scene import SceneIndex
+from mjstack.scene.index import ALL, Rows
 from mjstack.sim import Simulation
 
 
@@ -86,7 +87,7 @@ def random_uniform(
     low: float = -1.0,
     high: float = 1.0,
     step: torch.Tensor | None = None,
-    mask: torch.Tensor | None = None,
+    at: Rows = ALL,
 ) -> torch.Tensor:
     """Random numbers of every world's current episode, which depend neither on nworld nor on which
     worlds reset.
@@ -98,11 +99,11 @@ def random_uniform(
         low: Smallest value.
         high: Upper bound.
         step: Step within the episode, shape ``(nworld,)``; 0 if None, which is right for resets.
-        mask: Worlds whose numbers are read, shape ``(nworld,)``, bool, all if None: the others'
-            may be any.
+        at: The worlds, from `rows_of`.
 
     Returns:
-        Shape ``(nworld, size)``, in the type of the simulation's floats.
+        Shape ``(nworld, size)``, or a row for each of ``at``, in the type of the simulation's
+        floats.
     """
     stream = zlib.crc32(name.encode())
     if env.device.type == "cuda":
@@ -120,7 +121,6 @@ def random_uniform(
             high=high,
         )
     step = torch.zeros_like(env.world) if step is None else step
-    at = rows_of(mask)
     draw = uniform(
         seed=env.seed,
         world=env.world[at],
@@ -129,22 +129,14 @@ def random_uniform(
         stream=stream,
         size=size,
     )
-    numbers = low + 0.5 * (high - low) * (draw.to(env.sim.qpos.dtype) + 1.0)
-    return spread(numbers, at, env.nworld)
+    return low + 0.5 * (high - low) * (draw.to(env.sim.qpos.dtype) + 1.0)
 
 
-def rows_of(mask: torch.Tensor | None) -> torch.Tensor | slice:
+def rows_of(mask: torch.Tensor) -> Rows:
     """The worlds of a mask where the host can look at it, and all of them on CUDA: an index for
     what costs by the world.
     """
-    return slice(None) if mask is None or mask.is_cuda else mask.nonzero().squeeze(1)
-
-
-def spread(part: torch.Tensor, at: torch.Tensor | slice, nworld: int) -> torch.Tensor:
-    """Values of the worlds of `rows_of`, in all worlds: 0 for the others."""
-    if isinstance(at, slice):
-        return part
-    return part.new_zeros((nworld, *part.shape[1:])).index_copy_(0, at, part)
+    return ALL if mask.is_cuda else mask.nonzero().squeeze(1)
 
 
 def episode_draw(

@@ -11,7 +11,7 @@ from mjstack.errors import UnknownName
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, episode_draw
 from mjstack.math import lowest_point
-from mjstack.scene.index import RobotTensors, SceneIndex
+from mjstack.scene.index import ALL, RobotTensors, Rows, SceneIndex
 from mjstack.sim.simulation import Simulation
 
 
@@ -24,11 +24,13 @@ Pose = Literal["home", "start"]  # the robot's own commands
 LOADED = 1e-5  # N: a jaw that presses with more touches the object
 
 
-def write_robot(env: EnvView, mask: Tensor, command: Tensor) -> None:
-    """Put the masked worlds' robot at a command, shape ``(nworld, n)``: qpos and ctrl."""
+def write_robot(env: EnvView, mask: Tensor, command: Tensor, at: Rows = ALL) -> None:
+    """Put the masked worlds' robot at a command, shape ``(nworld, n)``: qpos and ctrl. Where ``at``
+    has their numbers, the command has their rows alone.
+    """
     tensors = robot(env)
-    tensors.qpos.write_masked(env.sim.qpos, mask, command)
-    tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
+    tensors.qpos.write_masked(env.sim.qpos, mask, command, at)
+    tensors.ctrl.write_masked(env.sim.ctrl, mask, command, at)
 
 
 def gripper_opening(env: EnvView) -> Tensor:
@@ -50,11 +52,17 @@ def pose_w(env: EnvView, name: str) -> Tensor:
     return env.sim.qpos[:, address : address + 7]
 
 
-def write_object(env: EnvView, mask: Tensor, name: str, xy: Tensor, quat: Tensor) -> None:
+def write_object(
+    env: EnvView, mask: Tensor, name: str, xy: Tensor, quat: Tensor, at: Rows = ALL
+) -> None:
     """Put the masked worlds' object at x and y [m], turned by a quaternion (wxyz); its height
-    stays.
+    stays. Where ``at`` has their numbers, the values have their rows alone.
     """
     view = pose_w(env, name)
+    if isinstance(at, Tensor):
+        view[at, :2] = xy
+        view[at, 3:] = quat
+        return
     torch.where(mask[:, None], torch.cat((xy, view[:, 2:3], quat), dim=1), view, out=view)
 
 

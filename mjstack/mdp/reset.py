@@ -16,7 +16,6 @@ from mjstack.managers.view import (
     offers,
     random_uniform,
     rows_of,
-    spread,
     uses_fields,
 )
 from mjstack.math import quat_from_yaw
@@ -30,12 +29,13 @@ from mjstack.mdp.starts.randomization import (
     bounds,
 )
 from mjstack.mdp.starts.reach import require_reach
-from mjstack.scene.index import joint_limits
+from mjstack.scene.index import Rows, joint_limits
 
 
 def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
     """Put the robot at its home, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
-    write_robot(env, mask, getattr(robot(env), pose).expand(env.nworld, -1))
+    at = rows_of(mask)
+    write_robot(env, mask, getattr(robot(env), pose).expand(len(env.world[at]), -1), at)
     env.sim.qvel.masked_fill_(mask[:, None], 0.0)
 
 
@@ -62,9 +62,10 @@ class JointNoise:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos and ctrl."""
-        noise = random_uniform(env, self.label, self._width.shape[0], mask=mask)
-        command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
-        write_robot(env, mask, torch.clamp(command, self._low, self._high))
+        at = rows_of(mask)
+        noise = random_uniform(env, self.label, self._width.shape[0], at=at)
+        command = robot(env).ctrl.read(env.sim.ctrl)[at] + self._width * noise
+        write_robot(env, mask, torch.clamp(command, self._low, self._high), at)
 
 
 class JitterObjects:
@@ -90,10 +91,11 @@ class JitterObjects:
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos."""
         count = 3 * len(env.index.objects)
-        draws = random_uniform(env, self.label, count, mask=mask).view(env.nworld, -1, 3)
+        at = rows_of(mask)
+        draws = random_uniform(env, self.label, count, at=at).unflatten(1, (-1, 3))
         for number, name in enumerate(env.index.objects):
             xy, yaw = draws[:, number].split((2, 1), dim=1)
-            _write_object(env, mask, name, self._xy * xy, self._yaw * yaw[:, 0])
+            _write_object(env, mask, name, self._xy * xy, self._yaw * yaw[:, 0], at)
 
 
 @offers(places_objects=True)
@@ -162,15 +164,14 @@ class RandomizeObjects:
         count = len(env.index.objects)
         some = count * (2 * self._candidates + 1)
         at = rows_of(mask)
-        draws = random_uniform(env, self.label, some + 2 * count * self._more, mask=mask)[at]
+        draws = random_uniform(env, self.label, some + 2 * count * self._more, at=at)
         first = draws[:, :some].reshape(len(draws), count, -1)
         more = draws[:, some:].reshape(len(draws), count, -1)
         candidates = torch.cat((first[..., 1:], more), dim=2)
         offsets, _ = self._placement.choose(candidates.reshape(len(draws), count, -1, 2))
-        offsets = spread(offsets, at, env.nworld)
-        yaw = spread(self._yaw * first[..., 0], at, env.nworld)
+        yaw = self._yaw * first[..., 0]
         for number, name in enumerate(env.index.objects):
-            _write_object(env, mask, name, offsets[:, number], yaw[:, number])
+            _write_object(env, mask, name, offsets[:, number], yaw[:, number], at)
 
 
 class _Randomized:
@@ -185,8 +186,9 @@ class _Randomized:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write the model fields."""
-        factors = random_uniform(env, self.label, len(self._nominal), *self._ends, mask=mask)
-        self._quantity.write(mask, self._nominal * factors)
+        at = rows_of(mask)
+        factors = random_uniform(env, self.label, len(self._nominal), *self._ends, at=at)
+        self._quantity.write(mask, self._nominal * factors, at)
 
 
 @uses_fields(*ObjectMasses.fields)
@@ -219,11 +221,13 @@ class ActuatorGains(_Randomized):
         super().__init__(env, ServoGains(env), bounds("scale", scale))
 
 
-def _write_object(env: EnvView, mask: Tensor, name: str, offset: Tensor, yaw: Tensor) -> None:
+def _write_object(
+    env: EnvView, mask: Tensor, name: str, offset: Tensor, yaw: Tensor, at: Rows
+) -> None:
     """Move the masked worlds' object off the position where the simulation's reset has put it, by
-    x and y [m], and turns it [rad].
+    x and y [m], and turn it [rad]; the values are those of ``at``.
     """
     # Float64, because a float32 cosine need not be that of any angle, and a file of starts has the
     # angle.
     turned = quat_from_yaw(yaw.double()).to(offset.dtype)
-    write_object(env, mask, name, pose_w(env, name)[:, :2] + offset, turned)
+    write_object(env, mask, name, pose_w(env, name)[at, :2] + offset, turned, at)

@@ -13,6 +13,10 @@ from mjstack.errors import UnknownName
 from mjstack.math import quat_z_row
 from mjstack.scene.build import WORLD, force_sensor
 
+Rows = torch.Tensor | slice
+"""Worlds: their numbers, shape ``(n,)``, or all of them."""
+ALL = slice(None)
+
 
 class Columns:
     """Some columns of a batched view. Where they lie side by side, reading them costs nothing and
@@ -43,11 +47,18 @@ class Columns:
         """Write all worlds."""
         view[:, self._at] = value
 
-    def write_masked(self, view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor) -> None:
-        """Write the worlds of a ``(nworld,)`` bool mask."""
+    def write_masked(
+        self, view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor, at: Rows = ALL
+    ) -> None:
+        """Write the worlds of a ``(nworld,)`` bool mask. Where ``at`` has their numbers, the value
+        has their rows alone.
+        """
+        value = value.to(view.dtype)
+        if isinstance(at, torch.Tensor):
+            view[at if isinstance(self._at, slice) else at[:, None], self._at] = value
+            return
         rows = mask.view(-1, *[1] * (view.dim() - 1))
         part = self.read(view)
-        value = value.to(view.dtype)
         if isinstance(self._at, slice):
             torch.where(rows, value, part, out=part)
         else:

@@ -201,13 +201,13 @@ class NativeSimulation(Simulation):
         A diverged world is left alone: MuJoCo would spend every solver iteration on its NaN, and
         gain nothing.
         """
-        rows = self._rows(mask)
-        finite = np.isfinite(self._physics).all(axis=1)
-        diverged = rows & ~finite
-        if diverged.any():
+        worlds = np.flatnonzero(self._rows(mask))
+        some = len(worlds) < self.nworld
+        finite = np.isfinite(self._physics[worlds] if some else self._physics).all(axis=1)
+        if not finite.all():
             for array in derived:
-                array[diverged] = np.nan
-        return np.flatnonzero(rows & finite)
+                array[worlds[~finite]] = np.nan
+        return worlds[finite]
 
     def _visit(self, worlds: np.ndarray, n: int) -> Iterator[np.ndarray]:
         """Worlds in parts that take n steps in one call of MuJoCo's."""

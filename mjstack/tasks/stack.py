@@ -184,11 +184,14 @@ class StackSuccess(HeldSuccess):
         """
         self._step = step
         self._slot.add_(1).remainder_(self._steps)
+        stands = self._check.placed(step).all(1) & self._check.released(step)[:, 0]
+        if not stands.is_cuda and not bool(stands.any()):
+            return stands  # no window that holds this step can pass: its slot is never judged
         self._pose.index_copy_(1, self._slot, step.pose[:, None])
         self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
         for ring in (self._far, self._turned):
             ring.index_fill_(1, self._slot, 0.0)
-        return self._check.placed(step).all(1) & self._check.released(step)[:, 0]
+        return stands
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""

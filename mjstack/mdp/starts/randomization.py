@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mjstack.errors import ParameterError
 from mjstack.managers.view import EnvView
-from mjstack.scene.index import Columns
+from mjstack.scene.index import ALL, Columns, Rows
 
 
 class Quantity(Protocol):
@@ -37,8 +37,10 @@ class Quantity(Protocol):
     def read(self) -> Tensor:
         """The numbers of every world, shape ``(nworld, n)``."""
 
-    def write(self, mask: Tensor, values: Tensor) -> None:
-        """Write numbers ``(nworld, n)``, and what follows from them, into the masked worlds."""
+    def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
+        """Write numbers ``(nworld, n)``, and what follows from them, into the masked worlds. Where
+        ``at`` has their numbers, the values have their rows alone.
+        """
 
 
 class ObjectMasses(Quantity):
@@ -64,15 +66,15 @@ class ObjectMasses(Quantity):
         """See `Quantity`."""
         return self._mass.read()
 
-    def write(self, mask: Tensor, values: Tensor) -> None:
+    def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
         """See `Quantity`."""
         mass = values.to(self._mass.dtype)
         factor = mass.double() / self.nominal
-        self._mass.write(mask, mass)
+        self._mass.write(mask, mass, at)
         for elements in self._scaled:
-            elements.scale(mask, factor)
-        self._inverse.scale(mask, 1.0 / factor)
-        self._inverse_dofs.scale(mask, (1.0 / factor).repeat_interleave(6, dim=1))
+            elements.scale(mask, factor, at)
+        self._inverse.scale(mask, 1.0 / factor, at)
+        self._inverse_dofs.scale(mask, (1.0 / factor).repeat_interleave(6, dim=1), at)
 
 
 class SlidingFriction(Quantity):
@@ -108,12 +110,12 @@ class SlidingFriction(Quantity):
         """See `Quantity`."""
         return torch.stack([group.read(self._view)[:, 0] for group in self._groups], dim=1)
 
-    def write(self, mask: Tensor, values: Tensor) -> None:
+    def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
         """See `Quantity`; lowers what the objects lie on."""
         values = values.to(self._view.dtype)
         for number, group in enumerate(self._groups):
-            group.write_masked(self._view, mask, values[:, number, None])
-        self._lowered.write_masked(self._view, mask, self._least)
+            group.write_masked(self._view, mask, values[:, number, None], at)
+        self._lowered.write_masked(self._view, mask, self._least, at)
 
 
 class ServoGains(Quantity):
@@ -136,11 +138,11 @@ class ServoGains(Quantity):
         """See `Quantity`; float64."""
         return self._gain.read()[..., 0].double() / self._kp
 
-    def write(self, mask: Tensor, values: Tensor) -> None:
+    def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
         """See `Quantity`."""
         held = (values.double() * self._kp).to(self._gain.dtype).double() / self._kp
-        self._gain.scale(mask, held)
-        self._bias.scale(mask, held)
+        self._gain.scale(mask, held, at)
+        self._bias.scale(mask, held, at)
 
 
 def bounds(name: str, values: Sequence[float]) -> tuple[float, float]:
@@ -168,9 +170,10 @@ class _Elements:
     def read(self) -> Tensor:
         return self._columns.read(self._view)
 
-    def write(self, mask: Tensor, value: Tensor) -> None:
-        self._columns.write_masked(self._view, mask, value)
+    def write(self, mask: Tensor, value: Tensor, at: Rows) -> None:
+        self._columns.write_masked(self._view, mask, value, at)
 
-    def scale(self, mask: Tensor, factor: Tensor) -> None:
+    def scale(self, mask: Tensor, factor: Tensor, at: Rows) -> None:
         """Write nominal times factor, ``(nworld, elements)``, into the masked worlds."""
-        self.write(mask, self.nominal * factor.view(*factor.shape, *[1] * (self.nominal.dim() - 1)))
+        factor = factor.view(*factor.shape, *[1] * (self.nominal.dim() - 1))
+        self.write(mask, self.nominal * factor, at)
