@@ -124,8 +124,9 @@ def claim_folder(
         yield folder
     except BaseException as error:
         with suppress(OSError):
-            if before is not None and not any(folder.rglob("report.json")):
-                for path in {*folder.iterdir()} - before:  # Hydra's
+            new = {*folder.iterdir()} - before if before is not None else set()
+            if all(path.name == ".hydra" or path.suffix == ".log" for path in new):  # Hydra's
+                for path in new:
                     (shutil.rmtree if path.is_dir() else os.remove)(path)
             if made:
                 os.removedirs(folder)
