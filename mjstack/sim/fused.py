@@ -133,6 +133,31 @@ def shared_bytes(nv: int, row: int, njmax: int) -> int:
     return 4 * floats + 8 * njmax
 
 
+def collision(m: mjw.Model, d: mjw.Data) -> None:
+    """`mujoco_warp.collision`, its narrow phase by blocks that go from pair to pair.
+
+    MJWarp launches a thread for each contact that the buffer has room for. Its 255 registers leave
+    room for one block on a multiprocessor, and most blocks find nothing to do.
+
+    Args:
+        m: The uploaded model.
+        d: The worlds.
+    """
+    launch = wp.launch
+
+    def launch_few(*args: Any, **kwargs: Any) -> Any:
+        kernel = kwargs["kernel"] if "kernel" in kwargs else args[0]
+        if "primitive_narrowphase" in kernel.key and d.qpos.device.is_cuda:
+            kwargs |= {"block_dim": 64, "max_blocks": 16 * d.qpos.device.sm_count}
+        return launch(*args, **kwargs)
+
+    wp.launch = launch_few
+    try:
+        mjw.collision(m, d)
+    finally:
+        wp.launch = launch
+
+
 def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
     """`mujoco_warp.make_constraint`, the rows of elliptic contacts in one launch.
 
@@ -152,7 +177,7 @@ def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
     warps = 64 * device.sm_count if device.is_cuda else 1
     rows = _fill(Rows(), m, d)
     rows.disableflags = flags
-    kernel = _rows_kernel(m.nv, warps)
+    kernel = _rows_kernel(m.nv, d.efc.J.shape[2], m.nbody, warps)
     wp.launch_tiled(kernel, dim=warps, inputs=[rows], block_dim=32, device=device)
 
 
@@ -191,10 +216,12 @@ def _fill(struct: Any, m: mjw.Model, d: mjw.Data) -> Any:
 
 
 @cache
-def _rows_kernel(nv: int, warps: int) -> wp.Kernel:
+def _rows_kernel(nv: int, row: int, nbody: int, warps: int) -> wp.Kernel:
     """The kernel of `make_constraint` for these sizes."""
     numbers = {
         "NV": nv,
+        "NVP": row,
+        "NBODY": nbody,
         "STRIDE": warps,
         "ELLIPTIC": _ELLIPTIC,
         "FRICTIONLESS": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS),
@@ -204,7 +231,10 @@ def _rows_kernel(nv: int, warps: int) -> wp.Kernel:
     @wp.func_native(_source("rows", numbers))
     def rows(warp: int, lane: int, io: Rows) -> None: ...
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    # So many blocks on a multiprocessor: more wait for memory at once, and no register is spilled.
+    bounds = (32, 28)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=bounds)
     def kernel(problem: Rows) -> None:
         warp, lane = wp.tid()  # type: ignore[misc]
         rows(warp, lane, problem)

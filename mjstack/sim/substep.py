@@ -105,7 +105,7 @@ def rearranged_step(
         mjw.fwd_acceleration(m, d, factorize=True)
 
     def contacts() -> None:
-        mjw.collision(m, d)
+        (fused if own else mjw).collision(m, d)
         (fused if own else mjw).make_constraint(m, d)
 
     side_by_side(device, kinematics, *beside_kinematics, branches=branches)
