@@ -9,7 +9,7 @@ import mujoco
 import torch
 
 from mjstack.errors import UnsupportedModel, first_line
-from mjstack.sim import fused
+from mjstack.sim import fused, fused_smooth
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
 from mjstack.sim.simulation import Simulation, named_options
@@ -94,6 +94,7 @@ class MjwarpSimulation(Simulation):
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
             self._best, self._why = self._best_step()
             step = self._resolve(step)
+            self._smooth = self._best == "fused" and self._smooth_applies()
             self._usage = usage = Usage(model, nworld, self.device)
 
         self.arrangement = ARRANGEMENTS[step]
@@ -262,6 +263,7 @@ class MjwarpSimulation(Simulation):
                 sensors=i == n - 1 or not arrangement.sensors_once,
                 branches=arrangement.branches,
                 own=arrangement.fused,
+                smooth=arrangement.fused and self._smooth,
                 beside_kinematics=beside,
             )
             beside = (count,)
@@ -279,6 +281,13 @@ class MjwarpSimulation(Simulation):
         why = fused.why_not(self._m, self._d)
         return ("arranged", why) if why else ("fused", "")
 
+    def _smooth_applies(self) -> bool:
+        """Whether a fused step's smooth dynamics are our own."""
+        why = fused_smooth.why_not(self._m)
+        if why:
+            _tell(f"sim.step: a fused step has MJWarp's smooth dynamics, because {why}.")
+        return not why
+
     def _resolve(self, asked: str) -> str:
         """The step that is done."""
         if asked == "auto":
@@ -295,7 +304,10 @@ class MjwarpSimulation(Simulation):
         """Poses of the current qpos, and nothing that a later step would start from: its forward
         computes them anew.
         """
-        mjw.kinematics(self._m, self._d)
+        if self.arrangement.fused and self._smooth:
+            fused_smooth.positions(self._m, self._d)
+        else:
+            mjw.kinematics(self._m, self._d)
         self._place(posed=True)
 
     def _place(self, *, posed: bool = False) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import torch
 
-from mjstack.sim import fused
+from mjstack.sim import fused, fused_smooth
 from mjstack.sim.graph import side_by_side
 from mjstack.sim.warp_setup import mjw, wp
 
@@ -24,7 +24,7 @@ class Arrangement:
         own_stages: Only the stages that the model needs: no cameras, lights, tendons, flexes or
             energy.
         scratch: Temporaries at fixed addresses (`Scratch`), not allocated and freed by the graph.
-        fused: Contact rows and the solver as one kernel each.
+        fused: Contact rows and the solver as one kernel each, and smooth dynamics as three.
     """
 
     branches: bool = True
@@ -76,6 +76,7 @@ def rearranged_step(
     sensors: bool,
     branches: bool = True,
     own: bool = True,
+    smooth: bool = True,
     beside_kinematics: tuple[Callable[[], None], ...] = (),
 ) -> None:
     """`mujoco_warp.step`, with contacts and smooth dynamics as parallel branches: neither needs the
@@ -88,12 +89,9 @@ def rearranged_step(
         sensors: Whether sensordata is computed; of several steps only the last one's is seen.
         branches: Whether a captured graph gets branches.
         own: Whether contact rows and the solver are one kernel each.
+        smooth: Whether smooth dynamics are three kernels.
         beside_kinematics: Work that may run while the poses are computed.
     """
-
-    def kinematics() -> None:
-        mjw.kinematics(m, d)
-        mjw.com_pos(m, d)
 
     def forces() -> None:
         mjw.transmission(m, d)
@@ -101,6 +99,9 @@ def rearranged_step(
         mjw.fwd_actuation(m, d)
 
     def dynamics() -> None:
+        if smooth:
+            fused_smooth.forces(m, d)
+            return
         side_by_side(device, forces, lambda: mjw.crb(m, d), branches=branches)
         mjw.fwd_acceleration(m, d, factorize=True)
 
@@ -108,7 +109,7 @@ def rearranged_step(
         (fused if own else mjw).collision(m, d)
         (fused if own else mjw).make_constraint(m, d)
 
-    side_by_side(device, kinematics, *beside_kinematics, branches=branches)
+    side_by_side(device, lambda: pose(m, d, own=smooth), *beside_kinematics, branches=branches)
     side_by_side(device, contacts, dynamics, branches=branches)
     (fused if own else mjw).solve(m, d)
     if sensors:
@@ -116,7 +117,16 @@ def rearranged_step(
         mjw.sensor_pos(m, d)
         mjw.sensor_vel(m, d)
         mjw.sensor_acc(m, d)
-    mjw.implicit(m, d)
+    (fused_smooth.advance if smooth else mjw.implicit)(m, d)
+
+
+def pose(m: mjw.Model, d: mjw.Data, *, own: bool) -> None:
+    """Poses, and what is computed about centres of mass: in one kernel, or by MJWarp."""
+    if own:
+        fused_smooth.positions(m, d)
+        return
+    mjw.kinematics(m, d)
+    mjw.com_pos(m, d)
 
 
 @wp.kernel(enable_backward=False)
