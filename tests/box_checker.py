@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -25,7 +26,7 @@ class BoxRecording:
     """One world at every step end.
 
     Attributes:
-        phase: Name of its phase, shape ``(steps,)``.
+        phase: Name of its phase, shape ``(steps,)``; None for a driver without phases.
         pose: Red's and blue's, shape ``(steps, 2, 7)``.
         velocity: Likewise, as MuJoCo has it, shape ``(steps, 2, 6)``.
         jaw_force: Of each jaw on each cube [N], shape ``(steps, 2, jaws, 3)``.
@@ -38,7 +39,7 @@ class BoxRecording:
         finite_elsewhere: Whether the rest of its state stayed finite.
     """
 
-    phase: np.ndarray
+    phase: np.ndarray | None
     pose: np.ndarray
     velocity: np.ndarray
     jaw_force: np.ndarray
@@ -65,7 +66,7 @@ def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> Bo
     box = cfg.scene.box
     out = BoxOutcome()
     assert box is not None
-    steps = len(rec.phase)
+    steps = len(rec.pose)
     top = cfg.scene.table_center[2] + cfg.scene.table_half[2]
     wanted = sum(round(p.seconds / cfg.timing.step_dt) for p in cfg.controller.phases.values())
 
@@ -88,7 +89,7 @@ def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> Bo
     y_low = box.center[1] - box.half[1]
     y_high = box.center[1] + box.half[1]
 
-    released_at = {}
+    released_at: dict[str, int] = {}
     for cube, color in enumerate(COLORS):
         corners, speed = corners_of(
             rec.pose[:, cube], rec.velocity[:, cube], cfg.scene.objects["red"].half_height
@@ -111,67 +112,29 @@ def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> Bo
         detached = ~touching[:, cube].any(1)
         airborne = loaded & (z.min(1) - top >= rules.lift_height) & ~supported[:, cube]
 
-        # A world that goes back to its approach is judged from there.
-        approaches = np.flatnonzero(rec.phase == f"approach_{color}")
-        first = approaches[-1] + 1 if len(approaches) else 0
-
-        def steps_in(*roles: str, color: str = color, first: int = first) -> list[int]:
-            names = {f"{role}_{color}" for role in roles}
-            return [f for f in range(first, steps) if rec.phase[f] in names]
-
-        grasp = longest(loaded, steps_in("close"))
-        if grasp < rules.grasp_steps:
-            out.failed.add(f"GRASP_{color.upper()}")
-        lift = longest(airborne, steps_in("lift", "carry"))
-        if lift < rules.lift_steps:
-            out.failed.add(f"LIFT_{color.upper()}")
-        distance = 0.0
-        for run in runs(airborne, steps_in("carry")):
-            if len(run) >= rules.carry_steps:
-                xy = rec.pose[run, cube, :2]
-                distance = max(distance, float(np.linalg.norm(xy - xy[0], axis=1).max()))
-        holds = steps_in("hold")
-        if not (distance >= rules.carry_distance and len(holds) and over[holds[-1]]):
-            out.failed.add(f"CARRY_{color.upper()}")
-
-        grasps = [run for run in runs(loaded, steps_in("close")) if len(run) >= rules.grasp_steps]
-        grasped_at = (
-            grasps[-1][rules.grasp_steps - 1] if grasps else None
-        )  # the last one made while closing
-        unloaded = 0
-        if grasped_at is not None:
-            unloaded = sum(
-                not loaded[f] for f in steps_in("close", "lift", "carry", "hold") if f >= grasped_at
-            )
-        if unloaded:
-            out.failed.add(f"DROP_{color.upper()}")
-
-        widest = 0.0
-        for f in steps_in("open", "retreat", "settle"):
-            if detached[f]:
-                widest = max(widest, float(opening[f]))
-                if opening[f] >= rules.open_fraction:
-                    released_at.setdefault(color, f)
-        if color not in released_at:
-            out.failed.add(f"RELEASE_{color.upper()}")
-
         still = detached & (outside <= rules.inside) & (speed < rules.rest_speed)
-        settles = steps_in("settle")
-        settled = rest_until(still, settles[-1]) if settles else 0
-        if settled < rules.window:
-            out.failed.add(f"SETTLED_{color.upper()}")
+        seen = Seen(loaded, airborne, over, detached, still, opening, rec.pose[:, cube, :2])
+        if rec.phase is None:
+            found = judge_freely(seen, rules, steps)
+        else:
+            found = judge_by_phase(seen, rules, rec.phase, color)
+        for rule, holds in found.holds.items():
+            if not holds:
+                out.failed.add(f"{rule}_{color.upper()}")
+        if found.released_at is not None:
+            released_at[color] = found.released_at
         if rest_until(still, steps - 1) < rules.window:
             out.failed.add("INSIDE")
 
         slot = np.array(cfg.scene.places[f"{color}_slot"].xy)
         out.values |= {
             f"slot_err_{color}_m": float(np.linalg.norm(rec.pose[-1, cube, :2] - slot)),
-            f"grasp_steps_{color}": grasp,
-            f"lift_steps_{color}": lift,
-            f"carry_{color}_m": distance,
-            f"unloaded_steps_{color}": unloaded,
-            f"opening_{color}": widest,
-            f"settled_steps_{color}": settled,
+            f"grasp_steps_{color}": found.grasp,
+            f"lift_steps_{color}": found.lift,
+            f"carry_{color}_m": found.carry,
+            f"unloaded_steps_{color}": found.unloaded,
+            f"opening_{color}": found.widest,
+            f"settled_steps_{color}": found.settled,
         }
 
     blue_loaded = np.flatnonzero(touching[:, BLUE].all(1))
@@ -183,6 +146,132 @@ def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> Bo
     if not clearance >= rules.jaw_clearance:
         out.failed.add("JAW_CLEAR")
     return out
+
+
+@dataclass
+class Seen:
+    """A cube at every step end."""
+
+    loaded: np.ndarray
+    airborne: np.ndarray
+    over: np.ndarray
+    detached: np.ndarray
+    still: np.ndarray
+    opening: np.ndarray
+    xy: np.ndarray
+
+
+@dataclass
+class Found:
+    """A cube's rules, and the numbers behind them."""
+
+    grasp: int
+    lift: int
+    carry: float
+    over_box: bool
+    unloaded: int
+    widest: float
+    released_at: int | None
+    settled: int
+    rules: Any
+
+    @property
+    def holds(self) -> dict[str, bool]:
+        return {
+            "GRASP": self.grasp >= self.rules.grasp_steps,
+            "LIFT": self.lift >= self.rules.lift_steps,
+            "CARRY": self.carry >= self.rules.carry_distance and self.over_box,
+            "DROP": self.unloaded == 0,
+            "RELEASE": self.released_at is not None,
+            "SETTLED": self.settled >= self.rules.window,
+        }
+
+
+def farthest(xy: np.ndarray, run: list[int]) -> float:
+    """Largest distance from where a run began."""
+    return float(np.linalg.norm(xy[run] - xy[run[0]], axis=1).max())
+
+
+def judge_by_phase(seen: Seen, rules: Any, phase: np.ndarray, color: str) -> Found:
+    """The rules in the phases that they name."""
+    # A world that goes back to its approach is judged from there.
+    approaches = np.flatnonzero(phase == f"approach_{color}")
+    first = approaches[-1] + 1 if len(approaches) else 0
+
+    def steps_in(*roles: str) -> list[int]:
+        names = {f"{role}_{color}" for role in roles}
+        return [f for f in range(first, len(phase)) if phase[f] in names]
+
+    carries = [r for r in runs(seen.airborne, steps_in("carry")) if len(r) >= rules.carry_steps]
+    holds = steps_in("hold")
+    grasps = [r for r in runs(seen.loaded, steps_in("close")) if len(r) >= rules.grasp_steps]
+    unloaded = 0
+    if grasps:  # the last one made while closing
+        grasped_at = grasps[-1][rules.grasp_steps - 1]
+        held = [f for f in steps_in("close", "lift", "carry", "hold") if f >= grasped_at]
+        unloaded = sum(not seen.loaded[f] for f in held)
+    free = [f for f in steps_in("open", "retreat", "settle") if seen.detached[f]]
+    settles = steps_in("settle")
+    return Found(
+        grasp=longest(seen.loaded, steps_in("close")),
+        lift=longest(seen.airborne, steps_in("lift", "carry")),
+        carry=max((farthest(seen.xy, run) for run in carries), default=0.0),
+        over_box=bool(len(holds) and seen.over[holds[-1]]),
+        unloaded=unloaded,
+        widest=max((float(seen.opening[f]) for f in free), default=0.0),
+        released_at=next((f for f in free if seen.opening[f] >= rules.open_fraction), None),
+        settled=rest_until(seen.still, settles[-1]) if settles else 0,
+        rules=rules,
+    )
+
+
+def judge_freely(seen: Seen, rules: Any, steps: int) -> Found:
+    """Grasp, lift and carry in this order at any time before the settled window; released after the
+    carry, and at rest for the window at some time after that.
+    """
+    before = range(steps - rules.window)
+
+    def reaches(holds: np.ndarray, start: int | None, length: int) -> int | None:
+        """The step that makes a run from ``start`` on long enough."""
+        found = [] if start is None else runs(holds, [f for f in before if f >= start])
+        return next((run[length - 1] for run in found if len(run) >= length), None)
+
+    grasped_at = reaches(seen.loaded, 0, rules.grasp_steps)
+    lifted_at = reaches(seen.airborne, grasped_at, rules.lift_steps)
+    lifting = [] if grasped_at is None else [f for f in before if f >= grasped_at]
+    carrying = [] if lifted_at is None else [f for f in before if f >= lifted_at]
+
+    carry = 0.0
+    carried_at = None
+    for run in runs(seen.airborne, carrying):
+        for length in range(rules.carry_steps, len(run) + 1):
+            carry = max(carry, farthest(seen.xy, run[:length]))
+            if carry >= rules.carry_distance and carried_at is None:
+                carried_at = run[length - 1]
+
+    unloaded = 0
+    over_box = False
+    for f in range(steps):
+        if seen.loaded[f]:
+            over_box = bool(seen.over[f])
+        elif lifted_at is not None and f >= lifted_at and not over_box:
+            unloaded += 1
+
+    free = [f for f in range(steps) if carried_at is not None and f >= carried_at]
+    free = [f for f in free if seen.detached[f]]
+    released_at = next((f for f in free if seen.opening[f] >= rules.open_fraction), None)
+    after = [] if released_at is None else range(released_at, steps)
+    return Found(
+        grasp=longest(seen.loaded, list(before)),
+        lift=longest(seen.airborne, lifting),
+        carry=carry,
+        over_box=over_box,
+        unloaded=unloaded,
+        widest=max((float(seen.opening[f]) for f in free), default=0.0),
+        released_at=released_at,
+        settled=max((rest_until(seen.still, f) for f in after), default=0),
+        rules=rules,
+    )
 
 
 def corners_of(

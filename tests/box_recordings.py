@@ -5,7 +5,7 @@ checker or for alterations.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -215,6 +215,12 @@ class World:
     def outcome(self) -> BoxOutcome:
         """The verdict of the plain checker."""
         return check_box_world(self.recording, self.context.cfg, self.context.model)
+
+    @property
+    def outcome_without_phases(self) -> BoxOutcome:
+        """The same of a driver without phases."""
+        recording = replace(self.recording, phase=None)
+        return check_box_world(recording, self.context.cfg, self.context.model)
 
 
 def feed(

@@ -619,29 +619,56 @@ def test_expert_episodes_of_the_box_pass_without_phases() -> None:
     worlds = [World.of(rec, k) for rec in (planned(), scripted()) for k in range(2)]
     result = feed(worlds, torch.float32, phased=False)
     broken = [set(RULES.broken(int(bits))) for bits in result.failed]
+    for k, world in enumerate(worlds):
+        assert_same(result, k, world.outcome_without_phases)
     assert [broken[k] for k in (0, 2, 3)] == [set()] * 3
     assert {"DROP_RED", "SETTLED_RED", "INSIDE"} <= broken[1]
     assert not any(name.endswith("_BLUE") for name in broken[1])
 
 
-def test_the_box_without_phases_knows_what_was_not_done() -> None:
+def test_cheats_in_the_box_break_a_rule() -> None:
+    """Each of them, judged without phases, by the check and by the plain checker."""
     rec = planned()
-    names = ("no_grasp", "early_blue", "never_open", "moving_at_the_end", "touched")
+    names = (
+        "no_grasp",
+        "early_blue",
+        "never_open",
+        "held",
+        "thrown",
+        "pushed",
+        "knocked",
+        "leaned",
+    )
+    names += ("moving_at_the_end", "touched")
     worlds = {name: World.of(rec) for name in names}
     worlds["no_grasp"].jaw(0, 0)[:] = 0.0
     for jaw in (0, 1):
         worlds["early_blue"].jaw(1, jaw)[worlds["early_blue"].steps("hold_red")[-1]] = 1.0
+        opens = worlds["held"].steps("open_blue")[0]  # blue stays in the hand
+        worlds["held"].jaw(1, jaw)[opens:] = worlds["held"].jaw(1, jaw)[opens - 1]
+        flies = worlds["thrown"].steps("carry_red")  # into the box, from beside it
+        worlds["thrown"].jaw(0, jaw)[flies[len(flies) // 3] :] = 0.0
+        pushes = worlds["pushed"].steps("lift_blue", "carry_blue", "hold_blue")  # a jaw each step
+        worlds["pushed"].jaw(1, jaw)[pushes[jaw::2]] = 0.0
     gripper = worlds["never_open"].gripper
     gripper[:] = np.minimum(gripper, gripper.min() + 0.5 * (gripper.max() - gripper.min()))
+    worlds["knocked"].pose(1)[-1, 2] += 0.1
+    worlds["leaned"].jaw(1, 1)[-60:] = [2e-5, 0.0, 0.0]
     worlds["moving_at_the_end"].velocity(1)[-1, 0] = 0.05
     worlds["touched"].jaw(0, 1)[worlds["touched"].steps("open_blue")] = 1.0
     result = feed(list(worlds.values()), phased=False)
-    broken = {
-        name: set(RULES.broken(int(bits))) for name, bits in zip(names, result.failed, strict=True)
-    }
+    broken = {}
+    for k, (name, world) in enumerate(worlds.items()):
+        broken[name] = CASES.broken(result, k)
+        assert_same(result, k, world.outcome_without_phases)
     red = {f"{rule}_RED" for rule in ("GRASP", "LIFT", "CARRY", "RELEASE", "SETTLED")}
     assert broken["no_grasp"] == red | {"ORDER"}
     assert broken["early_blue"] == {"ORDER"}
     assert broken["never_open"] >= {"RELEASE_RED", "RELEASE_BLUE", "ORDER"}
+    assert broken["held"] == {"RELEASE_BLUE", "SETTLED_BLUE", "INSIDE"}
+    assert broken["thrown"] >= {"CARRY_RED", "DROP_RED"}
+    assert broken["pushed"] >= {"LIFT_BLUE", "CARRY_BLUE"}
+    assert broken["knocked"] == {"INSIDE"}
+    assert broken["leaned"] == {"INSIDE"}
     assert broken["moving_at_the_end"] == {"INSIDE"}
     assert broken["touched"] == set()

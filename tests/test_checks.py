@@ -109,6 +109,7 @@ class Halfway(EpisodeCheck):
         ("task.check.xy_err=wide", ["task.check.xy_err=wide", "a number above 0 [m]"]),
         ("task.check.lift_steps=2.5", ["task.check.lift_steps=2.5", "int"]),
         ("task.check.rest_speed=0", ["task.check.rest_speed=0", "above 0 [m/s]"]),
+        ("task.check.open_fraction=1.5", ["task.check.open_fraction=1.5", "at most 1"]),
         ("task.check.window=601", ["task.check.window=601", "600 steps"]),
         ("task.check.object=green", ["task.check: object", "green", "red"]),
         ("task.check.func=mjstack.tasks.stack.StackChek", ["task.check: func=", "StackCheck"]),

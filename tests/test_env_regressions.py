@@ -276,9 +276,9 @@ def test_a_value_function_is_no_reset_term() -> None:
 
 def test_keys_that_can_be_added_say_how() -> None:
     with pytest.raises(
-        mjstack.MjstackError, match=r"To add it, write \+reward\.success\.params\.force=\.\.\."
+        mjstack.MjstackError, match=r"To add it, write \+reward\.progress\.params\.force=\.\.\."
     ):
-        native("reward.success.params.force=0.5")
+        native("reward.progress.params.force=0.5")
 
 
 def test_a_closed_environment_and_a_missing_field_say_so() -> None:

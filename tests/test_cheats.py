@@ -1,0 +1,235 @@
+"""Policies that cheat at the stack task break a named rule when judged without phases; the plain
+checker agrees. Every accepted episode of the expert passes.
+
+Some cheats are driven, by joint targets of the expert that are changed a little. Others, which
+would take long to drive, are written into a recorded episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from check_cases import rules_of
+from stack_checker import BLUE, RED
+from test_stack_check import World, feed, reference
+
+from mjstack.drivers.driver import Driver, PhaselessDriver
+from mjstack.envs import Env
+from mjstack.episodes.context import RunContext
+from mjstack.episodes.rollout import Observer, play_episode
+from mjstack.sim import Simulation
+
+RULES = rules_of("stack")
+NWORLD = 4
+
+
+class Targets(PhaselessDriver):
+    """Gives joint targets, shape ``(steps, nworld, nu)``."""
+
+    def __init__(self, targets: torch.Tensor) -> None:
+        super().__init__(targets.shape[1], len(targets), targets.device)
+        self._rest = iter(targets)
+
+    def command(self) -> torch.Tensor:
+        return next(self._rest)
+
+
+class Keep(Observer):
+    """Keeps actions and states at every step end."""
+
+    def start(self, env: Env, driver: Driver) -> None:
+        super().start(env, driver)
+        self.actions: list[torch.Tensor] = []
+        self.states: dict[str, list[torch.Tensor]] = {"qpos": [], "qvel": [], "sensordata": []}
+
+    def after_step(self, step: int) -> None:
+        self.actions.append(self.env.action_manager.action.clone())
+        for name, kept in self.states.items():
+            kept.append(getattr(self.env.sim, name).clone())
+
+
+def worlds_of(keep: Keep, rec: SimpleNamespace) -> list[World]:
+    """The kept worlds, for the plain checker."""
+    index = keep.env.index
+    qpos, qvel, force = (torch.stack(kept).numpy() for kept in keep.states.values())
+    pose = np.stack([qpos[..., a : a + 7] for a in index.object_qpos], axis=2)
+    velocity = np.stack([qvel[..., a : a + 6] for a in index.object_qvel], axis=2)
+    gripper = qpos[..., index.robot_qpos[index.n_arm :]]
+    count = keep.env.sim.step_count.tolist()
+    return [
+        World(pose[:, k], velocity[:, k], force[:, k], gripper[:, k], count[k], rec)
+        for k in range(NWORLD)
+    ]
+
+
+@pytest.fixture(scope="module")
+def drive(
+    stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]
+) -> Callable[..., list[set[str]]]:
+    """Drives jittered native worlds without phases by the expert's joint targets, changed; the
+    broken rules of each world, on which the plain checker agrees.
+    """
+    experts: dict[str, tuple[torch.Tensor, dict[str, slice]]] = {}
+
+    def expert(robot: str) -> tuple[torch.Tensor, dict[str, slice]]:
+        if robot not in experts:
+            context = stage(robot)
+            keep = Keep()
+            context.play(make_sim("native", NWORLD, robot=robot), context.cfg.reset, [keep])
+            spans = {p.name: slice(p.start, p.stop) for p in context.planner.phases}
+            experts[robot] = (torch.stack(keep.actions), spans)
+        return experts[robot]
+
+    def play(
+        robot: str, change: Callable[[torch.Tensor, dict[str, slice]], None]
+    ) -> list[set[str]]:
+        context = stage(robot)
+        targets, spans = expert(robot)
+        targets = targets.clone()
+        change(targets, spans)
+        env = context.start(make_sim("native", NWORLD, robot=robot), context.cfg.reset)
+        keep = Keep()
+        episode = play_episode(env, Targets(targets), [keep])
+        rec = SimpleNamespace(
+            cfg=context.cfg, phases=context.planner.phases, jaw_force=context.index.jaw_force
+        )
+        broken = [set(RULES.broken(int(bits))) for bits in episode.failed]
+        worlds = worlds_of(keep, rec)
+        for k in (0, NWORLD - 1):
+            assert reference(worlds[k], phased=False).failed == broken[k]
+        return broken
+
+    return play
+
+
+def stay_low(targets: torch.Tensor, spans: dict[str, slice]) -> None:
+    """Let go, and leave the open gripper around the cube."""
+    targets[spans["retreat"].start :] = targets[spans["release"].stop - 1]
+
+
+def test_the_expert_passes_without_phases(robot: str, drive: Callable[..., list[set[str]]]) -> None:
+    assert drive(robot, lambda targets, spans: None) == [set()] * NWORLD
+
+
+def test_holding_is_no_stack(robot: str, drive: Callable[..., list[set[str]]]) -> None:
+    """It never lets go; in the last two worlds it does so when the settled window has begun."""
+
+    def hold(targets: torch.Tensor, spans: dict[str, slice]) -> None:
+        let_go = targets[spans["release"], 2:].clone()
+        targets[spans["release"].start :] = targets[spans["place_stack"].stop - 1]
+        late = len(targets) - 50 - len(let_go) // 2
+        targets[late : late + len(let_go), 2:] = let_go
+        targets[late + len(let_go) :, 2:] = let_go[-1]
+
+    broken = drive(robot, hold)
+    assert broken[:2] == [{"RELEASED"}] * 2
+    assert all("RELEASED" in rules for rules in broken)
+
+
+def test_leaning_on_the_stack_is_no_release(drive: Callable[..., list[set[str]]]) -> None:
+    """World 0 keeps the open gripper away from the cube. In the others it turns towards the cube,
+    by more from world to world.
+    """
+    turns = torch.tensor([0.0, 0.02, 0.05, 0.08])
+
+    def lean(targets: torch.Tensor, spans: dict[str, slice]) -> None:
+        stay_low(targets, spans)
+        ramp = torch.linspace(0.0, 1.0, 40)[:, None]
+        targets[spans["retreat"].stop - 40 : spans["retreat"].stop, :, 0] += ramp * turns
+        targets[spans["retreat"].stop :, :, 0] += turns
+
+    broken = drive("so101", lean)
+    assert broken[0] == set()
+    assert {"RELEASED"} in broken
+
+
+def test_knocking_it_over_at_the_end_is_no_stack(drive: Callable[..., list[set[str]]]) -> None:
+    """The open gripper swings into the stack in the last steps, a step later in each world."""
+
+    def knock(targets: torch.Tensor, spans: dict[str, slice]) -> None:
+        stay_low(targets, spans)
+        for world in range(NWORLD):
+            targets[len(targets) - 12 + 2 * world :, world, 0] += 0.6
+
+    broken = drive("so101", knock)
+    assert all("RELEASED" in rules for rules in broken)
+    assert "STACKED" in broken[0]
+
+
+# Written into a recorded episode
+
+
+@pytest.fixture
+def recording(recorded: Callable[[str], SimpleNamespace]) -> World:
+    return World.of(recorded("so101"))
+
+
+def judge(world: World) -> set[str]:
+    """The broken rules, on which the plain checker agrees."""
+    broken = set(RULES.broken(int(feed([world], world.rec, phased=False).failed[0])))
+    assert reference(world, phased=False).failed == broken
+    return broken
+
+
+def fly(world: World, first: int, steps: int = 25) -> None:
+    """From a step on red is in free flight, out of the jaws, onto blue, where it comes to rest."""
+    land = world.pose[-1, RED].copy()
+    at = np.linspace(0.0, 1.0, steps)[:, None]
+    start = world.pose[first, RED, :3].copy()
+    path = start + at * (land[:3] - start)
+    path[:, 2:] += 4.0 * 0.08 * at * (1.0 - at)
+    world.pose[first : first + steps, RED, :3] = path
+    world.pose[first + steps :, RED] = land
+    for jaw in (0, 1):
+        world.jaw(jaw)[first:] = 0.0
+
+
+def test_a_throw_is_no_carry(recording: World) -> None:
+    """Held up for long enough, then thrown onto blue."""
+    fly(recording, recording.steps("above_blue").start)
+    assert judge(recording) == {"CARRY"}
+
+
+def test_a_throw_from_the_table_is_no_lift(recording: World) -> None:
+    """Flung up when it has been in the air for nine steps, which is one too few."""
+    top = recording.rec.cfg.scene.table_top
+    up = np.flatnonzero(recording.pose[:, RED, 2] - 0.022 - top > recording.t.airborne_height)
+    fly(recording, int(up[0]) + recording.t.lift_steps - 1)
+    assert judge(recording) == {"LIFT", "CARRY"}
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_a_cube_pushed_up_the_others_side_is_not_carried(recording: World, both: bool) -> None:
+    """Along the table to blue, and up its side, with one jaw, or with either in turn."""
+    flight = slice(recording.steps("lift_red").start, recording.steps("place_stack").stop)
+    n = flight.stop - flight.start
+    place = recording.pose[-1, RED].copy()
+    side = recording.pose[-1, BLUE, :3] - np.array([0.0, 0.045, 0.0])
+    above = [*side[:2], place[2]]
+    corners = np.array([recording.pose[0, RED, :3], side, above, place[:3]])
+    at = np.linspace(0.0, 3.0, n)
+    path = [np.interp(at, range(4), corners[:, axis]) for axis in range(3)]
+    recording.pose[flight, RED, :3] = np.stack(path, axis=1)
+    recording.pose[flight, RED, 3:] = recording.pose[0, RED, 3:]
+    recording.pose[flight.stop :, RED] = place
+    steps = np.arange(flight.start, flight.stop)
+    for jaw in (0, 1):
+        recording.jaw(jaw)[flight.stop :] = 0.0
+        pushes = steps % 2 == jaw if both else jaw == 0
+        recording.jaw(jaw)[flight] = np.where(np.broadcast_to(pushes, n)[:, None], 1.0, 0.0)
+    assert judge(recording) == {"LIFT", "CARRY"}
+
+
+def test_a_fall_in_the_last_step_is_no_stack(recording: World) -> None:
+    recording.pose[-1, RED, :3] = recording.pose[-1, BLUE, :3] + [0.0, 0.045, 0.0]
+    recording.velocity[-1, RED, 2] = -0.3
+    assert {"STACKED", "REST_POSITION"} <= judge(recording)
+
+
+def test_a_jaw_that_touches_in_one_step_is_no_release(recording: World) -> None:
+    recording.jaw(0)[-1, 2] = 2e-5
+    assert judge(recording) == {"RELEASED"}
