@@ -12,6 +12,7 @@ import torch
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.schema import Config
+from mjstack.drivers.driver import PhaselessDriver
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import play_episode
 
@@ -109,19 +110,12 @@ def test_what_nothing_can_meet_fails_by_its_own_rule(
     }
 
 
-class Still:
-    """A driver without phases, which holds the arm where it starts."""
+class Still(PhaselessDriver):
+    """Holds the arm where it starts."""
 
     def __init__(self, cfg: Config) -> None:
-        self.phases: list = []
-        self.steps = cfg.task.episode_steps
-        self.phase = torch.zeros(cfg.nworld, dtype=torch.int64)
-        self.error = torch.zeros(cfg.nworld)
-        self.retries = torch.zeros(cfg.nworld, dtype=torch.int32)
+        super().__init__(cfg.nworld, cfg.task.episode_steps, torch.device("cpu"))
         self._command = torch.tensor(cfg.robot.start).expand(cfg.nworld, -1)
-
-    def rewind(self) -> Still:
-        return self
 
     def command(self) -> torch.Tensor:
         return self._command

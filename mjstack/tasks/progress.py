@@ -80,33 +80,27 @@ class Progress:
         placed = read(self._check.placed(step))
 
         # Which stage each object is in
+        offset = pos - goal
+        above = offset[..., 2]
         away = torch.linalg.vector_norm(pos - grasp_point_pos(env).float()[:, None], dim=-1)
-        across = torch.linalg.vector_norm((goal - pos)[..., :2], dim=-1)
-        above = (pos - goal)[..., 2]
+        across = torch.linalg.vector_norm(offset[..., :2], dim=-1)
         held = in_hand & (away <= self._within)
         lifted = held & (low >= self._height)
         over = (across <= self._near) & (above >= -BELOW)
-        stage = held + 0
+        stage = held.long()
         for number, reached in ((2, lifted), (3, over), (4, placed)):
             stage.masked_fill_(reached, number)
 
-        # How far it has got in it, of which only that of its stage counts
-        opening = step.opening.amin(1, keepdim=True) / self._open
-        done = (
-            self._nearness(away),
-            low / self._height,
-            self._nearness(across),
-            self._nearness(above.abs()),
-            opening.expand_as(low),
-        )
-        part = torch.stack(done, dim=-1).clamp(0.0, 1.0).gather(-1, stage[..., None])[..., 0]
-        value = (stage + part) / len(STAGES)
+        # How far it has got in it: the column of its stage
+        distances = torch.stack((away, across, above.abs()), dim=-1)
+        reach, carry, place = (1.0 - torch.tanh(distances / self._scale)).unbind(-1)
+        lift = low / self._height
+        release = (step.opening.amin(1, keepdim=True) / self._open).expand_as(low)
+        done = torch.stack((reach, lift, carry, place, release), dim=-1).clamp(0.0, 1.0)
+        value = (stage + done.gather(-1, stage[..., None])[..., 0]) / len(STAGES)
 
         # One object after the other
         finished = (placed & ~in_hand)[:, :-1]
         value[:, :-1].masked_fill_(finished, 1.0)
-        value[:, 1:] *= finished.cumprod(1)
+        value[:, 1:].mul_(finished.cumprod(1))
         return value.mean(1)
-
-    def _nearness(self, distance: Tensor) -> Tensor:
-        return 1.0 - torch.tanh(distance / self._scale)
