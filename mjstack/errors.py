@@ -90,6 +90,10 @@ class RunError(MjstackError):
     """The folder of an earlier run that cannot be read, or has not what is asked for."""
 
 
+class PolicyError(MjstackError):
+    """A policy's folder that cannot be read, or that was trained for something else."""
+
+
 class FolderError(MjstackError):
     """A folder that has another run, or that another process is writing."""
 

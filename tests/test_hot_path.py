@@ -143,6 +143,8 @@ PATHS: dict[str, list[str] | None] = {
         ),
         "_put",
     ],
+    "drivers/policy.py": ["PolicyDriver.command", "PolicyDriver._ask"],
+    "policy/network.py": ["PolicyNetwork.normalized", "PolicyNetwork.forward"],
     "drivers/tilt.py": ["CarryTilt.desired_approach"],
     "episodes/failures.py": ["FailureMonitor.update", "_of"],
     "kinematics/batched_ik.py": [

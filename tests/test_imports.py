@@ -22,6 +22,7 @@ LAYERS = [
     {"mdp"},
     {"tasks"},
     {"envs"},
+    {"policy"},
     {"drivers"},
     {"episodes", "bench"},
     {"adapters", "datasets", "gates"},
@@ -46,6 +47,7 @@ HOMES = {
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),
     "pyarrow": ("datasets/",),
+    "safetensors": ("policy/",),
     "rich": ("jobs/", "cli.py", "bench/", "report/table.py", "managers/term.py"),
 }
 

@@ -17,7 +17,14 @@ from mjstack.bench.timing import (
 )
 from mjstack.drivers.driver import Recorded
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.rollout import CLOSED_LOOP, CommandRecorder, Episode, Observer, rollout
+from mjstack.episodes.rollout import (
+    CLOSED_LOOP,
+    POLICY,
+    CommandRecorder,
+    Episode,
+    Observer,
+    rollout,
+)
 from mjstack.errors import name_worlds
 from mjstack.sim import Simulation
 
@@ -51,7 +58,7 @@ def measure_episode(
     cfg = context.cfg
     mjwarp = sim.backend == "mjwarp"
     out = Measurement(name="episode")
-    steps = context.planner.phases[-1].stop
+    steps = context.episode_steps
     before = context.artifacts.timed_episode
     if before is not None and (before.description, len(before.start)) != (
         sim.description,
@@ -152,7 +159,7 @@ def _play(context: RunContext, sim: Simulation, meter: EnergyMeter, out: Measure
     cfg = context.cfg
     mjwarp = sim.backend == "mjwarp"
     commands = CommandRecorder()
-    keep = mjwarp and cfg.controller.name == CLOSED_LOOP
+    keep = mjwarp and cfg.controller.name in (CLOSED_LOOP, POLICY)
     recorders: list[Observer] = [commands] if keep else []
     episode = context.play(sim, cfg.reset, [*recorders, EnergyObserver(meter)])
     if mjwarp:

@@ -76,6 +76,9 @@ def _jobs(cfg: Config) -> None:
     for key in ("run", "world"):
         wrong = getattr(cfg, key) is not None and cfg.job.name != "replay"
         _refuse(wrong, cfg, key, "null, because it is for job=replay alone. Add job=replay")
+    wrong = cfg.policy is not None and cfg.controller.name != "policy"
+    expected = "null, because no policy drives the worlds. Add controller=policy"
+    _refuse(wrong, cfg, "policy", expected)
     wrong = cfg.starts is not None and not reads_starts_file(cfg.reset)
     expected = "null, because no reset term reads it. Add reset=starts_file"
     _refuse(wrong, cfg, "starts", expected)

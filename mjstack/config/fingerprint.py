@@ -14,11 +14,12 @@ from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
 
 CONTENT = "sha256:"  # in front of what stands for a file
+POLICY_FILE = "policy.json"  # of a policy's folder; it names the weights by their SHA-256
 
 
 def config_content(cfg: Config) -> dict[str, Any]:
-    """The whole configuration in JSON's types, with the SHA-256 of the robot's and of each starts
-    file in place of its path.
+    """The whole configuration in JSON's types, with the SHA-256 of the robot's file, of each starts
+    file and of the policy in place of its path.
 
     Raises:
         ConfigError: One of these files cannot be read.
@@ -26,6 +27,8 @@ def config_content(cfg: Config) -> dict[str, Any]:
     config: dict[str, Any] = json.loads(json.dumps(asdict(cfg)))
     if cfg.robot.file is not None:
         config["robot"]["file"] = _content("robot.file", cfg.robot.file)
+    if cfg.policy is not None:
+        config["policy"] = _content("policy", str(Path(cfg.policy) / POLICY_FILE))
     for name, term in cfg.reset.items():
         path = term.params.get("path")
         params = config["reset"][name]["params"]

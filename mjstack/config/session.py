@@ -143,16 +143,24 @@ def check_trusted(cfg: DictConfig, saved: Path) -> None:
     for key, name in list_items(cfg):
         if not (key.startswith(_REPLAYED) and key.endswith(".func")):
             continue
-        label = key.removesuffix(".func")
-        # A module runs when it is imported.
-        if not (
-            is_trusted(str(name), saved)
-            and is_trusted(str(getattr(find_object(label, str(name)), "__module__", "")), saved)
-        ):
+        if not is_trusted_function(key.removesuffix(".func"), str(name), saved):
             raise CompositionError(
                 f"{key}={name}: expected a name of mjstack, of a package registered under"
                 f" {ENTRY_POINTS}, or beside a folder of the search path. {add_folder(saved)}"
             )
+
+
+def is_trusted_function(label: str, dotted: str, saved: Path) -> bool:
+    """Whether a saved file may name a function, and the function was defined in a trusted module
+    too; arguments as of `is_trusted`, and the key that names it.
+
+    Raises:
+        TermError: There is no such function.
+    """
+    # A module runs when it is imported.
+    return is_trusted(dotted, saved) and is_trusted(
+        str(getattr(find_object(label, dotted), "__module__", "")), saved
+    )
 
 
 def is_trusted(dotted: str, saved: Path) -> bool:

@@ -10,11 +10,13 @@ import mujoco
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
+from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env, driven_config
 from mjstack.envs.buffers import Advance, Workload, measured_sizes, play_workload
 from mjstack.episodes.rollout import (
     CLOSED_LOOP,
     NOMINAL,
+    POLICY,
     Episode,
     Observer,
     Reset,
@@ -28,6 +30,7 @@ from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
 from mjstack.managers.view import offers
 from mjstack.mdp.geometry import source_xy
+from mjstack.policy import Policy, load_policy
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import SceneIndex, build_model
 from mjstack.scene.phases import Phase
@@ -60,7 +63,7 @@ class NominalRun:
 
 @dataclass(eq=False)
 class Stage:
-    """Scene and plan of a run, each built once when it is first needed.
+    """Scene, plan and policy of a run, each built once when it is first needed.
 
     Attributes:
         cfg: The configuration of scene, robot and phases.
@@ -87,6 +90,18 @@ class Stage:
     def planner(self) -> OpenLoopPlanner:
         """The planner, its nominal plan made."""
         return OpenLoopPlanner(self.cfg)
+
+    @cached_property
+    def policy(self) -> Policy:
+        """The policy of ``controller=policy``.
+
+        Raises:
+            MjstackError: There is none, or it cannot be read.
+        """
+        if self.cfg.policy is None:
+            expected = "the folder of a trained policy, which controller=policy plays"
+            raise ConfigError("policy", None, expected)
+        return load_policy(Path(self.cfg.policy))
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -169,6 +184,16 @@ class RunContext:
         """The planner, its nominal plan made."""
         return self.stage.planner
 
+    @property
+    def phases(self) -> list[Phase]:
+        """Those of the driver: a policy has none."""
+        return [] if self.cfg.controller.name == POLICY else self.planner.phases
+
+    @property
+    def episode_steps(self) -> int:
+        """Length of a driven episode."""
+        return self.phases[-1].stop if self.phases else self.cfg.task.episode_steps
+
     @cached_property
     def check(self) -> EpisodeCheck:
         """The task's check, for its rules, thresholds and report."""
@@ -217,6 +242,8 @@ class RunContext:
     def driver(self, env: Env) -> Driver:
         """The configured driver, for worlds that have started."""
         sim = env.sim
+        if env.cfg.controller.name == POLICY:
+            return PolicyDriver(env, self.stage.policy)
         if env.cfg.controller.name == CLOSED_LOOP:
             # Loads Warp, which a native open-loop run does not need.
             from mjstack.drivers.closed_loop import ClosedLoopDriver
@@ -325,13 +352,13 @@ class RunContext:
         return apply_configured(self.cfg, found) if self.cfg.batch.auto and found else None
 
     def phase(self, name: str) -> Phase:
-        """A phase by its name."""
+        """A phase of the scripted motion by its name."""
         return next(phase for phase in self.planner.phases if phase.name == name)
 
 
 def lacks_episode(cfg: Config) -> str:
     """Why no driver can play a judged episode of the task; empty if one can."""
-    if not cfg.controller.phases:
+    if not cfg.controller.phases and cfg.controller.name != POLICY:
         return f"task {cfg.task.name} has no phases: no open- or closed-loop driver"
     if cfg.task.check is None:
         return f"task {cfg.task.name} has no check"

@@ -62,7 +62,7 @@ class Circumstances:
         sign, phase, step = torch.stack((monitor.sign, monitor.phase, monitor.step)).cpu().numpy()
         return cls(
             objects=list(index.objects),
-            phase_names=list(cfg.controller.phases),
+            phase_names=[phase.name for phase in monitor.driver.phases],
             start_places=np.stack(places, axis=1),
             retries=episode.retries,
             # NaN is not reached.
@@ -84,7 +84,7 @@ class Circumstances:
         step = self.sign_step[world]
         cells = {
             "sign": Sign(self.sign[world]).name,
-            "phase": self.phase_names[phase] if phase >= 0 else "",
+            "phase": self.phase_names[phase] if 0 <= phase < len(self.phase_names) else "",
             "step": step if step >= 0 else "",
             "retries": self.retries[world],
             "unreachable": int(self.unreachable[world]),

@@ -18,7 +18,9 @@ from mjstack.sim import Simulation
 from mjstack.sim.graph import StepGraph
 from mjstack.tasks.check import CheckResult, make_check
 
-CLOSED_LOOP = "closed_loop"  # the controller with feedback; any other name plays a plan
+# Controllers with feedback; any other name plays a plan.
+CLOSED_LOOP = "closed_loop"
+POLICY = "policy"
 StepHook = Callable[[int, Simulation], None]
 Reset = dict[str, TermCfg]
 NOMINAL: Reset = {"home": TermCfg(func="mjstack.mdp.reset.home")}

@@ -11,8 +11,9 @@ def run_batch(context: RunContext) -> list[GateResult]:
     """Play the task in nworld worlds that start differently, under every seed, and judge each."""
     cfg = context.cfg
     t = cfg.gate.batch
-    # Throughput continues from the first seed.
-    carry = context.phase(cfg.gate.throughput.from_phase).start - 1
+    # Throughput continues from the first seed; a policy is in no phase.
+    phases = context.phases
+    carry = context.phase(cfg.gate.throughput.from_phase).start - 1 if phases else -1
     snapshots = Snapshots([carry])
     tally = play_seeds(
         context,

@@ -113,6 +113,13 @@ def _on_driven_worlds(
     """Measurements *physics* and *episode*, on the same worlds."""
     t = context.cfg.gate.throughput
     wanted = [name for name in ("physics", "episode") if name in t.measurements]
+    found: dict[str, Measurement] = {}
+    if "physics" in wanted and not context.phases:
+        wanted.remove("physics")
+        missing = "it starts as a phase begins, and a policy has none"
+        found["physics"] = Measurement(name="physics", missing=missing)
+    if not wanted:
+        return found
     if lack := lacks_episode(context.cfg):
         return {name: Measurement(name=name, missing=lack) for name in wanted}
     gc.collect()  # environments hold on to their worlds in cycles, and a GPU has not room for all
@@ -126,7 +133,6 @@ def _on_driven_worlds(
     result.notes["backend"] = sim.description
     if sim.sizes is not None:
         result.notes["sizes"] = str(sim.sizes)
-    found = {}
     step_seconds = 0.0
     if "physics" in wanted:
         found["physics"] = _guarded("physics", measure_physics, context, sim, **limits)

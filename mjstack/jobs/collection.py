@@ -27,7 +27,6 @@ from mjstack.jobs.demonstration import (
 from mjstack.jobs.runner import run_provenance
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
-from mjstack.scene.phases import build_phases
 from mjstack.sim import Simulation
 
 DATASET = "dataset"  # within the job's folder
@@ -65,7 +64,7 @@ class CollectPlan:
         del provenance["date"], provenance["config_sha256"]
         spec = make_spec(env, cfg, provenance)
         step = 4 * sum(column.dim for column in spec.features.values() if column.dtype == "float32")
-        world = build_phases(cfg)[-1].stop * step / 2**30
+        world = context.episode_steps * step / 2**30
         if gib < world:
             expected = f"at least {world:.2g}, which the steps of one world take"
             raise ConfigError("job.buffer_gib", gib, expected)
@@ -314,7 +313,8 @@ class Collection:
                 "retries": sum(batch.retries for batch in self.batches),
             }
             share = f"{succeeded:,} of {worlds:,} worlds ({100.0 * succeeded / worlds:.4g} %)"
-            reasons.append(f"the expert succeeded in {share}")
+            driver = "expert" if self._context.phases else "policy"
+            reasons.append(f"the {driver} succeeded in {share}")
             broken = sum((Counter(batch.broken) for batch in self.batches), Counter())
             details += [f"{text}: {count} of {worlds} worlds" for text, count in broken.items()]
             details += [

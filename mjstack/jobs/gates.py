@@ -12,7 +12,7 @@ from mjstack.envs import build_env
 from mjstack.envs.build import driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.earlier_run import archive_starts
-from mjstack.episodes.rollout import CLOSED_LOOP
+from mjstack.episodes.rollout import CLOSED_LOOP, POLICY
 from mjstack.errors import ConfigError, KeyedError, Unreachable
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
@@ -94,6 +94,8 @@ def check_task(context: RunContext) -> None:
     if cfg.task.check is not None:
         _ = context.check  # reads its thresholds
     check_env(context, cfg)
+    if cfg.controller.name == POLICY:
+        check_policy(context)
     if not cfg.controller.phases:
         return
     phases = context.planner.phases  # reads the robot, and reaches every nominal target
@@ -103,11 +105,24 @@ def check_task(context: RunContext) -> None:
     check_env(context, driven_config(cfg, reset={}), action="controller.action")
     if cfg.controller.approach_gain > 0.0:
         turn_sign(context.model, cfg)
-    if cfg.controller.name == CLOSED_LOOP or "success" in cfg.gates:
+    if success_config(cfg).controller.name == CLOSED_LOOP and (
+        cfg.controller.name == CLOSED_LOOP or "success" in cfg.gates
+    ):
         # Loads Warp, which a native open-loop run does not need.
         from mjstack.kinematics.chain import build_chain
 
         build_chain(context.model, cfg.robot)
+
+
+def check_policy(context: RunContext) -> None:
+    """Raise if the configured policy does not fit the configured worlds."""
+    cfg = driven_config(context.cfg, reset={})
+    env = build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu")
+    try:
+        env.reset()
+        context.driver(env)
+    finally:
+        env.close()
 
 
 def check_env(context: RunContext, cfg: Config, **keys: str) -> None:

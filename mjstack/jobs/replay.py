@@ -179,6 +179,8 @@ def _changes(then: dict, now: dict) -> list[str]:
         for name, value in here.items()
         if name in before and before[name] != value
     ]
+    if then.get("policy") != now.get("policy"):
+        lines.append("the policy is not the same as in that run: it was written anew")
     if then.get("model_sha256") != now["model_sha256"]:
         lines.append("the compiled model is not the same as in that run: this is another physics")
     return lines

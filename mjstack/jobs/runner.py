@@ -213,12 +213,14 @@ def run_provenance(context: RunContext) -> Provenance:
     # The numbers of the compiled model: the physics sees these, not the files
     buffer = np.empty(mujoco.mj_sizeModel(context.model), np.uint8)
     mujoco.mj_saveModel(context.model, None, buffer)
+    config = config_content(context.cfg)
     return collect_provenance() | {
         "device": f"{device}: {name}",
         "driver": cuda_driver() if device.startswith("cuda") else "no CUDA device",
-        "config_sha256": config_hash(config_content(context.cfg)),
+        "config_sha256": config_hash(config),
         "model_sha256": hashlib.sha256(buffer.tobytes().hex().encode()).hexdigest(),
         "starts_schema": SCHEMA,
+        **({"policy": config["policy"]} if context.cfg.policy else {}),
     }
 
 

@@ -48,7 +48,7 @@ class Config:
     task: TaskCfg = spec()
     """The task; it chooses some of the groups above."""
     controller: ControllerCfg = spec()
-    """Joint trajectories planned before the episode, or feedback."""
+    """Joint trajectories planned before the episode, feedback, or a trained policy."""
     gate: GateCfg = field(default_factory=GateCfg)
     """Parameters of the gates, all in use at once; gates=[...] chooses gates."""
     job: JobCfg = spec()
@@ -68,6 +68,8 @@ class Config:
     """Write an mp4 of the same world."""
     starts: str | None = spec(None)
     """reset=starts_file: a file with one row per world, from which all of them start."""
+    policy: str | None = spec(None)
+    """controller=policy: the folder of a trained policy."""
     run: str | None = spec(None)
     """job=replay: the folder of an earlier run."""
     world: str | None = spec(None)

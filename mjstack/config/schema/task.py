@@ -116,7 +116,7 @@ class ControllerCfg:
     """The phases of the expert. Its joint targets go through the action terms of ``action``."""
 
     name: str = spec()
-    """open_loop or closed_loop."""
+    """open_loop, closed_loop or policy."""
     action: dict[str, Any] = spec()
     """Its action terms, by name."""
     phases: dict[str, PhaseCfg] = spec(factory=dict)

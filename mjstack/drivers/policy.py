@@ -1,0 +1,98 @@
+"""The driver that asks a trained policy: it observes as the policy was trained, and plays a part of
+each answer before it asks again.
+"""
+
+import copy
+
+import torch
+from torch import Tensor
+
+from mjstack.drivers.driver import PhaselessDriver
+from mjstack.envs.env import Env
+from mjstack.errors import ArgumentError, PolicyError, TermError
+from mjstack.managers.observation import ObservationManager
+from mjstack.mdp.geometry import robot
+from mjstack.policy import Policy
+
+_GRID = 2.0**20  # per rad or m
+
+
+class PolicyDriver(PhaselessDriver):
+    """Joint targets of a policy for every world.
+
+    A world asks at its reset and every ``execute`` control steps from there, so worlds may end and
+    start anew whenever they like.
+
+    On a CPU the network computes in float64, and only if a world asks. Targets are rounded to
+    2**-20 rad or m. So a world gets the same targets alone as in a batch, where sums are made in
+    another order. On CUDA every step computes the network in float32, because a captured step
+    cannot skip it, and worlds that do not ask keep their targets.
+    """
+
+    def __init__(self, env: Env, policy: Policy) -> None:
+        """Build the policy's observation and allocate for the environment's worlds.
+
+        Args:
+            env: The environment, its worlds started; its action terms must take absolute joint
+                targets.
+            policy: The policy.
+
+        Raises:
+            MjstackError: The policy was trained for something else, or the environment takes other
+                actions.
+        """
+        cfg = env.cfg
+        if list(cfg.action.values()) != list(cfg.controller.action.values()):
+            expected = "absolute joint targets, which a policy gives"
+            raise ArgumentError(
+                "env", "other actions", expected, "Build it with action=joint_absolute"
+            )
+        policy.check_fit(cfg)
+        group = policy.group
+        try:
+            self._observations = ObservationManager(env, {group: policy.observation})
+        except TermError as error:
+            raise PolicyError(
+                f"policy={policy.folder}: its observation cannot be computed here: {error}"
+            ) from error
+        policy.check_widths(self._observations.term_dims[group])
+        self._observed = self._observations.groups[group]
+        self._remembers = any(term.history > 1 for term in policy.observation.terms.values())
+        self._env = env
+        super().__init__(env.nworld, cfg.task.episode_steps, env.device)
+
+        # The network, and the part of its last answer that is played
+        dtype = torch.float32 if env.device.type == "cuda" else torch.float64
+        network = copy.deepcopy(policy.network).to(env.device, dtype)
+        self._network = network.requires_grad_(False)
+        self._dtype = dtype
+        self._execute = policy.execute
+        shape = (env.nworld, min(policy.execute, network.chunk), network.joints)
+        self._chunk = torch.zeros(shape, device=env.device)
+        self._command = robot(env).ctrl.read(env.sim.ctrl).float().clone()
+
+    def command(self) -> Tensor:
+        """Joint targets of the next step, shape ``(nworld, nu)``, float32. The driver's own memory:
+        do not write into it.
+        """
+        step = self._env.episode_step
+        slot = step.remainder(self._execute)
+        asks = slot == 0
+        asking = asks.is_cuda or bool(asks.any())
+        if self._remembers or asking:
+            self._observations.compute()
+        if self._remembers:
+            self._observations.refresh(step == 0)
+        if asking:
+            self._ask(asks)
+        played = slot.clamp(max=self._chunk.shape[1] - 1)[:, None, None]
+        target = self._chunk.gather(1, played.expand(-1, 1, self._chunk.shape[2]))[:, 0]
+        # A world whose state is not finite keeps its targets, and the check fails it.
+        self._command.copy_(torch.where(torch.isfinite(target), target, self._command))
+        return self._command
+
+    def _ask(self, asks: Tensor) -> None:
+        """Take the policy's answer in the worlds that ask, shape ``(nworld,)``, bool."""
+        answer = self._network(self._observed.to(self._dtype))[:, : self._chunk.shape[1]]
+        answer = (torch.round(answer * _GRID) / _GRID).float()
+        torch.where(asks[:, None, None], answer, self._chunk, out=self._chunk)

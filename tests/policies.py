@@ -1,0 +1,42 @@
+"""Policies for tests: small networks with random weights, which drive worlds without success."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from mjstack.config.fingerprint import config_content
+from mjstack.config.schema import Backend, Config
+from mjstack.envs import build_env
+from mjstack.policy import Policy, PolicyNetwork, save_policy
+
+
+def make_policy(
+    cfg: Config, *, group: str = "policy", chunk: int = 6, execute: int = 4, seed: int = 0
+) -> Policy:
+    """A policy around the robot's start that moves every joint by up to some 0.05 rad."""
+    env = build_env(cfg, nworld=1, backend=Backend.native, device="cpu")
+    widths = env.observation_manager.term_dims[group]
+    env.close()
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        network = PolicyNetwork(sum(widths.values()), len(cfg.robot.joints), chunk, [16, 16])
+    start = torch.tensor(cfg.robot.start, dtype=torch.float32)
+    network.set_scale("action", start, torch.full_like(start, 0.05))
+    return Policy(
+        network=network,
+        group=group,
+        observation=cfg.observation[group],
+        widths=widths,
+        execute=execute,
+        hidden=[16, 16],
+        config=config_content(cfg),
+        training={"seed": seed},
+    )
+
+
+def write_policy(folder: Path, cfg: Config, **options: int | str) -> Path:
+    """The folder of such a policy."""
+    save_policy(folder, make_policy(cfg, **options))  # type: ignore[arg-type]
+    return folder

@@ -1,0 +1,369 @@
+"""A policy's folder and its driver: what is saved comes back, what does not fit is refused in one
+line, and every gate takes a policy.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from compositions import load_config
+from environments import configure, on_new_sim, one_second_episode
+from policies import make_policy, write_policy
+
+from mjstack.cli import run
+from mjstack.drivers.policy import PolicyDriver
+from mjstack.envs import Env, driven_config
+from mjstack.episodes.rollout import CommandRecorder, rollout
+from mjstack.errors import MjstackError
+from mjstack.jobs.gates import check_machine
+from mjstack.policy import load_policy, save_policy
+
+SHORT = one_second_episode()
+
+
+def driven(nworld: int, *overrides: str, backend: str = "native") -> Env:
+    """Started worlds of a driven episode."""
+    cfg = driven_config(configure("reset=randomized", *overrides))
+    env = on_new_sim(backend, nworld, cfg)
+    env.reset(seed=3)
+    return env
+
+
+def play(env: Env, driver: PolicyDriver, steps: int) -> torch.Tensor:
+    """The driver's commands, shape ``(steps, nworld, nu)``."""
+    commands = []
+    for _ in range(steps):
+        command = driver.command()
+        commands.append(command.clone())
+        env.action_manager.process(command)
+        env.advance()
+    return torch.stack(commands)
+
+
+def test_a_saved_policy_gives_the_same_bits(tmp_path: Path) -> None:
+    policy = make_policy(configure())
+    save_policy(tmp_path / "one", policy)
+    loaded = load_policy(tmp_path / "one")
+    seen = torch.randn(5, sum(policy.widths.values()))
+    assert torch.equal(policy.network(seen), loaded.network(seen))
+    for name in ("group", "observation", "widths", "execute", "hidden", "config", "training"):
+        assert getattr(loaded, name) == getattr(policy, name), name
+    assert loaded.joints == configure().robot.joints
+    assert {"mjstack", "mujoco", "torch"} == set(loaded.versions)
+
+
+def test_a_second_policy_replaces_the_first_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever write fails, the folder still has the first policy."""
+    import mjstack.policy.checkpoint as module
+
+    first = make_policy(configure(), seed=1)
+    save_policy(tmp_path, first)
+    real = module.write_atomic
+    for failing in (1, 2):
+        calls = []
+
+        def full(path: Path, content: bytes, calls: list = calls, failing: int = failing) -> None:
+            calls.append(path)
+            if len(calls) == failing:
+                raise OSError(28, "No space left on device")
+            real(path, content)
+
+        monkeypatch.setattr(module, "write_atomic", full)
+        with pytest.raises(OSError, match="No space"):
+            save_policy(tmp_path, make_policy(configure(), seed=2))
+        kept = load_policy(tmp_path).network.state_dict()
+        assert all(torch.equal(kept[k], v) for k, v in first.network.state_dict().items())
+    monkeypatch.setattr(module, "write_atomic", real)
+    save_policy(tmp_path, make_policy(configure(), seed=2))
+    assert len(list(tmp_path.iterdir())) == 2  # the first one's weights are gone
+
+
+@pytest.mark.parametrize(("chunk", "execute"), [(6, 4), (2, 5), (1, 1)])
+def test_answers_are_played_in_chunks(chunk: int, execute: int) -> None:
+    """Against the network asked by hand, every ``execute`` steps; the last target of a shorter
+    chunk holds.
+    """
+    env = driven(3)
+    policy = make_policy(configure(), chunk=chunk, execute=execute)
+    commands = play(env, PolicyDriver(env, policy), 11)
+
+    again = on_new_sim("native", 3, driven_config(configure("reset=randomized")))
+    again.reset(seed=3)
+    probe = PolicyDriver(again, policy)
+    for step in range(11):
+        if step % execute == 0:
+            observed = probe._observations.compute()["policy"]
+            answer = policy.network(observed)
+        wanted = answer[:, min(step % execute, chunk - 1)]
+        torch.testing.assert_close(commands[step], wanted, rtol=0.0, atol=2e-6)
+        again.action_manager.process(commands[step])
+        again.advance()
+    assert commands.std(0).max() > 1e-4  # it does something
+
+
+def test_a_world_asks_anew_at_its_own_reset() -> None:
+    env = driven(3)
+    driver = PolicyDriver(env, make_policy(configure(), chunk=4, execute=4))
+    first = play(env, driver, 6)
+    mask = torch.tensor([False, True, False])
+    env.episode.masked_fill_(mask, -1)
+    env.reset(mask=mask)
+    again = play(env, driver, 4)
+    assert torch.equal(again[:4, 1], first[:4, 1])
+    assert not torch.equal(again[:4, 0], first[:4, 0])
+
+
+def test_a_history_is_that_of_the_environment() -> None:
+    """Terms with a history: the driver's columns are those of an environment with the group."""
+    cfg = configure("task=reach", "action=joint_absolute", "reset=randomized")
+    env = on_new_sim("native", 4, cfg)
+    env.reset(seed=1)
+    policy = make_policy(cfg, execute=3)
+    assert any(term.history > 1 for term in policy.observation.terms.values())
+    driver = PolicyDriver(env, policy)
+    ended = 0
+    for step in range(12):
+        command = driver.command()
+        own = driver._observed.clone()
+        assert torch.equal(own, env.observation_manager.groups["policy"]), step
+        _, _, terminated, truncated, _ = env.step(command.clone())
+        ended += int((terminated | truncated).sum())
+        if step == 5:
+            env.reset(mask=torch.tensor([True, False, False, False]))
+
+
+@pytest.mark.parametrize("nworld", [1, 7, 33])
+def test_a_world_alone_gets_what_it_got_in_a_batch(nworld: int) -> None:
+    """Bit for bit: job=replay plays one world of a batch."""
+    policy = make_policy(configure())
+    batch = driven(nworld)
+    alone = on_new_sim("native", 1, driven_config(configure("reset=randomized")))
+    alone.world.fill_(nworld - 1)
+    alone.reset(seed=3)
+    many = play(batch, PolicyDriver(batch, policy), 10)
+    one = play(alone, PolicyDriver(alone, policy), 10)
+    assert torch.equal(many[:, -1], one[:, 0])
+
+
+def test_other_actions_are_refused() -> None:
+    env = on_new_sim("native", 1, configure())
+    with pytest.raises(MjstackError, match="action=joint_absolute"):
+        PolicyDriver(env, make_policy(configure()))
+
+
+MISFITS = [
+    (["robot=rebot"], "was trained with robot.name=so101, and here it is rebot"),
+    (["task=box"], "was trained with task.name=stack, and here it is box"),
+    (["robot.home=[0,0,0.4,1.2,1.6,0.7]"], "was trained with robot.home=[0.0, 0.0, 0.473"),
+    (["timing.decimation=20", "task.control_hz=25"], "was trained with task.control_hz=50.0"),
+    (["scene.objects.red.size=[0.021,0.021,0.021]"], "scene.objects.red=box [0.022"),
+]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_policy(tmp_path / "mine", configure())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"), MISFITS, ids=[" ".join(overrides) for overrides, _ in MISFITS]
+)
+def test_a_policy_of_something_else_is_refused(
+    folder: Path, overrides: list[str], says: str
+) -> None:
+    assert_refused([*overrides], folder, says)
+
+
+def assert_refused(overrides: list[str], folder: Path, says: str) -> None:
+    """One line, before anything is written."""
+    with pytest.raises(MjstackError) as caught:
+        check_machine(
+            load_config(["controller=policy", f"policy={folder}", "gates=[baseline]", *overrides])
+        )
+    assert caught.value.exit_code == 2
+    message = str(caught.value)
+    assert "\n" not in message
+    assert says in message, message
+
+
+def edit(change: Callable[[dict], object]) -> Callable[[Path], object]:
+    """Change policy.json."""
+
+    def apply(folder: Path) -> None:
+        path = folder / "policy.json"
+        facts = json.loads(path.read_text())
+        change(facts)
+        path.write_text(json.dumps(facts))
+
+    return apply
+
+
+def weights(folder: Path) -> Path:
+    (path,) = folder.glob("*.safetensors")
+    return path
+
+
+def put(facts: dict, *keys: str, value: object) -> None:
+    for key in keys[:-1]:
+        facts = facts[key]
+    facts[keys[-1]] = value
+
+
+TERM = ("observation", "terms", "joint_pos")
+DAMAGED: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no file": (lambda f: (f / "policy.json").unlink(), "has no policy.json"),
+    "no weights": (lambda f: weights(f).unlink(), "FileNotFoundError"),
+    "truncated weights": (
+        lambda f: weights(f).write_bytes(weights(f).read_bytes()[:-100]),
+        "its content is not that of policy.json",
+    ),
+    "truncated json": (
+        lambda f: (f / "policy.json").write_text((f / "policy.json").read_text()[:200]),
+        "cannot be read (JSONDecodeError",
+    ),
+    "another format": (edit(lambda d: put(d, "format", value=7)), "has format 7, expected 1"),
+    "another network": (edit(lambda d: put(d, "network", "hidden", value=[16])), "cannot be read"),
+    "no number": (edit(lambda d: put(d, "action", "execute", value=0)), "cannot be read"),
+    "a key less": (edit(lambda d: d["config"]["robot"].pop("home")), "cannot be read (KeyError"),
+    "a strange function": (
+        edit(lambda d: put(d, *TERM, "func", value="os.system")),
+        "joint_pos.func=os.system: expected a name of mjstack",
+    ),
+    "a function that is gone": (
+        edit(lambda d: put(d, *TERM, "func", value="mjstack.mdp.observation.nope")),
+        "'nope' does not exist",
+    ),
+    "another object": (
+        edit(lambda d: put(d, "observation", "terms", "red_to_blue", "params", "a", value="green")),
+        "its observation cannot be computed here: observation.policy.terms.red_to_blue",
+    ),
+    "another width": (
+        edit(lambda d: put(d, *TERM, "func", value="mjstack.mdp.observation.grasp_point_pos")),
+        "observation.policy.terms.joint_pos.width=6, and here it is 3",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_a_damaged_policy_is_refused(folder: Path, case: str) -> None:
+    damage, says = DAMAGED[case]
+    damage(folder)
+    assert_refused([], folder, says)
+
+
+def test_a_policy_needs_its_controller(folder: Path) -> None:
+    with pytest.raises(MjstackError, match="Add controller=policy"):
+        load_config([f"policy={folder}"])
+    with pytest.raises(MjstackError, match="policy=null: expected the folder of a trained policy"):
+        check_machine(load_config(["controller=policy", "gates=[baseline]"]))
+
+
+def test_nothing_is_written_where_a_policy_is_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    status = run(
+        [*SHORT, "robot=rebot", "controller=policy", f"policy={folder}", f"hydra.run.dir={out}"]
+    )
+    assert status == 2
+    assert not out.exists()
+    error = capsys.readouterr().err
+    assert error.startswith("mjstack: policy=")
+    assert error.count("\n") == 1
+
+
+def report(folder: Path) -> dict:
+    gates = json.loads((folder / "report.json").read_text())["gates"]
+    return {gate["name"]: gate for gate in gates}
+
+
+def test_every_gate_takes_a_policy(folder: Path, tmp_path: Path) -> None:
+    """A policy that fails is judged in every world, and a replay ends bit for bit where it did."""
+    out = tmp_path / "run"
+    policy = ["controller=policy", f"policy={folder}"]
+    status = run(
+        [
+            *SHORT,
+            *policy,
+            "task.episode_steps=60",
+            "sim=native",
+            "nworld=5",
+            "gates=[baseline,batch,throughput,success]",
+            "gate.throughput.measurements=[physics,episode]",
+            "gate.success.seeds=1",
+            "video=false",
+            f"hydra.run.dir={out}",
+        ]
+    )
+    assert status == 1
+    gates = report(out)
+    assert {"baseline", "batch", "throughput", "success"} <= set(gates)
+    assert "not lifted" in gates["baseline"]["reason"]
+    assert "path_error_m" not in gates["baseline"]["metrics"]
+    for gate in ("batch", "success"):
+        assert gates[gate]["metrics"]["episodes"] == 5
+        assert gates[gate]["metrics"]["failed.LIFT"] == 5
+    assert "no figure" in gates["throughput"]["reason"]  # an episode that fails has no speed
+    assert np.load(out / "success_seed0.npz")["phase_names"].size == 0
+
+    for world in ("batch:3", "success:2"):
+        again = tmp_path / f"replay_{world.replace(':', '_')}"
+        status = run(["job=replay", f"run={out}", f"world={world}", f"hydra.run.dir={again}"])
+        assert status == 1
+        assert "bit for bit where it did" in report(again)["replay_native"]["reason"]
+
+
+def test_a_replay_names_a_policy_that_was_written_anew(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    policy = ["controller=policy", f"policy={folder}", "task.episode_steps=60"]
+    run([*SHORT, *policy, "sim=native", "nworld=2", "gates=[batch]", f"hydra.run.dir={out}"])
+    write_policy(folder, configure(), seed=9)
+    again = tmp_path / "again"
+    run(["job=replay", f"run={out}", "world=1", f"hydra.run.dir={again}"])
+    assert any("written anew" in line for line in report(again)["replay_native"]["details"])
+
+
+@pytest.mark.full
+def test_a_policy_collects(folder: Path, tmp_path: Path) -> None:
+    """Its episodes become a dataset; without a success they are kept on request."""
+    pytest.importorskip("pyarrow")
+    out = tmp_path / "data"
+    status = run(
+        [
+            *SHORT,
+            "job=collect",
+            "controller=policy",
+            f"policy={folder}",
+            "task.episode_steps=60",
+            "sim=native",
+            "nworld=2",
+            "job.episodes=2",
+            "job.keep_failures=true",
+            f"hydra.run.dir={out}",
+        ]
+    )
+    assert status == 0
+    assert "the policy succeeded in 0 of 2" in report(out)["collect"]["reason"]
+
+
+def test_the_rollout_plays_a_policy(backend: str) -> None:
+    """Its targets are native's as long as the states are: here in the first steps. On CUDA they
+    come from the captured step.
+    """
+    policy = make_policy(configure(), chunk=4, execute=3)
+    native = driven(3)
+    wanted = play(native, PolicyDriver(native, policy), 8)
+    env = driven(3, "graph=require", backend=backend)
+    recorder = CommandRecorder()
+    timing = rollout(env, PolicyDriver(env, policy), [recorder], steps=8)
+    recorded = recorder.recorded.rewind()
+    commands = torch.stack([recorded.command().cpu() for _ in range(8)])
+    torch.testing.assert_close(commands, wanted, rtol=0.0, atol=1e-4)
+    assert timing.captured == (backend == "mjwarp-cuda")
