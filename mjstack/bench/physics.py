@@ -179,7 +179,8 @@ def measure_arrangements(
             branches=False, fused=False
         ),
         "contacts beside smooth dynamics": ARRANGEMENTS["arranged"],
-        "contact rows and the solver as one kernel each": ARRANGEMENTS["fused"],
+        "contact rows and the solver as one kernel each": Arrangement(smooth=False),
+        "smooth dynamics as three kernels": ARRANGEMENTS["fused"],
     }
     device = resolve_device(cfg.sim.device)
     sizes = resolve_env_sizes(cfg) if random else None

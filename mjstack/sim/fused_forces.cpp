@@ -9,21 +9,31 @@ SHARED float velocity[6 * NBODY], force[6 * NBODY];
 SHARED float qvel[NV], bias[NV], h[NV * LD], acc[NV];
 SHARED float torque[NA + 1];  // of actuators, at their joints
 SHARED int driven[NA + 1], first[NV];
+SHARED unsigned long long movers[NBODY];  // degrees of freedom that move a body, as bits
 
 load(io.cinert, 10 * NBODY, inertia);
 load(io.cdof, 6 * NV, motion);
 load(io.qvel, NV, qvel);
 for (int i = lane; i < NV; i += T) first[i] = io.M_colind.data[io.M_rowadr.data[i]];
 for (int e = lane; e < NV * LD; e += T) h[e] = 0.0f;
-SYNC();
-
-// Degrees of freedom that move a body, as bits
-auto movers = [&](int body) {
+for (int b = lane; b < NBODY; b += T) {
   unsigned long long bits = 0;
   WP_PRAGMA_UNROLL
   for (int k = 0; k < NV; ++k)
-    if (wp::index(io.body_isdofancestor, body, k)) bits |= 1ull << k;
-  return bits;
+    if (wp::index(io.body_isdofancestor, b, k)) bits |= 1ull << k;
+  movers[b] = bits;
+}
+SYNC();
+
+// Calls a function with the degrees of freedom that bits names, the first one first
+auto each = [](unsigned long long bits, auto call) {
+  for (; bits; bits &= bits - 1) {
+#ifdef __CUDA_ARCH__
+    call(__ffsll(bits) - 1);
+#else
+    call(__builtin_ctzll(bits));
+#endif
+  }
 };
 
 // Inertia of subtrees, and velocities along the degrees of freedom
@@ -36,13 +46,14 @@ for (int e = lane; e < 10 * NBODY; e += T) {
 for (int i = lane; i < NV; i += T) {
   const int joint = io.dof_jntid.data[i], start = io.jnt_dofadr.data[joint];
   const bool free = io.jnt_type.data[joint] == FREE;
-  const int begin = free ? start + 3 : i;  // the three turns of a free joint are one
-  const unsigned long long bits = movers(io.dof_bodyid.data[i]);
-  Spatial v{}, before{};
-  for (int k = 0; k <= i; ++k) {
-    if (k == begin) before = v;
-    if (bits >> k & 1) v = v + spatial(motion, k) * qvel[k];
-  }
+  // The three turns of a free joint are one: none changes the others' axes.
+  const int begin = free ? start + 3 : i;
+  const unsigned long long bits = movers[io.dof_bodyid.data[i]], earlier = (1ull << begin) - 1ull;
+  Spatial v{};
+  auto add = [&](int k) { v = v + spatial(motion, k) * qvel[k]; };
+  each(bits & earlier, add);
+  const Spatial before = v;
+  each(bits & ~earlier & ((2ull << i) - 1ull), add);
   put_spatial(reached, i, v);
   put_spatial(motion_rate, i, free && i < begin ? Spatial{} : cross_motion(before, spatial(motion, i)));
 }
@@ -57,9 +68,7 @@ for (int b = lane; b < NBODY; b += T) {
   if (dofs) v = spatial(reached, io.body_dofadr.data[w] + dofs - 1);
   if (b) {
     Spatial a{V3{0.0f, 0.0f, 0.0f}, vec(g, 0) * -gravity};
-    const unsigned long long bits = movers(b);
-    for (int k = 0; k < NV; ++k)
-      if (bits >> k & 1) a = a + spatial(motion_rate, k) * qvel[k];
+    each(movers[b], [&](int k) { a = a + spatial(motion_rate, k) * qvel[k]; });
     f = momentum_of(inertia + 10 * b, a) + cross_force(v, momentum_of(inertia + 10 * b, v));
   }
   put_spatial(velocity, b, v);

@@ -98,7 +98,8 @@ def _largest_tree(m: mjw.Model) -> int:
 def _shared_bytes(m: mjw.Model) -> int:
     """Shared memory of a world [bytes]: the arrays at the heads of the C++ files."""
     poses = 58 * m.nbody + 6 * m.njnt + 6 * m.nv + 14 * m.ngeom + 12 * m.nsite + 32
-    rest = 32 * m.nbody + (28 + (_largest_tree(m) | 1)) * m.nv + 2 * m.nactuator + 32
+    tree = _largest_tree(m)
+    rest = 34 * m.nbody + (33 + (tree | 1)) * m.nv + 2 * tree + 2 * m.nactuator + 64
     return 4 * max(poses, rest)
 
 

@@ -152,30 +152,62 @@ auto next_activation = [&](const auto &io, int u, float act, float rate, bool li
 };
 
 // Solves A y = x by L D L', all trees at once. A row of h has the columns from its tree's first
-// degree of freedom on, which are LD at most.
+// degree of freedom on, LD at most. A thread has its rows in registers; of the others' it needs one
+// column after the other.
 constexpr int LD = BLOCK | 1;
+constexpr int ROWS = (NV + T - 1) / T;
 auto solve = [&](const int *first, float *h, float *x) {
-  // Column by column. Rows below the pivot's keep L D.
+  SHARED float columns[2][NV + BLOCK], rest[2][NV], inverse[NV];
+  float a[ROWS][BLOCK], y[ROWS];
+  WP_PRAGMA_UNROLL
+  for (int r = 0; r < ROWS; ++r) {
+    const int i = wp::min(lane + r * T, NV - 1);
+    WP_PRAGMA_UNROLL
+    for (int k = 0; k < BLOCK; ++k) a[r][k] = h[i * LD + k];
+    y[r] = x[i];
+  }
+  for (int e = lane; e < 2 * BLOCK; e += T) columns[e / BLOCK][NV + e % BLOCK] = 0.0f;
+
+  // L D, and L D y. Every second column has the same place, so one pause per column is enough.
+  WP_PRAGMA_UNROLL
   for (int j = 0; j < BLOCK; ++j) {
-    for (int i = lane; i < NV; i += T) {
-      const int pivot = first[i] + j;
-      if (pivot >= i) continue;
-      const float scale = h[i * LD + j] / h[pivot * LD + j];
-      x[i] -= scale * x[pivot];
-      for (int k = j + 1; k <= i - first[i]; ++k) h[i * LD + k] -= scale * h[(first[i] + k) * LD + j];
+    float *column = columns[j & 1], *known = rest[j & 1];
+    WP_PRAGMA_UNROLL
+    for (int r = 0; r < ROWS; ++r) {
+      const int i = lane + r * T;
+      if (i >= NV) continue;
+      column[i] = a[r][j];
+      known[i] = y[r];
+      if (i == first[i] + j) inverse[i] = 1.0f / a[r][j];
     }
     SYNC();
+    WP_PRAGMA_UNROLL
+    for (int r = 0; r < ROWS; ++r) {
+      const int i = lane + r * T, pivot = i < NV ? first[i] + j : NV;
+      if (pivot >= i) continue;
+      const float scale = a[r][j] * inverse[pivot];
+      y[r] -= scale * known[pivot];
+      // Columns beyond the diagonal hold numbers that no one uses.
+      WP_PRAGMA_UNROLL
+      for (int k = j + 1; k < BLOCK; ++k) a[r][k] -= scale * column[pivot - j + k];
+    }
   }
-  // An element of x is complete once all later ones of its tree have been taken out, and is scaled
-  // at the end: no one reads what another thread writes in the same round.
-  for (int j = BLOCK - 1; j >= 0; --j) {
+
+  // L' y. An element is complete once all later ones of its tree have been taken out.
+  for (int r = 0; r < ROWS; ++r) {
+    const int i = lane + r * T;
+    if (i >= NV) continue;
+    WP_PRAGMA_UNROLL
+    for (int k = 0; k < BLOCK; ++k) h[i * LD + k] = a[r][k];
+    x[i] = y[r] * inverse[i];
+  }
+  SYNC();
+  for (int j = BLOCK - 1; j > 0; --j) {
     for (int i = lane; i < NV; i += T) {
       const int later = first[i] + j;
       if (later > i && later < NV && first[later] == first[i])
-        x[i] -= h[later * LD + i - first[i]] * (x[later] / h[later * LD + j]);
+        x[i] -= h[later * LD + i - first[i]] * inverse[i] * x[later];
     }
     SYNC();
   }
-  for (int i = lane; i < NV; i += T) x[i] /= h[i * LD + i - first[i]];
-  SYNC();
 };

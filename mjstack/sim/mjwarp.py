@@ -94,7 +94,7 @@ class MjwarpSimulation(Simulation):
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
             self._best, self._why = self._best_step()
             step = self._resolve(step)
-            self._smooth = self._best == "fused" and self._smooth_applies()
+            self._smooth_applies = self._best == "fused" and self._check_smooth()
             self._usage = usage = Usage(model, nworld, self.device)
 
         self.arrangement = ARRANGEMENTS[step]
@@ -263,7 +263,7 @@ class MjwarpSimulation(Simulation):
                 sensors=i == n - 1 or not arrangement.sensors_once,
                 branches=arrangement.branches,
                 own=arrangement.fused,
-                smooth=arrangement.fused and self._smooth,
+                smooth=self._smooth(),
                 beside_kinematics=beside,
             )
             beside = (count,)
@@ -281,12 +281,16 @@ class MjwarpSimulation(Simulation):
         why = fused.why_not(self._m, self._d)
         return ("arranged", why) if why else ("fused", "")
 
-    def _smooth_applies(self) -> bool:
-        """Whether a fused step's smooth dynamics are our own."""
+    def _check_smooth(self) -> bool:
+        """Whether a fused step's smooth dynamics can be three kernels."""
         why = fused_smooth.why_not(self._m)
         if why:
             _tell(f"sim.step: a fused step has MJWarp's smooth dynamics, because {why}.")
         return not why
+
+    def _smooth(self) -> bool:
+        """Whether smooth dynamics are three kernels."""
+        return self.arrangement.fused and self.arrangement.smooth and self._smooth_applies
 
     def _resolve(self, asked: str) -> str:
         """The step that is done."""
@@ -304,7 +308,7 @@ class MjwarpSimulation(Simulation):
         """Poses of the current qpos, and nothing that a later step would start from: its forward
         computes them anew.
         """
-        if self.arrangement.fused and self._smooth:
+        if self._smooth():
             fused_smooth.positions(self._m, self._d)
         else:
             mjw.kinematics(self._m, self._d)

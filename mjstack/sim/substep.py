@@ -24,7 +24,8 @@ class Arrangement:
         own_stages: Only the stages that the model needs: no cameras, lights, tendons, flexes or
             energy.
         scratch: Temporaries at fixed addresses (`Scratch`), not allocated and freed by the graph.
-        fused: Contact rows and the solver as one kernel each, and smooth dynamics as three.
+        fused: Contact rows and the solver as one kernel each.
+        smooth: With fused, smooth dynamics as three kernels where they apply.
     """
 
     branches: bool = True
@@ -32,6 +33,7 @@ class Arrangement:
     own_stages: bool = True
     scratch: bool = True
     fused: bool = True
+    smooth: bool = True
 
 
 ARRANGEMENTS = {

@@ -78,8 +78,8 @@ class SimCfg:
     """auto, cpu or cuda:N."""
     step: str = spec(choices=("auto", "fused", "arranged", "stock"))
     """MJWarp's step. stock: ``mujoco_warp.step``; arranged: its stages as parallel branches; fused:
-    contact rows and the solver as one kernel each, too; auto: fused where it does all that the
-    model needs.
+    contact rows, the solver and smooth dynamics as a few kernels, too; auto: fused where it does
+    all that the model needs.
     """
 
 
