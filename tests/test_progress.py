@@ -1,4 +1,5 @@
-"""Every reward against the expert, and letting go against holding on.
+"""Every reward against the expert, and letting go against holding on. The expert's accepted
+episodes pass without phases, too.
 
 The exact statement: the stage of `Progress` never falls along an accepted episode in which no grasp
 was tried again, in any step of any world, so the reward of a step is at least that with which its
@@ -27,6 +28,7 @@ from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import Observer, rollout
 from mjstack.errors import ConfigError
 from mjstack.managers.term import Term
+from mjstack.tasks.check import make_check
 from mjstack.tasks.progress import STAGES
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -52,6 +54,20 @@ class Terms(Observer):
         self.rows.append(torch.stack([term(self.env).float().cpu() for term in self.terms]))
 
 
+class JudgeWithoutPhases(Observer):
+    """Judges every world as if the driver had no phases."""
+
+    def start(self, env: Env, driver: Driver) -> None:
+        self.check = make_check(env.cfg)
+        self.check.start(env, driver.steps)
+
+    def update(self) -> None:
+        self.check.update()
+
+    def finish(self) -> None:
+        self.failed = self.check.result().failed
+
+
 def configure(task: str, robot: str) -> Config:
     chosen = [f"task={task}", f"robot={robot}", "sim=native"]
     if task in ("push", "tower"):
@@ -71,8 +87,10 @@ def expert(task: str, robot: str) -> SimpleNamespace:
         env = context.start(sim, cfg.reset)
         rollout(env, context.driver(env), [terms])
     else:
-        episode = context.play(sim, cfg.reset, [terms])
+        freely = JudgeWithoutPhases()
+        episode = context.play(sim, cfg.reset, [terms, freely])
         assert not episode.failed.any()
+        assert not freely.failed.any(), "accepted with phases, not without"
         assert not episode.retries.any()
     sim.close()
     value, success = torch.stack(terms.rows).unbind(1)
