@@ -322,3 +322,16 @@ def test_a_step_with_mjwarps_smooth_dynamics(caplog: pytest.LogCaptureFixture) -
     assert "a fused step has MJWarp's smooth dynamics, because there is a fluid." in caplog.text
     sim.step(3)
     assert bool(sim.qpos.isfinite().all())
+
+
+def test_a_later_step_reads_nothing_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A graph could not be captured."""
+    cfg = configure("sim.step=fused", "graph=off")
+    sim = make_simulation(
+        build_model(cfg), cfg, 2, backend=Backend.mjwarp, device="cpu", sizes=resolve_env_sizes(cfg)
+    )
+    sim.step(1)
+    read = []
+    monkeypatch.setattr(wp.array, "numpy", read.append)
+    sim.step(1)
+    assert not read

@@ -177,7 +177,7 @@ def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
     warps = 64 * device.sm_count if device.is_cuda else 1
     rows = _fill(Rows(), m, d)
     rows.disableflags = flags
-    kernel = _rows_kernel(m.nv, d.efc.J.shape[2], m.nbody, warps)
+    kernel = _rows_kernel(m.nv, warps)
     wp.launch_tiled(kernel, dim=warps, inputs=[rows], block_dim=32, device=device)
 
 
@@ -216,12 +216,10 @@ def _fill(struct: Any, m: mjw.Model, d: mjw.Data) -> Any:
 
 
 @cache
-def _rows_kernel(nv: int, row: int, nbody: int, warps: int) -> wp.Kernel:
+def _rows_kernel(nv: int, warps: int) -> wp.Kernel:
     """The kernel of `make_constraint` for these sizes."""
     numbers = {
         "NV": nv,
-        "NVP": row,
-        "NBODY": nbody,
         "STRIDE": warps,
         "ELLIPTIC": _ELLIPTIC,
         "FRICTIONLESS": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS),
@@ -231,8 +229,7 @@ def _rows_kernel(nv: int, row: int, nbody: int, warps: int) -> wp.Kernel:
     @wp.func_native(_source("rows", numbers))
     def rows(warp: int, lane: int, io: Rows) -> None: ...
 
-    # So many blocks on a multiprocessor: more wait for memory at once, and no register is spilled.
-    bounds = (32, 28)
+    bounds = (32, 26)  # so many blocks on a multiprocessor, though a few registers are spilled
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=bounds)
     def kernel(problem: Rows) -> None:

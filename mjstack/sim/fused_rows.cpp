@@ -1,59 +1,117 @@
 // Constraint rows of elliptic and frictionless contacts, by the 32 threads of a warp that goes from
-// group to group of contacts: the body of a Warp native function. A contact has four threads, one per
-// row (and a second row each, if it has six), so that a group waits for memory once.
+// group to group of contacts: the body of a Warp native function. What a contact says is read by a
+// thread per contact of the group and row, so that the group waits for memory once; in between, the
+// threads are the columns of J of one contact after the other.
 //
-// Constants that fused.py puts before it: NV degrees of freedom, NVP columns of J (a multiple of 4),
-// NBODY bodies, STRIDE warps, and MuJoCo's numbers of the constraint types ELLIPTIC and FRICTIONLESS,
-// and of the flag REFSAFE. On Warp's CPU device a block has one thread.
+// Constants that fused.py puts before it: NV degrees of freedom, STRIDE warps, and MuJoCo's numbers
+// of the constraint types ELLIPTIC and FRICTIONLESS, and of the flag REFSAFE. On Warp's CPU device
+// a block has one thread.
 
 #ifdef __CUDA_ARCH__
-constexpr int T = 32, SHARE = 4;  // threads of a warp, and of a contact
-__shared__ unsigned long long dofs[NBODY];
+constexpr int T = 32, GROUP = 8;
+#define READ(x) __ldg(&(x))  // no store of this kernel changes it
+#define FROM(x, thread) __shfl_sync(~0u, x, thread)
 #else
-constexpr int T = 1, SHARE = 1;
-unsigned long long dofs[NBODY];
+constexpr int T = 1, GROUP = 1;
+#define READ(x) (x)
+#define FROM(x, thread) (x)
 #endif
-constexpr int GROUP = T / SHARE;               // contacts
+constexpr int SHARE = T / GROUP;           // threads of a contact
 constexpr int EACH = (6 + SHARE - 1) / SHARE;  // rows of a thread, SHARE apart
 constexpr float TINY = 1e-15f;
 constexpr float LEAST = 1e-4f, MOST = 0.9999f;  // of an impedance
 
-// The degrees of freedom that move a body, a bit each
-for (int b = lane; b < NBODY; b += T) {
-  dofs[b] = 0;
-  for (int c = 0; c < NV; ++c)
-    dofs[b] |= (unsigned long long)(wp::index(io.body_isdofancestor, b, c) != 0) << c;
-}
-#ifdef __CUDA_ARCH__
-__syncwarp();
-#endif
-
 const int count = wp::min(io.contact_dist.shape[0], io.nacon.data[0]);
 for (int group = warp * GROUP; group < count; group += STRIDE * GROUP) {
-  const bool there = group + lane / SHARE < count;
-  const int con = there ? group + lane / SHARE : group;
+  const int con = wp::min(group + lane % GROUP, count - 1);
   const float margin = io.contact_includemargin.data[con];
   const float distance = io.contact_dist.data[con] - margin;
   const int world = io.contact_worldid.data[con];
-  const bool counts = there && (io.contact_type.data[con] & 1) && distance < 0.0f;
+  const bool counts =
+      group + lane % GROUP < count && (io.contact_type.data[con] & 1) && distance < 0.0f;
   const int dim = counts ? io.contact_dim.data[con] : 0;
 
   // Room for the rows. Those beyond it are left out, and the count tells that they are.
   int first = 0;
 #ifdef __CUDA_ARCH__
-  if (lane % SHARE == 0 && dim) first = atomicAdd(io.nefc.data + world, dim);
-  first = __shfl_sync(~0u, first, lane / SHARE * SHARE);
+  if (lane < GROUP && dim) first = atomicAdd(io.nefc.data + world, dim);
+  first = FROM(first, lane % GROUP);
 #else
   first = io.nefc.data[world];
   io.nefc.data[world] += dim;
 #endif
   const int rows = wp::max(0, wp::min(dim, io.efc_aref.shape[1] - first));
-  for (int k = lane % SHARE; k < dim; k += SHARE)
+  for (int k = lane / GROUP; k < dim; k += SHARE)
     wp::index(io.contact_efc_address, con, k) = k < rows ? first + k : -1;
-  if (lane % SHARE >= rows) continue;
 
-  const int body[2] = {io.geom_bodyid.data[io.contact_geom.data[con][0]],
-                       io.geom_bodyid.data[io.contact_geom.data[con][1]]};
+  // J, and the rows' velocities
+  float frame[9], offset[6];
+  int body[2];
+  WP_PRAGMA_UNROLL
+  for (int k = 0; k < 9; ++k) frame[k] = io.contact_frame.data[con].data[k / 3][k % 3];
+  WP_PRAGMA_UNROLL
+  for (int side = 0; side < 2; ++side) {
+    body[side] = io.geom_bodyid.data[io.contact_geom.data[con][side]];
+    const auto &com = wp::index(io.subtree_com, world, io.body_rootid.data[body[side]]);
+    WP_PRAGMA_UNROLL
+    for (int k = 0; k < 3; ++k) offset[3 * side + k] = io.contact_pos.data[con][k] - com[k];
+  }
+  float speeds[EACH] = {};
+  for (int i = 0; i < GROUP; ++i) {
+    const int its_rows = FROM(rows, i);
+    if (!its_rows) continue;
+    const int its_world = FROM(world, i), its_first = FROM(first, i);
+    const int its_body[2] = {FROM(body[0], i), FROM(body[1], i)};
+    float f[9], o[6], velocity[6] = {};
+    WP_PRAGMA_UNROLL
+    for (int k = 0; k < 9; ++k) f[k] = FROM(frame[k], i);
+    WP_PRAGMA_UNROLL
+    for (int k = 0; k < 6; ++k) o[k] = FROM(offset[k], i);
+    for (int c = lane; c < NV; c += T) {
+      float motion[6];  // angular, then linear
+#ifdef __CUDA_ARCH__
+      const float2 *pairs = reinterpret_cast<const float2 *>(&wp::index(io.cdof, its_world, c));
+      WP_PRAGMA_UNROLL
+      for (int k = 0; k < 3; ++k) {
+        const float2 pair = __ldg(pairs + k);
+        motion[2 * k] = pair.x;
+        motion[2 * k + 1] = pair.y;
+      }
+#else
+      for (int k = 0; k < 6; ++k) motion[k] = wp::index(io.cdof, its_world, c)[k];
+#endif
+      const float speed = READ(wp::index(io.qvel, its_world, c));
+      float x[6] = {};  // of the bodies against each other, linear, then angular
+      WP_PRAGMA_UNROLL
+      for (int side = 0; side < 2; ++side) {
+        const float sign =
+            READ(wp::index(io.body_isdofancestor, its_body[side], c)) ? 2.0f * side - 1.0f : 0.0f;
+        x[0] += sign * (motion[3] + motion[1] * o[3 * side + 2] - motion[2] * o[3 * side + 1]);
+        x[1] += sign * (motion[4] + motion[2] * o[3 * side] - motion[0] * o[3 * side + 2]);
+        x[2] += sign * (motion[5] + motion[0] * o[3 * side + 1] - motion[1] * o[3 * side]);
+        WP_PRAGMA_UNROLL
+        for (int k = 0; k < 3; ++k) x[3 + k] += sign * motion[k];
+      }
+      float *J = &wp::index(io.efc_J, its_world, its_first, c);
+      WP_PRAGMA_UNROLL
+      for (int k = 0; k < 6; ++k) {
+        if (k >= its_rows) break;
+        const int of = k / 3 * 3, axis = k % 3 * 3;
+        const float value = x[of] * f[axis] + x[of + 1] * f[axis + 1] + x[of + 2] * f[axis + 2];
+        J[k * (io.efc_J.strides[1] / sizeof(float))] = value;
+        velocity[k] += value * speed;
+      }
+    }
+    WP_PRAGMA_UNROLL
+    for (int k = 0; k < 6; ++k) {
+      if (k >= its_rows) break;
+#ifdef __CUDA_ARCH__
+      for (int step = 16; step; step >>= 1) velocity[k] += __shfl_xor_sync(~0u, velocity[k], step);
+#endif
+      if (i == lane % GROUP && k % SHARE == lane / GROUP) speeds[k / SHARE] = velocity[k];
+    }
+  }
+  if (lane / GROUP >= rows) continue;
 
   // Impedance: https://mujoco.readthedocs.io/en/latest/modeling.html#solver-parameters
   const auto solimp = io.contact_solimp.data[con];
@@ -89,83 +147,23 @@ for (int group = warp * GROUP; group < count; group += STRIDE * GROUP) {
                        + wp::index(io.body_invweight0, shared, body[1])[0];
   const float D = 1.0f / wp::max(weight * (1.0f - impedance) / impedance, TINY);
 
-#pragma unroll 1
+  // The rows
+  WP_PRAGMA_UNROLL
   for (int n = 0; n < EACH; ++n) {
-    const int k = lane % SHARE + n * SHARE;
+    const int k = lane / GROUP + n * SHARE;
     if (k >= rows) break;
     const int r = first + k;
-
-    // The row of J: along an axis of the contact's frame, how fast one body's point moves against the
-    // other's, or the body turns. Of a body that turns by w and moves by v it is move v + turn w.
-    const auto &axis = io.contact_frame.data[con].data[k % 3];
-    float move[3], turn[2][3];
-    WP_PRAGMA_UNROLL
-    for (int j = 0; j < 3; ++j) {
-      move[j] = k < 3 ? axis[j] : 0.0f;
-      turn[0][j] = turn[1][j] = axis[j];
-    }
-    WP_PRAGMA_UNROLL
-    for (int side = 0; side < 2; ++side) {
-      const auto &com = wp::index(io.subtree_com, world, io.body_rootid.data[body[side]]);
-      const auto &at = io.contact_pos.data[con];
-      const float x = at[0] - com[0], y = at[1] - com[1], z = at[2] - com[2];
-      if (k >= 3) continue;
-      turn[side][0] = y * move[2] - z * move[1];
-      turn[side][1] = z * move[0] - x * move[2];
-      turn[side][2] = x * move[1] - y * move[0];
-    }
-    const unsigned long long moves[2] = {dofs[body[0]], dofs[body[1]]};
-    float *J = &wp::index(io.efc_J, world, r, 0);
-    float speed = 0.0f;
-#pragma unroll 1
-    for (int quad = 0; quad < NVP; quad += 4) {
-      float value[4] = {};
-      WP_PRAGMA_UNROLL
-      for (int j = 0; j < 4; ++j) {
-        const int c = quad + j;
-        if (c >= NV) break;
-        float w[6];  // angular, then linear
-#ifdef __CUDA_ARCH__
-        const float2 *pairs = reinterpret_cast<const float2 *>(&wp::index(io.cdof, world, c));
-        WP_PRAGMA_UNROLL
-        for (int i = 0; i < 3; ++i) {
-          const float2 pair = __ldg(pairs + i);
-          w[2 * i] = pair.x;
-          w[2 * i + 1] = pair.y;
-        }
-        const float rate = __ldg(&wp::index(io.qvel, world, c));
-#else
-        for (int i = 0; i < 6; ++i) w[i] = wp::index(io.cdof, world, c)[i];
-        const float rate = wp::index(io.qvel, world, c);
-#endif
-        const float moved = move[0] * w[3] + move[1] * w[4] + move[2] * w[5];
-        WP_PRAGMA_UNROLL
-        for (int side = 0; side < 2; ++side) {
-          const float *t = turn[side];
-          const float one = moved + (t[0] * w[0] + t[1] * w[1] + t[2] * w[2]);
-          if (moves[side] >> c & 1) value[j] += side ? one : -one;
-        }
-        speed += value[j] * rate;
-      }
-#ifdef __CUDA_ARCH__
-      *reinterpret_cast<float4 *>(J + quad) = make_float4(value[0], value[1], value[2], value[3]);
-#else
-      for (int j = 0; j < 4; ++j) J[quad + j] = value[j];
-#endif
-    }
-
-    // Reference and weight
     const bool own = k > 0 && (friction_ref[0] != 0.0f || friction_ref[1] != 0.0f);
     const auto ref = own ? friction_ref : normal_ref;
     const float least_time = io.disableflags & REFSAFE ? ref[0] : wp::max(ref[0], 2.0f * timestep);
     const float damping = ref[1] <= 0.0f ? -ref[1] / wp::max(TINY, high)
                                          : 2.0f / wp::max(TINY, high * least_time);
-    float aref = -damping * speed, scale = 1.0f;
+    float aref = -damping * speeds[n], scale = 1.0f;
     if (k == 0) {
       const float stiffness =
           ref[0] <= 0.0f ? -ref[0] / wp::max(TINY, high * high)
                          : 1.0f / wp::max(TINY, high * high * least_time * least_time * ref[1] * ref[1]);
-      aref = -stiffness * impedance * distance - damping * speed;
+      aref = -stiffness * impedance * distance - damping * speeds[n];
     } else {
       const auto &friction = io.contact_friction.data[con];
       const float ratio = friction[0] / friction[k - 1];
@@ -173,7 +171,7 @@ for (int group = warp * GROUP; group < count; group += STRIDE * GROUP) {
     }
     wp::index(io.efc_D, world, r) = D / scale;
     wp::index(io.efc_aref, world, r) = aref;
-    wp::index(io.efc_vel, world, r) = speed;
+    wp::index(io.efc_vel, world, r) = speeds[n];
     wp::index(io.efc_pos, world, r) = (k ? 0.0f : distance) + margin;
     wp::index(io.efc_margin, world, r) = margin;
     wp::index(io.efc_frictionloss, world, r) = 0.0f;
@@ -181,3 +179,5 @@ for (int group = warp * GROUP; group < count; group += STRIDE * GROUP) {
     wp::index(io.efc_id, world, r) = con;
   }
 }
+#undef READ
+#undef FROM

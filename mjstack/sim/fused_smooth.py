@@ -7,6 +7,7 @@ import re
 from functools import cache
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import mujoco
 import numpy as np
@@ -33,6 +34,9 @@ _LIMITS = {
     "LIMIT_BROADPHASE": mjw.OverflowType.BROADPHASE,
     "LIMIT_NARROWPHASE": mjw.OverflowType.NARROWPHASE,
 }
+
+
+_TREES: WeakKeyDictionary[wp.array, int] = WeakKeyDictionary()
 
 
 def why_not(m: mjw.Model) -> str:
@@ -91,8 +95,10 @@ def _only(values: np.ndarray, allowed: Any) -> bool:
 
 def _largest_tree(m: mjw.Model) -> int:
     """Degrees of freedom from a tree's first one to its last one, at most."""
-    first = m.M_colind.numpy()[m.M_rowadr.numpy()]
-    return int((np.arange(m.nv) - first).max()) + 1
+    if m.M_colind not in _TREES:  # nothing may be read while a graph is captured
+        first = m.M_colind.numpy()[m.M_rowadr.numpy()]
+        _TREES[m.M_colind] = int((np.arange(m.nv) - first).max()) + 1
+    return _TREES[m.M_colind]
 
 
 def _shared_bytes(m: mjw.Model) -> int:
