@@ -183,8 +183,9 @@ auto solve = [&](const int *first, float *h, float *x) {
     SYNC();
     WP_PRAGMA_UNROLL
     for (int r = 0; r < ROWS; ++r) {
-      const int i = lane + r * T, pivot = i < NV ? first[i] + j : NV;
-      if (pivot >= i) continue;
+      const int i = lane + r * T;
+      if (i >= NV || first[i] + j >= i) continue;
+      const int pivot = first[i] + j;
       const float scale = a[r][j] * inverse[pivot];
       y[r] -= scale * known[pivot];
       // Columns beyond the diagonal hold numbers that no one uses.
