@@ -224,6 +224,7 @@ def test_parts(boxes: int, flags: int, device: str) -> None:
                 *((d.mocap_quat, 0.1), (d.xfrc_applied, 0.01 * (k % 2))),
             ):
                 add(array, size)
+            wp.synchronize_device(device)  # torch's stream, too
             for _ in range(5):
                 mjw.step(m, d)
             assert np.isfinite(d.qvel.numpy()).all()
@@ -255,9 +256,11 @@ def test_nan_stays_in_its_world(device: str) -> None:
         results = []
         for spoilt in (False, True):
             mjw.reset_data(m, d)
+            wp.synchronize_device(device)
             if spoilt:
                 wp.to_torch(d.qvel)[1, 3] = math.nan
                 wp.to_torch(d.qpos)[1, 8] = math.nan
+            wp.synchronize_device(device)
             fused_smooth.positions(m, d)
             fused_smooth.forces(m, d)
             d.efc.Ma.zero_()

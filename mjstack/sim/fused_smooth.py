@@ -94,11 +94,8 @@ def _only(values: np.ndarray, allowed: Any) -> bool:
 
 
 def _largest_tree(m: mjw.Model) -> int:
-    """Degrees of freedom from a tree's first one to its last one, at most."""
-    if m.M_colind not in _TREES:  # nothing may be read while a graph is captured
-        first = m.M_colind.numpy()[m.M_rowadr.numpy()]
-        _TREES[m.M_colind] = int((np.arange(m.nv) - first).max()) + 1
-    return _TREES[m.M_colind]
+    """Degrees of freedom of the largest tree; without a copy from the device, for captures."""
+    return max(tile.size for tile in m.M_tiles)
 
 
 def _shared_bytes(m: mjw.Model) -> int:
