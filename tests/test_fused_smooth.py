@@ -247,6 +247,21 @@ def test_overflow_is_reported() -> None:
     assert d.overflow.numpy().tolist() == [lost, lost | int(bits.NEFC), lost]
 
 
+def test_a_launch_makes_no_kernel_and_reads_no_array(monkeypatch: pytest.MonkeyPatch) -> None:
+    """But the first one: launches are captured."""
+    model = parts()
+    with wp.ScopedDevice("cpu"):
+        m = mjw.put_model(model)
+        d = mjw.make_data(model, nworld=N, njmax=200, nconmax=100)
+        stages = (fused_smooth.positions, fused_smooth.forces, fused_smooth.advance)
+        for stage in stages:
+            stage(m, d)
+        monkeypatch.setattr(wp.array, "numpy", None)
+        monkeypatch.setattr(wp, "func_native", None)
+        for stage in stages:
+            stage(m, d)
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_nan_stays_in_its_world(device: str) -> None:
     model = parts(1)

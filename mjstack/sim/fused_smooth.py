@@ -129,7 +129,7 @@ def _launch(stage: str, m: mjw.Model, d: mjw.Data) -> None:
     """Run a stage on all worlds."""
     values = {name: _find(name, m, d) for name in _names(stage)}
     kinds = tuple(
-        (name, int if isinstance(value, int) else wp.array(dtype=value.dtype, ndim=value.ndim))
+        (name, None, 0) if isinstance(value, int) else (name, value.dtype, value.ndim)
         for name, value in values.items()
     )
     sizes = {
@@ -155,7 +155,10 @@ def _launch(stage: str, m: mjw.Model, d: mjw.Data) -> None:
 
 @cache
 def _kernel(
-    stage: str, kinds: tuple[tuple[str, Any], ...], sizes: tuple[tuple[str, int], ...], cuda: bool
+    stage: str,
+    kinds: tuple[tuple[str, Any, int], ...],
+    sizes: tuple[tuple[str, int], ...],
+    cuda: bool,
 ) -> tuple[wp.Kernel, Any]:
     """The kernel of a stage for models of these sizes, and the struct that it takes."""
     numbers = {
@@ -168,7 +171,10 @@ def _kernel(
         "BIAS_AFFINE": mjw.BiasType.AFFINE,
     }
     head = _source("tree", {name: int(value) for name, value in numbers.items()})
-    struct = wp.struct(type(f"Fused{stage.title()}", (), {"__annotations__": dict(kinds)}))
+    fields = {
+        name: wp.array(dtype=dtype, ndim=ndim) if dtype else int for name, dtype, ndim in kinds
+    }
+    struct = wp.struct(type(f"Fused{stage.title()}", (), {"__annotations__": fields}))
 
     @wp.func_native(head + _source(stage, {}))
     def body(world: int, lane: int, io: struct) -> None: ...  # type: ignore[valid-type]
