@@ -7,7 +7,6 @@ import re
 from functools import cache
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import mujoco
 import numpy as np
@@ -34,9 +33,6 @@ _LIMITS = {
     "LIMIT_BROADPHASE": mjw.OverflowType.BROADPHASE,
     "LIMIT_NARROWPHASE": mjw.OverflowType.NARROWPHASE,
 }
-
-
-_TREES: WeakKeyDictionary[wp.array, int] = WeakKeyDictionary()
 
 
 def why_not(m: mjw.Model) -> str:
