@@ -131,7 +131,7 @@ def test_a_bad_value_is_one_line(override: str, parts: list[str]) -> None:
 @pytest.mark.parametrize(
     ("overrides", "parts"),
     [
-        (["task=reach"], ["task.check=null", "task reach"]),
+        (["task=reach", "task.check=null"], ["task.check=null", "task reach"]),
         (["task=box", "task.check.places=[red_slot]"], ["task.check.places", "each object"]),
         (["task=box", "task.check.places=[red_slot,lid]"], ["task.check.places", "lid"]),
     ],

@@ -351,7 +351,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("args", "words"),
     [
         (["reset=nominal"], "reset=[home]: expected starts that differ"),
-        (["task=reach"], "task=reach"),
+        (["task=reach", "task.check=null"], "task=reach"),
         (
             ["+observation.state={terms: {q: {func: mjstack.mdp.observation.joint_pos}}}"],
             "observation.state=a group",

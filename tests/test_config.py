@@ -32,7 +32,7 @@ def choices() -> list[str]:
             continue
         if group.startswith("hydra"):
             continue
-        if group == "gate":  # a list of all its files
+        if group in ("gate", "trainer"):  # a list of all its files; keys of job=train
             continue
         out.append(f"{'+' if group == 'experiment' else ''}{group}={path.stem}".lstrip("+"))
     return out
@@ -49,6 +49,11 @@ def rounds() -> list[list[str]]:
 def test_every_file_composes() -> None:
     for found in rounds():
         assert isinstance(load_config(found), Config)
+
+
+def test_trainers_are_keys_of_their_job() -> None:
+    for path in (CONFIG_FOLDER / "trainer").glob("*.yaml"):
+        assert load_config(["job=train", f"trainer={path.stem}"]).job.trainer
 
 
 def test_walk_found_the_groups() -> None:
@@ -253,7 +258,8 @@ BAD = [
     (["job=collect", "job.episode=3"], "Did you mean 'job.episodes'?"),
     (
         ["job.episodes=3"],
-        "job.episodes is a key of job=collect, and this is job=gates. Set job=collect.",
+        "job.episodes is a key of job=collect and job=train, and this is job=gates. Set"
+        " job=collect.",
     ),
     (
         ["job=study", "job.nworlds=[4]"],
@@ -271,7 +277,8 @@ BAD = [
     (["gate=batch"], "gates=[...]"),
     (
         ["job=study_schema"],
-        "Did you mean 'study'? Available: collect, gates, reachability, replay, scaling, study.",
+        "Did you mean 'study'? Available: collect, gates, reachability, replay, scaling, study,"
+        " train.",
     ),
     (["nworld=2.5"], "nworld"),
     (["sim.nworlds=3"], "nworld'?"),

@@ -125,7 +125,7 @@ PATHS: dict[str, list[str] | None] = {
     ],
     "tasks/box_terms.py": ["ToSlot.__call__"],
     "tasks/progress.py": ["Progress.__call__"],
-    "tasks/reach.py": ["ReachSuccess.__init__"],
+    "tasks/reach.py": ["ReachSuccess.__init__", "ReachCheck.placed", "ReachCheck.trace"],
     "drivers/open_loop.py": ["JointTrajectory.command"],
     "drivers/driver.py": ["Recorded.append", "Recorded.command", "OpenLoopDriver.command"],
     "drivers/closed_loop.py": [

@@ -25,7 +25,7 @@ LAYERS = [
     {"policy"},
     {"drivers"},
     {"episodes", "bench"},
-    {"adapters", "datasets", "gates"},
+    {"adapters", "datasets", "gates", "train"},
     {"jobs"},
     {"cli"},
     {"__main__"},

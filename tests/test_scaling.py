@@ -497,7 +497,7 @@ BAD = [
     ["job.nworld=[2]"],
     ["job.backends=[cuda]"],
     ["view=true"],
-    ["task=reach"],
+    ["task=reach", "task.check=null"],
     ["gate.throughput.measurements=[physic]"],
     ["job.backends=[mjwarp]", "sim.device=cuda:77"],
     ["hydra.run.dir=afile/below"],

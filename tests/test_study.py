@@ -252,7 +252,7 @@ BAD = [
         "job.variants.condim_3.gripper_condim=5",
     ),
     (["job=study", "job.variants=null"], "job.variants"),
-    (["job=study", "task=reach"], "task=reach"),
+    (["job=study", "task=reach", "task.check=null"], "task=reach"),
 ]
 
 

@@ -10,6 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mjstack.config.fields import accepted, check_fields
 from mjstack.config.schema import (
+    CloneJobCfg,
     Config,
     ObservationGroupCfg,
     ObservationTermCfg,
@@ -61,6 +62,8 @@ def complete(cfg: Config) -> None:
             for name, node in cfg.job.variants.items()
         }
         cfg.job.variants = _typed_all("job.variants", variants, SolverCfg)
+    if isinstance(cfg.job, CloneJobCfg):
+        cfg.job.add = _typed_all("job.add", cfg.job.add, ObservationTermCfg)
     _complete_robot(cfg.robot)
     _choose_phases(cfg)
 

@@ -27,7 +27,9 @@ def config_content(cfg: Config) -> dict[str, Any]:
     config: dict[str, Any] = json.loads(json.dumps(asdict(cfg)))
     if cfg.robot.file is not None:
         config["robot"]["file"] = _content("robot.file", cfg.robot.file)
-    if cfg.policy is not None:
+    if cfg.policy is None:  # hashes without one are older than it
+        del config["policy"]
+    else:
         config["policy"] = _content("policy", str(Path(cfg.policy) / POLICY_FILE))
     for name, term in cfg.reset.items():
         path = term.params.get("path")

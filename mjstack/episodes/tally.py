@@ -38,6 +38,7 @@ class EpisodeTally:
         several: Whether there are several seeds; then an episode's name has its seed.
         check: The task's.
         path: The file of failing episodes; None where nothing is written.
+        replayed: Whether job=replay takes the run.
         seeds: Those that were played.
         succeeded: For each seed, which worlds succeeded, shape ``(nworld,)``, bool.
         circumstances: For each seed, if they were recorded.
@@ -61,6 +62,7 @@ class EpisodeTally:
     several: bool
     check: EpisodeCheck
     path: Path | None
+    replayed: bool
     seeds: list[int] = field(default_factory=list)
     succeeded: list[np.ndarray] = field(default_factory=list)
     circumstances: list[Circumstances] = field(default_factory=list)
@@ -182,7 +184,7 @@ class EpisodeTally:
     @property
     def way_to_look(self) -> str:
         """The command that replays a failing episode; empty if there is none."""
-        if not self.failed or self.path is None:
+        if not self.failed or self.path is None or not self.replayed:
             return ""
         gate = "" if self.path.name == FAILING else f"{self.gate}:"
         run = shlex.join([*search_path_args(), "job=replay", f"run={self.path.parent}"])
@@ -279,6 +281,7 @@ def play_seeds(
         several=count > 1,
         check=context.check,
         path=None if folder is None else folder / name,
+        replayed=cfg.job.name == "gates",
     )
     sim = context.batch_simulation(cfg.nworld)
     tally.notes = {

@@ -158,8 +158,6 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     config = config_content(cfg)
     for key in _NO_MATTER:
         del config[key]
-    if config["policy"] is None:  # datasets without one are older than it
-        del config["policy"]
     backend, _ = resolve_backend(cfg)
     config["sim"] = {"backend": backend}
     config["job"] = {"keep_failures": cast(CollectJobCfg, cfg.job).keep_failures}

@@ -68,6 +68,32 @@ def object_pose(env: EnvView, *, object: str) -> Tensor:
     return pose_w(env, object)
 
 
+@offers(unit="1")
+def headings(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
+    """How boxes are turned about z: cosine and sine of four times the yaw of each, which are the
+    same after a quarter turn, shape ``(nworld, 2 * objects)``.
+
+    Args:
+        env: The environment.
+        objects: The boxes; all boxes of the scene that can move if None.
+    """
+    if objects is None:
+        free = env.cfg.scene.free
+        objects = [name for name, thing in free.items() if thing.shape == "box"]
+    columns = []
+    for name in objects:
+        w, x, y, z = pose_w(env, name)[:, 3:].unbind(1)
+        cos = 1.0 - 2.0 * (y * y + z * z)
+        sin = 2.0 * (w * z + x * y)
+        # Of the yaw, then of twice, then of four times. A box that stands on edge has no yaw.
+        length = torch.sqrt(cos * cos + sin * sin).clamp(min=1e-6)
+        cos, sin = cos / length, sin / length
+        for _ in range(2):
+            cos, sin = cos * cos - sin * sin, 2.0 * cos * sin
+        columns += [cos, sin]
+    return torch.stack(columns, dim=1) if columns else env.sim.qpos[:, :0]
+
+
 @offers(unit=("m/s",) * 3 + ("rad/s",) * 3)
 def object_velocity(env: EnvView, *, object: str) -> Tensor:
     """Linear [m/s, world frame] and angular [rad/s, body frame] velocity, shape ``(nworld, 6)``."""

@@ -12,7 +12,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from safetensors import safe_open
 from safetensors.torch import load, save
+from torch import Tensor
 
 from mjstack.config.complete import typed
 from mjstack.config.fingerprint import POLICY_FILE, config_content
@@ -220,3 +222,24 @@ def _read_group(seen: Mapping[str, Any], path: Path) -> ObservationGroupCfg:
             )
         group.terms[name] = term
     return group
+
+
+def write_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
+    """Write tensors and facts in JSON's types as one file, at once or not at all.
+
+    Raises:
+        OSError: It cannot be written; an earlier file is intact.
+    """
+    plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    write_atomic(path, save(plain, metadata={"facts": json.dumps(facts)}))
+
+
+def read_state(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and facts of `write_state`.
+
+    Raises:
+        PolicyError: The file cannot be read.
+    """
+    with reading(path, PolicyError, "Remove it to train anew"), safe_open(path, "pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return tensors, json.loads(file.metadata()["facts"])

@@ -142,6 +142,20 @@ def save_trajectories(
         height.legend(frameon=False)
 
 
+def save_curves(
+    path: Path, at: Sequence[float], lines: Mapping[str, Sequence[float]], title: str, label: str
+) -> None:
+    """Plot values over a number that counts, on a logarithmic scale, a line for each by its
+    name.
+    """
+    with figure(path, title, figsize=(7.5, 4.5)) as (_, axes):
+        for name, values in lines.items():
+            axes.plot(at, values, ".-", label=name)
+        axes.set(xlabel=label, yscale="log")
+        axes.grid(alpha=0.3, which="both")
+        axes.legend(frameon=False)
+
+
 def save_places(
     path: Path,
     places: np.ndarray,

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from mjstack.config.fields import MOST_WORLDS, spec
+from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
 
 
 class Backend(StrEnum):
@@ -298,10 +298,81 @@ class CollectJobCfg(JobCfg):
     """Device memory for the steps of one batch of worlds; more worlds are played in turns."""
 
 
+@dataclass(slots=True)
+class TrainJobCfg(JobCfg):
+    """A policy is trained, and judged from starts that training has not used."""
+
+    trainer: str = spec()
+    """Dotted name of its ``mjstack.train.trainer.Trainer``."""
+    folder: str | None = spec(None)
+    """Folder of the training; null: ``outputs/train/<hash>`` of everything training depends on."""
+    test_seed: int = spec(ge=0, le=MOST_SEEDS - 1)
+    """First seed of the starts from which the policy is judged, gate.success.seeds of them."""
+
+
+@dataclass(slots=True)
+class CloneSizes:
+    """How much is trained; as the keys of the job of these names."""
+
+    episodes: int = spec(unit="episodes", ge=1)
+    """Episodes that the expert plays."""
+    noisy_episodes: int = spec(unit="episodes", ge=0)
+    """Episodes more with noise on the executed commands."""
+    hidden: list[int] = spec(ge=1, le=65536)
+    """Widths of the network's hidden layers."""
+    batches: int = spec(ge=1)
+    """Steps of the optimizer."""
+    batch_size: int = spec(ge=1)
+    """Answers of a batch."""
+    save_every: int = spec(unit="batches", ge=1)
+    """Batches between two saved policies."""
+
+
+@dataclass(slots=True)
+class CloneJobCfg(TrainJobCfg):
+    """A network learns to answer as the expert does. What is null is as ``sizes`` has it."""
+
+    group: str = spec()
+    """Observation group of the policy."""
+    leave_out: list[str] = spec(factory=list)
+    """Terms of the group that the policy does not see."""
+    add: dict[str, Any] = spec(factory=dict, finite=False)
+    """Terms by name that it sees besides."""
+    observation_noise: bool = spec()
+    """Whether its observations have their noise."""
+    command_noise: float = spec(unit="rad", ge=0.0)
+    """Standard deviation of that noise, which changes slowly."""
+    chunk: int = spec(unit="steps", ge=1, le=1000)
+    """Joint targets of one answer."""
+    execute: int = spec(unit="steps", ge=1, le=1000)
+    """Control steps between two answers."""
+    learning_rate: float = spec(gt=0.0)
+    """Of AdamW at the start; a cosine brings it to 0."""
+    weight_decay: float = spec(ge=0.0)
+    """Of AdamW."""
+    averaging: float = spec(ge=0.0, le=1.0)
+    """Share of the policy's weights that a batch keeps: they are an average."""
+    episodes: int | None = spec(None, unit="episodes", ge=1)
+    """Episodes that the expert plays."""
+    noisy_episodes: int | None = spec(None, unit="episodes", ge=0)
+    """Episodes more with noise on the executed commands; labels stay the expert's."""
+    hidden: list[int] | None = spec(None, ge=1, le=65536)
+    """Widths of the network's hidden layers."""
+    batches: int | None = spec(None, ge=1)
+    """Steps of the optimizer."""
+    batch_size: int | None = spec(None, ge=1)
+    """Answers of a batch."""
+    save_every: int | None = spec(None, unit="batches", ge=1)
+    """Batches between two saved policies."""
+    sizes: dict[str, CloneSizes] = spec(factory=dict)
+    """What is null above, on ``cuda`` and on ``cpu``."""
+
+
 # Jobs with keys of their own; the others have `JobCfg`.
 JOB_SCHEMAS = {
     "study": StudyJobCfg,
     "scaling": ScalingJobCfg,
     "reachability": ReachabilityJobCfg,
     "collect": CollectJobCfg,
+    "train": CloneJobCfg,
 }

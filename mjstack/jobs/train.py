@@ -1,0 +1,156 @@
+"""Job *train*: a policy is trained, and judged as gate *success* judges, from starts that training
+has not used.
+"""
+
+import copy
+import json
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import cast
+
+from mjstack.config.fingerprint import config_content, config_hash
+from mjstack.config.functions import find_object
+from mjstack.config.schema import Config, TrainJobCfg
+from mjstack.episodes.context import RunContext, Stage, require_episode
+from mjstack.episodes.rollout import POLICY
+from mjstack.errors import ConfigError, FolderError
+from mjstack.files import check_unused, reading, to_csv, write_atomic
+from mjstack.gates.runner import run_guarded
+from mjstack.gates.success import run_success
+from mjstack.jobs.gates import check_task
+from mjstack.jobs.runner import CheckedJob, Job, write_tables
+from mjstack.report.picture import save_curves
+from mjstack.report.record import GateResult, Status
+from mjstack.report.table import Table
+from mjstack.train.trainer import LAST, STATE, Trained, Trainer
+
+NAME = "train"
+CONFIG = "training.json"  # the configuration of the training in the folder
+# Changing one of these changes no training.
+_NO_MATTER = ("batch", "gates", "gate", "graph", "view", "video", "run", "world")
+
+
+def training_config(cfg: Config) -> dict:
+    """Everything that a training depends on, in JSON's types."""
+    config = config_content(cfg)
+    for key in _NO_MATTER:
+        del config[key]
+    del config["job"]["folder"], config["job"]["test_seed"]
+    return config
+
+
+def check_train(cfg: Config) -> CheckedJob:
+    """Raise for what cannot be done, before anything is written."""
+    require_episode(cfg)
+    job = cast(TrainJobCfg, cfg.job)
+    trainer = find_object("job.trainer", job.trainer)
+    if not isinstance(trainer, Trainer):
+        raise ConfigError("job.trainer", job.trainer, "a mjstack.train.trainer.Trainer")
+    context = RunContext(cfg)
+    check_task(context)
+    used = trainer.check(context)
+    tested = range(job.test_seed, job.test_seed + cfg.gate.success.seeds)
+    if used.start < tested.stop and tested.start < used.stop:
+        expected = f"seeds that training does not use, which are {used.start} to {used.stop - 1}"
+        raise ConfigError("job.test_seed", job.test_seed, expected)
+    name = config_hash(training_config(cfg))[:12]
+    folder = Path(job.folder or f"outputs/train/{name}")
+    check_unused(folder, NAME, STATE, "job.folder")
+    _check_folder(folder, cfg)
+    return CheckedJob(
+        context=context,
+        title=f"task {cfg.task.name}, training",
+        work=partial(_run, trainer),
+        folder=folder,
+        own=STATE,
+        resumes=NAME,
+    )
+
+
+def _check_folder(folder: Path, cfg: Config) -> None:
+    """Refuse a folder with another training."""
+    path = folder / CONFIG
+    if not path.exists():
+        return
+    with reading(path, FolderError, "Set job.folder to another folder"):
+        theirs = json.loads(path.read_text())
+    ours = json.loads(json.dumps(training_config(cfg)))
+    if theirs != ours:
+        keys = sorted(key for key in {*theirs, *ours} if theirs.get(key) != ours.get(key))
+        raise FolderError(
+            f"{folder} has the training of another configuration, which differs in"
+            f" {', '.join(keys)}. Set job.folder to another folder, or these keys back"
+        )
+
+
+def _run(trainer: Trainer, context: RunContext, folder: Path) -> None:
+    """Train, and judge the last policy."""
+    _check_folder(folder, context.cfg)  # hydra.run.dir may name one
+    write_atomic(folder / CONFIG, json.dumps(training_config(context.cfg), indent=1) + "\n")
+    run_guarded(context, NAME, partial(_train, trainer, folder))
+    if context.artifacts.results[NAME].status is Status.passed:
+        own = judged_context(context, folder / LAST)
+        run_guarded(own, "success", run_success)
+        context.artifacts.pictures += own.artifacts.pictures
+
+
+def judged_context(context: RunContext, policy: Path) -> RunContext:
+    """The context in which a policy is judged: it starts as the configuration says, under seeds
+    that training has not used.
+    """
+    cfg = context.cfg
+    gate = copy.copy(cfg.gate)
+    gate.success = replace(gate.success, reset=cfg.reset)
+    judged = replace(
+        cfg,
+        seed=cast(TrainJobCfg, cfg.job).test_seed,
+        policy=str(policy),
+        controller=replace(cfg.controller, name=POLICY),
+        gate=gate,
+    )
+    stage = Stage(judged)
+    stage.model = context.model
+    return replace(context.with_config(judged), stage=stage)
+
+
+def _train(trainer: Trainer, folder: Path, context: RunContext) -> list[GateResult]:
+    """The training as a result of the report."""
+    began = time.perf_counter()
+    trained = trainer.train(context, folder)
+    _write_curve(context, trained)
+    seconds = time.perf_counter() - began
+    last = trained.curve[-1]
+    figures = ", ".join(f"{name.replace('_', ' ')} {last[name]:.4g}" for name in trained.lines)
+    return [
+        GateResult(
+            name=NAME,
+            status=Status.passed,
+            reason=f"{trained.notes['policy']} after {last['batch']:,} batches: {figures}",
+            seconds=seconds,
+            metrics=trained.metrics,
+            notes=trained.notes,
+        )
+    ]
+
+
+def _write_curve(context: RunContext, trained: Trained) -> None:
+    """Write train.csv, train.md and train.png."""
+    rows = trained.curve
+    columns = {name.replace("_", " "): name for name in rows[0]}
+    title = f"{context.cfg.robot.title}, task {context.cfg.task.name}: training"
+    lines = {name.replace("_", " "): [row[name] for row in rows] for name in trained.lines}
+    at = [row["batch"] for row in rows]
+    write_tables(
+        context,
+        NAME,
+        title,
+        Table.of(columns, rows),
+        [f"{name}: {value}" for name, value in trained.notes.items()],
+        to_csv(rows),
+        lambda path: save_curves(path, at, lines, title, "batch"),
+    )
+
+
+JOB = Job(check_train)

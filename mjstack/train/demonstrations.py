@@ -1,0 +1,179 @@
+"""Episodes of an expert on the device, for a policy to imitate: what the policy would have seen,
+and the joint targets that the expert would have given.
+"""
+
+import math
+from contextlib import closing
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from mjstack.config.schema import CloneJobCfg, CloneSizes, ObservationGroupCfg
+from mjstack.drivers.driver import Driver
+from mjstack.envs import Env
+from mjstack.episodes.context import RunContext
+from mjstack.episodes.rollout import Observer, play_episode
+from mjstack.managers.observation import ObservationManager
+from mjstack.managers.view import random_uniform
+
+NOISE_SECONDS = 0.5  # in which the noise of a joint is forgotten
+
+
+class NoisyDriver:
+    """An expert whose arm is pushed off its way: a slow random offset is added to the joint targets
+    of the arm, and the expert answers to where that leads.
+
+    Attributes:
+        label: The expert's joint targets of the last step, shape ``(nworld, nu)``.
+    """
+
+    def __init__(self, expert: Driver, env: Env, noise: float) -> None:
+        """Take the expert, and the standard deviation of the offsets [rad]."""
+        self.phases = expert.phases
+        self.steps = expert.steps
+        self.phase = expert.phase
+        self.error = expert.error
+        self.retries = expert.retries
+        self._expert = expert
+        self._env = env
+        self._arm = env.index.n_arm
+        shape = (env.nworld, len(env.index.ctrl))
+        self.label = torch.zeros(shape, device=env.device)
+        self._given = torch.zeros(shape, device=env.device)
+        self._offset = torch.zeros((env.nworld, self._arm), device=env.device)
+        self._keep = math.exp(-env.cfg.timing.step_dt / NOISE_SECONDS)
+        # A uniform number from -1 to 1 has a variance of 1/3.
+        self._width = noise * math.sqrt(3.0 * (1.0 - self._keep**2))
+
+    def command(self) -> Tensor:
+        """Joint targets of the next step, shape ``(nworld, nu)``."""
+        env = self._env
+        self.label.copy_(self._expert.command())
+        self._given.copy_(self.label)
+        if self._width > 0.0:
+            draw = random_uniform(env, "train.noise", self._arm, step=env.episode_step).float()
+            self._offset.mul_(self._keep).add_(draw, alpha=self._width)
+            self._given[:, : self._arm] += self._offset
+        return self._given
+
+
+class DemonstrationRecorder(Observer):
+    """Keeps every step of every world on the device.
+
+    Attributes:
+        seen: Observations before each step, shape ``(steps, nworld, inputs)``.
+        labels: The expert's joint targets of each step, shape ``(steps, nworld, nu)``.
+        widths: Numbers of each term of the observation.
+    """
+
+    seen: Tensor
+    labels: Tensor
+    widths: dict[str, int]
+
+    def __init__(self, name: str, group: ObservationGroupCfg) -> None:
+        """Take the observation group's name and configuration."""
+        self._name = name
+        self._group = group
+
+    def start(self, env: Env, driver: Driver) -> None:
+        """See `Observer`."""
+        super().start(env, driver)
+        self._observations = ObservationManager(env, {self._name: self._group})
+        self._now = self._observations.groups[self._name]
+        self.widths = self._observations.term_dims[self._name]
+        shape = (driver.steps, env.nworld)
+        self.seen = torch.zeros((*shape, self._now.shape[1]), device=env.device)
+        self.labels = torch.zeros((*shape, len(env.index.ctrl)), device=env.device)
+        self._next = torch.zeros(1, dtype=torch.int64, device=env.device)
+        self._observations.refresh(torch.ones(env.nworld, dtype=torch.bool, device=env.device))
+
+    def update(self) -> None:
+        """See `Observer`."""
+        driver = cast(NoisyDriver, self.driver)
+        self.seen.index_copy_(0, self._next, self._now[None])
+        self.labels.index_copy_(0, self._next, driver.label[None])
+        self._next.add_(1)
+        self._observations.compute()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Demonstrations:
+    """Accepted episodes of an expert.
+
+    Attributes:
+        seen: Observations before each step, shape ``(episodes, steps, inputs)``.
+        labels: The expert's joint targets, shape ``(episodes, steps, nu)``.
+        widths: Numbers of each term of the observation, in order.
+        played: Episodes that were played.
+        seeds: Seeds of their starts.
+    """
+
+    seen: Tensor
+    labels: Tensor
+    widths: dict[str, int]
+    played: int
+    seeds: list[int]
+
+
+def batches_of(job: CloneJobCfg, sizes: CloneSizes, nworld: int) -> list[tuple[int, float]]:
+    """Batches of worlds, each with another seed: how many of their worlds count, and the noise
+    [rad] of their commands.
+    """
+    return [
+        (min(nworld, count - first), noise)
+        for count, noise in (
+            (sizes.episodes, 0.0),
+            (sizes.noisy_episodes, job.command_noise),
+        )
+        for first in range(0, count, nworld)
+    ]
+
+
+def play_expert(
+    context: RunContext, sizes: CloneSizes, group: ObservationGroupCfg
+) -> Demonstrations:
+    """Play the expert, and keep the episodes that the task's check accepts.
+
+    Args:
+        context: The run; starts and expert are the configured ones.
+        sizes: How many episodes.
+        group: What a policy will see.
+    """
+    cfg = context.cfg
+    job = cast(CloneJobCfg, cfg.job)
+    nworld = min(cfg.nworld, max(sizes.episodes, sizes.noisy_episodes))
+    batches = batches_of(job, sizes, nworld)
+    most = sum(count for count, _ in batches)
+    seeds = list(range(cfg.seed, cfg.seed + len(batches)))
+    seen = labels = torch.zeros(0)
+    widths: dict[str, int] = {}
+    kept = 0
+    with closing(context.batch_simulation(nworld)) as sim:
+        for seed, (count, noise) in zip(seeds, batches, strict=True):
+            env = context.start(sim, cfg.reset, seed=seed)
+            driver = NoisyDriver(context.driver(env), env, noise)
+            recorder = DemonstrationRecorder(job.group, group)
+            label = f"steps of the expert, seed {seed}"
+            episode = play_episode(env, driver, [recorder], advance=context.advance, label=label)
+            if not kept and not widths:
+                seen = sim.qpos.new_zeros(
+                    (most, *recorder.seen.transpose(0, 1).shape[1:]), dtype=torch.float32
+                )
+                labels = seen.new_zeros((*seen.shape[:2], recorder.labels.shape[2]))
+                widths = recorder.widths
+            good = (episode.result.failed == 0).nonzero()[:, 0]
+            good = good[good < count]
+            into = slice(kept, kept + len(good))
+            seen[into] = recorder.seen[:, good].transpose(0, 1)
+            labels[into] = recorder.labels[:, good].transpose(0, 1)
+            kept += len(good)
+            what = f"noise of {noise:g} rad" if noise else "no noise"
+            context.print_line(
+                f"train: seed {seed}, {what}: {len(good)} of {count} episodes of the expert"
+                " succeeded"
+            )
+    return Demonstrations(
+        seen=seen[:kept], labels=labels[:kept], widths=widths, played=most, seeds=seeds
+    )

@@ -1,0 +1,45 @@
+"""A trainer, as job=train runs it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mjstack.episodes.context import RunContext
+
+# In the folder of a training: two policies, and what it needs to go on.
+LAST = "last"
+BEST = "best"
+STATE = "training.safetensors"
+
+
+@dataclass(kw_only=True, slots=True)
+class Trained:
+    """The result of a training.
+
+    Attributes:
+        metrics: Figures, by name with unit.
+        notes: Facts in words, by name.
+        curve: Rows of the training curve: values by column. ``batch`` is the abscissa.
+        lines: Columns that are drawn.
+    """
+
+    metrics: dict[str, float]
+    notes: dict[str, str]
+    curve: list[dict[str, Any]]
+    lines: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Trainer:
+    """One way to train; ``conf/trainer/<name>.yaml`` names it.
+
+    Attributes:
+        check: Raises a `MjstackError` for what cannot be trained, before anything is written.
+            Returns the seeds of the starts that training uses.
+        train: Trains in a folder, in which it goes on with an earlier call's training, and leaves
+            the policies `LAST` and `BEST` there.
+    """
+
+    check: Callable[[RunContext], range]
+    train: Callable[[RunContext, Path], Trained]

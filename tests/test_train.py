@@ -1,0 +1,190 @@
+"""job=train: small trainings on native MuJoCo, what they leave, and how they go on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from compositions import load_config
+from environments import at_double_speed, configure, on_new_sim
+
+import mjstack.train.clone as clone
+from mjstack.cli import run
+from mjstack.envs import driven_config
+from mjstack.episodes.context import RunContext
+from mjstack.errors import MjstackError
+from mjstack.interrupt import handle_interrupts
+from mjstack.jobs.train import check_train
+from mjstack.mdp.observation import headings
+from mjstack.policy import load_policy
+from mjstack.train.demonstrations import play_expert
+
+TINY = (
+    "job=train",
+    "sim=native",
+    "nworld=4",
+    "job.episodes=4",
+    "job.noisy_episodes=2",
+    "job.hidden=[32]",
+    "job.batches=30",
+    "job.batch_size=64",
+    "job.save_every=10",
+    "gate.success.rate=0.0",
+)
+REACH = (*TINY, "task=reach")
+
+
+def report(folder: Path) -> dict:
+    gates = json.loads((folder / "report.json").read_text())["gates"]
+    return {gate["name"]: gate for gate in gates}
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    return load_policy(folder).network.state_dict()
+
+
+def test_a_training_leaves_policies_a_curve_and_a_judgement(tmp_path: Path) -> None:
+    out = tmp_path / "training"
+    assert run([*REACH, f"job.folder={out}"]) == 0
+    gates = report(out)
+    train = gates["train"]["metrics"]
+    assert train["batches"] == 30
+    assert train["expert_episodes_played"] == 6
+    assert 2 <= train["expert_episodes"] <= 6
+    success = gates["success"]["metrics"]
+    assert success["episodes"] == 4
+    assert 0.0 <= success["success_rate_low95"] <= success["success_rate_high95"] <= 1.0
+    assert "success:" not in gates["success"]["reason"]  # job=replay takes runs of job=gates
+    rows = np.genfromtxt(out / "train.csv", delimiter=",", names=True)
+    assert rows["batch"].tolist() == [10.0, 20.0, 30.0]
+    assert rows["validation_loss"][-1] < rows["validation_loss"][0]
+    for name in ("train.png", "train.md", "best/policy.json", "last/policy.json"):
+        assert (out / name).stat().st_size > 0, name
+
+    # What the policy sees and says
+    policy = load_policy(out / "last")
+    assert policy.training["batch"] == 30
+    assert policy.training["seed"] == 0
+    assert "last_action" not in policy.widths
+    assert policy.widths["headings"] == 4
+    assert (policy.network.chunk, policy.execute) == (16, 8)
+
+    # It is there already: the same command judges it anew, and drives other gates
+    before = weights(out / "last")
+    assert run([*REACH, f"job.folder={out}"]) == 0
+    assert all(torch.equal(v, before[k]) for k, v in weights(out / "last").items())
+    drive = ["controller=policy", f"policy={out}/last", "gates=[batch]", "sim=native", "nworld=3"]
+    status = run(
+        ["task=reach", *drive, "gate.batch.failed_worlds=3", f"hydra.run.dir={tmp_path / 'gates'}"]
+    )
+    assert status == 0
+
+
+@pytest.mark.parametrize("after", [7, 10])
+def test_a_training_goes_on_where_it_was_interrupted(
+    after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bit for bit as one that was not."""
+    whole = tmp_path / "whole"
+    assert run([*REACH, f"job.folder={whole}"]) == 0
+
+    parts = tmp_path / "parts"
+    import mjstack.interrupt as interrupt
+
+    step = clone.Learner._step
+
+    def stop(self: clone.Learner, rate: float) -> None:
+        step(self, rate)
+        if self.done + 1 == after:
+            monkeypatch.setattr(interrupt, "_asked", True)
+
+    monkeypatch.setattr(clone.Learner, "_step", stop)
+    monkeypatch.setattr(clone, "_SHOWN", 1)
+    with handle_interrupts():
+        assert run([*REACH, f"job.folder={parts}"]) == 130
+    monkeypatch.undo()
+    assert (parts / "training.safetensors").exists()
+    assert run([*REACH, f"job.folder={parts}"]) == 0
+    first = weights(whole / "last")
+    assert all(torch.equal(v, first[k]) for k, v in weights(parts / "last").items())
+    curves = [
+        np.genfromtxt(folder / "train.csv", delimiter=",", names=True)["loss"]
+        for folder in (whole, parts)
+    ]
+    np.testing.assert_allclose(*curves, rtol=1e-5)
+
+
+def test_a_clone_of_stack_drives_the_batch(tmp_path: Path) -> None:
+    """From few episodes at double speed, which take seconds: no success is asked for."""
+    fast = [*at_double_speed(), "reset=jitter"]
+    out = tmp_path / "training"
+    assert run([*TINY, *fast, f"job.folder={out}"]) == 0
+    assert report(out)["train"]["metrics"]["expert_episodes"] >= 4
+    drive = ["controller=policy", f"policy={out}/last", "gates=[batch]", "sim=native", "nworld=2"]
+    status = run(
+        [*fast, *drive, "gate.batch.failed_worlds=2", f"hydra.run.dir={tmp_path / 'gates'}"]
+    )
+    assert status == 0
+
+
+def test_noise_moves_the_arm_alone_and_labels_lack_it() -> None:
+    """The expert's inverse kinematics goes on from its own targets, so its labels stay smooth."""
+    cfg = load_config(
+        [*REACH, "job.command_noise=0.02", "job.episodes=2", "nworld=2", "task.check.distance=0.2"]
+    )
+    context = RunContext(cfg)
+    sizes = clone.resolve_sizes(cfg.job, "cpu")
+    data = play_expert(context, sizes, clone.observed_group(cfg))
+    assert data.seeds == [0, 1]
+    assert len(data.seen) == 4
+    rough = data.labels[:, 60:].diff(dim=1).diff(dim=1).abs().amax((1, 2))
+    assert rough[2:].max() < 3.0 * rough[:2].max()
+    speed = data.seen[:, 100:, 6:12].abs().mean(1)  # where the expert holds still
+    assert (speed[2:, :5].mean(0) > 5.0 * speed[:2, :5].mean(0)).all()
+    assert (speed[:, 5] < 1e-3).all()  # the gripper's
+
+
+def test_headings_are_those_of_a_quarter_turn() -> None:
+    env = on_new_sim("native", 8, driven_config(configure("reset=randomized")))
+    env.reset(seed=0)
+    found = headings(env)
+    for column, address in enumerate(env.index.object_qpos):
+        w, _, _, z = env.sim.qpos[:, address + 3 : address + 7].unbind(1)
+        yaw = 2.0 * torch.atan2(z, w)
+        torch.testing.assert_close(found[:, 2 * column], torch.cos(4.0 * yaw))
+        torch.testing.assert_close(found[:, 2 * column + 1], torch.sin(4.0 * yaw))
+    assert torch.equal(headings(env, objects=["blue"]), found[:, 2:])
+
+
+BAD = [
+    (["task=reach", "task.check=null"], "task=reach: expected a task with phases and a check"),
+    (["job.group=nope"], "observation group 'nope' does not exist"),
+    (["job.trainer=os.getcwd"], "job.trainer=os.getcwd: expected a mjstack.train.trainer.Trainer"),
+    (["job.test_seed=0"], "job.test_seed=0: expected seeds that training does not use"),
+    (["job.add.headings.func=mjstack.mdp.observation.nope"], "'nope' does not exist"),
+    (["job.batches=0"], "job.batches=0: expected an integer of at least 1"),
+    (["job.hidden=[0]"], "job.hidden=[0]"),
+    (["trainer=clon"], "Did you mean 'clone'?"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
+def test_bad_input_is_one_line(
+    overrides: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run(["job=train", "sim=native", *overrides, f"job.folder={out}"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert says in error
+    assert not out.exists()
+
+
+def test_a_folder_belongs_to_one_training(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert run([*REACH, f"job.folder={out}"]) == 0
+    with pytest.raises(MjstackError, match="differs in job"):
+        check_train(load_config([*REACH, f"job.folder={out}", "job.chunk=4"]))
