@@ -288,15 +288,15 @@ def test_kinematics_belongs_to_the_last_state(backend: str, make_sim: Make, stag
     stale = {name: getattr(sim, name).clone() for name in POSES}
     sim.kinematics()
     posed = {name: getattr(sim, name).clone() for name in POSES}
-    sim.forward()
+    sim.forward()  # by MJWarp's own kernels, whose roundings differ on CUDA
     for name in POSES:
-        assert torch.equal(getattr(sim, name), posed[name]), name
-        assert not torch.equal(stale[name], posed[name]), name
+        torch.testing.assert_close(getattr(sim, name), posed[name], rtol=0.0, atol=1e-6)
+        assert (stale[name] - posed[name]).abs().max() > 1e-5, name
     sim.step(10, kinematics=True)
     posed = {name: getattr(sim, name).clone() for name in POSES}
     sim.forward()
     for name in POSES:
-        assert torch.equal(getattr(sim, name), posed[name]), name
+        torch.testing.assert_close(getattr(sim, name), posed[name], rtol=0.0, atol=1e-6)
     sim.step(0)
     sim.qpos[:, 0] += 0.5
     sim.step(0, kinematics=True)
