@@ -157,9 +157,14 @@ class Learner:
             network = PolicyNetwork(
                 self._seen.shape[2], self._labels.shape[2], job.chunk, sizes.hidden
             )
-        for name, values in (("observation", self._seen), ("action", self._labels)):
-            std, mean = torch.std_mean(values.flatten(0, 1), dim=0)
-            network.set_scale(name, mean.cpu(), std.cpu())
+        std, mean = torch.std_mean(self._labels.flatten(0, 1), dim=0)
+        network.set_scale("action", mean.cpu(), std.cpu())
+        # A term has one scale: a joint that hardly moves would count as much as one that does, and
+        # the policy would follow its noise.
+        std, mean = torch.std_mean(self._seen.flatten(0, 1), dim=0)
+        parts = std.split(list(demonstrations.widths.values()))
+        std = torch.cat([part.amax().expand(len(part)) for part in parts if len(part)])
+        network.set_scale("observation", mean.cpu(), std.cpu())
         self._network = network.to(device)
         self._average = copy.deepcopy(self._network).requires_grad_(False)
         self._optimizer = torch.optim.AdamW(
