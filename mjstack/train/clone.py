@@ -25,6 +25,7 @@ from mjstack.train.demonstrations import Demonstrations, batches_of, play_expert
 from mjstack.train.trainer import BEST, LAST, STATE, Trained, Trainer
 
 _HELD_OUT = 20  # of so many episodes one is for validation
+_LEAST = 0.1  # scale of a column, of the largest one of its term
 _SHOWN = 10  # batches between two looks at the progress
 
 
@@ -159,11 +160,11 @@ class Learner:
             )
         std, mean = torch.std_mean(self._labels.flatten(0, 1), dim=0)
         network.set_scale("action", mean.cpu(), std.cpu())
-        # A term has one scale: a joint that hardly moves would count as much as one that does, and
-        # the policy would follow its noise.
+        # A column that hardly moves would count as much as the others of its term, and the policy
+        # would follow its noise.
         std, mean = torch.std_mean(self._seen.flatten(0, 1), dim=0)
-        parts = std.split(list(demonstrations.widths.values()))
-        std = torch.cat([part.amax().expand(len(part)) for part in parts if len(part)])
+        parts = [part for part in std.split(list(demonstrations.widths.values())) if len(part)]
+        std = torch.cat([torch.maximum(part, _LEAST * part.amax()) for part in parts])
         network.set_scale("observation", mean.cpu(), std.cpu())
         self._network = network.to(device)
         self._average = copy.deepcopy(self._network).requires_grad_(False)
