@@ -107,15 +107,19 @@ def claim_folder(
     """
     name = folder.name
     handle = None
-    made = numbered or not folder.exists()
     before = None
+    made: list[Path] = []
     try:
         for number in itertools.count(2):
+            missing = [path for path in (folder, *folder.parents) if not path.exists()]
             try:
-                folder.mkdir(parents=True, exist_ok=not numbered)
+                folder.mkdir(parents=True)
+                made = missing
                 break
             except FileExistsError:
-                if not numbered:  # it is a file
+                if not numbered and folder.is_dir():
+                    break
+                if not numbered:
                     raise
             folder = folder.with_name(f"{name}-{number}")
         handle = lock_folder(folder)
@@ -123,13 +127,14 @@ def claim_folder(
         before = {*folder.iterdir()}
         yield folder
     except BaseException as error:
-        with suppress(OSError):
+        with suppress(OSError):  # something stays
             new = {*folder.iterdir()} - before if before is not None else set()
             if all(path.name == ".hydra" or path.suffix == ".log" for path in new):  # Hydra's
                 for path in new:
-                    (shutil.rmtree if path.is_dir() else os.remove)(path)
-            if made:
-                os.removedirs(folder)
+                    (shutil.rmtree if path.name == ".hydra" else os.remove)(path)
+            if handle is not None:  # else it is another process's
+                for path in made:
+                    path.rmdir()
         if not isinstance(error, OSError):
             raise
         raise FolderError(

@@ -339,5 +339,7 @@ def is_short(args: list[str]) -> bool:
         r"seconds|seeds|repetitions|steps|iterations|physics_dt|decimation|scaling|study|timing"
         r"|video|view|minutes|launcher|range|job.episodes=[^23]|/proc|nworld=(?![12]\b)"
     )
-    quick = text.startswith(("job=replay", "job=collect")) or set(QUICK) <= set(args)
+    if "job=collect" in text:  # a hundred episodes by default
+        return bool(re.search(r"job\.episodes=[23]\b", text)) and not re.search(long, text)
+    quick = text.startswith("job=replay") or set(QUICK) <= set(args)
     return quick and not re.search(long, text)

@@ -305,6 +305,19 @@ def test_the_second_of_two_writes_nothing(
     assert begin("job=collect", **COLLECTING) == 0
 
 
+def test_a_failed_claim_removes_what_it_made_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(KeyboardInterrupt), claim_folder(tmp_path / "a" / "run"):
+        raise KeyboardInterrupt
+    assert contents(tmp_path) == {}
+    with claim_folder(tmp_path / "run"):
+        monkeypatch.setattr(Path, "exists", lambda path: False)  # not yet there at the first look
+        with pytest.raises(FolderError), claim_folder(tmp_path / "run"):
+            pass
+        assert (tmp_path / "run").is_dir()
+
+
 def test_a_run_that_did_not_begin_leaves_nothing(begin: Callable[..., int]) -> None:
     assert begin("hydra.job_logging.handlers.file.filename=/proc/x") == 2
     assert contents(Path()) == {}

@@ -20,7 +20,9 @@ from mjstack.interrupt import handle_interrupts
 from mjstack.jobs.train import check_train
 from mjstack.mdp.observation import headings
 from mjstack.policy import load_policy
+from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.train.demonstrations import play_expert
+from mjstack.train.trainer import STATE
 
 TINY = (
     "job=train",
@@ -165,6 +167,7 @@ BAD = [
     (["job.trainer=os.getcwd"], "job.trainer=os.getcwd: expected a mjstack.train.trainer.Trainer"),
     (["job.test_seed=0"], "job.test_seed=0: expected seeds that training does not use"),
     (["job.add.headings.func=mjstack.mdp.observation.nope"], "'nope' does not exist"),
+    (["job.leave_out=[last_actoin]"], "Did you mean 'last_action'?"),
     (["job.batches=0"], "job.batches=0: expected an integer of at least 1"),
     (["job.hidden=[0]"], "job.hidden=[0]"),
     (["trainer=clon"], "Did you mean 'clone'?"),
@@ -188,3 +191,8 @@ def test_a_folder_belongs_to_one_training(tmp_path: Path) -> None:
     assert run([*REACH, f"job.folder={out}"]) == 0
     with pytest.raises(MjstackError, match="differs in job"):
         check_train(load_config([*REACH, f"job.folder={out}", "job.chunk=4"]))
+    state, facts = read_state(out / STATE)
+    facts["made_with"]["device"] = "cuda"
+    write_state(out / STATE, state, facts)
+    assert run([*REACH, f"job.folder={out}"]) == 1
+    assert "Set job.folder to another folder" in report(out)["train"]["reason"]

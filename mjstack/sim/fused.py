@@ -6,6 +6,7 @@ contact or a whole world.
 import dataclasses
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import mujoco
@@ -13,6 +14,7 @@ import mujoco
 from mjstack.sim.warp_setup import mjw, wp
 
 MAX_NV = 64
+_LAUNCH = Lock()
 _SHARED = 48 * 1024 - 256  # bytes of shared memory that every block may have, less Warp's own
 _ELLIPTIC = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
 _vec5 = wp.types.vector(length=5, dtype=float)
@@ -143,7 +145,6 @@ def collision(m: mjw.Model, d: mjw.Data) -> None:
         m: The uploaded model.
         d: The worlds.
     """
-    launch = wp.launch
 
     def launch_few(*args: Any, **kwargs: Any) -> Any:
         kernel = kwargs["kernel"] if "kernel" in kwargs else args[0]
@@ -151,11 +152,13 @@ def collision(m: mjw.Model, d: mjw.Data) -> None:
             kwargs |= {"block_dim": 64, "max_blocks": 16 * d.qpos.device.sm_count}
         return launch(*args, **kwargs)
 
-    wp.launch = launch_few
-    try:
-        mjw.collision(m, d)
-    finally:
-        wp.launch = launch
+    with _LAUNCH:
+        launch = wp.launch
+        wp.launch = launch_few
+        try:
+            mjw.collision(m, d)
+        finally:
+            wp.launch = launch
 
 
 def make_constraint(m: mjw.Model, d: mjw.Data) -> None:

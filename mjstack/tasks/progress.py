@@ -67,7 +67,7 @@ class Progress:
         self._within = within
         self._height = height
         self._near = near
-        self._open = open_fraction
+        self._open = max(open_fraction, 1e-6)  # 0: any opening will do
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,7 +16,7 @@ from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import Backend, CloneJobCfg, CloneSizes, Config, ObservationGroupCfg
 from mjstack.envs import build_env, driven_config
 from mjstack.episodes.context import RunContext
-from mjstack.errors import MjstackError, UnknownName
+from mjstack.errors import FolderError, MjstackError, UnknownName
 from mjstack.interrupt import check_interrupt
 from mjstack.managers.observation import ObservationManager
 from mjstack.policy import Policy, PolicyNetwork, save_policy
@@ -67,6 +67,9 @@ def observed_group(cfg: Config) -> ObservationGroupCfg:
     if job.group not in cfg.observation:
         raise UnknownName("job.group: observation group", job.group, cfg.observation)
     group = cfg.observation[job.group]
+    for name in job.leave_out:
+        if name not in group.terms:
+            raise UnknownName(f"job.leave_out: term of {job.group}", name, group.terms)
     terms = {k: term for k, term in group.terms.items() if k not in job.leave_out} | job.add
     return replace(group, noise=job.observation_noise, terms=terms)
 
@@ -77,6 +80,14 @@ def train_clone(context: RunContext, folder: Path) -> Trained:
     job = cast(CloneJobCfg, cfg.job)
     sizes = resolve_sizes(job, context.backend[1])
     group = observed_group(cfg)
+    made_with = {"sizes": asdict(sizes), "device": context.backend[1].partition(":")[0]}
+    if (folder / STATE).exists():
+        _, facts = read_state(folder / STATE)
+        if facts["made_with"] != made_with:
+            raise FolderError(
+                f"{folder} has a training with {facts['made_with']}, and this one has {made_with}."
+                " Set job.folder to another folder"
+            )
     began = time.perf_counter()
     demonstrations = play_expert(context, sizes, group)
     if len(demonstrations.seen) < 2:
@@ -87,7 +98,7 @@ def train_clone(context: RunContext, folder: Path) -> Trained:
         )
     seconds = time.perf_counter() - began
     cfg = replace(cfg, observation={job.group: group})
-    learner = Learner(context, cfg, sizes, demonstrations, folder)
+    learner = Learner(context, cfg, sizes, demonstrations, folder, made_with)
     learner.learn()
     last = learner.curve[-1]
     return Trained(
@@ -129,6 +140,7 @@ class Learner:
         sizes: CloneSizes,
         demonstrations: Demonstrations,
         folder: Path,
+        made_with: dict[str, Any],
     ) -> None:
         """Make the network, or read that of an earlier call.
 
@@ -138,12 +150,14 @@ class Learner:
             sizes: How much is trained.
             demonstrations: The expert's episodes.
             folder: Where policies and state are.
+            made_with: What an earlier call must have had alike, kept with the state.
         """
         self._context = context
         job = cast(CloneJobCfg, cfg.job)
         self._job = job
         self._sizes = sizes
         self._folder = folder
+        self._made_with = made_with
         self._seen = demonstrations.seen
         self._labels = demonstrations.labels
         device = self._seen.device
@@ -297,6 +311,7 @@ class Learner:
 
     def _write_state(self) -> None:
         facts = {
+            "made_with": self._made_with,
             "done": self.done,
             "seconds": self.seconds,
             "best": self.best,
