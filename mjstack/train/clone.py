@@ -58,7 +58,7 @@ def resolve_sizes(job: CloneJobCfg, device: str) -> CloneSizes:
 
 
 def observed_group(cfg: Config) -> ObservationGroupCfg:
-    """What the policy will see: terms of a configured group, and others.
+    """The observation group of the policy: terms of a configured group, and added ones.
 
     Raises:
         MjstackError: There is no such group or term.
@@ -150,7 +150,7 @@ class Learner:
             sizes: How much is trained.
             demonstrations: The expert's episodes.
             folder: Where policies and state are.
-            made_with: What an earlier call must have had alike, kept with the state.
+            made_with: Sizes and device. An earlier call must have had the same.
         """
         self._context = context
         job = cast(CloneJobCfg, cfg.job)

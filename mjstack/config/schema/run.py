@@ -365,7 +365,7 @@ class CloneJobCfg(TrainJobCfg):
     save_every: int | None = spec(None, unit="batches", ge=1)
     """Batches between two saved policies."""
     sizes: dict[str, CloneSizes] = spec(factory=dict)
-    """What is null above, on ``cuda`` and on ``cpu``."""
+    """Values of the keys that are null above, for ``cuda`` and for ``cpu``."""
 
 
 # Jobs with keys of their own; the others have `JobCfg`.
