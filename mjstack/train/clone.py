@@ -81,13 +81,12 @@ def train_clone(context: RunContext, folder: Path) -> Trained:
     sizes = resolve_sizes(job, context.backend[1])
     group = observed_group(cfg)
     made_with = {"sizes": asdict(sizes), "device": context.backend[1].partition(":")[0]}
-    if (folder / STATE).exists():
-        _, facts = read_state(folder / STATE)
-        if facts["made_with"] != made_with:
-            raise FolderError(
-                f"{folder} has a training with {facts['made_with']}, and this one has {made_with}."
-                " Set job.folder to another folder"
-            )
+    earlier = read_state(folder / STATE) if (folder / STATE).exists() else None
+    if earlier and (theirs := earlier[1]["made_with"]) != made_with:
+        raise FolderError(
+            f"{folder} has a training with {theirs}, and this one has {made_with}. Set job.folder"
+            " to another folder"
+        )
     began = time.perf_counter()
     demonstrations = play_expert(context, sizes, group)
     if len(demonstrations.seen) < 2:
@@ -99,6 +98,8 @@ def train_clone(context: RunContext, folder: Path) -> Trained:
     seconds = time.perf_counter() - began
     cfg = replace(cfg, observation={job.group: group})
     learner = Learner(context, cfg, sizes, demonstrations, folder, made_with)
+    if earlier:
+        learner.restore(*earlier)
     learner.learn()
     last = learner.curve[-1]
     return Trained(
@@ -142,7 +143,7 @@ class Learner:
         folder: Path,
         made_with: dict[str, Any],
     ) -> None:
-        """Make the network, or read that of an earlier call.
+        """Make the network.
 
         Args:
             context: The run, for its progress.
@@ -196,15 +197,12 @@ class Learner:
             config=config_content(cfg),
         )
 
-        # Where an earlier call was stopped
         self.done = 0
         self.seconds = 0.0
         self.best = math.inf
         self.curve: list[dict[str, Any]] = []
         self._sum = torch.zeros((), device=device)  # of losses since the last row
         self._count = 0
-        if (folder / STATE).exists():
-            self._restore()
 
     def learn(self) -> None:
         """Make the missing batches, saving policies and state now and then.
@@ -320,9 +318,8 @@ class Learner:
         }
         write_state(self._folder / STATE, self._parameters(), facts)
 
-    def _restore(self) -> None:
-        """Go on from the state of an earlier call."""
-        state, facts = read_state(self._folder / STATE)
+    def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
+        """Go on from the state and facts of an earlier call."""
         self._generator.set_state(state["generator"])
         for name, network in (("network", self._network), ("average", self._average)):
             own = {k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(name)}
