@@ -46,6 +46,7 @@ OBSERVATIONS = {
     "grasp_point_to_object": (OBJECT, 3),
     "object_to_object": ({"a": "red", "b": "blue"}, 3),
     "object_pose": (OBJECT, 7),
+    "headings": ({}, 4),
     "object_velocity": (OBJECT, 6),
     "jaw_force": (OBJECT, 2),
     "last_action": ({}, "a"),
