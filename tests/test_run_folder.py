@@ -4,6 +4,7 @@ keep the same command from going on.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import resource
@@ -67,6 +68,8 @@ def in_children(
     count: int, work: Callable[[int], int | None], output: Path | None = None
 ) -> list[int]:
     """Exit statuses of forked processes that do the same, as nearly at once as can be."""
+    # A child that freed the threads of an earlier test's worlds would wait for them: it has none.
+    gc.collect()
     ready, start = os.pipe()
     pids = []
     for number in range(count):
