@@ -35,10 +35,7 @@ _EXAMPLES = (
     ),
     ("job=collect job.episodes=20", "demonstrations of the expert, as a dataset; resumes"),
     ("job=train task=reach", "a policy that imitates the expert, judged by gate success; resumes"),
-    (
-        "controller=policy policy=outputs/train/HASH/last 'gates=[success]'",
-        "a trained policy in the expert's place, in any gate",
-    ),
+    ("controller=policy policy=FOLDER", "a trained policy in the expert's place, in any gate"),
     ("job=scaling robot=so101", "throughput from 1 to 32,768 worlds; resumes"),
     ("job=study nworld=8", "what the solver's limits cost, and which worlds still succeed"),
     (
