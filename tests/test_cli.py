@@ -287,6 +287,7 @@ def test_an_override_with_dashes_is_told_without(
 def test_the_command_in_another_program_leaves_its_ctrl_c_alone(folder: Path) -> None:
     program = """
 import os, signal, sys, threading
+signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
 from mjstack.__main__ import main
 sys.argv = ["mjstack", "nworld=many"]
 

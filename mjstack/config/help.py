@@ -21,7 +21,6 @@ _GROUP = re.compile(r"  - (?P<name>\w+): (?P<default>\[.*\]|\S+) # (?P<words>.+)
 _EXAMPLES = (
     ("robot=rebot nworld=64", "all gates this machine can run"),
     ("'gates=[baseline,parity]' timing=fine", "two gates, 1 ms physics"),
-    ("batch.njmax=200 'gates=[capacity]'", "are 200 constraint rows enough?"),
     ("-m robot=so101,rebot timing=default,fine", "a sweep with a summary table"),
     ("'gates=[batch]' gate.batch.seeds=10", "ten seeds: how rare are failures?"),
     ("'gates=[success]' nworld=64", "how often does it work from random starts?"),
@@ -168,7 +167,7 @@ def help_text(cfg: Config, width: int) -> str:
         ],
         [
             "Examples:",
-            *_table([(f"mjstack {command}", words) for command, words in _EXAMPLES], width),
+            *(line for made, words in _EXAMPLES for line in (f"  mjstack {made}", f"    {words}")),
         ],
         [
             "Groups, to be set as group=choice, and their choices, the default first:",
