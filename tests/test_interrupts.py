@@ -90,6 +90,7 @@ def main(kind: str, count: str) -> int:
     moments = random.Random(kind)
     ended: Counter[str] = Counter()
     slowest = 0.0
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
     with tempfile.TemporaryDirectory() as fixture:
         fuzz._preload()
         warnings.simplefilter("ignore")  # of a machine that cannot draw

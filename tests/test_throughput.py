@@ -32,14 +32,14 @@ from mjstack.sim import Simulation
 from mjstack.sim.native import NativeSimulation
 from mjstack.sim.substep import ARRANGEMENTS
 
-SHORT = (
+FEW = (
     "gates=[throughput]",
     "gate.throughput.repetitions=3",
     "gate.throughput.steps=3",
     "gate.throughput.env_steps=2",
     "gate.throughput.cpu_max_seconds=120",
-    *at_double_speed(),
 )
+SHORT = (*FEW, *at_double_speed())  # of stack
 SPEEDS = ("per_s", "ms_per", "seconds", "ratio", "over_physics", "power")
 
 
@@ -384,7 +384,7 @@ def test_a_task_without_a_check_is_not_asked_for_batch(
     new_context: Callable[..., RunContext],
 ) -> None:
     result, _ = run_throughput(
-        new_context("task=reach", "task.check=null", "sim=native", "nworld=1", *SHORT)
+        new_context("task=reach", "task.check=null", "sim=native", "nworld=1", *FEW)
     )
     assert result.status is Status.passed
     assert "episode: not measured: task reach has no check" in result.reason
