@@ -15,15 +15,21 @@ from mjstack.policy import Policy, PolicyNetwork, save_policy
 def make_policy(
     cfg: Config, *, group: str = "policy", chunk: int = 6, execute: int = 4, seed: int = 0
 ) -> Policy:
-    """A policy around the robot's start that moves every joint by up to some 0.05 rad."""
+    """A policy around the robot's start that moves every joint by up to some 0.05 rad. If the
+    configuration has a policy decide below the control rate, its actions are those of the
+    configuration.
+    """
     env = build_env(cfg, nworld=1, backend=Backend.native, device="cpu")
     widths = env.observation_manager.term_dims[group]
+    action = cfg.action if cfg.timing.policy_decimation > 1 else None
+    width = env.action_manager.action_dim if action else len(cfg.robot.joints)
     env.close()
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        network = PolicyNetwork(sum(widths.values()), len(cfg.robot.joints), chunk, [16, 16])
-    start = torch.tensor(cfg.robot.start, dtype=torch.float32)
-    network.set_scale("action", start, torch.full_like(start, 0.05))
+        network = PolicyNetwork(sum(widths.values()), width, chunk, [16, 16])
+    if action is None:
+        start = torch.tensor(cfg.robot.start, dtype=torch.float32)
+        network.set_scale("action", start, torch.full_like(start, 0.05))
     return Policy(
         network=network,
         group=group,
@@ -32,6 +38,7 @@ def make_policy(
         execute=execute,
         hidden=[16, 16],
         config=config_content(cfg),
+        action=action,
         training={"seed": seed},
     )
 

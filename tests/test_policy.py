@@ -216,6 +216,7 @@ def put(facts: dict, *keys: str, value: object) -> None:
     facts[keys[-1]] = value
 
 
+GRIPPER = "mjstack.mdp.action.Gripper"
 TERM = ("observation", "terms", "joint_pos")
 DAMAGED: dict[str, tuple[Callable[[Path], object], str]] = {
     "no file": (lambda f: (f / "policy.json").unlink(), "has no policy.json"),
@@ -240,9 +241,17 @@ DAMAGED: dict[str, tuple[Callable[[Path], object], str]] = {
         edit(lambda d: put(d, *TERM, "func", value="mjstack.mdp.observation.nope")),
         "'nope' does not exist",
     ),
+    "a strange action": (
+        edit(lambda d: put(d, "action", "terms", value={"arm": {"func": "os.system"}})),
+        "action.arm.func=os.system: expected a name of mjstack",
+    ),
+    "another action": (
+        edit(lambda d: put(d, "action", "terms", value={"grip": {"func": GRIPPER}})),
+        "was trained with action.width=6, and here it is 1",
+    ),
     "another object": (
         edit(lambda d: put(d, "observation", "terms", "red_to_blue", "params", "a", value="green")),
-        "its observation cannot be computed here: observation.policy.terms.red_to_blue",
+        "its observation or action cannot be computed here: observation.policy.terms.red_to_blue",
     ),
     "another width": (
         edit(lambda d: put(d, *TERM, "func", value="mjstack.mdp.observation.grasp_point_pos")),

@@ -10,7 +10,7 @@ import numpy as np
 from mjstack.bench import env_step, ik, physics, solver
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
-from mjstack.envs import build_env
+from mjstack.envs import build_env, decided_every_step
 from mjstack.envs.buffers import Advance
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, MjstackError
@@ -68,7 +68,8 @@ def _env_step(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[T
         device = "cpu" if backend is Backend.native else resolve_device(cfg.sim.device)
         slow = backend is Backend.mjwarp and device == "cpu"
         nworld = min(cfg.nworld, args.cpu_nworld) if slow else cfg.nworld
-        env = build_env(cfg, nworld=nworld, backend=backend, device=device)
+        every_step = decided_every_step(cfg)
+        env = build_env(every_step, nworld=nworld, backend=backend, device=device)
         title = f"{env.sim.description}, {nworld} worlds"
         result = env_step.measure_env_step(
             env, steps=args.steps, repetitions=args.repetitions, advance=advance

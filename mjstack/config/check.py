@@ -54,6 +54,11 @@ def places_objects(term: TermCfg) -> bool:
     return "xy" in term.params and bool(offered(term.func, "places_objects"))
 
 
+def starts_midway(term: TermCfg) -> bool:
+    """Whether a reset term starts worlds in the middle of an episode, which cannot be judged."""
+    return bool(offered(term.func, "starts_midway"))
+
+
 def _require(what: str, name: str | None, known: Mapping | Sequence) -> None:
     if name is not None and name not in known:
         raise UnknownName(what, name, known)

@@ -14,6 +14,7 @@ from mjstack.config.schema import (
     Config,
     ObservationGroupCfg,
     ObservationTermCfg,
+    PpoJobCfg,
     RewardTermCfg,
     RobotCfg,
     SolverCfg,
@@ -62,7 +63,7 @@ def complete(cfg: Config) -> None:
             for name, node in cfg.job.variants.items()
         }
         cfg.job.variants = _typed_all("job.variants", variants, SolverCfg)
-    if isinstance(cfg.job, CloneJobCfg):
+    if isinstance(cfg.job, CloneJobCfg | PpoJobCfg):
         cfg.job.add = _typed_all("job.add", cfg.job.add, ObservationTermCfg)
     _complete_robot(cfg.robot)
     _choose_phases(cfg)

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import ConfigKeyError
 
 from mjstack.config.fields import accepted, find_field
-from mjstack.config.schema import JOB_SCHEMAS, Config, GateCfg, JobCfg
+from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Config, GateCfg, JobCfg
 from mjstack.config.session import (
     CONFIG_NAME,
     compose_raw,
@@ -127,7 +127,9 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
         owner = getattr(cause, "object_type", None)
         known = [field.name for field in fields(owner)] if is_dataclass(owner) else []
         return _unknown_key(key, known, overrides)
-    schema = JOB_SCHEMAS.get(_job(overrides), JobCfg)
+    schema = TRAINER_SCHEMAS.get(_chosen("trainer", overrides)) or JOB_SCHEMAS.get(
+        _chosen("job", overrides, "gates"), JobCfg
+    )
     field = (
         find_field(schema, key.removeprefix("job."))
         if key.startswith("job.")
@@ -147,7 +149,7 @@ def _unknown_key(key: str, known: Sequence[str], overrides: Sequence[str]) -> Co
     """A key that does not exist, with the one that may have been meant: one beside it (*known*), or
     one elsewhere.
     """
-    job = _job(overrides)
+    job = _chosen("job", overrides, "gates")
     parent, _, leaf = key.rpartition(".")
     owners = [
         f"job={n}" for n, schema in JOB_SCHEMAS.items() if n != job and find_field(schema, leaf)
@@ -181,10 +183,10 @@ def _unknown_key(key: str, known: Sequence[str], overrides: Sequence[str]) -> Co
     )
 
 
-def _job(overrides: Sequence[str]) -> str:
-    """The job that overrides choose."""
-    chosen = [override for override in overrides if override.startswith("job=")]
-    return chosen[-1].removeprefix("job=") if chosen else "gates"
+def _chosen(group: str, overrides: Sequence[str], default: str = "") -> str:
+    """The choice of a group that overrides make."""
+    chosen = [override for override in overrides if override.startswith(f"{group}=")]
+    return chosen[-1].removeprefix(f"{group}=") if chosen else default
 
 
 def _keys(overrides: Iterable[str]) -> list[str]:

@@ -9,7 +9,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from mjstack.errors import TermError, first_line, suggest
+from mjstack.errors import MissingExtra, TermError, first_line, suggest
 
 
 def resolve_func(
@@ -52,6 +52,7 @@ def find_object(label: str, path: str) -> Any:
 
     Raises:
         TermError: There is no such module, or nothing of that name in it.
+        MissingExtra: The module needs a package that is not installed.
     """
     module_name, _, attribute = path.rpartition(".")
     if not module_name:
@@ -60,6 +61,8 @@ def find_object(label: str, path: str) -> Any:
         )
     try:
         module = importlib.import_module(module_name)
+    except MissingExtra:
+        raise
     except Exception as error:  # the module is the user's, and may raise anything
         kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
         reason = f"{kind}{first_line(error)}"

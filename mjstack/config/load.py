@@ -18,7 +18,7 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 from mjstack.config.check import validate
 from mjstack.config.complete import complete
 from mjstack.config.explain import check_added, check_overrides, explain, parse
-from mjstack.config.schema import JOB_SCHEMAS, Config
+from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Config
 from mjstack.config.session import (
     CONFIG_NAME,
     add_folder,
@@ -35,7 +35,7 @@ from mjstack.files import reading
 _schema = OmegaConf.structured(Config)
 _schema.gate._set_flag("struct", False)  # gates of the search path are added to it
 ConfigStore.instance().store(name="mjstack_schema", node=_schema, provider="mjstack")
-for _name, _node in JOB_SCHEMAS.items():
+for _name, _node in (JOB_SCHEMAS | TRAINER_SCHEMAS).items():
     ConfigStore.instance().store(name=f"{_name}_schema", node=_node, provider="mjstack")
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config
+from mjstack.drivers.driver import require_joint_targets
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.drivers.tilt import CarryTilt
 from mjstack.envs import Env
@@ -61,11 +62,7 @@ class ClosedLoopDriver:
         n = env.nworld
 
         # The environment
-        if list(cfg.action.values()) != list(cfg.controller.action.values()):
-            expected = "absolute joint commands, which the expert gives"
-            raise ArgumentError(
-                "env", "other actions", expected, "Build it with action=joint_absolute"
-            )
+        require_joint_targets(cfg, "absolute joint commands, which the expert gives")
         if bool((env.episode_step != 0).any()):  # it begins where the environment's episodes do
             raise ArgumentError(
                 "env",

@@ -5,7 +5,9 @@ from typing import Protocol
 
 import torch
 
+from mjstack.config.schema import Config
 from mjstack.drivers.open_loop import JointTrajectory
+from mjstack.errors import ArgumentError
 from mjstack.scene.phases import Phase
 
 
@@ -31,6 +33,26 @@ class Driver(Protocol):
 
     def command(self) -> torch.Tensor:
         """Commands of the next step, shape ``(nworld, nu)``."""
+
+
+def require_joint_targets(cfg: Config, expected: str) -> None:
+    """Check that an environment takes absolute joint targets in every control step.
+
+    Args:
+        cfg: Its configuration.
+        expected: Words for such actions.
+
+    Raises:
+        ArgumentError: It takes other actions, or holds them.
+    """
+    if list(cfg.action.values()) != list(cfg.controller.action.values()):
+        fix = "Build it with action=joint_absolute"
+        raise ArgumentError("env", "other actions", expected, fix)
+    held = cfg.timing.policy_decimation
+    if held > 1:
+        expected = "one for each, which a driver gives"
+        fix = "Build it with timing.policy_decimation=1"
+        raise ArgumentError("env", f"actions for {held} control steps", expected, fix)
 
 
 class PhaselessDriver(ABC):

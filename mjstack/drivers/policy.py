@@ -3,13 +3,15 @@ each answer before it asks again.
 """
 
 import copy
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from mjstack.drivers.driver import PhaselessDriver
+from mjstack.drivers.driver import PhaselessDriver, require_joint_targets
 from mjstack.envs.env import Env
-from mjstack.errors import ArgumentError, PolicyError, TermError
+from mjstack.errors import PolicyError, TermError
+from mjstack.managers.action import ActionManager
 from mjstack.managers.observation import ObservationManager
 from mjstack.mdp.geometry import robot
 from mjstack.policy import Policy
@@ -27,6 +29,9 @@ class PolicyDriver(PhaselessDriver):
     2**-20 rad or m. So a world gets the same targets alone as in a batch, where sums are made in
     another order. On CUDA every step computes the network in float32, because a captured step
     cannot skip it, and worlds that do not ask keep their targets.
+
+    A policy with other actions than absolute joint targets brings its action terms. They turn each
+    action, which is repeated until the next answer, into joint targets in every control step.
     """
 
     def __init__(self, env: Env, policy: Policy) -> None:
@@ -42,19 +47,21 @@ class PolicyDriver(PhaselessDriver):
                 actions.
         """
         cfg = env.cfg
-        if list(cfg.action.values()) != list(cfg.controller.action.values()):
-            expected = "absolute joint targets, which a policy gives"
-            raise ArgumentError(
-                "env", "other actions", expected, "Build it with action=joint_absolute"
-            )
+        require_joint_targets(cfg, "absolute joint targets, which a policy gives")
         policy.check_fit(cfg)
         group = policy.group
         try:
-            self._observations = ObservationManager(env, {group: policy.observation})
+            # Its own action terms write the joint targets
+            self._actions = ActionManager(env, policy.action) if policy.action else None
+            view = env if self._actions is None else _OwnActions(env, self._actions)
+            self._observations = ObservationManager(view, {group: policy.observation})
         except TermError as error:
             raise PolicyError(
-                f"policy={policy.folder}: its observation cannot be computed here: {error}"
+                f"policy={policy.folder}: its observation or action cannot be computed here:"
+                f" {error}"
             ) from error
+        width = len(cfg.robot.joints) if self._actions is None else self._actions.action_dim
+        policy.check_action_width(width)
         policy.check_widths(self._observations.term_dims[group])
         self._observed = self._observations.groups[group]
         self._remembers = any(term.history > 1 for term in policy.observation.terms.values())
@@ -69,13 +76,16 @@ class PolicyDriver(PhaselessDriver):
         self._execute = policy.execute
         shape = (env.nworld, min(policy.execute, network.chunk), network.joints)
         self._chunk = torch.zeros(shape, device=env.device)
-        self._command = robot(env).ctrl.read(env.sim.ctrl).float().clone()
+        self._ctrl = robot(env).ctrl
+        self._command = self._ctrl.read(env.sim.ctrl).float().clone()
 
     def command(self) -> Tensor:
         """Joint targets of the next step, shape ``(nworld, nu)``, float32. The driver's own memory:
         do not write into it.
         """
         step = self._env.episode_step
+        if self._actions is not None:
+            self._actions.reset(step == 0)
         slot = step.remainder(self._execute)
         asks = slot == 0
         asking = asks.is_cuda or bool(asks.any())
@@ -87,12 +97,34 @@ class PolicyDriver(PhaselessDriver):
             self._ask(asks)
         played = slot.clamp(max=self._chunk.shape[1] - 1)[:, None, None]
         target = self._chunk.gather(1, played.expand(-1, 1, self._chunk.shape[2]))[:, 0]
+        if self._actions is not None:
+            target = self._apply(self._actions, target)
         # A world whose state is not finite keeps its targets, and the check fails it.
         self._command.copy_(torch.where(torch.isfinite(target), target, self._command))
         return self._command
+
+    def _apply(self, actions: ActionManager, action: Tensor) -> Tensor:
+        """Joint targets that the policy's action terms write. The environment writes the same ones
+        again.
+        """
+        actions.process(torch.nan_to_num(action, 0.0, 0.0, 0.0))
+        actions.apply()
+        return self._ctrl.read(self._env.sim.ctrl).float()
 
     def _ask(self, asks: Tensor) -> None:
         """Take the policy's answer in the worlds that ask, shape ``(nworld,)``, bool."""
         answer = self._network(self._observed.to(self._dtype))[:, : self._chunk.shape[1]]
         answer = (torch.round(answer * _GRID) / _GRID).float()
         torch.where(asks[:, None, None], answer, self._chunk, out=self._chunk)
+
+
+class _OwnActions:
+    """The environment as a policy's terms see it: the actions are the policy's."""
+
+    def __init__(self, env: Env, actions: ActionManager) -> None:
+        self._env = env
+        self.action = actions.action
+        self.previous_action = actions.previous_action
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)

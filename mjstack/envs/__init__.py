@@ -1,6 +1,19 @@
 """The environment over both backends, and how it is built."""
 
-from mjstack.envs.build import build_env, demonstration_config, driven_config, make_env
+from mjstack.envs.build import (
+    build_env,
+    decided_every_step,
+    demonstration_config,
+    driven_config,
+    make_env,
+)
 from mjstack.envs.env import Env
 
-__all__ = ["Env", "build_env", "demonstration_config", "driven_config", "make_env"]
+__all__ = [
+    "Env",
+    "build_env",
+    "decided_every_step",
+    "demonstration_config",
+    "driven_config",
+    "make_env",
+]

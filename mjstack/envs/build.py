@@ -90,14 +90,22 @@ def build_env(
     return Env(sim, SceneIndex(model, cfg.robot, cfg.scene), cfg)
 
 
+def decided_every_step(cfg: Config) -> Config:
+    """The configuration of an environment that takes an action for every control step, whatever
+    the rate of a policy is.
+    """
+    return replace(cfg, timing=replace(cfg.timing, policy_decimation=1))
+
+
 def driven_config(cfg: Config, reset: dict[str, TermCfg] | None = None) -> Config:
     """The configuration of an environment in which a driver plays one whole episode.
 
     The driver's action terms take the place of the configured ones, and ``reset`` that of the
-    configured reset terms. Nothing ends an episode early or rewards it: the check judges the whole.
+    configured reset terms, and it acts in every control step. Nothing ends an episode early or
+    rewards it: the check judges the whole.
     """
     return replace(
-        cfg,
+        decided_every_step(cfg),
         action=cfg.controller.action,
         observation={},
         termination={},

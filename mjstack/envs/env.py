@@ -39,6 +39,11 @@ class Env:
     5. finished episodes go into the statistics;
     6. the worlds that ended are reset, and observed again.
 
+    With ``timing.policy_decimation`` 1 to 4 are repeated so many times with the same action, each
+    time for a control step. Rewards are summed. A world whose episode ends before the last of them
+    goes on without rewards until then, and is reset with the others: its success, its length and
+    its way of ending are those of the control step in which it ended.
+
     On CUDA the whole step is one graph: the first step after a build runs eagerly, the second is
     captured, and later ones replay it. After a change of anything that it has
     baked in, such as a term's Python number, call `recapture`.
@@ -91,6 +96,7 @@ class Env:
         self._check_faults = check_faults
         self._started = self._closed = False
         self._decimation = cfg.timing.decimation
+        self._held_steps = cfg.timing.policy_decimation
 
         # Terms are checked on worlds that have started, because a term may read anything.
         self.reset_manager = ResetManager(self, cfg.reset)
@@ -119,8 +125,8 @@ class Env:
 
     @property
     def max_episode_steps(self) -> int:
-        """Step after which an episode times out: the time-out term's, or the task's where there is
-        none.
+        """Control step after which an episode times out: the time-out term's, or the task's where
+        there is none.
         """
         limits = [
             t.params["steps"]
@@ -172,7 +178,7 @@ class Env:
     def step(
         self, action: Tensor
     ) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Advance every world by one control interval; see the class for the order.
+        """Advance every world by one decision of the policy; see the class for the order.
 
         Args:
             action: Shape ``(nworld, action_dim)``, float32.
@@ -180,7 +186,7 @@ class Env:
         Returns:
             ``obs``: by group, ``(nworld, dim)``, float32; of worlds that ended, the first of the
                 new episode.
-            ``reward``: ``(nworld,)``, float32.
+            ``reward``: ``(nworld,)``, float32; the sum over the control steps.
             ``terminated``: ended by what happened, ``(nworld,)``, bool.
             ``truncated``: ended by the clock alone, ``(nworld,)``, bool.
             ``extras``: ``final_obs`` (as ``obs``, before the reset: valid where an episode ended)
@@ -210,9 +216,11 @@ class Env:
 
         On CUDA it has fixed shapes and no host read, so that a larger graph may hold it.
         """
-        self.action_manager.apply()
-        self._step_physics()
-        self._evaluate()
+        ended: Tensor | None = None
+        for left in reversed(range(self._held_steps)):
+            self.action_manager.apply()
+            self._step_physics()
+            ended = self._evaluate(ended, last=left == 0)
         current_term.label = ""
 
     def captured(self, work: Callable[[], None], name: str) -> StepGraph:
@@ -236,8 +244,8 @@ class Env:
         self._version += 1
 
     def halves(self) -> tuple[StepGraph, StepGraph]:
-        """The physics of a step, and everything else of it: two graphs, for measurements. They act
-        on the action that was processed last.
+        """The physics of a control step, and everything else of it: two graphs, for measurements.
+        They act on the action that was processed last.
         """
 
         def managers() -> None:
@@ -305,17 +313,30 @@ class Env:
         current_term.label = ""
         self.sim.step(self._decimation, kinematics=True)
 
-    def _evaluate(self) -> None:
-        """Success, terminations, rewards and observations of the new state, and the resets."""
-        self.episode_step += 1
+    def _evaluate(self, ended: Tensor | None = None, *, last: bool = True) -> Tensor | None:
+        """Success, terminations, rewards and observations of the new state; after the last control
+        step of a decision the resets.
+
+        Args:
+            ended: Worlds whose episode ended in an earlier control step of the decision, shape
+                ``(nworld,)``, bool; None in the first one.
+            last: Whether it is the last one.
+
+        Returns:
+            The worlds that have ended now, for the next control step; None after the last.
+        """
+        self.episode_step += 1 if ended is None else ~ended
         broken = not_finite(self.sim.qpos, self.sim.qvel)
         if self._success is not None:
-            torch.logical_and(self._success(self), ~broken, out=self.success)
+            achieved = self._success(self)
+            if ended is not None:  # theirs stays
+                achieved = torch.where(ended, self.success, achieved)
+            torch.logical_and(achieved, ~broken, out=self.success)
 
         def reward() -> None:
             with step_cache():
-                self.termination_manager.compute()
-                self.reward_manager.compute(void=broken)
+                self.termination_manager.compute(ended)
+                self.reward_manager.compute(void=broken, ended=ended)
 
         def observe() -> None:
             with step_cache():
@@ -326,7 +347,10 @@ class Env:
         if self._check_faults and not broken.is_cuda:
             self._faults.record(broken)
             self._faults.raise_first()
-        self._reset_ended(broken)
+        if last:
+            self._reset_ended(broken)
+            return None
+        return self.termination_manager.terminated | self.termination_manager.truncated
 
     def _reset_ended(self, broken: Tensor) -> None:
         """The terminal observation, the statistics, the reset of the worlds that ended, and the

@@ -13,7 +13,7 @@ from mjstack.bench.episode import measure_episode
 from mjstack.bench.physics import measure_physics
 from mjstack.bench.timing import EnergyMeter, Measurement
 from mjstack.config.schema import Backend
-from mjstack.envs import build_env
+from mjstack.envs import build_env, decided_every_step
 from mjstack.episodes.context import RunContext, lacks_episode
 from mjstack.gates.runner import log_error
 from mjstack.report.record import GateResult, Status
@@ -159,7 +159,7 @@ def _on_environment(
     gc.collect()
     began = time.perf_counter()
     env = build_env(
-        context.cfg,
+        decided_every_step(context.cfg),
         model=context.model,
         backend=backend,
         device=device,

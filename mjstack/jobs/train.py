@@ -24,12 +24,14 @@ from mjstack.jobs.runner import CheckedJob, Job, write_tables
 from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
+from mjstack.train.expert_states import whole_starts
 from mjstack.train.trainer import LAST, STATE, Trained, Trainer
 
 NAME = "train"
 CONFIG = "training.json"  # the configuration of the training in the folder
 # Changing one of these changes no training.
 _NO_MATTER = ("batch", "gates", "gate", "graph", "view", "video", "run", "world")
+_NO_MATTER_OF_JOB = ("folder", "test_seed", "iterations", "minutes", "max_minutes")
 
 
 def training_config(cfg: Config) -> dict:
@@ -37,7 +39,8 @@ def training_config(cfg: Config) -> dict:
     config = config_content(cfg)
     for key in _NO_MATTER:
         del config[key]
-    del config["job"]["folder"], config["job"]["test_seed"]
+    for key in _NO_MATTER_OF_JOB:
+        config["job"].pop(key, None)
     return config
 
 
@@ -102,7 +105,7 @@ def judged_context(context: RunContext, policy: Path) -> RunContext:
     """
     cfg = context.cfg
     gate = copy.copy(cfg.gate)
-    gate.success = replace(gate.success, reset=cfg.reset)
+    gate.success = replace(gate.success, reset=whole_starts(cfg.reset))
     judged = replace(
         cfg,
         seed=cast(TrainJobCfg, cfg.job).test_seed,
@@ -127,7 +130,8 @@ def _train(trainer: Trainer, folder: Path, context: RunContext) -> list[GateResu
         GateResult(
             name=NAME,
             status=Status.passed,
-            reason=f"{trained.notes['policy']} after {last['batch']:,} batches: {figures}",
+            reason=f"{trained.notes['policy']} after {trained.abscissa}"
+            f" {last[trained.abscissa]:,}: {figures}",
             seconds=seconds,
             metrics=trained.metrics,
             notes=trained.notes,
@@ -141,7 +145,7 @@ def _write_curve(context: RunContext, trained: Trained) -> None:
     columns = {name.replace("_", " "): name for name in rows[0]}
     title = f"{context.cfg.robot.title}, task {context.cfg.task.name}: training"
     lines = {name.replace("_", " "): [row[name] for row in rows] for name in trained.lines}
-    at = [row["batch"] for row in rows]
+    at = [row[trained.abscissa] for row in rows]
     write_tables(
         context,
         NAME,
@@ -149,7 +153,7 @@ def _write_curve(context: RunContext, trained: Trained) -> None:
         Table.of(columns, rows),
         [f"{name}: {value}" for name, value in trained.notes.items()],
         to_csv(rows),
-        lambda path: save_curves(path, at, lines, title, "batch"),
+        lambda path: save_curves(path, at, lines, title, trained.abscissa, trained.scale),
     )
 
 

@@ -70,7 +70,7 @@ class RewardManager(_ValueManager):
         names: The terms.
         weights: ``weight x step_dt`` of every term, shape ``(nterm,)``, float32. Write into it to
             change a weight later.
-        reward: The sum at the last step, shape ``(nworld,)``, float32.
+        reward: The sum of the last decision, shape ``(nworld,)``, float32.
         values: Its summands, shape ``(nworld, nterm)``, float32.
         episode_sums: The summands since each world's last reset, shape ``(nworld, nterm)``,
             float32.
@@ -93,13 +93,19 @@ class RewardManager(_ValueManager):
         self.reward = self.values.sum(1)
         self.episode_sums = torch.zeros_like(self.values)
 
-    def compute(self, void: torch.Tensor | None = None) -> torch.Tensor:
+    def compute(
+        self, void: torch.Tensor | None = None, ended: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Write `values` and `reward`, and return `reward`.
 
         Args:
             void: Worlds whose state is not finite, shape ``(nworld,)``, bool: they get no reward
                 for this step.
+            ended: Within a decision that holds its action for several control steps: worlds whose
+                episode ended in an earlier one, which get no reward, shape ``(nworld,)``, bool. The
+                rewards of the others are added to those before.
         """
+        before = None if ended is None else self.values.clone()
         if self._terms:
             torch.mul(
                 torch.stack([term(self._env) for term in self._terms.values()], 1).float(),
@@ -108,7 +114,11 @@ class RewardManager(_ValueManager):
             )
         if void is not None:
             self.values.masked_fill_(void[:, None], 0.0)
+        if ended is not None:
+            self.values.masked_fill_(ended[:, None], 0.0)
         self.episode_sums += self.values
+        if before is not None:
+            self.values += before
         return torch.sum(self.values, dim=1, out=self.reward)
 
     def reset(self, mask: torch.Tensor) -> None:
@@ -148,11 +158,20 @@ class TerminationManager(_ValueManager):
             [not cfg[name].time_out for name in self.names], dtype=torch.bool, device=env.device
         )
 
-    def compute(self) -> None:
-        """Write `terminated`, `truncated` and `values`."""
+    def compute(self, ended: torch.Tensor | None = None) -> None:
+        """Write `terminated`, `truncated` and `values`.
+
+        Args:
+            ended: Worlds whose episode ended in an earlier control step of the same decision, shape
+                ``(nworld,)``, bool: they stay ended as they were.
+        """
         if not self._terms:
             return
-        torch.stack([term(self._env) for term in self._terms.values()], dim=1, out=self.values)
+        values = [term(self._env) for term in self._terms.values()]
+        if ended is not None:
+            earlier = self.values.unbind(1)
+            values = [torch.where(ended, *pair) for pair in zip(earlier, values, strict=True)]
+        torch.stack(values, dim=1, out=self.values)
         torch.any(self.values & self._ends, dim=1, out=self.terminated)
         # Where both hold, the state itself ended the episode: there is nothing left to bootstrap
         # from.

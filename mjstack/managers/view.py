@@ -57,8 +57,9 @@ def offers(**attributes: Any) -> Callable[[Any], Any]:
     Known attributes: ``unit`` of an observation (one, or one per number; ``joint`` and ``joint/s``
     are those of the robot's joints); ``ends_on`` of a termination, ``overflow`` or ``non_finite``,
     where it ends such worlds; of a reset term ``reads_file``, where its parameter ``path`` names a
-    file of starts, ``places_objects``, where its parameter ``xy`` is a region, and ``joint_noise``,
-    where its parameter ``arm`` moves the arm's joints.
+    file of starts, ``places_objects``, where its parameter ``xy`` is a region, ``joint_noise``,
+    where its parameter ``arm`` moves the arm's joints; ``starts_midway``, where worlds start in the
+    middle of an episode.
 
     Example:
         >>> @offers(unit="m")

@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mjstack.config.fields import Count, Positive
+from mjstack.config.fields import Count, Fraction, NotNegative, Positive
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
 from mjstack.managers.view import EnvView
@@ -105,9 +105,56 @@ class Gripper(_Commands):
         )
 
 
+class JointTargets(_Commands):
+    """Absolute joint targets of the control steps of one decision: the answer of a cloned policy.
+
+    The action has the targets of the first step, then of the second, and so on, each less ``mean``
+    and over ``std``. If there are fewer of them than control steps, the last ones hold.
+    """
+
+    unit = "standard deviations"
+
+    def __init__(
+        self, env: EnvView, *, mean: Sequence[float], std: Sequence[Positive], steps: Count = 1
+    ) -> None:
+        """Take the scale.
+
+        Args:
+            env: The environment.
+            mean: Of every joint's targets [rad, m].
+            std: Of every joint's targets [rad, m].
+            steps: Control steps for which there are targets.
+
+        Raises:
+            ParameterError: There are not as many numbers as joints.
+        """
+        joints = len(env.index.ctrl)
+        for key, values in (("mean", mean), ("std", std)):
+            if len(values) != joints:
+                raise ParameterError(key, list(values), f"{joints} numbers, one per joint")
+        self._set_up(env, range(joints), dim=steps * joints)
+        self._steps = steps
+        self._mean, self._std = (
+            torch.tensor(values, dtype=self._ctrl.dtype, device=env.device)
+            for values in (mean, std)
+        )
+        self.low, self.high = (
+            ((limit - self._mean) / self._std).repeat(steps) for limit in (self._low, self._high)
+        )
+        self._held = env.cfg.timing.policy_decimation
+        self._step = env.episode_step
+
+    def write_commands(self, action: Tensor) -> None:
+        """Write the commands of the control step."""
+        number = self._step.remainder(self._held).clamp(max=self._steps - 1)
+        targets = action.unflatten(1, (self._steps, -1))
+        now = targets.gather(1, number[:, None, None].expand(-1, 1, targets.shape[2]))[:, 0]
+        self._write_bounded(self._mean + self._std * now)
+
+
 class EndEffectorDelta(_Commands):
     """Moves the commanded grasp point by ``scale`` times the action in x, y and z, by batched
-    inverse kinematics.
+    inverse kinematics; with ``roll`` a fourth number turns the gripper about its approach axis.
 
     It starts from the last command, not from the measured joints, so that the arm does not sag by
     its servo error at every step; and it keeps no target itself, so that nothing winds up at
@@ -115,28 +162,63 @@ class EndEffectorDelta(_Commands):
     does, closing it moves the grasp point, by up to 16 mm there.
     """
 
-    def __init__(self, env: EnvView, *, scale: Positive, iterations: Count = 8) -> None:
+    def __init__(
+        self,
+        env: EnvView,
+        *,
+        scale: Positive,
+        iterations: Count = 8,
+        roll: NotNegative = 0.0,
+        upright: Fraction = 0.0,
+    ) -> None:
         """Build the solver.
 
         Args:
             env: The environment.
             scale: Distance for an action of 1 [m per step].
             iterations: Steps of damped least squares per step.
+            roll: Turn of ``robot.roll_joint`` for an action of 1 [rad per step]; 0 for none.
+            upright: How strongly the joints that the position leaves free point the gripper down,
+                as ``approach_gain`` of `BatchedIk`; 0 leaves them where they are.
+
+        Raises:
+            ParameterError: The robot has no joint that rolls the gripper and nothing else.
         """
         # Loads Warp, which other actions do not need.
         from mjstack.kinematics.batched_ik import BatchedIk
 
         self._n_arm = env.index.n_arm
-        self._set_up(env, range(self._n_arm), dim=3)
+        self._set_up(env, range(self._n_arm), dim=4 if roll else 3)
         self._all = robot(env).ctrl
         self._scale = scale
+        profile = env.cfg.robot
+        self._roll = None
+        if roll:
+            name = profile.roll_joint
+            if name is None or name in profile.ik_joints:
+                raise ParameterError(
+                    "roll", roll, f"0, because robot.roll_joint={name} is not free"
+                )
+            # The roll joint's column, and how far it turns
+            width = self._all.read(self._ctrl).shape[1]
+            self._roll = torch.zeros(width, dtype=self._ctrl.dtype, device=env.device)
+            self._roll[profile.joints.index(name)] = roll
+            self._limits = robot(env).ctrl_range.unbind(1)
         self._ik = BatchedIk(
-            env.sim.model, env.cfg.robot, env.nworld, env.device, iterations=iterations
+            env.sim.model,
+            profile,
+            env.nworld,
+            env.device,
+            iterations=iterations,
+            approach_gain=upright,
         )
 
     def write_commands(self, action: Tensor) -> None:
         """Write the arm's commands."""
         last = self._all.read(self._ctrl)
-        target = self._ik.forward(last)[0] + self._scale * action.clamp(-1.0, 1.0).float()
+        action = action.clamp(-1.0, 1.0)
+        target = self._ik.forward(last)[0] + self._scale * action[:, :3].float()
+        if self._roll is not None:
+            last = torch.clamp(last + self._roll * action[:, 3:], *self._limits)
         command, _ = self._ik.solve(last, target)
         self._write_bounded(command[:, : self._n_arm].to(self._ctrl.dtype))

@@ -6,7 +6,7 @@ policy that was there before.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mjstack.config.complete import typed
 from mjstack.config.fingerprint import POLICY_FILE, config_content
-from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg
+from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg, TermCfg
 from mjstack.config.session import is_trusted_function
 from mjstack.errors import PolicyError
 from mjstack.files import reading, write_atomic
@@ -37,9 +37,11 @@ class Policy:
         observation: That group's configuration.
         widths: Numbers of each term of the group, in order.
         execute: Control steps between two answers. Of a longer chunk the rest is not used, and the
-            last joint target of a shorter one holds.
+            last action of a shorter one holds.
         hidden: Widths of the network's hidden layers.
         config: The configuration of its training, in JSON's types.
+        action: The action terms of its training, by name; None where its actions are absolute joint
+            targets.
         training: Seed and figures of its training, in JSON's types.
         versions: Packages with which it was trained.
         folder: Where it was loaded from; None for a new one.
@@ -52,13 +54,14 @@ class Policy:
     execute: int
     hidden: list[int]
     config: dict[str, Any]
+    action: dict[str, TermCfg] | None = None
     training: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     folder: Path | None = None
 
     @property
     def joints(self) -> list[str]:
-        """Names of the joints whose absolute targets it gives, in order."""
+        """Names of the joints that it moves, in order."""
         return [*self.config["robot"]["arm_joints"], *self.config["robot"]["gripper_joints"]]
 
     def check_fit(self, cfg: Config) -> None:
@@ -82,6 +85,14 @@ class Policy:
             for one in (self.widths, widths)
         )
         self._compare(trained, here)
+
+    def check_action_width(self, width: int) -> None:
+        """Check how many numbers an action has in the worlds that it is to drive.
+
+        Raises:
+            PolicyError: It has another number.
+        """
+        self._compare({"action.width": self.network.joints}, {"action.width": width})
 
     def _compare(self, trained: Mapping[str, Any], here: Mapping[str, Any]) -> None:
         for key in dict.fromkeys([*trained, *here]):
@@ -134,7 +145,9 @@ def save_policy(folder: Path, policy: Policy) -> None:
         },
         "action": {
             "joints": policy.joints,
-            "kind": "absolute joint targets",
+            "kind": "action terms" if policy.action else "absolute joint targets",
+            "width": policy.network.joints,
+            "terms": {k: asdict(term) for k, term in (policy.action or {}).items()},
             "chunk": policy.network.chunk,
             "execute": policy.execute,
             "step_dt": 1.0 / policy.config["task"]["control_hz"],
@@ -177,7 +190,7 @@ def load_policy(folder: Path) -> Policy:
         policy = Policy(
             network=PolicyNetwork(
                 sum(seen["widths"].values()),
-                len(action["joints"]),
+                action["width"],
                 action["chunk"],
                 facts["network"]["hidden"],
             ),
@@ -185,6 +198,7 @@ def load_policy(folder: Path) -> Policy:
             observation=_read_group(seen, path),
             widths=seen["widths"],
             execute=action["execute"],
+            action=_read_terms("action", action["terms"], TermCfg, path) or None,
             hidden=facts["network"]["hidden"],
             config=facts["config"],
             training=facts["training"],
@@ -212,16 +226,23 @@ def _read_group(seen: Mapping[str, Any], path: Path) -> ObservationGroupCfg:
     """The observation group of a policy's file, its functions trusted."""
     key = f"observation.{seen['group']}"
     group = typed(key, {"noise": seen["noise"]}, ObservationGroupCfg)
-    for name, node in seen["terms"].items():
-        term = typed(f"{key}.terms.{name}", node, ObservationTermCfg)
-        if not is_trusted_function(f"{key}.terms.{name}", term.func, path):
+    group.terms = _read_terms(f"{key}.terms", seen["terms"], ObservationTermCfg, path)
+    return group
+
+
+def _read_terms(key: str, nodes: Mapping[str, Any], kind: type, path: Path) -> dict[str, Any]:
+    """Terms of a policy's file at a dotted key, their functions trusted."""
+    terms = {}
+    for name, node in nodes.items():
+        term = typed(f"{key}.{name}", node, kind)
+        if not is_trusted_function(f"{key}.{name}", term.func, path):
             raise PolicyError(
-                f"{path}: {key}.terms.{name}.func={term.func}: expected a name of mjstack, of a"
+                f"{path}: {key}.{name}.func={term.func}: expected a name of mjstack, of a"
                 " registered package, or beside a folder of the search path",
                 "Add the policy's --config-dir",
             )
-        group.terms[name] = term
-    return group
+        terms[name] = term
+    return terms
 
 
 def write_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:

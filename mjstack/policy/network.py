@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 _CONSTANT = 1e-6  # a column that varies less has no scale
-_FARTHEST = 5.0  # standard deviations: an observation beyond is taken for one there
+FARTHEST = 5.0  # standard deviations: an observation beyond is taken for one there
 
 
 class PolicyNetwork(nn.Module):
@@ -54,7 +54,7 @@ class PolicyNetwork(nn.Module):
     def normalized(self, observation: Tensor) -> Tensor:
         """Answer in normalised joint targets, shape ``(n, chunk, joints)``."""
         scaled = (observation - self.observation_mean) / self.observation_std
-        scaled = scaled.clamp(-_FARTHEST, _FARTHEST)
+        scaled = scaled.clamp(-FARTHEST, FARTHEST)
         return self.layers(scaled).unflatten(1, (self.chunk, self.joints))
 
     def forward(self, observation: Tensor) -> Tensor:

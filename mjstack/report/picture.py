@@ -143,15 +143,20 @@ def save_trajectories(
 
 
 def save_curves(
-    path: Path, at: Sequence[float], lines: Mapping[str, Sequence[float]], title: str, label: str
+    path: Path,
+    at: Sequence[float],
+    lines: Mapping[str, Sequence[float]],
+    title: str,
+    label: str,
+    scale: str = "log",
 ) -> None:
-    """Plot values over a number that counts, on a logarithmic scale, a line for each by its
-    name.
+    """Plot values over a number that counts, on a ``log`` or ``linear`` scale, a line for each by
+    its name.
     """
     with figure(path, title, figsize=(7.5, 4.5)) as (_, axes):
         for name, values in lines.items():
             axes.plot(at, values, ".-", label=name)
-        axes.set(xlabel=label, yscale="log")
+        axes.set(xlabel=label, yscale=scale)
         axes.grid(alpha=0.3, which="both")
         axes.legend(frameon=False)
 

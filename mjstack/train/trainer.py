@@ -20,14 +20,18 @@ class Trained:
     Attributes:
         metrics: Figures, by name with unit.
         notes: Facts in words, by name.
-        curve: Rows of the training curve: values by column. ``batch`` is the abscissa.
+        curve: Rows of the training curve: values by column.
         lines: Columns that are drawn.
+        abscissa: The column over which they are drawn.
+        scale: Of their axis, ``log`` or ``linear``.
     """
 
     metrics: dict[str, float]
     notes: dict[str, str]
     curve: list[dict[str, Any]]
     lines: list[str] = field(default_factory=list)
+    abscissa: str = "batch"
+    scale: str = "log"
 
 
 @dataclass(frozen=True, slots=True)

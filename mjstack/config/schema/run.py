@@ -23,6 +23,10 @@ class TimingCfg:
     """Duration of one physics step."""
     decimation: int = spec(unit="physics steps", ge=1, le=10_000)
     """Physics steps of one control step."""
+    policy_decimation: int = spec(1, unit="control steps", ge=1, le=1000)
+    """Control steps in which an action of a policy is repeated, in training. A driver decides in
+    every control step; a policy that was trained so repeats its answers by itself.
+    """
 
     @property
     def step_dt(self) -> float:
@@ -368,6 +372,86 @@ class CloneJobCfg(TrainJobCfg):
     """Values of the keys that are null above, for ``cuda`` and for ``cpu``."""
 
 
+@dataclass(slots=True)
+class PpoSettings:
+    """What differs between a random network and one that can do something; as the keys of the job
+    of these names.
+    """
+
+    std: list[float] = spec(length=3, gt=0.0)
+    """Standard deviation of the actions: at the start, smallest and largest."""
+    entropy: list[float] = spec(length=2, ge=0.0)
+    """Weight of the entropy at the start, and after ``entropy_iterations``."""
+    desired_kl: float = spec(gt=0.0)
+    """Change of the policy per iteration to which the learning rate adapts."""
+    critic_iterations: int = spec(ge=0)
+    """First iterations, in which only the critic learns."""
+
+
+@dataclass(slots=True)
+class PpoJobCfg(TrainJobCfg):
+    """A policy learns from the task's rewards, by rsl_rl's PPO. What is null is as ``settings`` has
+    it.
+    """
+
+    group: str = spec()
+    """Observation group of the policy."""
+    leave_out: list[str] = spec(factory=list)
+    """Terms of the group that the policy does not see."""
+    add: dict[str, Any] = spec(factory=dict, finite=False)
+    """Terms by name that it sees besides."""
+    observation_noise: bool = spec()
+    """Whether its observations have their noise."""
+    critic: list[str] = spec(factory=list)
+    """Observation groups that the critic sees besides the policy's."""
+    start_from: str | None = spec(None)
+    """Folder of a policy that training starts from, with its observation and its actions; null: a
+    random network.
+    """
+    iterations: int | None = spec(None, ge=1)
+    """Iterations of the training, over all calls; null: as ``minutes`` says."""
+    minutes: float | None = spec(None, unit="min", gt=0.0)
+    """Time of the training, over all calls; null: as ``iterations`` says."""
+    max_minutes: float | None = spec(None, unit="min", gt=0.0)
+    """Time budget of a call; the next one goes on. null: unlimited."""
+    save_every: int = spec(unit="iterations", ge=1)
+    """Iterations between two saved policies."""
+    expert_worlds: int = spec(unit="worlds", ge=1)
+    """reset=expert_states: worlds in which the expert plays at the beginning."""
+    hidden: list[int] = spec(ge=1, le=65536)
+    """Widths of the hidden layers of actor and critic."""
+    horizon: int = spec(unit="decisions", ge=1)
+    """Decisions of every world per iteration."""
+    epochs: int = spec(ge=1)
+    """How often an iteration goes through them."""
+    minibatches: int = spec(ge=1)
+    """Parts into which they are divided."""
+    learning_rate: float = spec(gt=0.0)
+    """At the start."""
+    gamma: float = spec(ge=0.0, le=1.0)
+    """Discount per decision."""
+    gae_lambda: float = spec(ge=0.0, le=1.0)
+    """Of the generalised advantage estimation."""
+    clip: float = spec(gt=0.0)
+    """Largest change of an action's probability that counts."""
+    reward_limit: float = spec(gt=0.0)
+    """Limit of the rewards, over the standard deviation of their discounted sum."""
+    entropy_iterations: int = spec(ge=1)
+    """Iterations over which the weight of the entropy changes."""
+    std: list[float] | None = spec(None, length=3, gt=0.0)
+    """Standard deviation of the actions: at the start, smallest and largest."""
+    entropy: list[float] | None = spec(None, length=2, ge=0.0)
+    """Weight of the entropy at the start, and after ``entropy_iterations``."""
+    desired_kl: float | None = spec(None, gt=0.0)
+    """Change of the policy per iteration to which the learning rate adapts."""
+    critic_iterations: int | None = spec(None, ge=0)
+    """First iterations, in which only the critic learns."""
+    settings: dict[str, PpoSettings] = spec(factory=dict)
+    """Values of the keys that are null above, for ``random`` and for ``start_from``."""
+
+
+# Trainers with keys of their own; the others have those of clone.
+TRAINER_SCHEMAS = {"ppo": PpoJobCfg}
 # Jobs with keys of their own; the others have `JobCfg`.
 JOB_SCHEMAS = {
     "study": StudyJobCfg,

@@ -1,0 +1,96 @@
+"""Worlds that start in the middle of an expert's episode."""
+
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from mjstack.config.fields import Count, Fraction
+from mjstack.errors import ParameterError, first_line
+from mjstack.managers.view import EnvView, offers, random_uniform, rows_of
+
+STATE = ("qpos", "qvel", "act", "ctrl")
+FIELD = "field."  # in front of a model field's name
+EPISODE = "episode"
+
+
+@offers(starts_midway=True)
+class ExpertStates:
+    """Some worlds start in a state of an accepted episode of the expert, in any of its phases; the
+    others as the terms before say.
+
+    The share of such worlds falls from episode to episode of a world. A world, an episode and a
+    state belong together under a seed, and the world gets the masses, friction and gains that it
+    had there. Counters and checks are those of any fresh episode.
+    """
+
+    label = "reset.expert"
+
+    def __init__(
+        self,
+        env: EnvView,
+        *,
+        path: str | None = None,
+        share: Fraction = 0.8,
+        last_share: Fraction = 0.0,
+        episodes: Count = 50,
+    ) -> None:
+        """Read the states.
+
+        Args:
+            env: The environment.
+            path: The file; null: trainer=ppo records one at the beginning.
+            share: Share of the worlds that start so in their first episode.
+            last_share: The share that is left at the end.
+            episodes: Episodes of a world over which the share falls.
+
+        Raises:
+            ParameterError: There is no file, or it has the states of another scene.
+        """
+        if path is None:
+            expected = "a file of states, which job=train trainer=ppo records in its folder"
+            raise ParameterError("path", None, expected)
+        try:
+            tensors = load_file(path)
+            self._source = tensors[EPISODE].to(env.device)
+        except Exception as error:  # it may be anything
+            expected = f"a file of states; it cannot be read ({first_line(error)})"
+            raise ParameterError("path", path, expected, "Record it anew") from error
+        self._count = len(self._source)
+        self._views: list[tuple[Tensor, Tensor]] = []  # of the worlds, and the states
+        for name in STATE:
+            self._add(path, name, getattr(env.sim, name), tensors.get(name))
+        self._fields: list[tuple[Tensor, Tensor]] = []
+        for name, field in env.sim.fields.items():
+            if FIELD + name in tensors:
+                values = tensors[FIELD + name].to(field)
+                self._fields.append((field, values))
+        self._share = share
+        self._fall = share - last_share
+        self._episodes = episodes
+
+    def __call__(self, env: EnvView, mask: Tensor) -> None:
+        """Write the state and the model fields."""
+        at = rows_of(mask)
+        draw = random_uniform(env, self.label, 2, 0.0, 1.0, at=at)
+        over = (env.episode[at].to(draw.dtype) / self._episodes).clamp(0.0, 1.0)
+        chosen = draw[:, 0] < self._share - self._fall * over
+        state = (draw[:, 1] * self._count).long().clamp(max=self._count - 1)
+        episode = self._source.index_select(0, state)
+        for pairs, rows in ((self._views, state), (self._fields, episode)):
+            for view, values in pairs:
+                if isinstance(at, Tensor):
+                    view[at[chosen]] = values[rows[chosen]]
+                    continue
+                into = (mask & chosen).view(-1, *[1] * (view.dim() - 1))
+                torch.where(into, values.index_select(0, rows), view, out=view)
+
+    def _add(self, path: str, name: str, view: Tensor, values: Any) -> None:
+        """Take the states of one view, if they are of its width."""
+        width = view.shape[1]
+        if values is None or values.shape[1] != width:
+            found = 0 if values is None else values.shape[1]
+            expected = f"states of this robot and scene: {width} numbers of {name}, not {found}"
+            raise ParameterError("path", path, expected, "Record them anew")
+        self._views.append((view, values.to(view)))

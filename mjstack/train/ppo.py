@@ -1,0 +1,158 @@
+"""Trainer *ppo*: a policy learns from the task's rewards, by rsl-rl-lib's PPO."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import cast
+
+import torch
+import torch.distributed as dist
+
+from mjstack.config.schema import (
+    Backend,
+    Config,
+    ObservationGroupCfg,
+    PpoJobCfg,
+    TermCfg,
+)
+from mjstack.envs import build_env
+from mjstack.episodes.context import RunContext
+from mjstack.errors import ConfigError, PolicyError, UnknownName
+from mjstack.policy import Policy, load_policy
+from mjstack.policy.checkpoint import read_state
+from mjstack.train.distributed import joined, torchrun_ranks
+from mjstack.train.expert_states import record_states, unrecorded, whole_starts, with_states
+from mjstack.train.ppo_learner import Learner, Plan
+from mjstack.train.trainer import LAST, STATE, Trained, Trainer
+
+_STATES = "expert_states.safetensors"  # in the training's folder
+_TARGETS = "mjstack.mdp.action.JointTargets"
+
+
+def make_plan(cfg: Config) -> Plan:
+    """Find out what is trained.
+
+    Raises:
+        MjstackError: There is no such group or term, or the policy to start from cannot be used.
+    """
+    job = cast(PpoJobCfg, cfg.job)
+    start = None
+    name = job.group
+    if job.start_from is None:
+        seen = _observed_group(cfg)
+    else:
+        start = load_policy(Path(job.start_from))
+        start.check_fit(cfg)
+        name = start.group
+        seen = start.observation
+        cfg = _acting_as(cfg, start)
+    for group in job.critic:
+        if group not in cfg.observation:
+            raise UnknownName("job.critic: observation group", group, cfg.observation)
+    others = {group: cfg.observation[group] for group in job.critic if group != name}
+    own = job.settings["random" if start is None else "start_from"]
+    given = {item.name: getattr(job, item.name) for item in fields(own)}
+    settings = replace(own, **{k: value for k, value in given.items() if value is not None})
+    return Plan(replace(cfg, observation={name: seen, **others}), start, name, settings)
+
+
+def _observed_group(cfg: Config) -> ObservationGroupCfg:
+    """The observation group of a new policy: terms of a configured group, and added ones."""
+    job = cast(PpoJobCfg, cfg.job)
+    if job.group not in cfg.observation:
+        raise UnknownName("job.group: observation group", job.group, cfg.observation)
+    group = cfg.observation[job.group]
+    for name in job.leave_out:
+        if name not in group.terms:
+            raise UnknownName(f"job.leave_out: term of {job.group}", name, group.terms)
+    terms = {k: term for k, term in group.terms.items() if k not in job.leave_out} | job.add
+    return replace(group, noise=job.observation_noise, terms=terms)
+
+
+def _acting_as(cfg: Config, policy: Policy) -> Config:
+    """The configuration with a policy's actions and rate. Of a clone, an action is the part of its
+    answer that it plays.
+    """
+    action = policy.action
+    network = policy.network
+    if action is None:
+        mean, std = (each.double().tolist() for each in (network.action_mean, network.action_std))
+        steps = min(network.chunk, policy.execute)
+        params = {"mean": mean, "std": std, "steps": steps}
+        action = {"targets": TermCfg(func=_TARGETS, params=params)}
+    elif network.chunk > 1:
+        raise PolicyError(
+            f"policy={policy.folder}: answers with {network.chunk} actions at once: expected 1, as"
+            " its actions are no joint targets",
+            "Name another policy",
+        )
+    timing = replace(cfg.timing, policy_decimation=policy.execute)
+    return replace(cfg, action=action, timing=timing)
+
+
+def check_ppo(context: RunContext) -> range:
+    """Check the terms, the policy to start from and the sizes; see `Trainer`."""
+    cfg = context.cfg
+    job = cast(PpoJobCfg, cfg.job)
+    if job.iterations is None and job.minutes is None:
+        raise ConfigError("job.iterations", None, "a number, or a limit in job.minutes")
+    if cfg.nworld * job.horizon < 2 * job.minibatches:
+        expected = f"at most {cfg.nworld * job.horizon // 2}, so that each has two decisions"
+        expected += f" (nworld={cfg.nworld} times job.horizon={job.horizon} are divided)"
+        raise ConfigError("job.minibatches", job.minibatches, expected)
+    plan = make_plan(cfg)
+    reset = whole_starts(cfg.reset) if unrecorded(cfg.reset) else cfg.reset
+    env = build_env(
+        replace(plan.cfg, reset=reset),
+        model=context.model,
+        nworld=1,
+        backend=Backend.native,
+        device="cpu",
+    )
+    try:
+        if plan.start is not None:
+            plan.start.check_widths(env.observation_manager.term_dims[plan.group])
+    finally:
+        env.close()
+    return range(cfg.seed, cfg.seed + torchrun_ranks().size)
+
+
+def train_ppo(context: RunContext, folder: Path) -> Trained:
+    """Let worlds act and learn from it; see `Trainer`."""
+    cfg = context.cfg
+    job = cast(PpoJobCfg, cfg.job)
+    device = torch.device(context.backend[1])
+    with joined(context.backend[1]) as ranks:
+        states = folder / _STATES
+        if unrecorded(cfg.reset):
+            if ranks.writes and not states.exists():
+                record_states(context, job.expert_worlds, states)
+            if ranks.size > 1:
+                dist.barrier()
+        plan = make_plan(with_states(cfg, states))
+        cards = [device] if device.type == "cuda" else []
+        with torch.random.fork_rng(devices=cards):
+            torch.manual_seed(cfg.seed + ranks.rank)
+            learner = Learner(context, plan, folder, ranks)
+            try:
+                if (folder / STATE).exists():
+                    learner.restore(*read_state(folder / STATE))
+                learner.learn()
+            finally:
+                learner.close()
+    last = learner.curve[-1]
+    return Trained(
+        metrics={
+            "iterations": learner.done,
+            "decisions": last["decisions"],
+            "training_s": learner.seconds,
+            "best_training_success": learner.best[0],
+        },
+        notes={"policy": str(folder / LAST), "seeds": str(cfg.seed)},
+        curve=learner.curve,
+        lines=["success", *(["progress"] if "progress" in last else [])],
+        abscissa="iteration",
+        scale="linear",
+    )
+
+
+TRAINER = Trainer(check_ppo, train_ppo)

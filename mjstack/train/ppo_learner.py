@@ -1,0 +1,342 @@
+"""What trainer *ppo* does: rsl-rl-lib's runner on an environment, and a policy of its actor."""
+
+import io
+import math
+import sys
+import time
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from mjstack.config.fingerprint import config_content
+from mjstack.config.schema import Config, PpoJobCfg, PpoSettings
+from mjstack.envs import build_env
+from mjstack.episodes.context import RunContext
+from mjstack.interrupt import check_interrupt
+from mjstack.policy import Policy, PolicyNetwork, save_policy
+from mjstack.policy.checkpoint import write_state
+from mjstack.train.distributed import Ranks
+from mjstack.train.rsl_rl import Log, Network, Runner, ScaledRewards
+from mjstack.train.trainer import BEST, LAST, STATE
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A training as its configuration, and the policy that it starts from, have it.
+
+    Attributes:
+        cfg: The configuration of its environment.
+        start: The policy that it starts from.
+        group: Name of the observation group that the policy sees.
+        settings: What differs between a random network and one that can do something.
+    """
+
+    cfg: Config
+    start: Policy | None
+    group: str
+    settings: PpoSettings
+
+
+class Learner:
+    """PPO on an environment; goes on where an earlier call was stopped.
+
+    Attributes:
+        done: Iterations so far.
+        seconds: Time of them, in all calls [s].
+        best: Largest share of successes of the episodes between two saves, and their return.
+        curve: A row for each time that policies were saved.
+    """
+
+    def __init__(self, context: RunContext, plan: Plan, folder: Path, ranks: Ranks) -> None:
+        """Build the environment and rsl_rl's runner.
+
+        Args:
+            context: The run, for its model, its device and its progress.
+            plan: The training.
+            folder: Where policies and state are.
+            ranks: The processes of the training.
+        """
+        self._context = context
+        self._plan = plan
+        self._job = cast(PpoJobCfg, plan.cfg.job)
+        self._folder = folder
+        self._ranks = ranks
+        backend, device = context.backend
+        env = build_env(
+            replace(plan.cfg, seed=plan.cfg.seed + ranks.rank),
+            model=context.model,
+            backend=backend,
+            device=device,
+        )
+        self._env = ScaledRewards(env, self._job, ranks)
+        with redirect_stdout(io.StringIO()):  # it prints the networks
+            self._runner = Runner(self._env, self._runner_config(), None, device)
+        self._log = Log()
+        self._runner.logger = self._log
+        self._alg = self._runner.alg
+        self._policy = self._make_policy()
+        if plan.start is not None:
+            self._begin_with(plan.start)
+
+        self.done = 0
+        self.seconds = 0.0
+        self.best = (-1.0, -math.inf)
+        self.curve: list[dict[str, Any]] = []
+        self._began = time.perf_counter()  # of this call
+        self._before = 0.0  # seconds of earlier calls
+
+    def close(self) -> None:
+        """Give the worlds back."""
+        self._env.close()
+
+    def learn(self) -> None:
+        """Make the missing iterations, saving policies and state now and then.
+
+        Raises:
+            KeyboardInterrupt: The command was interrupted; the state is saved.
+        """
+        self._began = time.perf_counter()
+        self._before = self.seconds
+        first = True
+        while not self._over():
+            self._iterate(spread=first)
+            first = False
+            self.done += 1
+            self.seconds = self._before + time.perf_counter() - self._began
+            if self.done % self._job.save_every == 0 or self._over():
+                self._save()
+            try:
+                self._show()
+                check_interrupt()
+            except KeyboardInterrupt:
+                self._write_state()
+                raise
+        if not self.curve:
+            self._save()
+
+    def _over(self) -> bool:
+        """Whether a limit is reached, in any process."""
+        job = self._job
+        in_call = self.seconds - self._before
+        over = (
+            self.done >= (job.iterations or math.inf)
+            or self.seconds >= 60.0 * (job.minutes or math.inf)
+            or in_call >= 60.0 * (job.max_minutes or math.inf)
+        )
+        if self._ranks.size == 1:
+            return over
+        flag = torch.tensor([float(over)], device=self._env.device)
+        self._ranks.sum_(flag)
+        return bool(flag > 0.0)
+
+    def _iterate(self, *, spread: bool) -> None:
+        """One iteration; in the first one of a call the ends of the episodes are spread out."""
+        settings = self._plan.settings
+        start, end = settings.entropy
+        share = min(1.0, self.done / self._job.entropy_iterations)
+        self._alg.entropy_coef = start + (end - start) * share
+        self._alg.actor.requires_grad_(self.done >= settings.critic_iterations)
+        with redirect_stdout(io.StringIO()):
+            self._runner.learn(1, init_at_random_ep_len=spread)
+        self._deviation().data.clamp_(*settings.std[1:])
+
+    def _show(self) -> None:
+        job = self._job
+        if job.iterations is not None:
+            self._context.advance("iterations", self.done, job.iterations)
+        else:
+            total = round(60.0 * (job.minutes or 0.0))
+            self._context.advance("seconds of training", min(total, round(self.seconds)), total)
+
+    def _save(self) -> None:
+        """Add a row to the curve, and write policies and state."""
+        row = self._row()
+        self.curve.append(row)
+        if not self._ranks.writes:
+            return
+        self._take_weights()
+        self._policy.training = {"trainer": "ppo", "seed": self._plan.cfg.seed, **row}
+        save_policy(self._folder / LAST, self._policy)
+        reached = (row["success"], row["return"])
+        if self.best[0] < 0.0 or reached > self.best:
+            self.best = reached
+            save_policy(self._folder / BEST, self._policy)
+        self._write_state()
+        self._context.print_line(
+            f"train: iteration {self.done}: success {row['success']:.3f}, return"
+            f" {row['return']:.4g}, {row['decisions_per_s']:,.0f} decisions/s"
+        )
+
+    def _row(self) -> dict[str, Any]:
+        """Figures since the last row. Values of reward terms are means over the episodes' steps."""
+        env = self._env.env
+        found = env.read_statistics()
+        steps = found.get("steps", math.nan)
+        each = self._job.horizon * env.nworld * self._ranks.size
+        earlier = self.curve[-1] if self.curve else {"decisions": 0, "training_s": 0.0}
+        decisions = each * self.done
+        spent = max(1e-9, self.seconds - earlier["training_s"])
+        weights = env.reward_manager.weights.tolist()
+        terms = {
+            name: found.get(f"reward/{name}", math.nan) / (weight * steps) if weight else math.nan
+            for name, weight in zip(env.reward_manager.names, weights, strict=True)
+        }
+        terms.pop("success", None)
+        return {
+            "iteration": self.done,
+            "decisions": decisions,
+            "training_s": self.seconds,
+            "decisions_per_s": (decisions - earlier["decisions"]) / spent,
+            "episodes": found["episodes"],
+            "success": found.get("success", math.nan),
+            "return": found.get("return", math.nan),
+            "steps": steps,
+            **terms,
+            "value_loss": self._log.losses.get("value", math.nan),
+            "std": float(self._deviation().data.mean()),
+            "entropy_weight": self._alg.entropy_coef,
+            "learning_rate": self._alg.learning_rate,
+        }
+
+    # Networks
+
+    def _runner_config(self) -> dict[str, Any]:
+        """Configuration of rsl_rl's runner."""
+        job = self._job
+        plan = self._plan
+        seen = list(plan.cfg.observation)
+        hidden = job.hidden if plan.start is None else plan.start.hidden
+        network = {"class_name": Network, "activation": "elu", "obs_normalization": True}
+        gaussian = {"class_name": "GaussianDistribution", "init_std": plan.settings.std[0]}
+        return {
+            "num_steps_per_env": job.horizon,
+            "save_interval": sys.maxsize,
+            "check_for_nan": False,  # the environment does
+            "obs_groups": {"actor": [plan.group], "critic": seen},
+            "actor": network | {"hidden_dims": hidden, "distribution_cfg": gaussian},
+            "critic": network | {"hidden_dims": job.hidden},
+            "algorithm": {
+                "class_name": "PPO",
+                "num_learning_epochs": job.epochs,
+                "num_mini_batches": job.minibatches,
+                "learning_rate": job.learning_rate,
+                "desired_kl": plan.settings.desired_kl,
+                "gamma": job.gamma,
+                "lam": job.gae_lambda,
+                "clip_param": job.clip,
+                "use_clipped_value_loss": False,
+            },
+        }
+
+    def _make_policy(self) -> Policy:
+        """The policy that is saved, its weights still to come."""
+        plan = self._plan
+        env = self._env.env
+        start = plan.start
+        targets = start is not None and start.action is None  # a clone's
+        chunk = plan.cfg.action["targets"].params["steps"] if targets else 1
+        hidden = self._job.hidden if start is None else start.hidden
+        widths = env.observation_manager.term_dims[plan.group]
+        width = self._env.num_actions // chunk
+        network = PolicyNetwork(sum(widths.values()), width, chunk, hidden)
+        if targets:
+            given = cast(Policy, start).network
+            network.set_scale("action", given.action_mean, given.action_std)
+        return Policy(
+            network=network,
+            group=plan.group,
+            observation=plan.cfg.observation[plan.group],
+            widths=widths,
+            execute=plan.cfg.timing.policy_decimation,
+            hidden=list(hidden),
+            config=config_content(plan.cfg),
+            action=None if targets else plan.cfg.action,
+        )
+
+    def _begin_with(self, start: Policy) -> None:
+        """Give the actor a policy's weights and the scale of its observation, which stays."""
+        actor = self._alg.actor
+        with torch.no_grad():
+            given = list(start.network.layers.parameters())
+            for own, theirs in zip(actor.mlp.parameters(), given, strict=True):
+                own.copy_(theirs[: len(own)])  # of the answer, the part that is played
+            scale = actor.obs_normalizer
+            scale._mean.copy_(start.network.observation_mean)
+            scale._std.copy_(start.network.observation_std - scale.eps)
+        scale.until = 0
+
+    def _take_weights(self) -> None:
+        """Copy the actor's weights and the scale of its observation into the policy."""
+        actor = self._alg.actor
+        network = self._policy.network
+        with torch.no_grad():
+            own = network.layers.parameters()
+            for mine, theirs in zip(own, actor.mlp.parameters(), strict=True):
+                mine.copy_(theirs)
+            scale = actor.obs_normalizer
+            network.set_scale("observation", scale.mean.cpu(), scale.std.cpu() + scale.eps)
+
+    def _deviation(self) -> Tensor:
+        """Standard deviation of each number of an action."""
+        return self._alg.actor.distribution.std_param
+
+    # State
+
+    def _parameters(self) -> dict[str, Tensor]:
+        """Everything that training changes but the worlds, by name."""
+        alg = self._alg
+        state = {"random": torch.get_rng_state(), "episode": self._env.env.episode}
+        if self._env.device.type == "cuda":
+            state["random_cuda"] = torch.cuda.get_rng_state(self._env.device)
+        state["rewards"] = self._env.sums
+        for name, network in (("actor", alg.actor), ("critic", alg.critic)):
+            state |= {f"{name}.{k}": v for k, v in network.state_dict().items()}
+        for number, values in alg.optimizer.state_dict()["state"].items():
+            state |= {f"optimizer.{number}.{k}": v for k, v in values.items()}
+        return state
+
+    def _write_state(self) -> None:
+        if not self._ranks.writes:
+            return
+        facts = {
+            "done": self.done,
+            "seconds": self.seconds,
+            "best": self.best,
+            "curve": self.curve,
+            "learning_rate": self._alg.learning_rate,
+        }
+        write_state(self._folder / STATE, self._parameters(), facts)
+
+    def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
+        """Go on from the state and facts of an earlier call. Worlds begin their next episodes."""
+        alg = self._alg
+        parts: dict[str, dict[str, Tensor]] = {}
+        for key, value in state.items():
+            kind, _, rest = key.partition(".")
+            parts.setdefault(kind, {})[rest] = value
+        for name, network in (("actor", alg.actor), ("critic", alg.critic)):
+            network.load_state_dict(parts[name])
+        moments: dict[int, dict[str, Tensor]] = {}
+        for key, value in parts.get("optimizer", {}).items():
+            number, _, name = key.partition(".")
+            moments.setdefault(int(number), {})[name] = value
+        alg.optimizer.load_state_dict(alg.optimizer.state_dict() | {"state": moments})
+        alg.learning_rate = facts["learning_rate"]
+        for group in alg.optimizer.param_groups:
+            group["lr"] = alg.learning_rate
+        self._env.sums.copy_(state["rewards"])
+        if self._ranks.writes:  # the others have their own
+            torch.set_rng_state(state["random"])
+            if "random_cuda" in state and self._env.device.type == "cuda":
+                torch.cuda.set_rng_state(state["random_cuda"], self._env.device)
+        self._env.env.episode.copy_(state["episode"])
+        self._env.env.reset()
+        self.done = facts["done"]
+        self.seconds = facts["seconds"]
+        self.best = (facts["best"][0], facts["best"][1])
+        self.curve = facts["curve"]
+        self._context.print_line(f"train: goes on after iteration {self.done}")

@@ -1,0 +1,146 @@
+"""A policy below the control rate: in training an environment holds its actions, and when it drives
+worlds it repeats them. Both do the same.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from environments import actions, configure, on_new_sim, on_shared_sim, state_of
+from policies import make_policy
+
+from mjstack.config.schema import Config
+from mjstack.drivers.closed_loop import make_expert
+from mjstack.drivers.policy import PolicyDriver
+from mjstack.envs import driven_config
+from mjstack.errors import ArgumentError, MjstackError
+
+HELD = 5
+REACH = ("task=reach", "~observation.policy.terms.last_action")
+
+
+def held(*overrides: str, steps: int = HELD) -> Config:
+    return configure(*REACH, f"timing.policy_decimation={steps}", *overrides)
+
+
+def test_a_held_action_is_that_action_again_and_again() -> None:
+    """Bit for bit, the observation's history included; rewards are summed."""
+    env = on_new_sim("native", 3, held())
+    single = on_new_sim("native", 3, held(steps=1))
+    env.reset(seed=1)
+    single.reset(seed=1)
+    for move in actions(env, 4):
+        obs, reward, *ends, _ = env.step(move)
+        rewards = []
+        for _ in range(HELD):
+            wanted, one, *_ = single.step(move)
+            rewards.append(one)
+        assert all(torch.equal(obs[name], wanted[name]) for name in obs)
+        torch.testing.assert_close(reward, torch.stack(rewards).sum(0))
+        assert not torch.stack(ends).any()
+    assert torch.equal(env.reward_manager.episode_sums, single.reward_manager.episode_sums)
+    theirs = state_of(single)
+    for name, value in state_of(env).items():
+        if name != "previous_action":
+            assert torch.equal(value, theirs[name]), name
+
+
+@pytest.mark.parametrize(
+    ("ends", "last", "success"),
+    [
+        (["task.episode_steps=7"], 7, 0.0),
+        (["task.success.params.distance=10.0", "task.success.params.steps=3"], 3, 1.0),
+    ],
+    ids=["time out", "success"],
+)
+def test_an_episode_ends_within_a_decision(ends: list[str], last: int, success: float) -> None:
+    """It counts up to the control step in which it ended, and the next one begins with the next
+    decision.
+    """
+    forever = ["~termination.time_out", "~termination.success"]
+    env = on_new_sim("native", 2, held(*ends))
+    single = on_new_sim("native", 2, held(*ends, *forever, steps=1))
+    env.reset(seed=4)
+    single.reset(seed=4)
+    moves = actions(env, 2)
+    rewards = []
+    for step in range(last):
+        rewards.append(single.step(moves[step // HELD])[1])
+    decisions = -(-last // HELD)
+    for number in range(decisions):
+        _, reward, terminated, truncated, extras = env.step(moves[number])
+        over = number == decisions - 1
+        assert terminated.tolist() == [over and success > 0.0] * 2
+        assert truncated.tolist() == [over and success == 0.0] * 2
+        wanted = torch.stack(rewards[HELD * number : HELD * (number + 1)]).sum(0)
+        torch.testing.assert_close(reward, wanted)
+    assert extras["success"].tolist() == [success > 0.0] * 2
+    found = env.read_statistics()
+    assert (found["episodes"], found["steps"], found["success"]) == (2.0, last, success)
+    assert found["return"] == pytest.approx(float(torch.stack(rewards).sum(0).mean()), rel=1e-5)
+    single.reset()
+    assert env.episode_step.tolist() == [0, 0]
+    assert torch.equal(env.sim.qpos, single.sim.qpos)
+
+
+@pytest.mark.parametrize("action", ["joint_delta", "ee_upright"])
+def test_a_policy_drives_as_it_was_trained(action: str) -> None:
+    """With its own action terms, observed last action and rate: the same joint targets and states
+    as in the environment of its training. A driver's joint targets are float32.
+    """
+    cfg = configure("task=reach", f"action={action}", f"timing.policy_decimation={HELD}")
+    policy = make_policy(cfg, chunk=1, execute=HELD)
+    trained = on_new_sim("native", 3, cfg)
+    obs, _ = trained.reset(seed=2)
+    driven = on_new_sim("native", 3, driven_config(cfg))
+    driven.reset(seed=2)
+    driver = PolicyDriver(driven, policy)
+    network = policy.network.double()
+    for _ in range(4):
+        answer = network(obs["policy"].double())[:, 0]
+        answer = (torch.round(answer * 2.0**20) / 2.0**20).float()
+        for _ in range(HELD):
+            driven.action_manager.process(driver.command())
+            driven.advance()
+        obs, *_ = trained.step(answer)
+        torch.testing.assert_close(trained.sim.ctrl, driven.sim.ctrl, rtol=0.0, atol=1e-6)
+        torch.testing.assert_close(trained.sim.qpos, driven.sim.qpos, rtol=0.0, atol=1e-6)
+    assert (trained.sim.ctrl - trained.sim.ctrl[:1]).abs().max() > 1e-4  # worlds differ
+
+
+def test_drivers_decide_in_every_control_step() -> None:
+    env = on_shared_sim("native", 2, held("action=joint_absolute"))
+    env.reset(seed=0)
+    with pytest.raises(ArgumentError, match="actions for 5 control steps, expected one for each"):
+        make_expert(env)
+
+
+def test_the_upright_gripper_rolls_and_points_down() -> None:
+    """The grasp point goes where it is sent, and the roll joint turns by itself."""
+    env = on_shared_sim("native", 2, configure("action=ee_upright", "reset=randomized"))
+    env.reset(seed=0)
+    term = env.action_manager.terms["arm"]
+    assert env.action_manager.action_dim == 5
+    column = env.cfg.robot.joints.index("wrist_roll")
+    before = env.sim.ctrl.clone()
+    point, _, tilt = (each.clone() for each in term._ik.forward(before))
+    action = torch.tensor([[0.0, 0.0, 1.0, 1.0, 1.0], [0.5, 0.5, 1.0, -1.0, 1.0]])
+    for _ in range(10):
+        env.step(action)
+    turned = (env.sim.ctrl - before)[:, column]
+    torch.testing.assert_close(turned, torch.tensor([0.3, -0.3]).double(), rtol=0.0, atol=1e-5)
+    after, _, upright = term._ik.forward(env.sim.ctrl)
+    moved = torch.tensor([[0.0, 0.0, 0.05], [0.025, 0.025, 0.05]])
+    torch.testing.assert_close(after - point, moved, rtol=0.0, atol=3e-3)
+    assert (upright[:, 2] <= tilt[:, 2] + 1e-3).all()
+    assert (upright[:, 2] < -0.9).all()
+
+
+def test_a_roll_needs_a_free_joint() -> None:
+    says = r"roll=0\.03: expected 0, because robot\.roll_joint=None is not free"
+    with pytest.raises(MjstackError, match=says):
+        on_shared_sim(
+            "native",
+            1,
+            configure("action=ee_upright", "robot.roll_joint=null", "controller.yaw_alignment=0"),
+        )
