@@ -63,6 +63,7 @@ PATHS: dict[str, list[str] | None] = {
         "JointPosition.write_commands",
         "Gripper.write_commands",
         "EndEffectorDelta.write_commands",
+        "JointTargets.write_commands",
         "_Commands._write_bounded",
     ],
     "mdp/reset.py": [
@@ -81,6 +82,9 @@ PATHS: dict[str, list[str] | None] = {
         *(f"_Elements.{n}" for n in ("read", "write", "scale")),
     ],
     "mdp/starts/starts_file.py": ["FromStartsFile.__call__"],
+    "mdp/starts/expert_states.py": ["ExpertStates.__call__"],
+    "train/expert_states.py": ["StateRecorder.update"],
+    "adapters/rsl_rl_runner.py": ["ScaledRewards.step"],
     "mdp/starts/placement.py": ["Placement.choose"],
     "tasks/check.py": ["EpisodeCheck.update"],
     "tasks/view.py": [
@@ -143,7 +147,7 @@ PATHS: dict[str, list[str] | None] = {
         ),
         "_put",
     ],
-    "drivers/policy.py": ["PolicyDriver.command", "PolicyDriver._ask"],
+    "drivers/policy.py": [f"PolicyDriver.{n}" for n in ("command", "_apply", "_ask")],
     "policy/network.py": ["PolicyNetwork.normalized", "PolicyNetwork.forward"],
     "drivers/tilt.py": ["CarryTilt.desired_approach"],
     "episodes/failures.py": ["FailureMonitor.update", "_of"],

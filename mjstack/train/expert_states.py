@@ -13,8 +13,8 @@ from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import Observer, play_episode
 from mjstack.errors import MjstackError
+from mjstack.files import write_npz
 from mjstack.mdp.starts.expert_states import EPISODE, FIELD, STATE
-from mjstack.policy.checkpoint import write_state
 
 _EVERY = 5  # control steps between two states
 
@@ -98,4 +98,4 @@ def record_states(context: RunContext, worlds: int, path: Path) -> None:
         steps = len(tensors["qpos"]) // len(good)
         tensors[EPISODE] = torch.arange(len(good), device=sim.device).repeat(steps)
         tensors |= {FIELD + name: field[good] for name, field in sim.fields.items()}
-        write_state(path, tensors, {"episodes": len(good), "seed": cfg.seed})
+        write_npz(path, {name: values.cpu().numpy() for name, values in tensors.items()})

@@ -24,7 +24,7 @@ from mjstack.train.expert_states import record_states, unrecorded, whole_starts,
 from mjstack.train.ppo_learner import Learner, Plan
 from mjstack.train.trainer import LAST, STATE, Trained, Trainer
 
-_STATES = "expert_states.safetensors"  # in the training's folder
+_STATES = "expert_states.npz"  # in the training's folder
 _TARGETS = "mjstack.mdp.action.JointTargets"
 
 

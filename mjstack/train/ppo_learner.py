@@ -12,6 +12,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from mjstack.adapters.rsl_rl_runner import Log, Network, Runner, ScaledRewards
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import Config, PpoJobCfg, PpoSettings
 from mjstack.envs import build_env
@@ -20,7 +21,6 @@ from mjstack.interrupt import check_interrupt
 from mjstack.policy import Policy, PolicyNetwork, save_policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.train.distributed import Ranks
-from mjstack.train.rsl_rl import Log, Network, Runner, ScaledRewards
 from mjstack.train.trainer import BEST, LAST, STATE
 
 

@@ -2,8 +2,8 @@
 
 from typing import Any
 
+import numpy as np
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
 from mjstack.config.fields import Count, Fraction
@@ -52,7 +52,8 @@ class ExpertStates:
             expected = "a file of states, which job=train trainer=ppo records in its folder"
             raise ParameterError("path", None, expected)
         try:
-            tensors = load_file(path)
+            with np.load(path, allow_pickle=False) as file:
+                tensors = {name: torch.from_numpy(file[name]) for name in file.files}
             self._source = tensors[EPISODE].to(env.device)
         except Exception as error:  # it may be anything
             expected = f"a file of states; it cannot be read ({first_line(error)})"

@@ -1,4 +1,4 @@
-"""Parts of rsl_rl as trainer *ppo* uses them."""
+"""Parts of rsl_rl's runner as trainer *ppo* uses them."""
 
 import sys
 from typing import Any

@@ -1,0 +1,286 @@
+"""trainer=ppo: small trainings on native MuJoCo, how they go on, what they start from; worlds that
+start in an expert's states.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from environments import at_double_speed, configure, mask_of, on_new_sim
+from policies import make_policy, write_policy
+
+import mjstack.interrupt as interrupt
+from mjstack.adapters.rsl_rl_runner import Runner
+from mjstack.cli import run
+from mjstack.envs import Env
+from mjstack.errors import MjstackError
+from mjstack.interrupt import handle_interrupts
+from mjstack.policy import load_policy
+
+TINY = (
+    "job=train",
+    "trainer=ppo",
+    "sim=native",
+    "nworld=4",
+    "job.iterations=4",
+    "job.save_every=2",
+    "job.hidden=[16]",
+    "job.horizon=4",
+    "job.epochs=2",
+    "job.minibatches=2",
+    "gate.success.rate=0.0",
+)
+REACH = (*TINY, "task=reach", "termination.time_out.params.steps=30")
+
+
+def report(folder: Path) -> dict:
+    gates = json.loads((folder / "report.json").read_text())["gates"]
+    return {gate["name"]: gate for gate in gates}
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    return load_policy(folder).network.state_dict()
+
+
+def same(a: Path, b: Path) -> bool:
+    first = weights(a)
+    return all(torch.equal(value, first[name]) for name, value in weights(b).items())
+
+
+def test_a_training_leaves_policies_a_curve_and_a_judgement(tmp_path: Path) -> None:
+    out = tmp_path / "training"
+    assert run([*REACH, f"job.folder={out}"]) == 0
+    gates = report(out)
+    assert gates["train"]["metrics"]["iterations"] == 4
+    assert gates["success"]["metrics"]["episodes"] == 4
+    rows = np.genfromtxt(out / "train.csv", delimiter=",", names=True)
+    assert rows["iteration"].tolist() == [2.0, 4.0]
+    assert rows["decisions"].tolist() == [32.0, 64.0]
+    assert np.isfinite(rows["return_"]).all()  # ends are spread out, so that some end early
+    assert ((rows["success"] >= 0.0) & (rows["success"] <= 1.0)).all()
+    assert (rows["reach"] > 0.0).all()
+    for name in ("train.png", "train.md", "best/policy.json", "last/policy.json"):
+        assert (out / name).stat().st_size > 0, name
+
+    policy = load_policy(out / "last")
+    assert policy.training["iteration"] == 4
+    assert policy.action == configure("task=reach").action
+    assert (policy.network.chunk, policy.execute) == (1, 5)
+    assert policy.widths["headings"] == 4
+    drive = ["controller=policy", f"policy={out}/last", "gates=[batch]", "sim=native", "nworld=2"]
+    status = run(
+        ["task=reach", *drive, "gate.batch.failed_worlds=2", f"hydra.run.dir={tmp_path / 'gates'}"]
+    )
+    assert status == 0
+
+
+@pytest.mark.full
+def test_a_training_goes_on_after_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights, optimizer, random numbers and figures are those of the interrupted one, so two
+    resumed trainings are the same. Worlds begin new episodes, because the state of the physics is
+    not saved: a training that was never interrupted is another one.
+    """
+    out = tmp_path / "out"
+    learn = Runner.learn
+    calls = []
+
+    def stop(self: Runner, *args: int, **options: bool) -> None:
+        learn(self, *args, **options)
+        calls.append(self)
+        if len(calls) == 3:
+            monkeypatch.setattr(interrupt, "_asked", True)
+
+    monkeypatch.setattr(Runner, "learn", stop)
+    with handle_interrupts():
+        assert run([*REACH, f"job.folder={out}"]) == 130
+    monkeypatch.undo()
+    assert len(calls) == 3
+    again = tmp_path / "again"
+    shutil.copytree(out, again)
+    for folder in (out, again):
+        assert run([*REACH, f"job.folder={folder}"]) == 0
+        rows = np.genfromtxt(folder / "train.csv", delimiter=",", names=True)
+        assert rows["iteration"].tolist() == [2.0, 4.0]
+    assert same(out / "last", again / "last")
+
+    # A larger limit goes on with it; one that is reached trains no more
+    assert run([*REACH, f"job.folder={out}", "job.iterations=6"]) == 0
+    assert load_policy(out / "last").training["iteration"] == 6
+    assert not same(out / "last", again / "last")
+    assert run([*REACH, f"job.folder={again}", "job.minutes=0.0001"]) == 0
+    assert load_policy(again / "last").training["iteration"] == 4
+
+
+@pytest.mark.full
+def test_a_clone_is_tuned(tmp_path: Path) -> None:
+    """While only the critic learns, the policy answers as the clone; then it changes."""
+    cfg = configure("task=reach", "~observation.policy.terms.last_action")
+    start = write_policy(tmp_path / "clone", cfg, chunk=6, execute=4)
+    tuned = [*REACH, f"job.start_from={start}"]
+    given = load_policy(start)
+    seen = torch.randn(7, sum(given.widths.values()))
+    for held, equal in ((4, True), (1, False)):
+        out = tmp_path / str(held)
+        assert run([*tuned, f"job.critic_iterations={held}", f"job.folder={out}"]) == 0
+        policy = load_policy(out / "last")
+        assert policy.action is None
+        assert (policy.network.chunk, policy.execute, policy.hidden) == (4, 4, [16, 16])
+        off = (policy.network(seen) - given.network(seen)[:, :4]).abs().max()
+        assert bool(off < 1e-6) == equal
+        assert off < 0.1
+
+
+def states_file(path: Path, env: Env, count: int = 3) -> Path:
+    """States of the environment's worlds after some steps, each from another episode."""
+    env.reset(seed=5)
+    for _ in range(20):
+        env.step(torch.ones((env.nworld, env.action_manager.action_dim)))
+    arrays = {
+        name: getattr(env.sim, name)[:count].numpy() for name in ("qpos", "qvel", "act", "ctrl")
+    }
+    arrays["episode"] = np.arange(count)
+    arrays |= {f"field.{name}": field[:count].numpy() for name, field in env.sim.fields.items()}
+    np.savez(path, **arrays)
+    return path
+
+
+def test_worlds_start_in_an_experts_states(tmp_path: Path) -> None:
+    """By seed, world and episode, a falling share of them, with fresh counters; the others as they
+    would without.
+    """
+    whole = on_new_sim("native", 6, configure("reset=randomized"))
+    path = states_file(tmp_path / "states.npz", whole)
+    bank = np.load(path)
+    params = [f"reset.expert.params.{name}" for name in ("path", "share", "last_share", "episodes")]
+    values = (path, 0.7, 0.2, 2)
+    keys = [f"{key}={value}" for key, value in zip(params, values, strict=True)]
+    envs = [on_new_sim("native", n, configure("reset=expert_states", *keys)) for n in (6, 4)]
+    whole.reset(seed=9)
+    for env in envs:
+        env.reset(seed=9)
+    shares = []
+    for _ in range(4):
+        starts = envs[0].sim.qpos.numpy()
+        assert np.array_equal(starts[:4], envs[1].sim.qpos.numpy())
+        midway = np.zeros(6, dtype=bool)
+        for world, start in enumerate(starts):
+            found = np.flatnonzero((bank["qpos"] == start).all(1))
+            midway[world] = len(found)
+            others = whole if not len(found) else None
+            for name, field in envs[0].sim.fields.items():
+                wanted = (
+                    others.sim.fields[name][world] if others else bank[f"field.{name}"][found[0]]
+                )
+                assert np.array_equal(field[world].numpy(), np.asarray(wanted)), name
+            if others:
+                assert np.array_equal(start, whole.sim.qpos[world].numpy())
+            else:
+                assert np.array_equal(envs[0].sim.qvel[world].numpy(), bank["qvel"][found[0]])
+                assert np.array_equal(envs[0].sim.ctrl[world].numpy(), bank["ctrl"][found[0]])
+        shares.append(midway.mean())
+        assert not envs[0].episode_step.any()
+        for env in (whole, *envs):
+            env.reset()
+    assert 0.0 < shares[0] < 1.0
+    assert len({tuple(row) for row in envs[0].sim.qpos.tolist()}) > 1
+
+    # A masked reset starts its worlds alone
+    before = envs[0].sim.qpos.clone()
+    envs[0].reset(mask=mask_of(envs[0], 1, 4))
+    moved = (envs[0].sim.qpos != before).any(1)
+    assert moved.tolist() == [False, True, False, False, True, False]
+
+
+@pytest.mark.full
+def test_the_expert_plays_at_the_beginning(tmp_path: Path) -> None:
+    """Its states are kept for later calls, and the policy is judged from whole starts."""
+    out = tmp_path / "training"
+    command = [*TINY, *at_double_speed(), "reset=expert_states", "job.expert_worlds=2"]
+    assert run([*command, "job.iterations=2", f"job.folder={out}"]) == 0
+    bank = np.load(out / "expert_states.npz")
+    height = bank["qpos"][:, 8]  # of red
+    assert len(bank["qpos"]) == len(bank["episode"]) == len(set(bank["episode"])) * 60
+    assert height.max() > height.min() + 0.04
+    written = (out / "expert_states.npz").stat().st_mtime_ns
+    assert run([*command, f"job.folder={out}"]) == 0
+    assert (out / "expert_states.npz").stat().st_mtime_ns == written
+    assert report(out)["success"]["metrics"]["episodes"] == 4
+    assert "cubes" in report(out)["success"]["notes"]["starts"]
+    assert "expert" not in report(out)["success"]["notes"]["starts"]
+
+
+BAD = [
+    (["job.iterations=null"], "job.iterations=null: expected a number, or a limit in job.minutes"),
+    (["job.minibatches=64"], "job.minibatches=64: expected at most 8"),
+    (["job.critic=[nope]"], "job.critic: observation group 'nope' does not exist"),
+    (["job.leave_out=[nope]"], "term of policy 'nope' does not exist"),
+    (["job.start_from=/nowhere"], "policy=/nowhere: has no policy.json"),
+    (["job.start_from={rebot}"], "was trained with robot.name=rebot, and here it is so101"),
+    (["job.batch_size=3"], "'job.batch_size' does not exist"),
+    (["reset=expert_states", "reset.expert.params.path=/nowhere"], "a file of states; it cannot"),
+    (["reset=expert_states", "reset.expert.params.share=2"], "reset.expert.params.share=2"),
+    (["job.settings.random.std=[1,2]"], "job.settings.random.std"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
+def test_bad_input_is_one_line(
+    overrides: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    if "{rebot}" in overrides[0]:
+        other = write_policy(tmp_path / "other", configure("task=reach", robot="rebot"))
+        overrides = [f"job.start_from={other}"]
+    assert run([*REACH, *overrides, f"job.folder={out}"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert says in error
+    assert not out.exists()
+
+
+def test_states_need_a_file_outside_of_a_training() -> None:
+    with pytest.raises(
+        MjstackError, match=r"path=null: expected a file of states, which job=train"
+    ):
+        on_new_sim("native", 1, configure("reset=expert_states"))
+
+
+def test_a_missing_extra_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in list(sys.modules):
+        if name.startswith(("rsl_rl", "mjstack.train.ppo", "mjstack.adapters.rsl_rl")):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "rsl_rl", None)
+    assert run([*REACH, f"job.folder={tmp_path / 'out'}"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "pip install 'mjstack[train]'" in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_clones_answer_has_its_actions() -> None:
+    """One action of the environment has the targets of a whole decision."""
+    policy = make_policy(configure("~observation.policy.terms.last_action"), chunk=3, execute=5)
+    params = {
+        "mean": policy.network.action_mean.tolist(),
+        "std": policy.network.action_std.tolist(),
+        "steps": 3,
+    }
+    cfg = configure("timing.policy_decimation=5", "~observation.policy.terms.last_action")
+    cfg.action = {
+        "targets": type(cfg.action["arm"])(func="mjstack.mdp.action.JointTargets", params=params)
+    }
+    env = on_new_sim("native", 2, cfg)
+    obs, _ = env.reset(seed=0)
+    answer = policy.network(obs["policy"])
+    action = policy.network.normalized(obs["policy"]).flatten(1)
+    assert env.action_manager.action_dim == 18
+    env.step(action)
+    torch.testing.assert_close(env.sim.ctrl.float(), answer[:, 2], rtol=0.0, atol=1e-6)
