@@ -30,7 +30,7 @@ def _words(text: str) -> list[str]:
 
 
 QUICK = ["nworld=2", "sim=native", "gates=[baseline]"]
-JOBS = _words("gates collect replay scaling study reachability train")
+JOBS = _words("gates collect export replay scaling study reachability train")
 CHOSEN = [*_words("task=stack task=box task=reach"), *(f"job={job}" for job in JOBS)]
 GROUPS = _words("""
 robot model scene timing solver batch sim action observation reset termination reward

@@ -277,8 +277,8 @@ BAD = [
     (["gate=batch"], "gates=[...]"),
     (
         ["job=study_schema"],
-        "Did you mean 'study'? Available: collect, gates, reachability, replay, scaling, study,"
-        " train.",
+        "Did you mean 'study'? Available: collect, export, gates, play, reachability, replay,"
+        " scaling, study, train.",
     ),
     (["nworld=2.5"], "nworld"),
     (["sim.nworlds=3"], "nworld'?"),

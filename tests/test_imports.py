@@ -48,6 +48,7 @@ HOMES = {
     "tensordict": ("adapters/",),
     "pyarrow": ("datasets/",),
     "safetensors": ("policy/",),
+    "onnx": ("policy/onnx.py",),
     "rich": ("jobs/", "cli.py", "bench/", "report/table.py", "managers/term.py"),
 }
 

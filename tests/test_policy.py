@@ -5,7 +5,11 @@ line, and every gate takes a policy.
 from __future__ import annotations
 
 import json
+import math
+import os
+import shutil
 from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +18,13 @@ import torch
 from compositions import load_config
 from environments import configure, on_new_sim, one_second_episode
 from policies import make_policy, write_policy
+from safetensors.torch import load, save
 
 from mjstack.cli import run
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env, driven_config
 from mjstack.episodes.rollout import CommandRecorder, rollout
-from mjstack.errors import MjstackError
+from mjstack.errors import MjstackError, PolicyError
 from mjstack.jobs.gates import check_machine
 from mjstack.policy import load_policy, save_policy
 
@@ -76,8 +81,9 @@ def test_a_second_policy_replaces_the_first_at_once(
             real(path, content)
 
         monkeypatch.setattr(module, "write_atomic", full)
-        with pytest.raises(OSError, match="No space"):
+        with pytest.raises(MjstackError, match=r"cannot be written \(No space left on device\)"):
             save_policy(tmp_path, make_policy(configure(), seed=2))
+        assert len(list(tmp_path.iterdir())) == 2
         kept = load_policy(tmp_path).network.state_dict()
         assert all(torch.equal(kept[k], v) for k, v in first.network.state_dict().items())
     monkeypatch.setattr(module, "write_atomic", real)
@@ -267,6 +273,98 @@ def test_a_damaged_policy_is_refused(folder: Path, case: str) -> None:
     assert_refused([], folder, says)
 
 
+def put_weights(content: bytes | Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    """Other weights, with a policy.json that names them."""
+
+    def apply(folder: Path) -> None:
+        path = weights(folder)
+        other = content(path.read_bytes()) if callable(content) else content
+        digest = sha256(other).hexdigest()
+        path.unlink()
+        (folder / f"weights-{digest[:12]}.safetensors").write_bytes(other)
+        edit(lambda d: put(d, "weights_sha256", value=digest))(folder)
+
+    return apply
+
+
+def change_tensors(change: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Path], None]:
+    return put_weights(lambda b: save({k: change(v) for k, v in load(b).items()}))
+
+
+def lead_out(name: str) -> Callable[[Path], None]:
+    """Move a file of the folder beside it, and leave a link."""
+
+    def apply(folder: Path) -> None:
+        (path,) = folder.glob(name)
+        outside = folder.parent / path.name
+        path.rename(outside)
+        path.symlink_to(outside)
+
+    return apply
+
+
+def sparse(folder: Path) -> None:
+    """A terabyte of weights that takes no room."""
+    os.truncate(weights(folder), 2**40)
+
+
+HUGE = [1_000_000] * 8
+STRANGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "a list": (lambda f: (f / "policy.json").write_text("[]"), "cannot be read (TypeError"),
+    "deep": (lambda f: (f / "policy.json").write_text("[" * 100_000), "(RecursionError"),
+    "bytes": (lambda f: (f / "policy.json").write_bytes(b"\xff\x00" * 99), "(JSONDecodeError"),
+    "large": (lambda f: os.truncate(f / "policy.json", 2**40), "more than 16777216"),
+    "text": (edit(lambda d: put(d, "action", "chunk", value="6")), "action.chunk is '6', not a"),
+    "a fraction": (edit(lambda d: put(d, "action", "execute", value=4.0)), "execute is 4.0, not"),
+    "NaN": (edit(lambda d: put(d, "action", "chunk", value=math.nan)), "action.chunk is nan, not"),
+    "negative": (edit(lambda d: put(d, "network", "hidden", value=[-16])), "hidden is -16, not a"),
+    "many digits": (edit(lambda d: put(d, "action", "execute", value=10**30)), "not a whole"),
+    "huge": (edit(lambda d: put(d, "network", "hidden", value=HUGE)), "cannot be read (Runtime"),
+    "many layers": (edit(lambda d: put(d, "network", "hidden", value=[1] * 9999)), "9999 layers"),
+    "a width": (
+        edit(lambda d: put(d, "observation", "widths", "joint_pos", value=True)),
+        "joint_pos is True, not a whole number",
+    ),
+    "other terms": (
+        edit(lambda d: put(d, "observation", "widths", value={"x": 24})),
+        "observation, action and config do not fit together",
+    ),
+    "other joints": (
+        edit(lambda d: put(d, "action", "joints", value=["a"] * 6)),
+        "observation, action and config do not fit together",
+    ),
+    "no group": (edit(lambda d: d["observation"].pop("group")), "cannot be read (KeyError: 'group"),
+    "a path": (edit(lambda d: put(d, "weights_sha256", value="/../x")), "is no SHA-256"),
+    "no header": (put_weights(b""), "safetensors: cannot be read (SafetensorError"),
+    "long header": (put_weights(b"\xff" * 7 + b"\x7f{}"), "cannot be read (SafetensorError"),
+    "cut": (put_weights(lambda b: b[:-4]), "cannot be read (SafetensorError"),
+    "doubles": (change_tensors(torch.Tensor.double), "than finite ones in float32"),
+    "not finite": (change_tensors(lambda v: v / 0.0), "than finite ones in float32"),
+    "other shapes": (change_tensors(lambda v: v[..., :1].clone()), "cannot be read (RuntimeError"),
+    "sparse": (sparse, "has 1099511627776 bytes, more than"),
+    "link": (lead_out("policy.json"), "it is a link that leads out of the folder"),
+    "linked weights": (lead_out("*.safetensors"), "it is a link that leads out of the folder"),
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_policy(tmp_path_factory.mktemp("whole") / "policy", configure())
+
+
+@pytest.mark.parametrize("case", STRANGE)
+def test_a_strangers_policy_is_refused_in_one_line(whole: Path, tmp_path: Path, case: str) -> None:
+    """Before its sizes take memory."""
+    folder = Path(shutil.copytree(whole, tmp_path / "policy"))
+    damage, says = STRANGE[case]
+    damage(folder)
+    with pytest.raises(PolicyError) as caught:
+        load_policy(folder)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert says in message, message
+
+
 def test_a_policy_needs_its_controller(folder: Path) -> None:
     with pytest.raises(MjstackError, match="Add controller=policy"):
         load_config([f"policy={folder}"])
@@ -327,6 +425,21 @@ def test_every_gate_takes_a_policy(folder: Path, tmp_path: Path) -> None:
         status = run(["job=replay", f"run={out}", f"world={world}", f"hydra.run.dir={again}"])
         assert status == 1
         assert "bit for bit where it did" in report(again)["replay_native"]["reason"]
+
+
+@pytest.mark.full
+def test_mjwarp_plays_a_policy_as_native_does(folder: Path, tmp_path: Path) -> None:
+    """From states of its own episode, which has no phases; and its buffers are sized."""
+    out = tmp_path / "run"
+    policy = ["controller=policy", f"policy={folder}", "gates=[parity,capacity]"]
+    short = ["task.episode_steps=60", "task.check.window=5", "gate.capacity.random_steps=20"]
+    mjwarp = ["sim=mjwarp", "sim.device=cpu", "nworld=2", f"hydra.run.dir={out}"]
+    assert run([*policy, *short, *mjwarp]) == 1
+    gates = report(out)
+    assert gates["capacity"]["status"] == "pass"
+    compared = {name.partition(".")[0] for name in gates["parity"]["metrics"] if ".step50." in name}
+    assert compared == {"third_1", "third_2", "third_3"}
+    assert gates["parity"]["reason"] == "failed: red not lifted, red not carried, not stacked"
 
 
 def test_a_replay_names_a_policy_that_was_written_anew(folder: Path, tmp_path: Path) -> None:

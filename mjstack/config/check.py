@@ -81,7 +81,8 @@ def _jobs(cfg: Config) -> None:
     for key in ("run", "world"):
         wrong = getattr(cfg, key) is not None and cfg.job.name != "replay"
         _refuse(wrong, cfg, key, "null, because it is for job=replay alone. Add job=replay")
-    wrong = cfg.policy is not None and cfg.controller.name != "policy"
+    plays = cfg.controller.name == "policy" or cfg.job.name == "play"
+    wrong = cfg.policy is not None and not plays
     expected = "null, because no policy drives the worlds. Add controller=policy"
     _refuse(wrong, cfg, "policy", expected)
     wrong = cfg.starts is not None and not reads_starts_file(cfg.reset)

@@ -210,12 +210,21 @@ class RunContext:
         and parity.
         """
         sim = make_simulation(self.model, self.cfg, 1, backend=Backend.native)
-        steps = [self.phase(name).stop - 1 for name in self.cfg.gate.parity.states.values()]
         world = WorldRecorder()
-        snapshots = Snapshots(steps)
+        snapshots = Snapshots(self.parity_steps.values())
         shown = () if "parity" in self.cfg.gates else self.viewers
         episode = self.play(sim, NOMINAL, [*shown, world, snapshots])
         return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)
+
+    @property
+    def parity_steps(self) -> dict[str, int]:
+        """Steps after which gate *parity* takes its states, by their names: the last ones of
+        phases, or, without phases, of thirds of the episode.
+        """
+        if self.phases:
+            states = self.cfg.gate.parity.states
+            return {name: self.phase(phase).stop - 1 for name, phase in states.items()}
+        return {f"third_{k}": k * self.episode_steps // 3 - 1 for k in (1, 2, 3)}
 
     def start(
         self,

@@ -59,7 +59,7 @@ def replay_world(
         observers: Look on.
     """
     cfg = context.cfg
-    with closing(_alone(context, backend, device)) as sim:
+    with closing(simulate_one(context, backend, device)) as sim:
         trace = _Trace()
         recorder = WorldRecorder()
         looking = [trace, *observers, recorder]
@@ -119,13 +119,13 @@ def start_of_world(
     context: RunContext, *, seed: int, world: int, backend: Backend, device: str
 ) -> np.ndarray:
     """Positions at which a world starts, shape ``(nq,)``; arguments as of `replay_world`."""
-    with closing(_alone(context, backend, device)) as sim:
+    with closing(simulate_one(context, backend, device)) as sim:
         context.start(sim, context.cfg.reset, seed=seed, worlds=[world])
         return sim.qpos[0].cpu().numpy().copy()
 
 
-def _alone(context: RunContext, backend: Backend, device: str) -> Simulation:
-    """A simulation for one world of the batch."""
+def simulate_one(context: RunContext, backend: Backend, device: str) -> Simulation:
+    """Make the simulation of one world of the batch, which plays alone."""
     sizes = _sizes_alone(resolve_sizes(context.cfg), context.cfg.nworld)
     return context.simulation(1, backend, device, sizes=sizes)
 

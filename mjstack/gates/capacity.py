@@ -3,6 +3,7 @@ they be?
 """
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 
@@ -56,7 +57,7 @@ def run_capacity(context: RunContext) -> list[GateResult]:
     # Environments first: each start is planned once, for both of its runs, and the plan of the
     # task's is kept for the gates that follow. Planning processes load during random actions.
     planned = 0 if cfg.controller.name in (CLOSED_LOOP, POLICY) else nworld
-    with context.planner.processes(planned):
+    with context.planner.processes(planned) if planned else nullcontext():
         env = _measure(
             context,
             result,

@@ -76,8 +76,8 @@ def _compare_states(context: RunContext, mjwarp: Simulation, result: GateResult)
     """
     limits = context.cfg.gate.parity
     problems = []
-    for name, phase in limits.states.items():
-        state = context.nominal.states[context.phase(phase).stop - 1]
+    for name, step in context.parity_steps.items():
+        state = context.nominal.states[step]
         for steps, largest in ((1, limits.step1), (50, limits.step50)):
             apart = compare_steps(context.nominal.sim, mjwarp, state, steps)
             for field, limit in largest.items():

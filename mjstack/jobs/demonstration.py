@@ -200,7 +200,7 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
                 "a group",
                 f"another name, because {name} are the measured joints",
             )
-        features[name] = _group_feature(env, group, units)
+        features[name] = group_feature(env, group, units)
     features |= {
         ACTION: positions,
         REWARD: Feature(dtype="float32", names=("reward",), units=("1",)),
@@ -225,9 +225,9 @@ def joint_units(env: Env) -> tuple[str, ...]:
     return tuple("rad" if kinds[int(address)] == hinge else "m" for address in env.index.robot_qpos)
 
 
-def _group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
-    """A column for each number of an observation group: ``red_pose.2``, and ``red_pose.2.t-1`` one
-    step before.
+def group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
+    """Name and unit of each column of an observation group: ``red_pose.2``, and ``red_pose.2.t-1``
+    one step before. ``joints`` are the joints' units.
     """
     names: list[str] = []
     units: list[str] = []

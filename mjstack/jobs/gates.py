@@ -96,6 +96,7 @@ def check_task(context: RunContext) -> None:
     check_env(context, cfg)
     if cfg.controller.name == POLICY:
         check_policy(context)
+        return
     if not cfg.controller.phases:
         return
     phases = context.planner.phases  # reads the robot, and reaches every nominal target

@@ -240,7 +240,7 @@ def _draw(context: RunContext, console: Console) -> list[str]:
         "trajectories.png": (save_trajectories, (positions, objects, title)),
     }
     if cfg.video:
-        drawn["episode.mp4"] = (save_video, (model, episode.qpos, cfg.timing.step_dt))
+        drawn["episode.mp4"] = (save_video, (model, episode.qpos[None], cfg.timing.step_dt))
     pictures = []
     for name, (draw, args) in drawn.items():
         if problem := safely_write(folder / name, draw, *args):

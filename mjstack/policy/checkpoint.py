@@ -5,13 +5,16 @@ policy that was there before.
 """
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import safe_open
 from safetensors.torch import load, save
 from torch import Tensor
@@ -25,6 +28,12 @@ from mjstack.files import reading, write_atomic
 from mjstack.policy.network import PolicyNetwork
 
 FORMAT = 1  # grows when an older mjstack could not read what is written
+_NAME_ANOTHER = "Name a folder that job=train has written"
+# A stranger's files may ask for more than this.
+_MOST_TEXT = 2**24  # bytes
+_MOST_WEIGHTS = 2**32  # bytes
+_MOST_COUNT = 1_000_000
+_MOST_LAYERS = 100
 
 
 @dataclass(kw_only=True, slots=True)
@@ -129,19 +138,39 @@ def save_policy(folder: Path, policy: Policy) -> None:
     """Write a policy's folder; an earlier policy in it is replaced at once or not at all.
 
     Raises:
-        OSError: It cannot be written; an earlier policy is intact.
+        PolicyError: It cannot be written; an earlier policy is intact.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     weights = save({k: v.contiguous() for k, v in policy.network.state_dict().items()})
     digest = sha256(weights).hexdigest()
     facts = {
-        "format": FORMAT,
+        **policy_facts(policy),
         "versions": {name: version(name) for name in ("mjstack", "mujoco", "torch")},
         "weights_sha256": digest,
+        "config": policy.config,
+    }
+    kept = {*folder.glob(_weights_name("*"))}
+    own = folder / _weights_name(digest)
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            write_atomic(own, weights)
+            write_atomic(folder / POLICY_FILE, json.dumps(facts, indent=1) + "\n")
+        except OSError:
+            if own not in kept:
+                own.unlink(missing_ok=True)
+            raise
+        for path in kept - {own}:
+            path.unlink(missing_ok=True)
+
+
+def policy_facts(policy: Policy) -> dict[str, Any]:
+    """What a policy sees and gives, its network and its training, in JSON's types."""
+    return {
+        "format": FORMAT,
         "observation": {
             "group": policy.group,
             "widths": policy.widths,
-            **policy.config["observation"][policy.group],
+            **asdict(policy.observation),
         },
         "action": {
             "joints": policy.joints,
@@ -154,13 +183,7 @@ def save_policy(folder: Path, policy: Policy) -> None:
         },
         "network": {"hidden": policy.hidden, "activation": "elu"},
         "training": policy.training,
-        "config": policy.config,
     }
-    write_atomic(folder / _weights_name(digest), weights)
-    write_atomic(folder / POLICY_FILE, json.dumps(facts, indent=1) + "\n")
-    for path in folder.glob(_weights_name("*")):
-        if path.name != _weights_name(digest):
-            path.unlink(missing_ok=True)
 
 
 def load_policy(folder: Path) -> Policy:
@@ -171,51 +194,83 @@ def load_policy(folder: Path) -> Policy:
             in the search path.
     """
     path = folder / POLICY_FILE
-    fix = "Name a folder that job=train has written"
     if not path.is_file():
-        raise PolicyError(
-            f"policy={folder}: has no {POLICY_FILE}, expected the folder of a policy", fix
-        )
-    with reading(path, PolicyError, fix):
-        facts = json.loads(path.read_text())
-        found = facts["format"]
-        if found != FORMAT:
+        expected = "expected the folder of a policy"
+        raise PolicyError(f"policy={folder}: has no {POLICY_FILE}, {expected}", _NAME_ANOTHER)
+    with reading(path, PolicyError, _NAME_ANOTHER):
+        facts = json.loads(_read(path, _MOST_TEXT))
+        if facts["format"] != FORMAT:
             raise PolicyError(
-                f"policy={folder}: has format {found}, expected {FORMAT}, which this mjstack reads",
+                f"policy={folder}: has format {facts['format']}, expected {FORMAT}, which this"
+                " mjstack reads",
                 "Use the mjstack that wrote it, or train it again",
             )
-        seen = facts["observation"]
-        action = facts["action"]
+        policy = _from_facts(facts, path)
         digest = facts["weights_sha256"]
-        policy = Policy(
-            network=PolicyNetwork(
-                sum(seen["widths"].values()),
-                action["width"],
-                action["chunk"],
-                facts["network"]["hidden"],
-            ),
-            group=seen["group"],
-            observation=_read_group(seen, path),
-            widths=seen["widths"],
-            execute=action["execute"],
-            action=_read_terms("action", action["terms"], TermCfg, path) or None,
-            hidden=facts["network"]["hidden"],
-            config=facts["config"],
-            training=facts["training"],
-            versions=facts["versions"],
-            folder=folder,
-        )
-        if policy.joints != action["joints"] or policy.execute < 1:
-            raise ValueError("action does not fit config")
-        _requirements(policy.config)  # they are all there
+        if not re.fullmatch("[0-9a-f]{64}", digest):
+            raise ValueError("weights_sha256 is no SHA-256")
     weights = folder / _weights_name(digest)
     with reading(weights, PolicyError, "Copy the whole folder again, or train the policy again"):
-        content = weights.read_bytes()
+        content = _read(weights, _MOST_WEIGHTS)
         if sha256(content).hexdigest() != digest:
             raise ValueError(f"its content is not that of {POLICY_FILE}")
-        policy.network.load_state_dict(load(content))
+        found = load(content)
+        for name, value in found.items():
+            if value.dtype != torch.float32 or not bool(value.isfinite().all()):
+                raise ValueError(f"{name} has other values than finite ones in float32")
+        policy.network.load_state_dict(found, assign=True)
     policy.network.requires_grad_(False)
     return policy
+
+
+def _read(path: Path, most: int) -> bytes:
+    """The content of a file inside its folder, if it is not larger than ``most`` bytes."""
+    if path.resolve().parent != path.parent.resolve():
+        raise ValueError("it is a link that leads out of the folder")
+    size = path.stat().st_size
+    if size > most:
+        raise ValueError(f"it has {size} bytes, more than {most}")
+    return path.read_bytes()
+
+
+def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
+    """The policy of a file, its weights without memory, so that sizes of a stranger take none."""
+    seen = facts["observation"]
+    action = facts["action"]
+    hidden = [_whole("network.hidden", width) for width in facts["network"]["hidden"]]
+    if len(hidden) > _MOST_LAYERS:
+        raise ValueError(f"network.hidden has {len(hidden)} layers, more than {_MOST_LAYERS}")
+    widths = {name: _whole(name, width) for name, width in seen["widths"].items()}
+    with torch.device("meta"):
+        network = PolicyNetwork(
+            sum(widths.values()),
+            _whole("action.width", action["width"]),
+            _whole("action.chunk", action["chunk"]),
+            hidden,
+        )
+    policy = Policy(
+        network=network,
+        group=str(seen["group"]),
+        observation=_read_group(seen, path),
+        widths=widths,
+        execute=_whole("action.execute", action["execute"]),
+        action=_read_terms("action", action["terms"], TermCfg, path) or None,
+        hidden=hidden,
+        config=facts["config"],
+        training=dict(facts["training"]),
+        versions=dict(facts["versions"]),
+        folder=path.parent,
+    )
+    if policy.joints != action["joints"] or list(policy.observation.terms) != list(widths):
+        raise ValueError("observation, action and config do not fit together")
+    _requirements(policy.config)  # they are all there
+    return policy
+
+
+def _whole(name: str, value: object) -> int:
+    if type(value) is not int or not 1 <= value <= _MOST_COUNT:
+        raise ValueError(f"{name} is {value!r}, not a whole number from 1 to {_MOST_COUNT}")
+    return value
 
 
 def _weights_name(digest: str) -> str:
@@ -245,14 +300,27 @@ def _read_terms(key: str, nodes: Mapping[str, Any], kind: type, path: Path) -> d
     return terms
 
 
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Raise one line for what cannot be written inside, such as on a full disk."""
+    try:
+        yield
+    except OSError as error:
+        raise PolicyError(
+            f"{path}: cannot be written ({error.strerror or error}), and stays as it was",
+            "Make room, and run the same command again",
+        ) from error
+
+
 def write_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
     """Write tensors and facts in JSON's types as one file, at once or not at all.
 
     Raises:
-        OSError: It cannot be written; an earlier file is intact.
+        PolicyError: It cannot be written; an earlier file is intact.
     """
     plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    write_atomic(path, save(plain, metadata={"facts": json.dumps(facts)}))
+    with _writing(path):
+        write_atomic(path, save(plain, metadata={"facts": json.dumps(facts)}))
 
 
 def read_state(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

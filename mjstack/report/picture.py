@@ -2,6 +2,7 @@
 video.
 """
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -54,14 +55,7 @@ def _render(
         MjstackError: This machine cannot draw offscreen.
     """
     data = mujoco.MjData(model)
-    try:
-        renderer = mujoco.Renderer(model, height, width)
-    except Exception as error:  # OpenGL loaders fail in their own ways
-        gl = os.environ.get("MUJOCO_GL", "not set")
-        raise MjstackError(
-            f"offscreen rendering fails (MUJOCO_GL={gl}: {type(error).__name__}). Set"
-            " MUJOCO_GL=egl or osmesa."
-        ) from error
+    renderer = _renderer(model, width, height)
     x, _, z = model.geom_pos[model.geom("table").id].tolist()
     tall = max(0.0, float(model.stat.center[2]) - z - 0.03)  # m that an arm stands out
     camera = mujoco.MjvCamera()
@@ -78,6 +72,26 @@ def _render(
             yield renderer.render()
 
 
+def _renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
+    try:
+        return mujoco.Renderer(model, height, width)
+    except Exception as error:  # OpenGL loaders fail in their own ways
+        gl = os.environ.get("MUJOCO_GL", "not set")
+        raise MjstackError(
+            f"offscreen rendering fails (MUJOCO_GL={gl}: {type(error).__name__})",
+            "Set MUJOCO_GL=egl or osmesa",
+        ) from error
+
+
+def require_offscreen(model: mujoco.MjModel) -> None:
+    """Try to draw.
+
+    Raises:
+        MjstackError: This machine cannot draw offscreen.
+    """
+    _renderer(model, 16, 16).close()
+
+
 def save_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
     """Draw a state, shape ``(nq,)``.
 
@@ -88,19 +102,45 @@ def save_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
     plt.imsave(path, image)
 
 
-def save_video(path: Path, model: mujoco.MjModel, qpos: np.ndarray, step_dt: float) -> None:
-    """Write an mp4 of an episode in real time from its states at the ends of steps, shape
-    ``(steps, nq)``, which are ``step_dt`` [s] apart.
+def save_video(
+    path: Path,
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    step_dt: float,
+    advance: Callable[[str, int, int], None] = lambda what, done, total: None,
+) -> None:
+    """Write an mp4 of episodes in real time, side by side.
+
+    Args:
+        path: The file.
+        model: The scene.
+        qpos: States at the ends of steps, shape ``(worlds, steps, nq)``.
+        step_dt: Time between two of them [s].
+        advance: Told about progress.
 
     Raises:
         MjstackError: This machine cannot draw offscreen, or lacks the extra ``video``.
     """
     writer_of = require_video()
     skip = max(1, round(1.0 / (25.0 * step_dt)))
-    writer = writer_of(str(path), (640, 480), fps=1.0 / (step_dt * skip), macro_block_size=16)
+    states = qpos[:, ::skip].swapaxes(0, 1)
+    count, worlds, nq = states.shape
+
+    # Rows and columns of pictures
+    columns = math.ceil(math.sqrt(worlds))
+    rows = math.ceil(worlds / columns)
+    width = (640 if worlds == 1 else 960) // columns
+    height = 3 * width // 4
+    size = (columns * width, rows * height)
+    writer = writer_of(str(path), size, fps=1.0 / (step_dt * skip), macro_block_size=16)
     writer.send(None)
-    for image in _render(model, qpos[::skip], 640, 480):
-        writer.send(np.ascontiguousarray(image))
+    images = _render(model, states.reshape(-1, nq), width, height)
+    for number in range(count):
+        frame = np.zeros((rows, height, columns, width, 3), np.uint8)
+        for world in range(worlds):
+            frame[world // columns, :, world % columns] = next(images)
+        writer.send(frame.reshape(rows * height, columns * width, 3))
+        advance("pictures of the video", number + 1, count)
     writer.close()
 
 

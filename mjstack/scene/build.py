@@ -112,6 +112,7 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
         spec.visual.global_.offwidth = 1280
         spec.visual.global_.offheight = 960
+        spec.visual.quality.shadowsize = 1024  # without a GPU, MuJoCo's 4096 doubles the time
     else:
         spec.compiler.discardvisual = True
     return spec.compile()

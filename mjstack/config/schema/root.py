@@ -63,13 +63,14 @@ class Config:
     """Capture the step as a CUDA graph: auto, require or off. Ignored on native MuJoCo; on Warp's
     CPU device, of physics alone."""
     view: bool = spec()
-    """Open MuJoCo's viewer on the parity world; gates without parity: the baseline world."""
+    """Open MuJoCo's viewer on the parity world; gates without parity: the baseline world; job=play:
+    every world."""
     video: bool = spec()
-    """Write an mp4 of the same world."""
+    """Write an mp4 of the same; job=play without view does so."""
     starts: str | None = spec(None)
     """reset=starts_file: a file with one row per world, from which all of them start."""
     policy: str | None = spec(None)
-    """controller=policy: the folder of a trained policy."""
+    """controller=policy, job=play: the folder of a trained policy."""
     run: str | None = spec(None)
     """job=replay: the folder of an earlier run."""
     world: str | None = spec(None)

@@ -1,0 +1,184 @@
+"""job=export: onnxruntime gives torch's numbers, the metadata is all that a program needs, and a
+program without mjstack drives native MuJoCo as PolicyDriver does.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from environments import configure
+from policies import make_policy
+
+import mjstack
+from mjstack.cli import run
+from mjstack.config.schema import Config
+from mjstack.drivers.policy import PolicyDriver
+from mjstack.episodes.context import RunContext
+from mjstack.episodes.rollout import NOMINAL
+from mjstack.policy import load_policy, save_policy
+from mjstack.policy.onnx import to_onnx
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "policy_native.py"
+
+
+def write_seeing(folder: Path, cfg: Config, *added: str) -> Path:
+    """A policy without noise, which also sees added terms of `mjstack.mdp.observation`."""
+    group = cfg.observation["policy"]
+    more = {
+        name: replace(group.terms["last_action"], func=f"mjstack.mdp.observation.{name}", params={})
+        for name in added
+    }
+    group = replace(group, noise=False, terms=group.terms | more)
+    save_policy(folder, make_policy(replace(cfg, observation={"policy": group}), execute=4))
+    return folder
+
+
+def export(policy: Path, out: Path, *overrides: str) -> int:
+    return run(["job=export", "sim=native", f"policy={policy}", f"hydra.run.dir={out}", *overrides])
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy of task reach in ``policy``, and its export in ``out``."""
+    folder = tmp_path_factory.mktemp("export")
+    write_seeing(folder / "policy", configure("task=reach"))
+    assert export(folder / "policy", folder / "out", "task=reach") == 0
+    return folder
+
+
+def session_of(folder: Path) -> onnxruntime.InferenceSession:
+    return onnxruntime.InferenceSession(str(folder / "policy.onnx"))
+
+
+@pytest.mark.parametrize("batch", [1, 64])
+def test_onnxruntime_gives_torchs_numbers(exported: Path, batch: int) -> None:
+    """Far observations are among them, which the network clamps."""
+    network = load_policy(exported / "policy").network
+    network.set_scale("observation", torch.randn(24), torch.rand(24) + 0.1)
+    seen = 4.0 * torch.randn(batch, network.observation_mean.shape[0])
+    session = onnxruntime.InferenceSession(to_onnx(network, {}))
+    (found,) = session.run(["action"], {"observation": seen.numpy()})
+    np.testing.assert_allclose(found, network(seen).numpy(), rtol=0.0, atol=2e-6)
+    assert found.shape == (batch, network.chunk, network.joints)
+
+
+def test_the_metadata_is_what_a_program_needs(exported: Path) -> None:
+    held = session_of(exported / "out").get_modelmeta().custom_metadata_map
+    facts = {name: json.loads(text) for name, text in held.items()}
+    cfg = configure("task=reach")
+    assert facts["action"] == {
+        "joints": cfg.robot.joints,
+        "kind": "absolute joint targets",
+        "width": 6,
+        "terms": {},
+        "chunk": 6,
+        "execute": 4,
+        "step_dt": 0.02,
+    }
+    assert facts["observation"]["widths"] == {
+        "joint_pos": 6,
+        "joint_vel": 6,
+        "grasp_point_to_goal": 6,
+        "last_action": 6,
+    }
+    assert list(facts["observation"]["terms"]) == list(facts["observation"]["widths"])
+    assert facts["columns"]["names"][12] == "grasp_point_to_goal.0.t-1"
+    assert facts["columns"]["units"][6:8] == ["10 rad/s", "10 rad/s"]
+    assert facts["robot"]["units"] == ["rad"] * 6
+    assert facts["normalization"]["action_mean"] == pytest.approx(cfg.robot.start)
+    assert facts["training"] == {"seed": 0}
+    assert facts["versions"].keys() == {"mjstack", "mujoco", "torch"}
+    assert facts["exported_with"]["mjstack"] == mjstack.__version__
+    assert facts["task"]["control_hz"] == 50.0
+
+
+def test_the_example_imports_no_mjstack() -> None:
+    tree = ast.parse(EXAMPLE.read_text())
+    names = {a.name for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
+    assert names <= {"json", "sys", "mujoco", "numpy", "onnxruntime"}
+    assert not any(isinstance(node, ast.ImportFrom) for node in ast.walk(tree))
+    assert len(EXAMPLE.read_text().splitlines()) <= 60
+
+
+def drivers_targets(policy: Path, cfg: Config, steps: int) -> np.ndarray:
+    """Joint targets of PolicyDriver from the nominal start."""
+    context = RunContext(cfg)
+    sim = context.batch_simulation(1)
+    env = context.start(sim, NOMINAL)
+    driver = PolicyDriver(env, load_policy(policy))
+    targets = []
+    for _ in range(steps):
+        command = driver.command()
+        targets.append(command[0].numpy().copy())
+        env.action_manager.process(command)
+        env.advance()
+    return np.array(targets)
+
+
+@pytest.mark.parametrize("task", ["reach", "stack"])
+def test_the_example_drives_as_the_driver_does(task: str, exported: Path, tmp_path: Path) -> None:
+    """Bit for bit but for onnxruntime's float32 where the driver has float64."""
+    cfg = configure(f"task={task}", "sim=native", "nworld=1")
+    policy = exported / "policy"
+    out = exported / "out"
+    if task == "stack":
+        policy = write_seeing(tmp_path / "policy", cfg, "headings")
+        out = tmp_path / "out"
+        assert export(policy, out) == 0
+    play = runpy.run_path(str(EXAMPLE))["play"]
+    wanted = drivers_targets(policy, cfg, 40)
+    np.testing.assert_allclose(play(str(out), 40), wanted, rtol=0.0, atol=2e-5)
+    assert wanted.std(0).max() > 1e-3  # it moves
+
+
+def refused(capsys: pytest.CaptureFixture[str]) -> str:
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+def test_bad_input_is_one_line(
+    exported: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    policy = exported / "policy"
+    assert export(policy, tmp_path / "out") == 2
+    assert "was trained with task.name=reach, and here it is stack" in refused(capsys)
+    before = (exported / "out" / "policy.onnx").read_bytes()
+    assert export(policy, exported / "out", "task=reach") == 2
+    assert "expected a new or an empty folder" in refused(capsys)
+    assert (exported / "out" / "policy.onnx").read_bytes() == before
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    assert export(policy, tmp_path / "out", "task=reach") == 2
+    assert "job=export needs onnx, which is not installed" in refused(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_full_disk_leaves_neither_file(
+    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import mjstack.jobs.export as module
+
+    real = module.write_atomic
+
+    def full(path: Path, content: bytes) -> None:
+        if path.suffix == ".onnx":
+            raise OSError(28, "No space left on device")
+        real(path, content)
+
+    monkeypatch.setattr(module, "write_atomic", full)
+    out = tmp_path / "out"
+    assert export(exported / "policy", out, "task=reach") == 1
+    assert not list(out.glob("*.onnx")) + list(out.glob("*.mjb"))
+    (gate,) = json.loads((out / "report.json").read_text())["gates"]
+    assert "cannot be written (No space left on device), and nothing was exported" in gate["reason"]

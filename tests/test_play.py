@@ -1,0 +1,175 @@
+"""job=play: worlds with a policy or the expert, in MuJoCo's viewer or as a video."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from compositions import load_config
+from environments import configure, has_gl
+from policies import write_policy
+
+import mjstack.jobs.play as play
+import mjstack.jobs.runner as runner
+from mjstack.cli import run
+from mjstack.episodes.context import RunContext
+from mjstack.errors import MjstackError
+from mjstack.report.picture import save_video
+from mjstack.scene import build_model
+from mjstack.sim import Simulation
+
+REACH = ("job=play", "task=reach", "task.episode_steps=60", "sim=native")
+
+
+def result(folder: Path) -> dict:
+    (gate,) = json.loads((folder / "report.json").read_text())["gates"]
+    return gate
+
+
+@pytest.fixture
+def saved(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """States of videos, none of which is drawn."""
+    videos: list[np.ndarray] = []
+
+    def save(path: Path, model: mujoco.MjModel, qpos: np.ndarray, *options: object) -> None:
+        path.touch()
+        videos.append(qpos)
+
+    monkeypatch.setattr(play, "save_video", save)
+    monkeypatch.setattr(play, "require_offscreen", lambda model: None)
+    return videos
+
+
+def test_a_policy_plays_worlds_as_a_batch_starts_them(
+    saved: list[np.ndarray], tmp_path: Path
+) -> None:
+    policy = write_policy(tmp_path / "policy", configure("task=reach"))
+    out = tmp_path / "out"
+    assert run([*REACH, f"policy={policy}", "nworld=2", "seed=5", f"hydra.run.dir={out}"]) == 0
+    gate = result(out)
+    assert gate["reason"] == "0 of 2 worlds succeeded"  # a world that fails is shown all the same
+    assert "world 1: failed: grasp point not above red" in gate["details"]
+    assert (out / "episode.mp4").exists()
+    (qpos,) = saved
+    assert qpos.shape == (2, 60, 20)
+
+    chosen = ("task=reach", "task.episode_steps=60", "reset=randomized", "sim=native", "nworld=2")
+    cfg = load_config([*chosen, "seed=5", "controller=policy", f"policy={policy}"])
+    context = RunContext(cfg)
+    sim = context.batch_simulation(2)
+    context.play(sim, cfg.reset)
+    assert np.array_equal(qpos[:, -1], sim.qpos.numpy())
+
+
+def test_the_expert_plays_without_a_policy_in_the_viewer(
+    saved: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every step of every world is shown; a video is written on request alone."""
+    shown: list[int] = []
+
+    def viewer(context: RunContext) -> Callable[[int, Simulation], None]:
+        return lambda step, sim: shown.append(step)
+
+    monkeypatch.setattr(runner, "_viewer", viewer)
+    monkeypatch.setenv("DISPLAY", ":0")
+    out = tmp_path / "out"
+    fast = [
+        f"controller.phases.{name}.seconds=0.2"
+        for name in configure("task=reach").controller.phases
+    ]
+    args = [*REACH, *fast, "task.check.window=5", "view=true", "nworld=2"]
+    assert run([*args, f"hydra.run.dir={out}"]) == 0
+    steps = len(shown) // 2
+    assert shown == [*range(steps)] * 2
+    assert steps > 5
+    assert not saved
+    assert not (out / "episode.mp4").exists()
+
+
+def test_a_task_without_a_check_is_shown_unjudged(saved: list[np.ndarray], tmp_path: Path) -> None:
+    cfg = configure("task=reach")
+    policy = write_policy(tmp_path / "policy", cfg)
+    out = tmp_path / "out"
+    args = [*REACH, "task.check=null", f"policy={policy}", "nworld=1", f"hydra.run.dir={out}"]
+    assert run(args) == 0
+    assert result(out)["reason"] == "not judged: the task has no check"
+    assert len(saved) == 1
+
+
+@pytest.mark.skipif(not has_gl(), reason="MuJoCo cannot draw offscreen here")
+def test_a_video_has_worlds_side_by_side(tmp_path: Path) -> None:
+    import imageio_ffmpeg
+
+    cfg = configure()
+    model = build_model(cfg, visuals=True)
+    home = np.tile(model.qpos0, (3, 4, 1))
+    home[1, :, RunContext(cfg).index.object_qpos[0] + 2] += 0.1  # its cube is in the air
+    save_video(tmp_path / "x.mp4", model, home, 0.02)
+    frames = imageio_ffmpeg.read_frames(str(tmp_path / "x.mp4"))
+    facts = next(frames)
+    assert facts["size"] == (960, 720)
+    picture = np.frombuffer(next(frames), np.uint8).reshape(720, 960, 3).astype(int)
+    first, second, third = picture[:360, :480], picture[:360, 480:], picture[360:, :480]
+    assert first.std() > 10
+    assert abs(first - third).max() < 120
+    assert abs(first - second).max() > 160
+    assert picture[370:, 490:].max() < 40  # the fourth is empty
+
+
+BAD = [
+    (["nworld=65"], "nworld=65: expected at most 64 worlds"),
+    (["policy=nowhere"], "policy=nowhere: has no policy.json"),
+    (["policy=null", "task=lonely"], "lonely"),
+    (["controller=policy"], "policy=null: expected the folder of a trained policy"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
+def test_bad_input_is_one_line(
+    overrides: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run([*REACH, *overrides, f"hydra.run.dir={out}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line
+    assert not out.exists()
+
+
+def test_a_task_without_phases_needs_a_policy() -> None:
+    cfg = load_config(list(REACH))
+    cfg.controller.phases = {}
+    with pytest.raises(MjstackError, match=r"task=reach: expected a task with phases.*policy=FOLD"):
+        play.check_play(cfg)
+
+
+def test_without_gl_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*args: object) -> None:
+        raise AttributeError("no GL")
+
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    out = tmp_path / "out"
+    assert run(["job=play", "task=reach", "sim=native", f"hydra.run.dir={out}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "offscreen rendering fails" in line
+    assert line.endswith("Set MUJOCO_GL=egl or osmesa.")
+    assert not out.exists()
+
+
+def test_a_video_that_cannot_be_written_fails_the_job(
+    saved: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(play, "save_video", full)
+    policy = write_policy(tmp_path / "policy", configure("task=reach"))
+    out = tmp_path / "out"
+    assert run([*REACH, f"policy={policy}", "nworld=1", f"hydra.run.dir={out}"]) == 1
+    assert "episode.mp4 was not written: No space left on device" in result(out)["reason"]
+    assert not (out / "episode.mp4").exists()
