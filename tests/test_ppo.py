@@ -16,12 +16,14 @@ from environments import at_double_speed, configure, mask_of, on_new_sim
 from policies import make_policy, write_policy
 
 import mjstack.interrupt as interrupt
+import mjstack.mdp.starts.expert_states as expert_states
 from mjstack.adapters.rsl_rl_runner import Runner
 from mjstack.cli import run
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
 from mjstack.interrupt import handle_interrupts
 from mjstack.policy import load_policy
+from mjstack.scene.index import ALL
 
 TINY = (
     "job=train",
@@ -150,10 +152,15 @@ def states_file(path: Path, env: Env, count: int = 3) -> Path:
     return path
 
 
-def test_worlds_start_in_an_experts_states(tmp_path: Path) -> None:
+@pytest.mark.parametrize("masked", [False, True], ids=["by row", "as on CUDA"])
+def test_worlds_start_in_an_experts_states(
+    masked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """By seed, world and episode, a falling share of them, with fresh counters; the others as they
     would without.
     """
+    if masked:  # the host does not look at the mask
+        monkeypatch.setattr(expert_states, "rows_of", lambda mask: ALL)
     whole = on_new_sim("native", 6, configure("reset=randomized"))
     path = states_file(tmp_path / "states.npz", whole)
     bank = np.load(path)

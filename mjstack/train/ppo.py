@@ -7,6 +7,7 @@ from typing import cast
 import torch
 import torch.distributed as dist
 
+from mjstack.config.functions import resolve_func
 from mjstack.config.schema import (
     Backend,
     Config,
@@ -17,6 +18,7 @@ from mjstack.config.schema import (
 from mjstack.envs import build_env
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, PolicyError, UnknownName
+from mjstack.managers.term import check_params
 from mjstack.policy import Policy, load_policy
 from mjstack.policy.checkpoint import read_state
 from mjstack.train.distributed import joined, torchrun_ranks
@@ -100,7 +102,12 @@ def check_ppo(context: RunContext) -> range:
         expected += f" (nworld={cfg.nworld} times job.horizon={job.horizon} are divided)"
         raise ConfigError("job.minibatches", job.minibatches, expected)
     plan = make_plan(cfg)
-    reset = whole_starts(cfg.reset) if unrecorded(cfg.reset) else cfg.reset
+    reset = cfg.reset
+    if unrecorded(reset):
+        for name in reset.keys() - whole_starts(reset).keys():
+            label = f"reset.{name}"
+            check_params(label, resolve_func(label, reset[name].func), reset[name].params, 1)
+        reset = whole_starts(reset)
     env = build_env(
         replace(plan.cfg, reset=reset),
         model=context.model,

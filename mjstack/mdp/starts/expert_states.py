@@ -32,9 +32,9 @@ class ExpertStates:
         env: EnvView,
         *,
         path: str | None = None,
-        share: Fraction = 0.8,
+        share: Fraction = 0.75,
         last_share: Fraction = 0.0,
-        episodes: Count = 50,
+        episodes: Count = 40,
     ) -> None:
         """Read the states.
 
