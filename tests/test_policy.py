@@ -21,6 +21,7 @@ from policies import make_policy, write_policy
 from safetensors.torch import load, save
 
 from mjstack.cli import run
+from mjstack.config.schema import ObservationTermCfg
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env, driven_config
 from mjstack.episodes.rollout import CommandRecorder, rollout
@@ -301,6 +302,14 @@ def lead_out(name: str) -> Callable[[Path], None]:
         path.symlink_to(outside)
 
     return apply
+
+
+def test_a_term_without_numbers(tmp_path: Path) -> None:
+    """Nothing that can move is a box, for example."""
+    cfg = configure()
+    func = "mjstack.mdp.observation.headings"
+    cfg.observation["policy"].terms["headings"] = ObservationTermCfg(func, params={"objects": []})
+    assert load_policy(write_policy(tmp_path / "mine", cfg)).widths["headings"] == 0
 
 
 def sparse(folder: Path) -> None:

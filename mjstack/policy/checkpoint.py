@@ -240,7 +240,8 @@ def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
     hidden = [_whole("network.hidden", width) for width in facts["network"]["hidden"]]
     if len(hidden) > _MOST_LAYERS:
         raise ValueError(f"network.hidden has {len(hidden)} layers, more than {_MOST_LAYERS}")
-    widths = {name: _whole(name, width) for name, width in seen["widths"].items()}
+    # A term may have no numbers here, such as headings where nothing is a box.
+    widths = {name: _whole(name, width, least=0) for name, width in seen["widths"].items()}
     with torch.device("meta"):
         network = PolicyNetwork(
             sum(widths.values()),
@@ -267,9 +268,9 @@ def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
     return policy
 
 
-def _whole(name: str, value: object) -> int:
-    if type(value) is not int or not 1 <= value <= _MOST_COUNT:
-        raise ValueError(f"{name} is {value!r}, not a whole number from 1 to {_MOST_COUNT}")
+def _whole(name: str, value: object, least: int = 1) -> int:
+    if type(value) is not int or not least <= value <= _MOST_COUNT:
+        raise ValueError(f"{name} is {value!r}, not a whole number from {least} to {_MOST_COUNT}")
     return value
 
 
