@@ -39,8 +39,8 @@ controller phases gate job task experiment
 CHOICES = _words("""
 so101 rebot builtin menagerie stack box reach fine default auto mjwarp native asset benchmark
 joint_delta ee_delta joint_absolute nominal jitter randomized starts_file open_loop
-closed_loop baseline batch parity capacity success throughput asset_solver so100 Stack null []
-[stack,box] '' stack.yaml ../stack /etc/passwd nope
+closed_loop state_based baseline batch parity capacity success throughput asset_solver so100 Stack
+null [] [stack,box] '' stack.yaml ../stack /etc/passwd nope
 """)
 _PLAIN = _words("""
 -1 0 1 2 3 7 0.5 -0.001 1e-30 1e30 1e308 -1e308 1e999 10000000000000000000000 007 0x10 1_000

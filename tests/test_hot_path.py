@@ -143,13 +143,28 @@ PATHS: dict[str, list[str] | None] = {
                 "_observe",
                 "_last_seen",
                 "_turn",
+                "_face_roll",
             )
         ),
         "_put",
     ],
     "drivers/policy.py": [f"PolicyDriver.{n}" for n in ("command", "_apply", "_ask")],
+    "drivers/state_based.py": [
+        f"StateBasedDriver.{n}"
+        for n in (
+            "command",
+            "_measure",
+            "_decide",
+            "_find_delivered",
+            "_lead_point",
+            "_tilted",
+            "_turn_left",
+            "_point",
+            "_grasp_offset",
+        )
+    ],
     "policy/network.py": ["PolicyNetwork.normalized", "PolicyNetwork.forward"],
-    "drivers/tilt.py": ["CarryTilt.desired_approach"],
+    "drivers/tilt.py": ["CarryTilt.desired_approach", "CarryTilt.release_approach"],
     "episodes/failures.py": ["FailureMonitor.update", "_of"],
     "kinematics/batched_ik.py": [
         "BatchedIk.solve",

@@ -18,8 +18,7 @@ from mjstack.bench.timing import (
 from mjstack.drivers.driver import Recorded
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import (
-    CLOSED_LOOP,
-    POLICY,
+    FEEDBACK,
     CommandRecorder,
     Episode,
     Observer,
@@ -159,7 +158,7 @@ def _play(context: RunContext, sim: Simulation, meter: EnergyMeter, out: Measure
     cfg = context.cfg
     mjwarp = sim.backend == "mjwarp"
     commands = CommandRecorder()
-    keep = mjwarp and cfg.controller.name in (CLOSED_LOOP, POLICY)
+    keep = mjwarp and cfg.controller.name in FEEDBACK
     recorders: list[Observer] = [commands] if keep else []
     episode = context.play(sim, cfg.reset, [*recorders, EnergyObserver(meter)])
     if mjwarp:

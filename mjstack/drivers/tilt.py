@@ -99,6 +99,20 @@ class CarryTilt:
         sin = torch.sin(turn)
         return torch.stack((cos * x - sin * y, sin * x + cos * y, z), dim=1)
 
+    def release_approach(
+        self, command: torch.Tensor, phase: torch.Tensor, there: torch.Tensor
+    ) -> torch.Tensor:
+        """Approach axis of the release pose, turned about the vertical to where the arm looks; from
+        these arguments alone, which are those of `desired_approach`. Fixed shapes, no host read.
+        """
+        start = self._nominal[self.place[phase]]
+        arm = self._there_ik.solve(start, there)[0]
+        x, y, z = self._there_ik.forward(arm)[2].unbind(1)
+        turn = self._sign * (command[:, 0] - arm[:, 0])
+        cos = torch.cos(turn)
+        sin = torch.sin(turn)
+        return torch.stack((cos * x - sin * y, sin * x + cos * y, z), dim=1)
+
 
 def turn_sign(model: mujoco.MjModel, cfg: Config) -> float:
     """1.0 where the arm's first joint turns to the left, seen from above; -1.0 where to the right.

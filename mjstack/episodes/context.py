@@ -16,7 +16,9 @@ from mjstack.envs.buffers import Advance, Workload, measured_sizes, play_workloa
 from mjstack.episodes.rollout import (
     CLOSED_LOOP,
     NOMINAL,
+    PHASELESS,
     POLICY,
+    STATE_BASED,
     Episode,
     Observer,
     Reset,
@@ -186,8 +188,8 @@ class RunContext:
 
     @property
     def phases(self) -> list[Phase]:
-        """Those of the driver: a policy has none."""
-        return [] if self.cfg.controller.name == POLICY else self.planner.phases
+        """Those of the driver: a policy and the state-based expert have none."""
+        return [] if self.cfg.controller.name in PHASELESS else self.planner.phases
 
     @property
     def episode_steps(self) -> int:
@@ -258,6 +260,10 @@ class RunContext:
             from mjstack.drivers.closed_loop import ClosedLoopDriver
 
             return ClosedLoopDriver(env, self.planner.nominal)
+        if env.cfg.controller.name == STATE_BASED:
+            from mjstack.drivers.state_based import StateBasedDriver
+
+            return StateBasedDriver(env, self.planner.nominal)
         sources = source_xy(env).double().cpu().numpy()
         trajectory = self.planner.plan(
             sources, lambda done: self.advance("planning", done, sim.nworld)

@@ -20,7 +20,10 @@ from mjstack.tasks.check import CheckResult, make_check
 
 # Controllers with feedback; any other name plays a plan.
 CLOSED_LOOP = "closed_loop"
+STATE_BASED = "state_based"
 POLICY = "policy"
+FEEDBACK = (CLOSED_LOOP, STATE_BASED, POLICY)
+PHASELESS = (STATE_BASED, POLICY)
 StepHook = Callable[[int, Simulation], None]
 Reset = dict[str, TermCfg]
 NOMINAL: Reset = {"home": TermCfg(func="mjstack.mdp.reset.home")}

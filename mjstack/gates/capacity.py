@@ -20,7 +20,7 @@ from mjstack.envs.buffers import (
     recommend_sizes,
 )
 from mjstack.episodes.context import RunContext, needs_episode
-from mjstack.episodes.rollout import CLOSED_LOOP, POLICY
+from mjstack.episodes.rollout import FEEDBACK
 from mjstack.errors import Unreachable, name_worlds
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, resolve_sizes
@@ -56,7 +56,7 @@ def run_capacity(context: RunContext) -> list[GateResult]:
 
     # Environments first: each start is planned once, for both of its runs, and the plan of the
     # task's is kept for the gates that follow. Planning processes load during random actions.
-    planned = 0 if cfg.controller.name in (CLOSED_LOOP, POLICY) else nworld
+    planned = 0 if cfg.controller.name in FEEDBACK else nworld
     with context.planner.processes(planned) if planned else nullcontext():
         env = _measure(
             context,

@@ -15,7 +15,7 @@ from mjstack.envs import Env
 from mjstack.episodes.context import RunContext, needs_episode
 from mjstack.episodes.record import starts_name
 from mjstack.episodes.regions import find_regions, regions_table, save_regions
-from mjstack.episodes.rollout import CLOSED_LOOP, POLICY, Observer
+from mjstack.episodes.rollout import CLOSED_LOOP, FEEDBACK, Observer
 from mjstack.episodes.tally import play_seeds
 from mjstack.mdp.starts.starts_file import write_starts
 from mjstack.report.record import GateResult
@@ -30,7 +30,7 @@ def success_config(cfg: Config) -> Config:
         for name, term in reset.items():
             if places_objects(term):
                 reset[name] = replace(term, params=term.params | {"xy": list(t.region)})
-    name = POLICY if cfg.controller.name == POLICY else CLOSED_LOOP
+    name = cfg.controller.name if cfg.controller.name in FEEDBACK else CLOSED_LOOP
     return replace(cfg, reset=reset, controller=replace(cfg.controller, name=name))
 
 

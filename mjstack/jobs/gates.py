@@ -12,7 +12,7 @@ from mjstack.envs import build_env
 from mjstack.envs.build import driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.earlier_run import archive_starts
-from mjstack.episodes.rollout import CLOSED_LOOP, POLICY
+from mjstack.episodes.rollout import CLOSED_LOOP, POLICY, STATE_BASED
 from mjstack.errors import ConfigError, KeyedError, Unreachable
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
@@ -95,7 +95,7 @@ def check_task(context: RunContext) -> None:
         _ = context.check  # reads its thresholds
     check_env(context, cfg)
     if cfg.controller.name == POLICY:
-        check_policy(context)
+        check_driver(context)
         return
     if not cfg.controller.phases:
         return
@@ -106,6 +106,8 @@ def check_task(context: RunContext) -> None:
     check_env(context, driven_config(cfg, reset={}), action="controller.action")
     if cfg.controller.approach_gain > 0.0:
         turn_sign(context.model, cfg)
+    if cfg.controller.name == STATE_BASED and cfg.task.check is not None:
+        check_driver(context)
     if success_config(cfg).controller.name == CLOSED_LOOP and (
         cfg.controller.name == CLOSED_LOOP or "success" in cfg.gates
     ):
@@ -115,8 +117,10 @@ def check_task(context: RunContext) -> None:
         build_chain(context.model, cfg.robot)
 
 
-def check_policy(context: RunContext) -> None:
-    """Raise if the configured policy does not fit the configured worlds."""
+def check_driver(context: RunContext) -> None:
+    """Raise if the configured driver does not fit the configured worlds, such as a policy of other
+    ones.
+    """
     cfg = driven_config(context.cfg, reset={})
     env = build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu")
     try:

@@ -16,12 +16,14 @@ class Target:
         toward: Number of the source towards which the offset's x axis points; -1 for world x.
         offset: Along that axis and to its left [m].
         z: Height [m].
+        above: The same over the anchor's centre, or over the table where a place is the anchor [m].
     """
 
     source: int
     toward: int
     offset: tuple[float, float]
     z: float
+    above: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +81,8 @@ def build_phases(cfg: Config) -> list[Phase]:
         if spec.anchor is not None:
             thing = scene.objects.get(spec.anchor)
             half = thing.half_height if thing is not None else 0.0
-            up = 0.0 if spec.level == "table" else bottom[spec.anchor] + half
+            centre = bottom[spec.anchor] + half
+            up = 0.0 if spec.level == "table" else centre
             rest = 0.0
             if spec.level == "on_top":
                 rest = up + half
@@ -92,7 +95,8 @@ def build_phases(cfg: Config) -> list[Phase]:
             toward = -1 if spec.toward is None else sources.index(spec.toward)
             offset = (spec.offset[0], spec.offset[1])
             z = scene.table_top + up + above
-            target = Target(sources.index(spec.anchor), toward, offset, z)
+            over = up + above - centre
+            target = Target(sources.index(spec.anchor), toward, offset, z, over)
         stop = start + round(spec.seconds / cfg.timing.step_dt)
         grasped = -1 if spec.grasps is None else sources.index(spec.grasps)
         carried = sources.index(held) if in_hand and spec.grasps is None else -1

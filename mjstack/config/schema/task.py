@@ -116,7 +116,7 @@ class ControllerCfg:
     """The phases of the expert. Its joint targets go through the action terms of ``action``."""
 
     name: str = spec()
-    """open_loop, closed_loop or policy."""
+    """open_loop, closed_loop, state_based or policy."""
     action: dict[str, Any] = spec()
     """Its action terms, by name."""
     phases: dict[str, PhaseCfg] = spec(factory=dict)
@@ -128,7 +128,9 @@ class ControllerCfg:
     ik_iterations: int = spec(ge=1, le=10_000)
     """Iterations per solution of a plan."""
     step_iterations: int = spec(ge=1, le=1000)
-    """Iterations of batched inverse kinematics per control step of closed_loop."""
+    """Iterations of batched inverse kinematics per control step of closed_loop and
+    state_based.
+    """
     posture_gain: float = spec(ge=0.0, le=1.0)
     """How strongly redundant joints follow the nominal plan per iteration."""
     approach_gain: float = spec(ge=0.0, le=1.0)

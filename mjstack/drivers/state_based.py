@@ -1,0 +1,434 @@
+"""The state-based expert: it decides from the state alone what is to be done next, so it can be
+asked in any state that somebody else has brought about.
+"""
+
+import math
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from mjstack.config.schema import Config
+from mjstack.drivers.closed_loop import ClosedLoopDriver
+from mjstack.errors import ConfigError
+from mjstack.managers.view import EnvView
+from mjstack.math import quat_to_matrix
+from mjstack.mdp.geometry import gripper_opening, objects_in_hand, pose_w, robot
+from mjstack.scene.phases import Phase, source_names
+from mjstack.tasks.check import make_check
+
+# How fast
+_SPEED = 0.5  # m/s, of the grasp point
+_CARRY_SPEED = 0.25  # m/s, with an object
+_SLOWING = 0.5  # largest share of the distance that is left, in one step
+_JOINT = 0.25  # rad, m: largest lead of a joint
+_ROLL = 0.1  # rad: largest lead of the roll
+_GRIP = 0.3  # largest lead of the gripper, of its opening
+
+# The way to a target: how much higher the grasp point stays for all that is not as it should be
+_FUNNEL = 3.0  # m per m of horizontal distance
+_ROLL_FUNNEL = 0.3  # m per rad between the jaws and a face of the object
+_GRIP_FUNNEL = 0.2  # m per share of the opening that lacks
+_UP_FIRST = 0.03  # m: so far below its way, the grasp point moves straight up
+_HIGH = 0.06  # m: so far over its target, the grasp point is still in the phase before
+_TURNED = 0.1  # rad: jaws turned by less from a face go down
+
+# What is the case
+_OPEN = 0.85  # share of its opening from which a gripper is open, as measured
+_NEAR = 0.004  # m: so near an object, horizontally, open jaws close,
+_NEAR_CLOSED = 0.012  # and closed ones do not open again
+_DEPTH = 0.013  # m: the same, vertically: fingers may touch the table
+_STUCK = 0.010  # m: so much higher above it, where the arm is at a standstill
+_STILL = 0.3  # rad/s, m/s: a joint that moves faster is not
+_REACH = 0.013  # m: an object whose surface is so near the grasp point is between the jaws
+_AT_GOAL = 0.007  # m: horizontally so near its goal, an object is let go of,
+_ABOVE = 0.004  # if it is this little higher than the phases let go of it,
+_BELOW = 0.010  # and no lower than this under its goal
+_LEFT = 0.08  # m: so near an object that was let go of, the gripper keeps its tilt
+_OFF_CENTER = (0.015, 0.015, 0.010)  # m: so far from the grasp point, an object is made up for
+
+
+class Role(IntEnum):
+    """The part of a phase in bringing an object to its goal."""
+
+    over = 0
+    down = 1
+    close = 2
+    carry = 3
+    place = 4
+    open = 5
+    retreat = 6
+
+
+class _State(NamedTuple):
+    """The measured state: joints; speed of the fastest joint of the arm; grasp point, closing and
+    approach axis; opening of the gripper; position of every object, and whether all jaws press on
+    it.
+    """
+
+    q: Tensor
+    speed: Tensor
+    point: Tensor
+    closing: Tensor
+    approach: Tensor
+    opening: Tensor
+    pos: Tensor
+    in_hand: Tensor
+
+
+class _Due(NamedTuple):
+    """What is to be done: the role, the phases of the object's roles, the object's number, whether
+    it is held, whether the grasp point is led along with it, whether the way is a funnel, how far
+    the roll is off, and whether objects were let go of before, and the gripper is still beside one.
+    """
+
+    role: Tensor
+    phases: Tensor
+    object: Tensor
+    held: Tensor
+    led: Tensor
+    funnel: Tensor
+    turn: Tensor
+    later: Tensor
+    beside: Tensor
+
+
+class StateBasedDriver(ClosedLoopDriver):
+    """Joint targets that are a function of the simulation's state: no clock, no memory.
+
+    The objects that `EpisodeCheck.goals` names go to their goals one after the other, as far as
+    `EpisodeCheck.placed` and the measured positions do not find them there. The configured phases
+    say where the grasp point goes: over the object, down, close, up and over its goal, down, open,
+    up. The state says which of these is due in each world. The grasp point stays as high above a
+    target as it is away from it horizontally, the jaws are turned or the gripper is not open, and
+    moves straight up where it is too low. What a held object is off the grasp point is made up for.
+
+    In a task without goals, such as reach, the grasp point goes to the only target of the phases.
+
+    A check judges it as it judges a policy: it has no phases. ``error`` and ``retries`` stay 0.
+
+    Attributes:
+        due: Number of the configured phase to whose target the last command led, shape
+            ``(nworld,)``, int64.
+    """
+
+    def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
+        """Allocate for the environment's worlds; arguments as of `ClosedLoopDriver`.
+
+        Raises:
+            MjstackError: As of `ClosedLoopDriver`, or the task has no goals.
+        """
+        super().__init__(env, nominal)
+        cfg = env.cfg
+        device = env.device
+        plan = self.phases
+        self.phases = []
+        self.steps = cfg.task.episode_steps
+        self.due = torch.zeros_like(self.phase)
+
+        # The task: objects and the phases that bring each to its goal
+        self._check = make_check(cfg)
+        self._view = self._check.view(env)
+        self._goals = list(self._check.goals(self._view.step()))
+        moved, roles = find_roles(cfg, plan, self._goals)
+        things = list(cfg.scene.objects)
+        self._roles = torch.tensor(roles, device=device)
+        self._moved = torch.tensor([things.index(name) for name in moved], device=device)
+        size = [max(cfg.scene.objects[name].half) + _REACH for name in moved]
+        self._reach = torch.tensor(size, device=device)
+
+        # Heights of targets: over an anchor that may stand anywhere, or over the table
+        targets = [phase.target for phase in plan]
+        above = [0.0 if target is None else target.above for target in targets]
+        self._above = torch.tensor(above, device=device)
+        self._follows = torch.tensor([_follows(phase, things) for phase in plan], device=device)
+        self._off_center = torch.tensor(_OFF_CENTER, device=device)
+
+        # The robot
+        names = cfg.robot.joints
+        aligned = cfg.robot.roll_joint if cfg.controller.yaw_alignment > 0.0 else None
+        self._locked = [
+            (names.index(name), value)
+            for name, value in cfg.robot.locked.items()
+            if name != aligned
+        ]
+        tensors = robot(env)
+        self._grip_lead = _GRIP * (tensors.gripper_open - tensors.gripper_closed).abs().float()
+        lag = servo_lag(env.sim.model, env.index.ctrl[: self._n_arm].tolist())
+        # A servo that lags has to be led by more than it is to move in a step.
+        self._lead = 1.0 / (1.0 - math.exp(-cfg.timing.step_dt / lag))
+        self._every = torch.ones_like(self.unreachable)
+
+    def command(self) -> Tensor:
+        """See `Driver`."""
+        cfg = self._cfg.controller
+        self._observe(self._every, self._every)
+        state = self._measure()
+        due = self._decide(state)
+        target, phase = self._lead_point(state, due)
+        self.due.copy_(phase)
+
+        # The arm, from where it is
+        q = state.q
+        start = q.clone()
+        for column, value in self._locked:
+            start[:, column] = value
+        if cfg.yaw_alignment > 0.0:
+            start[:, self._roll_column] += due.turn.clamp(-_ROLL, _ROLL) * (due.role == Role.down)
+        approach = None if self._tilt is None else self._tilted(state, due, phase)
+        posture = self._nominal[phase] if cfg.posture_gain > 0.0 else None
+        change = self._ik.solve(start, target, posture, approach)[0] - q
+        largest = change.abs().amax(1, keepdim=True)
+        command = q + change * (_JOINT / largest.clamp(min=1e-6)).clamp(max=1.0)
+
+        # The gripper
+        now = q[:, self._n_arm :]
+        grip = (self._grip[phase] - now).clamp(-self._grip_lead, self._grip_lead)
+        command[:, self._n_arm :] = now + grip
+        # A world whose state is not finite keeps its command, and the check fails it.
+        self._command.copy_(torch.where(torch.isfinite(command), command, self._command))
+        return self._command
+
+    def _measure(self) -> _State:
+        """The state now."""
+        env = self._env
+        q = robot(env).qpos.read(env.sim.qpos).float()
+        pos = [pose_w(env, name)[:, :3].float() for name in self._cfg.scene.objects]
+        return _State(
+            q,
+            robot(env).qvel.read(env.sim.qvel)[:, : self._n_arm].float().abs().amax(1),
+            *self._ik.forward(q),
+            opening=gripper_opening(env).float().amin(1),
+            pos=torch.stack(pos, dim=1),
+            in_hand=objects_in_hand(env.index, env.sim),
+        )
+
+    def _decide(self, state: _State) -> _Due:
+        """What is due in every world."""
+        # The first object that is not done
+        delivered, held, between = self._find_delivered(state)
+        letting_go = delivered & between & (state.opening < _OPEN)[:, None]
+        done = delivered & ~letting_go
+        number = done.long().cumprod(1).sum(1)
+        all_done = number == done.shape[1]
+        number = number.clamp(max=done.shape[1] - 1)
+        phases = self._roles[number]
+        thing = self._moved[number]
+        pick = number[:, None]
+        held = held.gather(1, pick)[:, 0] & ~all_done
+        letting_go = letting_go.gather(1, pick)[:, 0]
+
+        # Its role
+        own = state.in_hand.gather(1, thing[:, None])[:, 0]
+        other = (state.in_hand.sum(1) > own) & ~held & ~letting_go
+        offset = state.point - self._point(state, phases[:, Role.close])
+        near = _NEAR_CLOSED + (_NEAR - _NEAR_CLOSED) * state.opening.clamp(0.0, 1.0)
+        there = torch.linalg.vector_norm(offset[:, :2], dim=1) <= near
+        stuck = _STUCK * (1.0 - state.speed / _STILL).clamp(min=0.0)
+        there &= (offset[:, 2] >= -_DEPTH) & (offset[:, 2] <= _DEPTH + stuck)
+        role = torch.where(there, Role.close, Role.down)
+        for value, mask in (
+            (Role.place, held),
+            (Role.open, letting_go | other),
+            (Role.retreat, all_done),
+        ):
+            role = role.masked_fill(mask, value)
+        gap = torch.linalg.vector_norm(
+            state.point[:, None] - state.pos.index_select(1, self._moved), dim=2
+        )
+        return _Due(
+            role,
+            phases,
+            thing,
+            held,
+            led=held | letting_go | other,
+            funnel=(role == Role.down) | (role == Role.place) | (role == Role.retreat),
+            turn=self._turn_left(state, thing),
+            later=number > 0,
+            beside=(done & (gap <= _LEFT)).any(1),
+        )
+
+    def _find_delivered(self, state: _State) -> tuple[Tensor, Tensor, Tensor]:
+        """Whether each object is where it is let go of, is held, and is between the jaws, each
+        ``(nworld, objects)``, bool.
+        """
+        pos = state.pos.index_select(1, self._moved)
+        gap = torch.linalg.vector_norm(state.point[:, None] - pos, dim=2)
+        between = gap <= self._reach
+        held = state.in_hand.index_select(1, self._moved) & between
+        if not self._goals:
+            return torch.zeros_like(held), torch.zeros_like(held), between
+        step = self._view.step()
+        placed = self._view.columns(self._goals).read(self._check.placed(step))
+        goals = torch.stack(list(self._check.goals(step).values()), dim=1).float()
+        let_go = torch.stack(
+            [
+                self._point(state, row[Role.place].expand(len(pos))) - self._grasp_offset(row)
+                for row in self._roles
+            ],
+            dim=1,
+        )
+        offset = pos - let_go
+        across = torch.linalg.vector_norm(offset[..., :2], dim=2)
+        low = (offset[..., 2] <= _ABOVE) & (pos[..., 2] >= goals[..., 2] - _BELOW)
+        return (across <= _AT_GOAL) & low | placed & ~held, held, between
+
+    def _lead_point(self, state: _State, due: _Due) -> tuple[Tensor, Tensor]:
+        """Where the grasp point is led in this step [m], shape ``(nworld, 3)``, and the number of
+        the phase, shape ``(nworld,)``.
+        """
+        point = state.point
+
+        # Where it goes: an object in the jaws is what arrives, one of another goal is let go here
+        phase = due.phases.gather(1, due.role[:, None])[:, 0]
+        thing = state.pos.gather(1, due.object[:, None, None].expand(-1, 1, 3))[:, 0]
+        off = point - thing - self._grasp_offset(due.phases)
+        far = torch.linalg.vector_norm(point - thing, dim=1) > self._reach.amax()
+        off = torch.minimum(torch.maximum(off, -self._off_center), self._off_center)
+        end = self._point(state, phase) + off * due.led[:, None]
+        end = torch.where((due.led & far)[:, None], point, end)
+
+        # How high on the way there
+        before = torch.where(due.held, Role.carry, Role.over)
+        before = due.phases.gather(1, before[:, None])[:, 0]
+        clear = self._point(state, self._roles[0, Role.retreat].expand_as(phase))[:, 2]
+        most = torch.maximum(self._point(state, before)[:, 2], end[:, 2])
+        most = torch.where(due.later & ~due.held, torch.maximum(most, clear), most)
+        across = torch.linalg.vector_norm((end - point)[:, :2], dim=1)
+        higher = _FUNNEL * (across - _NEAR).clamp(min=0.0)
+        ready = _ROLL_FUNNEL * (due.turn.abs() - _TURNED).clamp(min=0.0)
+        ready = ready + _GRIP_FUNNEL * (_OPEN - state.opening).clamp(min=0.0)
+        higher = higher + ready * (due.role == Role.down)
+        way = torch.minimum(end[:, 2] + higher * due.funnel, most)
+        level = 1.0 - ((way - point[:, 2]) / _UP_FIRST - 0.33).clamp(0.0, 1.0)
+
+        # How far in this step
+        move = torch.cat(((end - point)[:, :2] * level[:, None], (way - point[:, 2])[:, None]), 1)
+        distance = torch.linalg.vector_norm(move, dim=1)
+        speed = torch.where(due.held, _CARRY_SPEED, _SPEED) * self._cfg.timing.step_dt
+        lead = self._lead * torch.minimum(speed, _SLOWING * distance)
+        # Fingers that touch the table are not pressed onto it.
+        lead = torch.where(due.role == Role.close, distance.clamp(max=_DEPTH), lead)
+        target = point + move * (lead / distance.clamp(min=1e-6))[:, None]
+        return target, torch.where(due.funnel & (higher > _HIGH), before, phase)
+
+    def _tilted(self, state: _State, due: _Due, phase: Tensor) -> Tensor:
+        """Desired approach axis, shape ``(nworld, 3)``: as the object's goal needs it; with the
+        object in the jaws, the one with which it is upright; beside one that was let go of, as it
+        is.
+        """
+        assert self._tilt is not None
+        tilt = self._tilt.release_approach(state.q, phase, self._aim(self._tilt.place[phase]))
+        stays = due.beside & ~due.led | (due.role == Role.close)
+        tilt = torch.where(stays[:, None], state.approach, tilt)
+
+        # The turn of the object's axis that points up most, to the vertical, by Rodrigues' formula
+        env = self._env
+        quat = torch.stack([pose_w(env, name)[:, 3:] for name in self._cfg.scene.objects], dim=1)
+        quat = quat.float().gather(1, due.object[:, None, None].expand(-1, 1, 4))[:, 0]
+        axes = quat_to_matrix(quat)
+        most = axes[:, 2].abs().argmax(1)
+        up = axes.gather(2, most[:, None, None].expand(-1, 3, 1))[..., 0]
+        up = up * torch.sign(up[:, 2:])
+        x, y, z = up.unbind(1)
+        turn = torch.stack((y, -x, torch.zeros_like(x)), dim=1)  # up x vertical
+        a = state.approach
+        along = (turn * a).sum(1, keepdim=True) / (1.0 + z[:, None])
+        upright = a * z[:, None] + torch.linalg.cross(turn, a) + turn * along
+        return torch.where(due.led[:, None], upright, tilt)
+
+    def _turn_left(self, state: _State, thing: Tensor) -> Tensor:
+        """How far the open jaws have to roll to the nearer face of an object [rad], shape
+        ``(nworld,)``.
+        """
+        if self._cfg.controller.yaw_alignment == 0.0:
+            return torch.zeros_like(state.opening)
+        roll = state.q[:, self._roll_column] - self._nominal[0, self._roll_column]
+        yaw = self._seen.gather(1, thing[:, None, None].expand(-1, 1, 3))[:, 0, 2]
+        wanted = self._face_roll(state.closing, state.approach, yaw, roll)
+        return self._cfg.controller.yaw_alignment * wanted - roll
+
+    def _point(self, state: _State, phase: Tensor) -> Tensor:
+        """Target of each world's phase, from where its anchor is [m], shape ``(nworld, 3)``."""
+        aim = self._aim(phase)
+        source = self._source[phase].clamp(max=state.pos.shape[1] - 1)
+        height = state.pos[..., 2].gather(1, source[:, None])[:, 0] + self._above[phase]
+        z = torch.where(self._follows[phase], height, aim[:, 2])
+        return torch.cat((aim[:, :2], z[:, None]), dim=1)
+
+    def _grasp_offset(self, phases: Tensor) -> Tensor:
+        """From an object's centre to the grasp point that grasps it, by the phases of its roles
+        [m], shape ``(..., 3)``.
+        """
+        above = self._above[phases[..., Role.close]]
+        zero = torch.zeros_like(above)
+        return torch.stack((zero, zero, above), dim=-1)
+
+
+def servo_lag(model: mujoco.MjModel, actuators: Sequence[int]) -> float:
+    """Longest time constant of some position servos [s]: damping over stiffness."""
+    dof = model.jnt_dofadr[model.actuator_trnid[actuators, 0]]
+    damping = model.dof_damping[dof] - model.actuator_biasprm[actuators, 2]
+    return max(1e-6, float((damping / model.actuator_gainprm[actuators, 0]).max()))
+
+
+def find_roles(
+    cfg: Config, phases: Sequence[Phase], goals: Sequence[str]
+) -> tuple[list[str], list[list[int]]]:
+    """The objects of a task, and for each the number of the phase that plays each `Role`.
+
+    Args:
+        cfg: The configuration.
+        phases: Its phases.
+        goals: Objects with goals.
+
+    Raises:
+        ConfigError: The phases do not bring an object to its goal, or there is none and the phases
+            have more than one target.
+    """
+    things = cfg.scene.objects
+    if not goals:
+        moves = [k for k, phase in enumerate(phases) if phase.target is not None]
+        anchor = str(phases[moves[0]].spec.anchor) if moves else ""
+        others = {(phase.spec.anchor or anchor, phase.spec.gripper) for phase in phases}
+        if len(others) != 1 or anchor not in things:
+            raise _refusal(cfg, "has no goals")
+        return [anchor], [[moves[0]] + [moves[-1]] * (len(Role) - 1)]
+    sources = source_names(cfg.scene)
+    rows = []
+    for name in goals:
+        number = sources.index(name)
+        closes = [k for k, phase in enumerate(phases) if phase.grasped == number]
+        carries = [k for k, phase in enumerate(phases) if phase.carried == number]
+        if not closes or not carries or closes[0] == 0:
+            raise _refusal(cfg, f"does not bring {name} to its goal in its phases")
+        close = closes[-1]
+        over = close - 1
+        while over > 0 and phases[over - 1].spec.anchor == name:
+            over -= 1
+        place = carries[-1]
+        carry = carries[-2] if len(carries) > 1 else place
+        after = [k for k in range(place + 1, len(phases)) if phases[k].target is not None]
+        last = after[0] if after else place
+        retreat = after[1] if len(after) > 1 else last
+        rows.append([over, close - 1, close, carry, place, last, retreat])
+    return list(goals), rows
+
+
+def _refusal(cfg: Config, why: str) -> ConfigError:
+    expected = f"another controller, because task {cfg.task.name} {why}"
+    return ConfigError("controller", cfg.controller.name, expected, "Set controller=closed_loop")
+
+
+def _follows(phase: Phase, things: Sequence[str]) -> bool:
+    """Whether the height of a phase's target follows its anchor: an object, but not the one that is
+    carried.
+    """
+    spec = phase.spec
+    if phase.target is None or spec.level == "table" or spec.anchor not in things:
+        return False
+    return things.index(spec.anchor) != phase.carried

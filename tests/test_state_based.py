@@ -1,0 +1,83 @@
+"""The state-based expert: accepted without phases, and a function of the state alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from compositions import load_config
+
+from mjstack.drivers.state_based import Role, StateBasedDriver, find_roles
+from mjstack.envs import Env
+from mjstack.episodes.context import RunContext
+from mjstack.errors import ConfigError
+from mjstack.scene.phases import build_phases
+
+Stage = Callable[..., RunContext]
+EXPERT = "controller=state_based"
+
+
+def started(stage: Stage, robot: str, *overrides: str, nworld: int) -> tuple[RunContext, Env]:
+    """Worlds that have started, and their context."""
+    context = stage(robot, EXPERT, "sim=native", "reset=jitter", *overrides)
+    return context, context.start(context.batch_simulation(nworld), context.cfg.reset)
+
+
+@pytest.mark.parametrize(
+    ("robot", "task", "steps"),
+    [
+        ("so101", "stack", 200),
+        pytest.param("rebot", "stack", 260, marks=pytest.mark.full),
+        pytest.param("so101", "box", 320, marks=pytest.mark.full),
+        pytest.param("rebot", "box", 400, marks=pytest.mark.full),
+    ],
+)
+def test_episodes_are_accepted(stage: Stage, robot: str, task: str, steps: int) -> None:
+    """The episode is as long as the expert needs, and the window of rest."""
+    own = stage(robot, f"task={task}", EXPERT, "sim=native", "reset=randomized")
+    cfg = replace(own.cfg, task=replace(own.cfg.task, episode_steps=steps))
+    context = replace(own, cfg=cfg)
+    episode = context.play(context.batch_simulation(4), cfg.reset)
+    assert not episode.failed.any(), context.check.rules.failing(episode.failed)
+
+
+def test_a_command_is_a_function_of_the_state(stage: Stage) -> None:
+    """A driver that has never been asked gives the same command, in whatever step it is asked."""
+    context, env = started(stage, "so101", nworld=2)
+    driver = context.driver(env)
+    other = context.start(context.batch_simulation(2), context.cfg.reset, seed=7)
+    fresh = context.driver(other)
+    assert isinstance(driver, StateBasedDriver)
+    seen = set()
+    for step in range(84):
+        command = driver.command()
+        if step % 4 == 0:
+            for name in ("qpos", "qvel", "sensordata"):
+                getattr(other.sim, name).copy_(getattr(env.sim, name))
+            torch.testing.assert_close(fresh.command(), command, rtol=0.0, atol=0.0)
+            seen |= set(driver.due.tolist())
+        env.step(command)
+    assert len(seen) >= 4  # over red, close, over blue and more
+    env.close()
+    other.close()
+
+
+def test_roles_are_found_in_the_phases() -> None:
+    cfg = load_config(["task=box"])
+    phases = build_phases(cfg)
+    names, rows = find_roles(cfg, phases, ["red", "blue"])
+    assert names == ["red", "blue"]
+    roles = [f"{phases[k].name}" for k in rows[1]]
+    assert roles == [
+        f"{each}_blue"
+        for each in ("approach", "descend", "close", "carry", "hold", "open", "retreat")
+    ]
+    assert len(roles) == len(Role)
+    _, ((over, *others),) = find_roles(
+        reach := load_config(["task=reach"]), build_phases(reach), []
+    )
+    assert (over, set(others)) == (0, {1})
+    with pytest.raises(ConfigError, match="another controller, because task stack has no goals"):
+        find_roles(stack := load_config(), build_phases(stack), [])
