@@ -127,6 +127,11 @@ def _run_one(hydra: Hydra, overrides: list[str]) -> int:
     given = _is_set("hydra.run.dir", overrides)
     resumed = None if given else checked.folder
     folder = resumed or _hydra_path(cfg, "run.dir")
+    if int(os.environ.get("RANK", 0)):  # torchrun's processes but the first one
+        if checked.assist is None:
+            raise CompositionError("torchrun: expected job=train. Run this job without torchrun.")
+        checked.assist(checked.context, folder)
+        return 0
     own = "" if given else checked.own
     begin_job()
     with claim_folder(folder, checked.resumes, own, numbered=not (given or resumed)) as claimed:

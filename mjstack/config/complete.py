@@ -55,16 +55,19 @@ def complete(cfg: Config) -> None:
         for name in path:
             parent = getattr(parent, name)
         setattr(parent, last, _typed_all(key, getattr(parent, last), kind))
-    for name, group in cfg.observation.items():
-        group.terms = _typed_all(f"observation.{name}.terms", group.terms, ObservationTermCfg)
+    _complete_groups("observation", cfg.observation)
     if isinstance(cfg.job, StudyJobCfg):
         variants = {
             name: asdict(cfg.solver) | node if isinstance(node, dict) else node
             for name, node in cfg.job.variants.items()
         }
         cfg.job.variants = _typed_all("job.variants", variants, SolverCfg)
-    if isinstance(cfg.job, CloneJobCfg | PpoJobCfg):
+    if isinstance(cfg.job, PpoJobCfg):
         cfg.job.add = _typed_all("job.add", cfg.job.add, ObservationTermCfg)
+    if isinstance(cfg.job, CloneJobCfg):
+        seen = _typed_all("job.observation", cfg.job.observation, ObservationGroupCfg)
+        _complete_groups("job.observation", seen)
+        cfg.job.observation = seen
     _complete_robot(cfg.robot)
     _choose_phases(cfg)
 
@@ -73,6 +76,11 @@ def _typed_all(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
     return {
         name: typed(f"{key}.{name}", node, kind) for name, node in nodes.items() if node is not None
     }
+
+
+def _complete_groups(key: str, groups: dict[str, ObservationGroupCfg]) -> None:
+    for name, group in groups.items():
+        group.terms = _typed_all(f"{key}.{name}.terms", group.terms, ObservationTermCfg)
 
 
 def typed(key: str, node: Any, kind: type) -> Any:

@@ -117,6 +117,23 @@ class EpisodeData:
     values: Mapping[str, float | int | bool | str] = field(default_factory=dict)
 
 
+def term_columns(term: str, dim: int, history: int) -> list[str]:
+    """Names of the numbers of an observation term: ``red_pose.2``, and ``red_pose.2.t-1`` one step
+    before.
+
+    Args:
+        term: Its name.
+        dim: How many numbers it has, history included.
+        history: How many steps it has.
+    """
+    width = dim // history
+    return [
+        f"{term}{f'.{i}' if width > 1 else ''}{f'.t-{age}' if age else ''}"
+        for age in range(history - 1, -1, -1)
+        for i in range(width)
+    ]
+
+
 def typed_arrays(spec: DatasetSpec, episode: EpisodeData) -> dict[str, np.ndarray]:
     """The episode's frames in the dataset's types, each ``(frames, dim)``, in the order of the
     features.

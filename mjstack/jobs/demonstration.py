@@ -16,6 +16,7 @@ from mjstack.config.functions import offered
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
 from mjstack.config.session import list_items
 from mjstack.datasets import DatasetSpec, Feature
+from mjstack.datasets.spec import term_columns
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.context import RunContext
@@ -234,13 +235,8 @@ def group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
     for term, dim in env.observation_manager.term_dims[group].items():
         cfg = cast(ObservationTermCfg, env.cfg.observation[group].terms[term])
         width = dim // cfg.history
-        own = _scaled(_term_units(cfg.func, width, joints), cfg.scale)
-        for age in range(cfg.history - 1, -1, -1):
-            names += [
-                f"{term}{f'.{i}' if width > 1 else ''}{f'.t-{age}' if age else ''}"
-                for i in range(width)
-            ]
-            units += own
+        names += term_columns(term, dim, cfg.history)
+        units += cfg.history * _scaled(_term_units(cfg.func, width, joints), cfg.scale)
     return Feature(dtype="float32", names=tuple(names), units=tuple(units))
 
 

@@ -80,6 +80,8 @@ class CheckedJob:
         folder: The default folder of a job that resumes; None for a folder of the hour.
         own: A file by which it knows that folder.
         resumes: Its name in report.json, by which it knows any folder that it goes on with.
+        assist: The part in a process of torchrun that writes nothing; None where one process does
+            all.
     """
 
     context: RunContext
@@ -88,6 +90,7 @@ class CheckedJob:
     folder: Path | None = None
     own: str = ""
     resumes: str = ""
+    assist: Callable[[RunContext, Path], object] | None = None
 
     def run(self, folder: Path, overrides: Sequence[str] = ()) -> Report:
         """Do the work and write its report after each result into the folder.

@@ -69,6 +69,7 @@ def check_train(cfg: Config) -> CheckedJob:
         folder=folder,
         own=STATE,
         resumes=NAME,
+        assist=trainer.train,
     )
 
 

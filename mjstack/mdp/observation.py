@@ -68,6 +68,34 @@ def object_pose(env: EnvView, *, object: str) -> Tensor:
     return pose_w(env, object)
 
 
+@offers(unit="m")
+def positions(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
+    """Where objects are [m], world frame, shape ``(nworld, 3 * objects)``.
+
+    Args:
+        env: The environment.
+        objects: The objects; all of the scene that can move if None.
+    """
+    names = env.cfg.scene.free if objects is None else objects
+    return torch.cat([pose_w(env, name)[:, :3] for name in names], dim=1)
+
+
+@offers(unit="m")
+def offsets(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
+    """From the grasp point to objects [m], shape ``(nworld, 3 * objects)``; arguments as of
+    `positions`.
+    """
+    at = positions(env, objects=objects)
+    return at - grasp_point_pos(env).repeat(1, at.shape[1] // 3)
+
+
+@offers(unit="m")
+def goals(env: EnvView) -> Tensor:
+    """Where the scene's places are [m], shape ``(nworld, 2 * places)``."""
+    places = [place_xy(env, name) for name in env.cfg.scene.places]
+    return torch.cat(places, dim=1) if places else env.sim.qpos[:, :0]
+
+
 @offers(unit="1")
 def headings(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     """How boxes are turned about z: cosine and sine of four times the yaw of each, which are the

@@ -46,10 +46,11 @@ class PolicyNetwork(nn.Module):
 
     def set_scale(self, name: str, mean: Tensor, std: Tensor) -> None:
         """Set how ``observation`` or ``action`` is normalised, each shape ``(width,)``. A constant
-        column is only shifted.
+        column of an observation is only shifted, and a constant joint target is always its mean.
         """
+        constant = 1.0 if name == "observation" else 0.0
         self.get_buffer(f"{name}_mean").copy_(mean)
-        self.get_buffer(f"{name}_std").copy_(torch.where(std > _CONSTANT, std, 1.0))
+        self.get_buffer(f"{name}_std").copy_(torch.where(std > _CONSTANT, std, constant))
 
     def normalized(self, observation: Tensor) -> Tensor:
         """Answer in normalised joint targets, shape ``(n, chunk, joints)``."""

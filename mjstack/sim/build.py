@@ -1,5 +1,6 @@
 """Chooses a backend and a device: the only branch on the backend."""
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,14 +16,14 @@ from mjstack.sim.sizes import BatchSizes, resolve_sizes
 
 
 def resolve_device(requested: str) -> str:
-    """``cpu`` or ``cuda:N`` for a requested device.
+    """``cpu`` or ``cuda:N`` for a requested device; ``auto`` under torchrun is the process's own.
 
     Raises:
         DeviceError: The CUDA device is not there.
     """
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if requested == "auto":
-        return "cuda:0" if count else "cpu"
+        return f"cuda:{int(os.environ.get('LOCAL_RANK', 0)) % count}" if count else "cpu"
     if requested.startswith("cuda") and int(requested.partition(":")[2]) >= count:
         found = ", ".join(f"cuda:{number}" for number in range(count)) or "no CUDA device"
         raise DeviceError(

@@ -14,40 +14,55 @@ from torch import Tensor
 
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import Backend, CloneJobCfg, CloneSizes, Config, ObservationGroupCfg
-from mjstack.envs import build_env, driven_config
+from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.context import RunContext
-from mjstack.errors import FolderError, MjstackError, UnknownName
+from mjstack.errors import ConfigError, FolderError, MjstackError, UnknownName
 from mjstack.interrupt import check_interrupt
 from mjstack.managers.observation import ObservationManager
 from mjstack.policy import Policy, PolicyNetwork, save_policy
 from mjstack.policy.checkpoint import read_state, write_state
+from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import Demonstrations, batches_of, play_expert
-from mjstack.train.trainer import BEST, LAST, STATE, Trained, Trainer
+from mjstack.train.distributed import Ranks, joined, torchrun_ranks
+from mjstack.train.trainer import BEST, LAST, STATE, EventWriter, Trained, Trainer
 
 _HELD_OUT = 20  # of so many episodes one is for validation
 _LEAST = 0.1  # scale of a column, of the largest one of its term
+_CONSTANT = 1e-6  # rad, m: a joint target that varies less is not learned
+_VALIDATED = 65536  # steps at once
 _SHOWN = 10  # batches between two looks at the progress
 
 
 def check_clone(context: RunContext) -> range:
-    """Check the observation and the sizes; see `Trainer`."""
+    """Check the observation, the sizes and the dataset; see `Trainer`."""
     cfg = context.cfg
     job = cast(CloneJobCfg, cfg.job)
-    group = observed_group(cfg)
-    env = build_env(
-        driven_config(cfg, reset={}),
-        model=context.model,
-        nworld=1,
-        backend=Backend.native,
-        device="cpu",
-    )
+    sizes = resolve_sizes(job, context.backend[1])
+    group = observed_group(job, sizes)
+    with _one_world(context) as env:
+        widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
+        if job.dataset is not None:
+            return check_dataset(Path(job.dataset), env, group, widths)
+    batches = batches_of(job, sizes, cfg.nworld)
+    if len(batches) < torchrun_ranks().size:
+        raise ConfigError(
+            "nworld",
+            cfg.nworld,
+            f"fewer, so that the {torchrun_ranks().size} processes of torchrun have a batch each",
+        )
+    return range(cfg.seed, cfg.seed + len(batches))
+
+
+@contextmanager
+def _one_world(context: RunContext) -> Iterator[Env]:
+    """One started world of the task."""
+    cfg = driven_config(context.cfg, reset={})
+    env = build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu")
     try:
         env.reset()
-        ObservationManager(env, {job.group: group})
+        yield env
     finally:
         env.close()
-    batches = batches_of(job, resolve_sizes(job, context.backend[1]), cfg.nworld)
-    return range(cfg.seed, cfg.seed + len(batches))
 
 
 def resolve_sizes(job: CloneJobCfg, device: str) -> CloneSizes:
@@ -57,67 +72,94 @@ def resolve_sizes(job: CloneJobCfg, device: str) -> CloneSizes:
     return replace(own, **{name: value for name, value in given.items() if value is not None})
 
 
-def observed_group(cfg: Config) -> ObservationGroupCfg:
-    """The observation group of the policy: terms of a configured group, and added ones.
+def observed_group(job: CloneJobCfg, sizes: CloneSizes) -> ObservationGroupCfg:
+    """The observation group of the policy.
 
     Raises:
         MjstackError: There is no such group or term.
     """
-    job = cast(CloneJobCfg, cfg.job)
-    if job.group not in cfg.observation:
-        raise UnknownName("job.group: observation group", job.group, cfg.observation)
-    group = cfg.observation[job.group]
-    for name in job.leave_out:
+    if job.group not in job.observation:
+        raise UnknownName("job.group: observation group", job.group, job.observation)
+    group = job.observation[job.group]
+    for name in job.leave_out or []:
         if name not in group.terms:
             raise UnknownName(f"job.leave_out: term of {job.group}", name, group.terms)
-    terms = {k: term for k, term in group.terms.items() if k not in job.leave_out} | job.add
+    terms = {name: term for name, term in group.terms.items() if name not in sizes.leave_out}
     return replace(group, noise=job.observation_noise, terms=terms)
 
 
 def train_clone(context: RunContext, folder: Path) -> Trained:
-    """Play the expert, and fit a network to its answers; see `Trainer`."""
+    """Play the expert or read a dataset, and fit a network to its answers; see `Trainer`."""
+    with joined(context.backend[1]) as ranks:
+        return _train(context, folder, ranks)
+
+
+def _train(context: RunContext, folder: Path, ranks: Ranks) -> Trained:
+    # An earlier call's training, which may be complete
     cfg = context.cfg
     job = cast(CloneJobCfg, cfg.job)
     sizes = resolve_sizes(job, context.backend[1])
-    group = observed_group(cfg)
-    made_with = {"sizes": asdict(sizes), "device": context.backend[1].partition(":")[0]}
+    device = context.backend[1].partition(":")[0]
+    made_with = {"sizes": asdict(sizes), "device": device, "processes": ranks.size}
     earlier = read_state(folder / STATE) if (folder / STATE).exists() else None
     if earlier and (theirs := earlier[1]["made_with"]) != made_with:
         raise FolderError(
             f"{folder} has a training with {theirs}, and this one has {made_with}. Set job.folder"
             " to another folder"
         )
+    if earlier and earlier[1]["done"] == sizes.batches:
+        context.print_line(f"train: {folder} is trained already, and is judged anew")
+        return _trained(folder, earlier[1])
+
+    # Demonstrations
     began = time.perf_counter()
-    demonstrations = play_expert(context, sizes, group)
-    if len(demonstrations.seen) < 2:
+    group = observed_group(job, sizes)
+    cfg = replace(cfg, observation={job.group: group})
+    if job.dataset is None:
+        demonstrations = play_expert(context, sizes, group, ranks)
+    else:
+        with _one_world(context) as env:
+            widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
+        demonstrations = read_demonstrations(Path(job.dataset), context, group, widths, ranks)
+    if len(demonstrations.ends) < 2:
         raise MjstackError(
-            f"the expert succeeded in {len(demonstrations.seen)} of {demonstrations.played}"
-            " episodes: expected two at least",
+            f"{demonstrations.source}: {len(demonstrations.ends)} of {demonstrations.played}"
+            " episodes succeeded, expected two at least",
             "Ask for more (job.episodes), or look at why with gates=[success]",
         )
-    seconds = time.perf_counter() - began
-    cfg = replace(cfg, observation={job.group: group})
-    learner = Learner(context, cfg, sizes, demonstrations, folder, made_with)
+    counts = torch.tensor([len(demonstrations.ends), demonstrations.played], device=device)
+    ranks.sum_(counts)
+    facts = {
+        "expert_episodes": int(counts[0]),
+        "expert_episodes_played": int(counts[1]),
+        "expert_s": time.perf_counter() - began,
+        "source": demonstrations.source,
+    }
+
+    # Batches
+    learner = Learner(context, cfg, sizes, demonstrations, folder, made_with, facts, ranks)
     if earlier:
         learner.restore(*earlier)
     learner.learn()
-    last = learner.curve[-1]
+    return _trained(folder, learner.facts())
+
+
+def _trained(folder: Path, facts: dict[str, Any]) -> Trained:
+    """The result of a complete training, from the facts of its state."""
+    last = facts["curve"][-1]
+    expert = dict(facts["expert"])
+    notes = {"policy": str(folder / LAST), "demonstrations": expert.pop("source")}
+    metrics = {
+        "batches": facts["done"],
+        "training_s": facts["seconds"],
+        "loss": last["loss"],
+        "validation_loss": last["validation_loss"],
+        "best_validation_loss": facts["best"],
+    }
     return Trained(
-        metrics={
-            "expert_episodes": len(demonstrations.seen),
-            "expert_episodes_played": demonstrations.played,
-            "expert_s": seconds,
-            "batches": learner.done,
-            "training_s": learner.seconds,
-            "loss": last["loss"],
-            "validation_loss": last["validation_loss"],
-            "best_validation_loss": learner.best,
-        },
-        notes={
-            "policy": str(folder / LAST),
-            "seeds": f"{demonstrations.seeds[0]} to {demonstrations.seeds[-1]}",
-        },
-        curve=learner.curve,
+        metrics=expert | metrics,
+        notes=notes,
+        curve=facts["curve"],
         lines=["loss", "validation_loss"],
     )
 
@@ -142,6 +184,8 @@ class Learner:
         demonstrations: Demonstrations,
         folder: Path,
         made_with: dict[str, Any],
+        expert: dict[str, Any],
+        ranks: Ranks,
     ) -> None:
         """Make the network.
 
@@ -152,6 +196,8 @@ class Learner:
             demonstrations: The expert's episodes.
             folder: Where policies and state are.
             made_with: Sizes and device. An earlier call must have had the same.
+            expert: Figures of the demonstrations.
+            ranks: The processes of the training.
         """
         self._context = context
         job = cast(CloneJobCfg, cfg.job)
@@ -159,25 +205,30 @@ class Learner:
         self._sizes = sizes
         self._folder = folder
         self._made_with = made_with
+        self._expert = expert
+        self._ranks = ranks
         self._seen = demonstrations.seen
         self._labels = demonstrations.labels
+        self._last = demonstrations.last()
         device = self._seen.device
-        episodes = torch.arange(len(self._seen), device=device)
+        episodes = torch.arange(len(demonstrations.ends), device=device)
         held_out = episodes % _HELD_OUT == min(_HELD_OUT, len(episodes)) - 1
-        self._training = episodes[~held_out]
-        self._validation = episodes[held_out]
+        held_out = held_out.repeat_interleave(demonstrations.lengths())
+        self._training = (~held_out).nonzero()[:, 0]
+        self._validation = held_out.nonzero()[:, 0]
+        self._batch_size = max(1, sizes.batch_size // ranks.size)
 
         # The network, its average and its optimizer
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(cfg.seed)
             network = PolicyNetwork(
-                self._seen.shape[2], self._labels.shape[2], job.chunk, sizes.hidden
+                self._seen.shape[1], self._labels.shape[1], job.chunk, sizes.hidden
             )
-        std, mean = torch.std_mean(self._labels.flatten(0, 1), dim=0)
+        mean, std = _moments(self._labels, ranks)
         network.set_scale("action", mean.cpu(), std.cpu())
         # A column that hardly moves would count as much as the others of its term, and the policy
         # would follow its noise.
-        std, mean = torch.std_mean(self._seen.flatten(0, 1), dim=0)
+        mean, std = _moments(self._seen, ranks)
         parts = [part for part in std.split(list(demonstrations.widths.values())) if len(part)]
         std = torch.cat([torch.maximum(part, _LEAST * part.amax()) for part in parts])
         network.set_scale("observation", mean.cpu(), std.cpu())
@@ -186,7 +237,7 @@ class Learner:
         self._optimizer = torch.optim.AdamW(
             self._network.parameters(), lr=job.learning_rate, weight_decay=job.weight_decay
         )
-        self._generator = torch.Generator(device).manual_seed(cfg.seed)
+        self._generator = torch.Generator(device).manual_seed(cfg.seed + ranks.rank)
         self._policy = Policy(
             network=self._average,
             group=job.group,
@@ -203,6 +254,7 @@ class Learner:
         self.curve: list[dict[str, Any]] = []
         self._sum = torch.zeros((), device=device)  # of losses since the last row
         self._count = 0
+        self._events: EventWriter | None = None
 
     def learn(self) -> None:
         """Make the missing batches, saving policies and state now and then.
@@ -212,6 +264,8 @@ class Learner:
         """
         total = self._sizes.batches
         before = self.seconds - time.perf_counter()
+        if self._ranks.writes:
+            self._events = EventWriter(self._folder, self.done, self._context.print_line)
         with _fast_products(self._seen.device):
             while self.done < total:
                 self._step(0.5 * (1.0 + math.cos(math.pi * self.done / total)))
@@ -225,25 +279,28 @@ class Learner:
                         self._context.advance("batches", self.done, total)
                         check_interrupt()
                     except KeyboardInterrupt:
-                        self._write_state()
+                        # The others' generators may be elsewhere: their last saved state counts.
+                        if self._ranks.size == 1:
+                            self._write_state()
                         raise
+        if self._events is not None:
+            self._events.close()
 
     def _step(self, rate: float) -> None:
         """One batch, at a share of the learning rate."""
         job = self._job
-        episodes = self._training
-        steps = self._seen.shape[1]
         draw = torch.randint(
-            len(episodes) * steps,
-            (self._sizes.batch_size,),
+            len(self._training),
+            (self._batch_size,),
             generator=self._generator,
             device=self._seen.device,
         )
-        loss = self._loss(self._network, episodes[draw // steps], draw % steps)
+        loss = self._loss(self._network, self._training[draw], self._sizes.input_noise)
         for group in self._optimizer.param_groups:
             group["lr"] = job.learning_rate * rate
         self._optimizer.zero_grad()
         loss.backward()
+        self._ranks.average_gradients(self._network.parameters())
         self._optimizer.step()
         # The first networks are soon forgotten.
         keep = min(job.averaging, (1.0 + self.done) / (10.0 + self.done))
@@ -252,33 +309,40 @@ class Learner:
         self._sum += loss.detach()
         self._count += 1
 
-    def _loss(self, network: PolicyNetwork, episodes: Tensor, steps: Tensor) -> Tensor:
-        """Mean squared error of the normalised answers at some steps of some episodes, each
-        ``(n,)``. At an episode's end its last joint targets hold.
+    def _loss(self, network: PolicyNetwork, steps: Tensor, noise: float = 0.0) -> Tensor:
+        """Mean squared error of the normalised answers at some steps, shape ``(n,)``. At an
+        episode's end its last joint targets hold.
+
+        Noise on the observation, in standard deviations, says that the answer is the same a little
+        off the expert's way: so the policy comes back to it.
         """
         ahead = torch.arange(network.chunk, device=steps.device)
-        then = (steps[:, None] + ahead).clamp(max=self._labels.shape[1] - 1)
-        wanted = self._labels[episodes[:, None], then]
-        wanted = (wanted - network.action_mean) / network.action_std
-        answer = network.normalized(self._seen[episodes, steps])
-        return torch.nn.functional.mse_loss(answer, wanted)
+        then = torch.minimum(steps[:, None] + ahead, self._last[steps][:, None])
+        scale = network.action_std.clamp(min=_CONSTANT)
+        wanted = (self._labels[then] - network.action_mean) / scale
+        seen = self._seen[steps]
+        if noise > 0.0:
+            draw = torch.randn(seen.shape, generator=self._generator, device=seen.device)
+            seen = seen + noise * network.observation_std * draw
+        return torch.nn.functional.mse_loss(network.normalized(seen), wanted)
 
     @torch.no_grad()
     def _validate(self) -> float:
         """The average network's loss in the episodes that are held out."""
-        steps = torch.arange(self._seen.shape[1], device=self._seen.device)
-        losses = [
-            self._loss(self._average, episode.expand(len(steps)), steps)
-            for episode in self._validation
-        ]
-        return float(torch.stack(losses).mean())
+        parts = self._validation.split(_VALIDATED)
+        total = torch.stack([self._loss(self._average, part) * len(part) for part in parts]).sum()
+        count = torch.full_like(total, len(self._validation))
+        self._ranks.sum_(total, count)
+        return float(total / count)
 
     def _save(self) -> None:
         """Add a row to the curve, and write policies and state."""
         loss = self._validate()
+        mean = self._sum / max(1, self._count)
+        self._ranks.sum_(mean)
         row = {
             "batch": self.done,
-            "loss": float(self._sum) / max(1, self._count),
+            "loss": float(mean) / self._ranks.size,
             "validation_loss": loss,
             "training_s": self.seconds,
         }
@@ -288,18 +352,22 @@ class Learner:
         self._policy.training = {
             "trainer": "clone",
             "seed": self._policy.config["seed"],
-            "episodes": len(self._seen),
+            "episodes": self._expert["expert_episodes"],
             **row,
         }
-        save_policy(self._folder / LAST, self._policy)
-        if loss <= self.best:
-            self.best = loss
-            save_policy(self._folder / BEST, self._policy)
+        better = loss <= self.best
+        self.best = min(loss, self.best)
+        if self._events is not None:
+            self._events.add(row, self.done)
+            save_policy(self._folder / LAST, self._policy)
+            if better:
+                save_policy(self._folder / BEST, self._policy)
         self._write_state()
 
     def _parameters(self) -> dict[str, Tensor]:
         """Everything that training changes, by name."""
-        state: dict[str, Tensor] = {"generator": self._generator.get_state()}
+        generators = self._ranks.gather(self._generator.get_state())
+        state = {f"generator.{rank}": each for rank, each in enumerate(generators)}
         for name, network in (("network", self._network), ("average", self._average)):
             state |= {f"{name}.{k}": v for k, v in network.state_dict().items()}
         moments = self._optimizer.state_dict()["state"]
@@ -307,20 +375,26 @@ class Learner:
             state |= {f"optimizer.{number}.{k}": v for k, v in values.items()}
         return state | {"sum": self._sum}
 
-    def _write_state(self) -> None:
-        facts = {
+    def facts(self) -> dict[str, Any]:
+        """Everything of the training that is no tensor, in JSON's types."""
+        return {
             "made_with": self._made_with,
+            "expert": self._expert,
             "done": self.done,
             "seconds": self.seconds,
             "best": self.best,
             "curve": self.curve,
             "count": self._count,
         }
-        write_state(self._folder / STATE, self._parameters(), facts)
+
+    def _write_state(self) -> None:
+        parameters = self._parameters()
+        if self._ranks.writes:
+            write_state(self._folder / STATE, parameters, self.facts())
 
     def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
         """Go on from the state and facts of an earlier call."""
-        self._generator.set_state(state["generator"])
+        self._generator.set_state(state[f"generator.{self._ranks.rank}"])
         for name, network in (("network", self._network), ("average", self._average)):
             own = {k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(name)}
             network.load_state_dict(own)
@@ -339,6 +413,17 @@ class Learner:
         self.curve = facts["curve"]
         self._count = facts["count"]
         self._context.print_line(f"train: goes on after batch {self.done} of {self._sizes.batches}")
+
+
+def _moments(values: Tensor, ranks: Ranks) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of each column, over the rows of all processes."""
+    variance, mean = torch.var_mean(values, dim=0, correction=0)
+    count = torch.full((1,), len(values), dtype=torch.float64, device=values.device)
+    first = mean.double() * count
+    second = (variance.double() + mean.double() ** 2) * count
+    ranks.sum_(count, first, second)
+    mean = (first / count).float()
+    return mean, (second / count - (first / count) ** 2).clamp(min=0.0).sqrt().float()
 
 
 @contextmanager

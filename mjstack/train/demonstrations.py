@@ -1,5 +1,5 @@
-"""Episodes of an expert on the device, for a policy to imitate: what the policy would have seen,
-and the joint targets that the expert would have given.
+"""Episodes of an expert for a policy to imitate: what the policy would have seen, and the joint
+targets that the expert has given.
 """
 
 import math
@@ -17,6 +17,7 @@ from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import Observer, play_episode
 from mjstack.managers.observation import ObservationManager
 from mjstack.managers.view import random_uniform
+from mjstack.train.distributed import Ranks
 
 NOISE_SECONDS = 0.5  # in which the noise of a joint is forgotten
 
@@ -100,21 +101,31 @@ class DemonstrationRecorder(Observer):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Demonstrations:
-    """Accepted episodes of an expert.
+    """Accepted episodes of an expert, one after the other.
 
     Attributes:
-        seen: Observations before each step, shape ``(episodes, steps, inputs)``.
-        labels: The expert's joint targets, shape ``(episodes, steps, nu)``.
+        seen: Observations before each step, shape ``(steps of all episodes, inputs)``.
+        labels: The expert's joint targets, shape ``(steps of all episodes, nu)``.
+        ends: The step after the last one of each episode, shape ``(episodes,)``, int64.
         widths: Numbers of each term of the observation, in order.
         played: Episodes that were played.
-        seeds: Seeds of their starts.
+        source: Where they come from, in words.
     """
 
     seen: Tensor
     labels: Tensor
+    ends: Tensor
     widths: dict[str, int]
     played: int
-    seeds: list[int]
+    source: str
+
+    def lengths(self) -> Tensor:
+        """Steps of each episode, shape ``(episodes,)``, int64."""
+        return self.ends.diff(prepend=self.ends.new_zeros(1))
+
+    def last(self) -> Tensor:
+        """The last step of the episode that each step belongs to, shape ``(steps,)``, int64."""
+        return (self.ends - 1).repeat_interleave(self.lengths())
 
 
 def batches_of(job: CloneJobCfg, sizes: CloneSizes, nworld: int) -> list[tuple[int, float]]:
@@ -132,7 +143,7 @@ def batches_of(job: CloneJobCfg, sizes: CloneSizes, nworld: int) -> list[tuple[i
 
 
 def play_expert(
-    context: RunContext, sizes: CloneSizes, group: ObservationGroupCfg
+    context: RunContext, sizes: CloneSizes, group: ObservationGroupCfg, ranks: Ranks
 ) -> Demonstrations:
     """Play the expert, and keep the episodes that the task's check accepts.
 
@@ -140,29 +151,29 @@ def play_expert(
         context: The run; starts and expert are the configured ones.
         sizes: How many episodes.
         group: What a policy will see.
+        ranks: The processes of the training: each plays every so manieth seed.
     """
     cfg = context.cfg
     job = cast(CloneJobCfg, cfg.job)
     nworld = min(cfg.nworld, max(sizes.episodes, sizes.noisy_episodes))
-    batches = batches_of(job, sizes, nworld)
-    most = sum(count for count, _ in batches)
-    seeds = list(range(cfg.seed, cfg.seed + len(batches)))
+    every = list(enumerate(batches_of(job, sizes, nworld), start=cfg.seed))
+    batches = every[ranks.rank :: ranks.size]
+    most = sum(count for _, (count, _) in batches)
     seen = labels = torch.zeros(0)
     widths: dict[str, int] = {}
-    kept = 0
+    kept = steps = 0
     with closing(context.batch_simulation(nworld)) as sim:
-        for seed, (count, noise) in zip(seeds, batches, strict=True):
+        for seed, (count, noise) in batches:
             env = context.start(sim, cfg.reset, seed=seed)
             driver = NoisyDriver(context.driver(env), env, noise)
             recorder = DemonstrationRecorder(job.group, group)
             label = f"steps of the expert, seed {seed}"
             episode = play_episode(env, driver, [recorder], advance=context.advance, label=label)
-            if not kept and not widths:
-                seen = sim.qpos.new_zeros(
-                    (most, *recorder.seen.transpose(0, 1).shape[1:]), dtype=torch.float32
-                )
-                labels = seen.new_zeros((*seen.shape[:2], recorder.labels.shape[2]))
+            if not widths:
                 widths = recorder.widths
+                steps = driver.steps
+                seen = recorder.seen.new_zeros((most, steps, recorder.seen.shape[2]))
+                labels = recorder.labels.new_zeros((most, steps, recorder.labels.shape[2]))
             good = (episode.result.failed == 0).nonzero()[:, 0]
             good = good[good < count]
             into = slice(kept, kept + len(good))
@@ -175,5 +186,10 @@ def play_expert(
                 " succeeded"
             )
     return Demonstrations(
-        seen=seen[:kept], labels=labels[:kept], widths=widths, played=most, seeds=seeds
+        seen=seen[:kept].flatten(0, 1),
+        labels=labels[:kept].flatten(0, 1),
+        ends=steps * torch.arange(1, kept + 1, device=seen.device),
+        widths=widths,
+        played=most,
+        source=f"the expert, seeds {every[0][0]} to {every[-1][0]}",
     )

@@ -1,6 +1,6 @@
 """A trainer, as job=train runs it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,38 @@ from mjstack.episodes.context import RunContext
 LAST = "last"
 BEST = "best"
 STATE = "training.safetensors"
+
+
+class EventWriter:
+    """Curves of a training as TensorBoard's event files. Without the package it writes nothing."""
+
+    def __init__(self, folder: Path, done: int, print_line: Callable[[str], None]) -> None:
+        """Begin a file.
+
+        Args:
+            folder: Where it goes.
+            done: Where an earlier call was stopped: TensorBoard leaves out its later values.
+            print_line: Told where the package is missing.
+        """
+        self._writer: Any = None
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            print_line("train: no curves for TensorBoard, which pip install tensorboard brings")
+            return
+        self._writer = SummaryWriter(str(folder), purge_step=done + 1)
+
+    def add(self, values: Mapping[str, float], step: int) -> None:
+        """Add values of a step to their curves."""
+        if self._writer is not None:
+            for name, value in values.items():
+                self._writer.add_scalar(f"train/{name}", value, step)
+            self._writer.flush()
+
+    def close(self) -> None:
+        """Complete the file."""
+        if self._writer is not None:
+            self._writer.close()
 
 
 @dataclass(kw_only=True, slots=True)

@@ -330,18 +330,22 @@ class CloneSizes:
     """Answers of a batch."""
     save_every: int = spec(unit="batches", ge=1)
     """Batches between two saved policies."""
+    input_noise: float = spec(ge=0.0)
+    """Noise on the observations that training sees, in their standard deviations."""
+    leave_out: list[str] = spec(factory=list)
+    """Terms of the observation group that the policy does not see."""
 
 
 @dataclass(slots=True)
 class CloneJobCfg(TrainJobCfg):
     """A network learns to answer as the expert does. What is null is as ``sizes`` has it."""
 
+    observation: dict[str, Any] = spec(factory=dict, finite=False)
+    """What the policy can see; ``observation@job.observation`` chooses it."""
     group: str = spec()
-    """Observation group of the policy."""
-    leave_out: list[str] = spec(factory=list)
-    """Terms of the group that the policy does not see."""
-    add: dict[str, Any] = spec(factory=dict, finite=False)
-    """Terms by name that it sees besides."""
+    """The group that it sees."""
+    dataset: str | None = spec(None)
+    """Folder of a dataset from which it learns; null: from the expert, who plays now."""
     observation_noise: bool = spec()
     """Whether its observations have their noise."""
     command_noise: float = spec(unit="rad", ge=0.0)
@@ -368,6 +372,10 @@ class CloneJobCfg(TrainJobCfg):
     """Answers of a batch."""
     save_every: int | None = spec(None, unit="batches", ge=1)
     """Batches between two saved policies."""
+    input_noise: float | None = spec(None, ge=0.0)
+    """Noise on the observations that training sees, in their standard deviations."""
+    leave_out: list[str] | None = spec(None)
+    """Terms of the group that the policy does not see."""
     sizes: dict[str, CloneSizes] = spec(factory=dict)
     """Values of the keys that are null above, for ``cuda`` and for ``cpu``."""
 

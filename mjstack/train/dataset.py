@@ -1,0 +1,258 @@
+"""Demonstrations from a dataset on disk: of job=collect, or any LeRobotDataset v3 with the columns
+that a policy sees.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+from mjstack.config.schema import CloneJobCfg, Config, ObservationGroupCfg
+from mjstack.datasets import lerobot
+from mjstack.datasets.reader import readable
+from mjstack.datasets.spec import term_columns
+from mjstack.envs import Env
+from mjstack.episodes.context import RunContext
+from mjstack.errors import DatasetError
+from mjstack.mdp.geometry import robot
+from mjstack.train.demonstrations import Demonstrations
+from mjstack.train.distributed import Ranks
+
+_ACTION = "action"
+_SUCCESS = "next.success"
+_EPISODE = "episode_index"
+_BEYOND = 1e-3  # rad, m: how far a joint target may be out of its actuator's range
+
+Place = tuple[str, int]  # a feature, and which of its numbers
+
+
+def check_dataset(
+    folder: Path, env: Env, group: ObservationGroupCfg, widths: Mapping[str, int]
+) -> range:
+    """Check that a policy can learn from a dataset.
+
+    Args:
+        folder: The dataset.
+        env: An environment of the task.
+        group: The observation of the policy.
+        widths: Numbers of each of its terms.
+
+    Returns:
+        The seeds of the dataset's starts, as far as it names them.
+
+    Raises:
+        MjstackError: It is no dataset, lacks columns, or is of another robot, task or rate.
+    """
+    cfg = env.cfg
+    info = _read_info(folder)
+    places = _find_columns(folder, info, cfg, group, widths)
+    _task_number(folder, cfg)
+    # The ranges of the first file: degrees, say, are far out of them
+    action = _read(_files(folder, info)[0], {_ACTION: places[_ACTION]})[_ACTION]
+    low, high = robot(env).ctrl_range.float().cpu().numpy().T
+    worst = np.maximum(low - action, action - high).max(0)
+    joint = int(worst.argmax())
+    if worst[joint] > _BEYOND:
+        values = action[:, joint]
+        raise DatasetError(
+            f"{folder}: {_ACTION} of {cfg.robot.joints[joint]} is {values.min():g} to"
+            f" {values.max():g}, expected absolute joint targets within {low[joint]:g} to"
+            f" {high[joint]:g} rad or m. Give a dataset with these units"
+        )
+    seeds = [row["seed"] for row in _episode_rows(folder, info) if "seed" in row]
+    return range(min(seeds), max(seeds) + 1) if seeds else range(0)
+
+
+def read_demonstrations(
+    folder: Path,
+    context: RunContext,
+    group: ObservationGroupCfg,
+    widths: dict[str, int],
+    ranks: Ranks,
+) -> Demonstrations:
+    """The episodes of a dataset that succeeded, on the device of the training.
+
+    Args:
+        folder: The dataset.
+        context: The run.
+        group: The observation of the policy.
+        widths: Numbers of each of its terms.
+        ranks: The processes of the training: each reads every so manieth episode.
+
+    Raises:
+        DatasetError: A file is missing or damaged.
+    """
+    cfg = context.cfg
+    info = _read_info(folder)
+    places = _find_columns(folder, info, cfg, group, widths)
+    wanted = dict(places) | {_EPISODE: [(_EPISODE, 0)], "task_index": [("task_index", 0)]}
+    if _SUCCESS in info["features"]:
+        wanted[_SUCCESS] = [(_SUCCESS, 0)]
+    task = _task_number(folder, cfg)
+    parts = [_read(path, wanted) for path in _files(folder, info)]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+
+    # Episodes of the task that succeeded
+    episode = columns[_EPISODE][:, 0]
+    ends = np.flatnonzero(np.diff(episode, append=-1)) + 1
+    starts = np.concatenate([[0], ends[:-1]])
+    good = columns["task_index"][ends - 1, 0] == task
+    if _SUCCESS in columns:
+        good &= columns[_SUCCESS][ends - 1, 0] != 0.0
+    own = [(a, b) for a, b in zip(starts[good], ends[good], strict=True)][ranks.rank :: ranks.size]
+    keep = np.concatenate([np.arange(a, b) for a, b in own]) if own else np.arange(0)
+    device = context.backend[1]
+
+    def on_device(name: str) -> torch.Tensor:
+        return torch.as_tensor(columns[name][keep].astype(np.float32), device=device)
+
+    played = len(ends[ranks.rank :: ranks.size])
+    context.print_line(f"train: {len(own)} of {played} episodes of {folder} succeeded in the task")
+    return Demonstrations(
+        seen=on_device("observation"),
+        labels=on_device(_ACTION),
+        ends=torch.as_tensor(np.cumsum([b - a for a, b in own]), dtype=torch.int64, device=device),
+        widths=widths,
+        played=played,
+        source=str(folder),
+    )
+
+
+def _read_info(folder: Path) -> dict[str, Any]:
+    """The content of info.json of a LeRobotDataset v3."""
+    lerobot.require_pyarrow()
+    path = folder / lerobot.INFO
+    if not path.is_file():
+        raise DatasetError(
+            f"job.dataset={folder}: has no {lerobot.INFO}, expected a LeRobotDataset v3. Give the"
+            " folder dataset of job=collect"
+        )
+    with readable(path):
+        info = json.loads(path.read_text(encoding="utf-8"))
+        version = str(info["codebase_version"])
+        for name in ("robot_type", "fps", "features"):
+            info[name]
+    if not version.startswith("v3"):
+        raise DatasetError(
+            f"job.dataset={folder}: is a LeRobotDataset {version}, expected v3.0. Convert it with"
+            " LeRobot"
+        )
+    return info
+
+
+def _find_columns(
+    folder: Path,
+    info: Mapping[str, Any],
+    cfg: Config,
+    group: ObservationGroupCfg,
+    widths: Mapping[str, int],
+) -> dict[str, list[Place]]:
+    """Where the numbers of the observation and of the action are.
+
+    Raises:
+        DatasetError: One is missing, or the dataset is of another robot or rate.
+    """
+    expected = {"robot_type": cfg.robot.name, "fps": round(cfg.task.control_hz)}
+    for key, value in expected.items():
+        if info[key] != value:
+            raise DatasetError(
+                f"job.dataset={folder}: has {key}={info[key]}, expected {value}. Give another"
+                " dataset, or set robot and task to its own"
+            )
+    features = info["features"]
+    job = cast(CloneJobCfg, cfg.job)
+    name = f"observation.{job.group}"
+    first = [name] if name in features else []
+    others = [each for each in features if each.startswith("observation.") and each != name]
+    seen = _places([*first, *others], features)
+    numbers = [
+        column
+        for term, width in widths.items()
+        for column in term_columns(term, width, group.terms[term].history)
+    ]
+    targets = [f"{joint}.pos" for joint in cfg.robot.joints]
+    done = _places([_ACTION], features)
+    for column, found, where in (
+        *((column, seen, name) for column in numbers),
+        *((column, done, _ACTION) for column in targets),
+    ):
+        if column not in found:
+            raise DatasetError(
+                f"job.dataset={folder}: has no column {column} in {where}, expected all that the"
+                " policy sees. Collect it with"
+                " job=collect observation=state, or choose observation@job.observation"
+            )
+    return {"observation": [seen[n] for n in numbers], _ACTION: [done[n] for n in targets]}
+
+
+def _places(names: Sequence[str], features: Mapping[str, Any]) -> dict[str, Place]:
+    """Where each number of some features is; the first one of a name."""
+    found: dict[str, Place] = {}
+    for name in names:
+        feature = features.get(name, {})
+        if str(feature.get("dtype")).startswith("float") and isinstance(feature["names"], list):
+            for number, column in enumerate(feature["names"]):
+                found.setdefault(str(column), (name, number))
+    return found
+
+
+def _files(folder: Path, info: Mapping[str, Any]) -> list[Path]:
+    """The data files, in order."""
+    if "mjstack" in info:  # others may lie beside those that count
+        shards = range(info["mjstack"]["shards"])
+        return [lerobot.shard_path(folder, lerobot.DATA, shard) for shard in shards]
+    return sorted(folder.glob("data/chunk-*/file-*.parquet"))
+
+
+def _episode_rows(folder: Path, info: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Rows of the episodes, their seeds alone."""
+    rows: list[dict[str, Any]] = []
+    for path in sorted(folder.glob("meta/episodes/chunk-*/file-*.parquet")):
+        with readable(path):
+            file = lerobot.require_pyarrow()[1].ParquetFile(path)
+            columns = [name for name in ("seed",) if name in file.schema_arrow.names]
+            rows += file.read(columns=columns).to_pylist() if columns else []
+    return rows
+
+
+def _task_number(folder: Path, cfg: Config) -> int:
+    """Number of the task in the dataset.
+
+    Raises:
+        DatasetError: The dataset does not have it.
+    """
+    path = folder / lerobot.TASKS
+    with readable(path):
+        table = lerobot.require_pyarrow()[1].ParquetFile(path).read()
+        names = table.column_names
+        text = "task" if "task" in names else next(n for n in names if n != "task_index")
+        tasks = dict(zip(table[text].to_pylist(), table["task_index"].to_pylist(), strict=True))
+    if cfg.task.instruction not in tasks:
+        raise DatasetError(
+            f"job.dataset={folder}: has the task {', '.join(map(repr, tasks)) or 'none'}, expected"
+            f" {cfg.task.instruction!r}. Give another dataset, or set task"
+        )
+    return int(tasks[cfg.task.instruction])
+
+
+def _read(path: Path, wanted: Mapping[str, Sequence[Place]]) -> dict[str, np.ndarray]:
+    """Numbers of a data file by name, each shape ``(frames, numbers)``."""
+    features = sorted({feature for places in wanted.values() for feature, _ in places})
+    with readable(path):
+        table = lerobot.require_pyarrow()[1].ParquetFile(path).read(columns=features)
+        values = {}
+        for feature in features:
+            column = table[feature].combine_chunks()
+            flat = column.flatten() if hasattr(column, "flatten") else column
+            array = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=float)
+            values[feature] = array.reshape(len(table), -1)
+        found = {
+            name: np.stack([values[feature][:, number] for feature, number in places], axis=1)
+            for name, places in wanted.items()
+        }
+        if not all(np.isfinite(array).all() for array in found.values()):
+            raise ValueError("numbers that are not finite")
+        return found
