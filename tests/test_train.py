@@ -10,6 +10,7 @@ import pytest
 import torch
 from compositions import load_config
 from environments import at_double_speed, configure, on_new_sim
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import mjstack.train.clone as clone
 from mjstack.cli import run
@@ -22,6 +23,7 @@ from mjstack.mdp.observation import headings
 from mjstack.policy import load_policy
 from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.train.demonstrations import play_expert
+from mjstack.train.distributed import Ranks
 from mjstack.train.trainer import STATE
 
 TINY = (
@@ -48,7 +50,9 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return load_policy(folder).network.state_dict()
 
 
-def test_a_training_leaves_policies_a_curve_and_a_judgement(tmp_path: Path) -> None:
+def test_a_training_leaves_policies_a_curve_and_a_judgement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "training"
     assert run([*REACH, f"job.folder={out}"]) == 0
     gates = report(out)
@@ -70,13 +74,19 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(tmp_path: Path) -> N
     policy = load_policy(out / "last")
     assert policy.training["batch"] == 30
     assert policy.training["seed"] == 0
-    assert "last_action" not in policy.widths
+    assert list(policy.widths) == ["joint_pos", "offsets", "positions", "headings", "goals"]
     assert policy.widths["headings"] == 4
     assert (policy.network.chunk, policy.execute) == (16, 8)
 
-    # It is there already: the same command judges it anew, and drives other gates
+    # Curves for TensorBoard
+    events = EventAccumulator(str(out)).Reload()
+    assert [event.step for event in events.Scalars("train/validation_loss")] == [10, 20, 30]
+
+    # It is there already: the same command judges it anew without the expert, and it drives gates
     before = weights(out / "last")
+    monkeypatch.setattr(clone, "play_expert", None)
     assert run([*REACH, f"job.folder={out}"]) == 0
+    assert report(out)["train"]["metrics"] == train
     assert all(torch.equal(v, before[k]) for k, v in weights(out / "last").items())
     drive = ["controller=policy", f"policy={out}/last", "gates=[batch]", "sim=native", "nworld=3"]
     status = run(
@@ -135,16 +145,21 @@ def test_a_clone_of_stack_drives_the_batch(tmp_path: Path) -> None:
 def test_noise_moves_the_arm_alone_and_labels_lack_it() -> None:
     """The expert's inverse kinematics goes on from its own targets, so its labels stay smooth."""
     cfg = load_config(
-        [*REACH, "job.command_noise=0.02", "job.episodes=2", "nworld=2", "task.check.distance=0.2"]
+        [
+            *(*REACH, "job.command_noise=0.02", "job.episodes=2", "nworld=2"),
+            *("task.check.distance=0.2", "job.leave_out=[]"),
+        ]
     )
     context = RunContext(cfg)
     sizes = clone.resolve_sizes(cfg.job, "cpu")
-    data = play_expert(context, sizes, clone.observed_group(cfg))
-    assert data.seeds == [0, 1]
-    assert len(data.seen) == 4
-    rough = data.labels[:, 60:].diff(dim=1).diff(dim=1).abs().amax((1, 2))
+    data = play_expert(context, sizes, clone.observed_group(cfg.job, sizes), Ranks())
+    assert data.source == "the expert, seeds 0 to 1"
+    assert data.ends.tolist() == [150, 300, 450, 600]
+    labels = data.labels.unflatten(0, (4, 150))
+    rough = labels[:, 60:].diff(dim=1).diff(dim=1).abs().amax((1, 2))
     assert rough[2:].max() < 3.0 * rough[:2].max()
-    speed = data.seen[:, 100:, 6:12].abs().mean(1)  # where the expert holds still
+    seen = data.seen.unflatten(0, (4, 150))
+    speed = seen[:, 100:, 6:12].abs().mean(1)  # where the expert holds still
     assert (speed[2:, :5].mean(0) > 5.0 * speed[:2, :5].mean(0)).all()
     assert (speed[:, 5] < 1e-3).all()  # the gripper's
 
@@ -166,8 +181,12 @@ BAD = [
     (["job.group=nope"], "observation group 'nope' does not exist"),
     (["job.trainer=os.getcwd"], "job.trainer=os.getcwd: expected a mjstack.train.trainer.Trainer"),
     (["job.test_seed=0"], "job.test_seed=0: expected seeds that training does not use"),
-    (["job.add.headings.func=mjstack.mdp.observation.nope"], "'nope' does not exist"),
-    (["job.leave_out=[last_actoin]"], "Did you mean 'last_action'?"),
+    (
+        ["job.observation.policy.terms.headings.func=mjstack.mdp.observation.nope"],
+        "'nope' does not exist",
+    ),
+    (["job.leave_out=[joint_vle]"], "Did you mean 'joint_vel'?"),
+    (["observation@job.observation=nope"], "nope"),
     (["job.batches=0"], "job.batches=0: expected an integer of at least 1"),
     (["job.hidden=[0]"], "job.hidden=[0]"),
     (["trainer=clon"], "Did you mean 'clone'?"),

@@ -46,9 +46,9 @@ class PolicyNetwork(nn.Module):
 
     def set_scale(self, name: str, mean: Tensor, std: Tensor) -> None:
         """Set how ``observation`` or ``action`` is normalised, each shape ``(width,)``. A constant
-        column of an observation is only shifted, and a constant joint target is always its mean.
+        column of an observation is only shifted; a constant joint target hardly leaves its mean.
         """
-        constant = 1.0 if name == "observation" else 0.0
+        constant = 1.0 if name == "observation" else 1e-3
         self.get_buffer(f"{name}_mean").copy_(mean)
         self.get_buffer(f"{name}_std").copy_(torch.where(std > _CONSTANT, std, constant))
 

@@ -28,7 +28,6 @@ from mjstack.train.trainer import BEST, LAST, STATE, EventWriter, Trained, Train
 
 _HELD_OUT = 20  # of so many episodes one is for validation
 _LEAST = 0.1  # scale of a column, of the largest one of its term
-_CONSTANT = 1e-6  # rad, m: a joint target that varies less is not learned
 _VALIDATED = 65536  # steps at once
 _SHOWN = 10  # batches between two looks at the progress
 
@@ -235,7 +234,7 @@ class Learner:
         self._network = network.to(device)
         self._average = copy.deepcopy(self._network).requires_grad_(False)
         self._optimizer = torch.optim.AdamW(
-            self._network.parameters(), lr=job.learning_rate, weight_decay=job.weight_decay
+            self._network.parameters(), lr=job.learning_rate, weight_decay=sizes.weight_decay
         )
         self._generator = torch.Generator(device).manual_seed(cfg.seed + ranks.rank)
         self._policy = Policy(
@@ -318,8 +317,7 @@ class Learner:
         """
         ahead = torch.arange(network.chunk, device=steps.device)
         then = torch.minimum(steps[:, None] + ahead, self._last[steps][:, None])
-        scale = network.action_std.clamp(min=_CONSTANT)
-        wanted = (self._labels[then] - network.action_mean) / scale
+        wanted = (self._labels[then] - network.action_mean) / network.action_std
         seen = self._seen[steps]
         if noise > 0.0:
             draw = torch.randn(seen.shape, generator=self._generator, device=seen.device)

@@ -332,6 +332,8 @@ class CloneSizes:
     """Batches between two saved policies."""
     input_noise: float = spec(ge=0.0)
     """Noise on the observations that training sees, in their standard deviations."""
+    weight_decay: float = spec(ge=0.0)
+    """Of AdamW."""
     leave_out: list[str] = spec(factory=list)
     """Terms of the observation group that the policy does not see."""
 
@@ -356,8 +358,6 @@ class CloneJobCfg(TrainJobCfg):
     """Control steps between two answers."""
     learning_rate: float = spec(gt=0.0)
     """Of AdamW at the start; a cosine brings it to 0."""
-    weight_decay: float = spec(ge=0.0)
-    """Of AdamW."""
     averaging: float = spec(ge=0.0, le=1.0)
     """Share of the policy's weights that a batch keeps: they are an average."""
     episodes: int | None = spec(None, unit="episodes", ge=1)
@@ -374,6 +374,8 @@ class CloneJobCfg(TrainJobCfg):
     """Batches between two saved policies."""
     input_noise: float | None = spec(None, ge=0.0)
     """Noise on the observations that training sees, in their standard deviations."""
+    weight_decay: float | None = spec(None, ge=0.0)
+    """Of AdamW."""
     leave_out: list[str] | None = spec(None)
     """Terms of the group that the policy does not see."""
     sizes: dict[str, CloneSizes] = spec(factory=dict)
