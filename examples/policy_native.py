@@ -17,6 +17,7 @@ def play(folder: str, steps: int) -> list[np.ndarray]:
     robot, execute = facts["robot"], facts["action"]["execute"]
     boxes = [data.body(name) for name, o in facts["objects"].items() if o["shape"] == "box"]
     data.qpos[robot["qpos"]] = data.ctrl[robot["ctrl"]] = robot["home"]
+    assert facts["action"]["kind"] == "absolute joint targets"
     past, targets = {}, [np.zeros(len(robot["joints"]))]
 
     def grasp(object: str, height: float = 0.0) -> np.ndarray:

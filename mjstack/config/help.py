@@ -33,8 +33,18 @@ _EXAMPLES = (
         "one world of an earlier run again: why did it fail?",
     ),
     ("job=collect job.episodes=20", "demonstrations of the expert, as a dataset; resumes"),
-    ("job=train task=reach", "a policy that imitates the expert, judged by gate success; resumes"),
-    ("controller=policy policy=FOLDER", "a trained policy in the expert's place, in any gate"),
+    (
+        "job=train job.folder=outputs/mine",
+        "a policy that imitates the expert, judged by gate success; resumes",
+    ),
+    (
+        "controller=policy policy=outputs/mine/last 'gates=[success]'",
+        "the policy in the expert's place, in any gate",
+    ),
+    (
+        "job=play policy=outputs/mine/last",
+        "four worlds of the policy as a video; view=true: in MuJoCo's viewer",
+    ),
     ("job=scaling robot=so101", "throughput from 1 to 32,768 worlds; resumes"),
     ("job=study nworld=8", "what the solver's limits cost, and which worlds still succeed"),
     (
