@@ -52,7 +52,8 @@ def check_train(cfg: Config) -> CheckedJob:
     if not isinstance(trainer, Trainer):
         raise ConfigError("job.trainer", job.trainer, "a mjstack.train.trainer.Trainer")
     context = RunContext(cfg)
-    check_task(context.with_config(replace(cfg, reset=whole_starts(cfg.reset))))
+    reset = whole_starts(cfg.reset) if trainer.midway else cfg.reset
+    check_task(context.with_config(replace(cfg, reset=reset)))
     used = trainer.check(context)
     tested = range(job.test_seed, job.test_seed + cfg.gate.success.seeds)
     if used.start < tested.stop and tested.start < used.stop:

@@ -55,7 +55,8 @@ class StateRecorder(Observer):
         self.states = {}
         for name in STATE:
             view = getattr(env.sim, name)
-            self.states[name] = view.new_zeros((driver.steps, *view.shape))
+            if view.shape[1]:
+                self.states[name] = view.new_zeros((driver.steps, *view.shape))
         self._next = torch.zeros(1, dtype=torch.int64, device=env.device)
 
     def update(self) -> None:

@@ -162,4 +162,4 @@ def train_ppo(context: RunContext, folder: Path) -> Trained:
     )
 
 
-TRAINER = Trainer(check_ppo, train_ppo)
+TRAINER = Trainer(check_ppo, train_ppo, midway=True)

@@ -23,6 +23,9 @@ from mjstack.policy.checkpoint import write_state
 from mjstack.train.distributed import Ranks
 from mjstack.train.trainer import BEST, LAST, STATE
 
+_MEASURED = 8192  # decisions by which the change of a policy is measured
+_FACTOR = 1.5  # of a learning rate, per iteration
+
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -49,6 +52,8 @@ class Learner:
         seconds: Time of them, in all calls [s].
         best: Largest share of successes of the episodes between two saves, and their return.
         curve: A row for each time that policies were saved.
+        change: KL divergence of the policy after the last iteration from the one before; NaN where
+            rsl_rl alone knows it.
     """
 
     def __init__(self, context: RunContext, plan: Plan, folder: Path, ranks: Ranks) -> None:
@@ -77,15 +82,22 @@ class Learner:
             self._runner = Runner(self._env, self._runner_config(), None, device)
         self._log = Log()
         self._runner.logger = self._log
-        self._alg = self._runner.alg
+        self._alg = alg = self._runner.alg
         self._policy = self._make_policy()
         if plan.start is not None:
             self._begin_with(plan.start)
+            rates = (plan.settings.learning_rate, self._job.critic_learning_rate)
+            groups = [
+                {"params": list(network.parameters()), "lr": rate}
+                for network, rate in zip((alg.actor, alg.critic), rates, strict=True)
+            ]
+            alg.optimizer = torch.optim.Adam(groups)
 
         self.done = 0
         self.seconds = 0.0
         self.best = (-1.0, -math.inf)
         self.curve: list[dict[str, Any]] = []
+        self.change = math.nan
         self._began = time.perf_counter()  # of this call
         self._before = 0.0  # seconds of earlier calls
 
@@ -143,6 +155,32 @@ class Learner:
         with redirect_stdout(io.StringIO()):
             self._runner.learn(1, init_at_random_ep_len=spread)
         self._deviation().data.clamp_(*settings.std[1:])
+        if self._plan.start is not None and self.done >= settings.critic_iterations:
+            self._adapt_rate()
+
+    def _adapt_rate(self) -> None:
+        """Adapt the actor's learning rate to the change of a policy that training started from.
+
+        rsl_rl does so for both networks at once and within bounds, which are too high for an actor
+        whose many actions have little noise.
+        """
+        actor = self._alg.actor
+        storage = self._alg.storage
+        some = slice(
+            None, None, -(-storage.num_envs * storage.num_transitions_per_env // _MEASURED)
+        )
+        with torch.inference_mode():
+            before = [p.flatten(0, 1)[some] for p in storage.distribution_params]
+            actor(storage.observations.flatten(0, 1)[some], stochastic_output=True)
+            change = actor.get_kl_divergence(before, actor.output_distribution_params).mean()
+        self._ranks.sum_(change)
+        self.change = float(change) / self._ranks.size
+        wanted = self._plan.settings.desired_kl
+        group = self._alg.optimizer.param_groups[0]
+        if self.change > 2.0 * wanted:
+            group["lr"] /= _FACTOR
+        elif self.change < 0.5 * wanted:
+            group["lr"] *= _FACTOR
 
     def _show(self) -> None:
         job = self._job
@@ -199,7 +237,7 @@ class Learner:
             "value_loss": self._log.losses.get("value", math.nan),
             "std": float(self._deviation().data.mean()),
             "entropy_weight": self._alg.entropy_coef,
-            "learning_rate": self._alg.learning_rate,
+            "learning_rate": self._alg.optimizer.param_groups[0]["lr"],
         }
 
     # Networks
@@ -223,7 +261,8 @@ class Learner:
                 "class_name": "PPO",
                 "num_learning_epochs": job.epochs,
                 "num_mini_batches": job.minibatches,
-                "learning_rate": job.learning_rate,
+                "learning_rate": plan.settings.learning_rate,
+                "schedule": "adaptive" if plan.start is None else "fixed",
                 "desired_kl": plan.settings.desired_kl,
                 "gamma": job.gamma,
                 "lam": job.gae_lambda,
@@ -307,7 +346,7 @@ class Learner:
             "seconds": self.seconds,
             "best": self.best,
             "curve": self.curve,
-            "learning_rate": self._alg.learning_rate,
+            "learning_rates": [group["lr"] for group in self._alg.optimizer.param_groups],
         }
         write_state(self._folder / STATE, self._parameters(), facts)
 
@@ -325,9 +364,9 @@ class Learner:
             number, _, name = key.partition(".")
             moments.setdefault(int(number), {})[name] = value
         alg.optimizer.load_state_dict(alg.optimizer.state_dict() | {"state": moments})
-        alg.learning_rate = facts["learning_rate"]
-        for group in alg.optimizer.param_groups:
-            group["lr"] = alg.learning_rate
+        alg.learning_rate = facts["learning_rates"][0]
+        for group, rate in zip(alg.optimizer.param_groups, facts["learning_rates"], strict=True):
+            group["lr"] = rate
         self._env.sums.copy_(state["rewards"])
         if self._ranks.writes:  # the others have their own
             torch.set_rng_state(state["random"])

@@ -75,7 +75,9 @@ class Trainer:
             Returns the seeds of the starts that training uses.
         train: Trains in a folder, in which it goes on with an earlier call's training, and leaves
             the policies `LAST` and `BEST` there.
+        midway: Whether its worlds may start in the middle of an episode.
     """
 
     check: Callable[[RunContext], range]
     train: Callable[[RunContext, Path], Trained]
+    midway: bool = False

@@ -394,6 +394,8 @@ class PpoSettings:
     """Weight of the entropy at the start, and after ``entropy_iterations``."""
     desired_kl: float = spec(gt=0.0)
     """Change of the policy per iteration to which the learning rate adapts."""
+    learning_rate: float = spec(gt=0.0)
+    """Of the actor at the start."""
     critic_iterations: int = spec(ge=0)
     """First iterations, in which only the critic learns."""
 
@@ -436,8 +438,8 @@ class PpoJobCfg(TrainJobCfg):
     """How often an iteration goes through them."""
     minibatches: int = spec(ge=1)
     """Parts into which they are divided."""
-    learning_rate: float = spec(gt=0.0)
-    """At the start."""
+    critic_learning_rate: float = spec(gt=0.0)
+    """Of the critic with ``start_from``; else it is the actor's."""
     gamma: float = spec(ge=0.0, le=1.0)
     """Discount per decision."""
     gae_lambda: float = spec(ge=0.0, le=1.0)
@@ -454,6 +456,8 @@ class PpoJobCfg(TrainJobCfg):
     """Weight of the entropy at the start, and after ``entropy_iterations``."""
     desired_kl: float | None = spec(None, gt=0.0)
     """Change of the policy per iteration to which the learning rate adapts."""
+    learning_rate: float | None = spec(None, gt=0.0)
+    """Of the actor at the start; it adapts to ``desired_kl``."""
     critic_iterations: int | None = spec(None, ge=0)
     """First iterations, in which only the critic learns."""
     settings: dict[str, PpoSettings] = spec(factory=dict)

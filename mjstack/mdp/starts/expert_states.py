@@ -61,7 +61,9 @@ class ExpertStates:
         self._count = len(self._source)
         self._views: list[tuple[Tensor, Tensor]] = []  # of the worlds, and the states
         for name in STATE:
-            self._add(path, name, getattr(env.sim, name), tensors.get(name))
+            view = getattr(env.sim, name)
+            if view.shape[1]:
+                self._add(path, name, view, tensors.get(name))
         self._fields: list[tuple[Tensor, Tensor]] = []
         for name, field in env.sim.fields.items():
             if FIELD + name in tensors:
