@@ -62,7 +62,7 @@ PATHS: dict[str, list[str] | None] = {
     "mdp/action.py": [
         "JointPosition.write_commands",
         "Gripper.write_commands",
-        "EndEffectorDelta.write_commands",
+        *(f"EndEffectorDelta.{n}" for n in ("write_commands", "_tilted")),
         "JointTargets.write_commands",
         "_Commands._write_bounded",
     ],

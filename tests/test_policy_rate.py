@@ -136,6 +136,27 @@ def test_the_upright_gripper_rolls_and_points_down() -> None:
     assert (upright[:, 2] < -0.9).all()
 
 
+def test_the_gripper_tilts_as_far_as_it_is_told() -> None:
+    """Away from the base, by a step at most, while the grasp point stays."""
+    env = on_shared_sim("native", 3, configure("action=ee_tilt", "reset=randomized"))
+    env.reset(seed=0)
+    term = env.action_manager.terms["arm"]
+    assert env.action_manager.action_dim == 6
+    before, _, _ = (each.clone() for each in term._ik.forward(env.sim.ctrl))
+    action = torch.zeros((3, 6))
+    action[:, 5] = 1.0  # where a jaw swings it moves the grasp point
+    action[:, 4] = torch.tensor([0.0, 0.5, 1.0])
+    tilts = []
+    for _ in range(45):
+        env.step(action)
+        point, _, approach = term._ik.forward(env.sim.ctrl)
+        away = point[:, :2] / point[:, :2].norm(dim=1, keepdim=True)
+        tilts.append(torch.atan2((approach[:, :2] * away).sum(1), -approach[:, 2]))
+    torch.testing.assert_close(tilts[-1], torch.tensor([0.4, 0.6, 0.8]), rtol=0.0, atol=0.03)
+    assert torch.stack(tilts).diff(dim=0).abs().max() < 0.04
+    torch.testing.assert_close(point[:, :2], before[:, :2], rtol=0.0, atol=2e-3)
+
+
 def test_a_roll_needs_a_free_joint() -> None:
     says = r"roll=0\.03: expected 0, because robot\.roll_joint=None is not free"
     with pytest.raises(MjstackError, match=says):

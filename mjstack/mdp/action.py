@@ -154,7 +154,8 @@ class JointTargets(_Commands):
 
 class EndEffectorDelta(_Commands):
     """Moves the commanded grasp point by ``scale`` times the action in x, y and z, by batched
-    inverse kinematics; with ``roll`` a fourth number turns the gripper about its approach axis.
+    inverse kinematics. With ``roll`` one more number turns the gripper about its approach axis.
+    With ``tilt`` another one says how far it tilts away from the base.
 
     It starts from the last command, not from the measured joints, so that the arm does not sag by
     its servo error at every step; and it keeps no target itself, so that nothing winds up at
@@ -170,6 +171,8 @@ class EndEffectorDelta(_Commands):
         iterations: Count = 8,
         roll: NotNegative = 0.0,
         upright: Fraction = 0.0,
+        tilt: NotNegative = 0.0,
+        tilt_step: Positive = 0.03,
     ) -> None:
         """Build the solver.
 
@@ -180,15 +183,23 @@ class EndEffectorDelta(_Commands):
             roll: Turn of ``robot.roll_joint`` for an action of 1 [rad per step]; 0 for none.
             upright: How strongly the joints that the position leaves free point the gripper down,
                 as ``approach_gain`` of `BatchedIk`; 0 leaves them where they are.
+            tilt: Angle from straight down for an action of 1 [rad]; for -1 the gripper points down,
+                as it always does with 0.
+            tilt_step: How far the gripper tilts in a step at most [rad].
 
         Raises:
-            ParameterError: The robot has no joint that rolls the gripper and nothing else.
+            ParameterError: The robot has no joint that rolls the gripper and nothing else; or the
+                gripper is to tilt where ``upright`` is 0.
         """
         # Loads Warp, which other actions do not need.
         from mjstack.kinematics.batched_ik import BatchedIk
 
         self._n_arm = env.index.n_arm
-        self._set_up(env, range(self._n_arm), dim=4 if roll else 3)
+        self._set_up(env, range(self._n_arm), dim=3 + bool(roll) + bool(tilt))
+        if tilt and not upright:
+            raise ParameterError("tilt", tilt, "0, because upright is 0")
+        self._tilt = tilt
+        self._tilt_step = tilt_step
         self._all = robot(env).ctrl
         self._scale = scale
         profile = env.cfg.robot
@@ -217,8 +228,22 @@ class EndEffectorDelta(_Commands):
         """Write the arm's commands."""
         last = self._all.read(self._ctrl)
         action = action.clamp(-1.0, 1.0)
-        target = self._ik.forward(last)[0] + self._scale * action[:, :3].float()
+        point, _, approach = self._ik.forward(last)
+        desired = None
+        if self._tilt:
+            desired = self._tilted(point, approach, action[:, -1].float())
+        target = point + self._scale * action[:, :3].float()
         if self._roll is not None:
-            last = torch.clamp(last + self._roll * action[:, 3:], *self._limits)
-        command, _ = self._ik.solve(last, target)
+            last = torch.clamp(last + self._roll * action[:, 3:4], *self._limits)
+        command, _ = self._ik.solve(last, target, approach=desired)
         self._write_bounded(command[:, : self._n_arm].to(self._ctrl.dtype))
+
+    def _tilted(self, point: Tensor, approach: Tensor, action: Tensor) -> Tensor:
+        """The approach axis turned towards the wanted tilt, by a step at most, in the vertical
+        plane through the base and the grasp point.
+        """
+        wanted = 0.5 * (action + 1.0) * self._tilt
+        away = point[:, :2] / torch.linalg.vector_norm(point[:, :2], dim=1, keepdim=True)
+        now = torch.atan2((approach[:, :2] * away).sum(1), -approach[:, 2])
+        angle = now + (wanted - now).clamp(-self._tilt_step, self._tilt_step)
+        return torch.cat((torch.sin(angle)[:, None] * away, -torch.cos(angle)[:, None]), dim=1)
