@@ -62,9 +62,7 @@ def complete(cfg: Config) -> None:
             for name, node in cfg.job.variants.items()
         }
         cfg.job.variants = _typed_all("job.variants", variants, SolverCfg)
-    if isinstance(cfg.job, PpoJobCfg):
-        cfg.job.add = _typed_all("job.add", cfg.job.add, ObservationTermCfg)
-    if isinstance(cfg.job, CloneJobCfg):
+    if isinstance(cfg.job, CloneJobCfg | PpoJobCfg):
         seen = _typed_all("job.observation", cfg.job.observation, ObservationGroupCfg)
         _complete_groups("job.observation", seen)
         cfg.job.observation = seen

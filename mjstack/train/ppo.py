@@ -58,15 +58,15 @@ def make_plan(cfg: Config) -> Plan:
 
 
 def _observed_group(cfg: Config) -> ObservationGroupCfg:
-    """The observation group of a new policy: terms of a configured group, and added ones."""
+    """The observation group of a new policy."""
     job = cast(PpoJobCfg, cfg.job)
-    if job.group not in cfg.observation:
-        raise UnknownName("job.group: observation group", job.group, cfg.observation)
-    group = cfg.observation[job.group]
+    if job.group not in job.observation:
+        raise UnknownName("job.group: observation group", job.group, job.observation)
+    group = job.observation[job.group]
     for name in job.leave_out:
         if name not in group.terms:
             raise UnknownName(f"job.leave_out: term of {job.group}", name, group.terms)
-    terms = {k: term for k, term in group.terms.items() if k not in job.leave_out} | job.add
+    terms = {name: term for name, term in group.terms.items() if name not in job.leave_out}
     return replace(group, noise=job.observation_noise, terms=terms)
 
 

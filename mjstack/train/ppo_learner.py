@@ -21,7 +21,7 @@ from mjstack.interrupt import check_interrupt
 from mjstack.policy import Policy, PolicyNetwork, save_policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.train.distributed import Ranks
-from mjstack.train.trainer import BEST, LAST, STATE
+from mjstack.train.trainer import BEST, LAST, STATE, EventWriter
 
 _MEASURED = 8192  # decisions by which the change of a policy is measured
 _FACTOR = 1.5  # of a learning rate, per iteration
@@ -98,12 +98,15 @@ class Learner:
         self.best = (-1.0, -math.inf)
         self.curve: list[dict[str, Any]] = []
         self.change = math.nan
+        self._events: EventWriter | None = None
         self._began = time.perf_counter()  # of this call
         self._before = 0.0  # seconds of earlier calls
 
     def close(self) -> None:
         """Give the worlds back."""
         self._env.close()
+        if self._events is not None:
+            self._events.close()
 
     def learn(self) -> None:
         """Make the missing iterations, saving policies and state now and then.
@@ -113,6 +116,8 @@ class Learner:
         """
         self._began = time.perf_counter()
         self._before = self.seconds
+        if self._ranks.writes:
+            self._events = EventWriter(self._folder, self.done, self._context.print_line)
         first = True
         while not self._over():
             self._iterate(spread=first)
@@ -196,6 +201,8 @@ class Learner:
         self.curve.append(row)
         if not self._ranks.writes:
             return
+        if self._events is not None:
+            self._events.add({k: v for k, v in row.items() if not math.isnan(v)}, self.done)
         self._take_weights()
         self._policy.training = {"trainer": "ppo", "seed": self._plan.cfg.seed, **row}
         save_policy(self._folder / LAST, self._policy)

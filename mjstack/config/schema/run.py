@@ -406,12 +406,12 @@ class PpoJobCfg(TrainJobCfg):
     it.
     """
 
+    observation: dict[str, Any] = spec(factory=dict, finite=False)
+    """What the policy can see; ``observation@job.observation`` chooses it."""
     group: str = spec()
-    """Observation group of the policy."""
+    """The group that it sees."""
     leave_out: list[str] = spec(factory=list)
     """Terms of the group that the policy does not see."""
-    add: dict[str, Any] = spec(factory=dict, finite=False)
-    """Terms by name that it sees besides."""
     observation_noise: bool = spec()
     """Whether its observations have their noise."""
     critic: list[str] = spec(factory=list)
