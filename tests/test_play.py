@@ -75,7 +75,7 @@ def test_the_expert_plays_without_a_policy_in_the_viewer(
         return lambda step, sim: shown.append(step)
 
     monkeypatch.setattr(runner, "_viewer", viewer)
-    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(runner, "opens_windows", lambda: True)
     out = tmp_path / "out"
     fast = [
         f"controller.phases.{name}.seconds=0.2"
@@ -158,6 +158,20 @@ def test_without_gl_nothing_is_written(
     (line,) = capsys.readouterr().err.splitlines()
     assert "offscreen rendering fails" in line
     assert line.endswith("Set MUJOCO_GL=egl or osmesa.")
+    assert not out.exists()
+
+
+def test_without_a_display_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """MuJoCo's viewer would end the process."""
+    monkeypatch.setenv("DISPLAY", ":98765")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    out = tmp_path / "out"
+    args = ["job=play", "task=reach", "sim=native", "controller=open_loop", "view=true"]
+    assert run([*args, f"hydra.run.dir={out}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "view=true: expected a display that opens windows (DISPLAY=:98765)" in line
     assert not out.exists()
 
 

@@ -5,7 +5,6 @@ import hashlib
 import logging
 import os
 import re
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +27,13 @@ from mjstack.gates.runner import log_error
 from mjstack.interrupt import check_interrupt, interrupted
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
 from mjstack.mdp.starts.placement import SCHEMA
-from mjstack.report.picture import require_video, save_scene, save_trajectories, save_video
+from mjstack.report.picture import (
+    opens_windows,
+    require_video,
+    save_scene,
+    save_trajectories,
+    save_video,
+)
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
 from mjstack.report.table import Console, Table, to_document
@@ -41,14 +46,10 @@ log = logging.getLogger(__name__)
 
 def check_showing(cfg: Config) -> None:
     """Raise if this machine cannot show an episode as ``view`` or ``video`` ask for."""
-    if (
-        cfg.view
-        and sys.platform.startswith("linux")
-        and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    ):
-        raise ConfigError(
-            "view", "true", "a display, and DISPLAY is not set", "Use video=true instead"
-        )
+    if cfg.view and not opens_windows():
+        shown = os.environ.get("DISPLAY", "not set")
+        expected = f"a display that opens windows (DISPLAY={shown})"
+        raise ConfigError("view", "true", expected, "Use video=true instead")
     if cfg.video:
         require_video()
 

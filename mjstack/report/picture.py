@@ -4,6 +4,7 @@ video.
 
 import math
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -155,6 +156,14 @@ def require_video() -> Callable[..., Any]:
     except ImportError as error:
         raise MissingExtra("video=true", "imageio-ffmpeg", "video") from error
     return imageio_ffmpeg.write_frames
+
+
+def opens_windows() -> bool:
+    """Whether MuJoCo's viewer can open one; where it cannot, it ends the process."""
+    import glfw
+
+    with warnings.catch_warnings(action="ignore"):
+        return bool(glfw.init())
 
 
 def save_trajectories(
