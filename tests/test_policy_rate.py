@@ -165,3 +165,31 @@ def test_a_roll_needs_a_free_joint() -> None:
             1,
             configure("action=ee_upright", "robot.roll_joint=null", "controller.yaw_alignment=0"),
         )
+
+
+def test_a_late_command_moves_the_arm_as_the_same_command_later() -> None:
+    """And after the reset of one world, which holds its start again, to the bit."""
+    late = 3
+    plain = ("action=joint_absolute", "reset=randomized")
+    cfg = configure(*plain, f"timing.command_delay={late}")
+    delayed = on_new_sim("native", 2, cfg)
+    direct = on_new_sim("native", 2, configure(*plain))
+    for env in (delayed, direct):
+        env.reset(seed=5)
+    start = direct.sim.ctrl.clone()
+    waiting = [start.clone() for _ in range(late)]
+    generator = torch.Generator().manual_seed(0)
+    for step in range(12):
+        action = start + 0.1 * torch.rand(start.shape, generator=generator)
+        if step == 7:
+            mask = torch.tensor([True, False])
+            for env in (delayed, direct):
+                env.reset(mask=mask)
+            for command in waiting:
+                command[0] = direct.sim.ctrl[0]
+        delayed.step(action)
+        assert torch.equal(delayed.sim.ctrl, action.to(start.dtype))  # terms see what was given
+        waiting.append(action.to(start.dtype))
+        direct.step(waiting.pop(0))
+        assert torch.equal(delayed.sim.qpos, direct.sim.qpos), step
+    assert not torch.equal(delayed.sim.ctrl, direct.sim.ctrl)

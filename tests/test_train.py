@@ -13,6 +13,7 @@ from environments import at_double_speed, configure, on_new_sim
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import mjstack.train.clone as clone
+import mjstack.train.clone_learner as clone_learner
 from mjstack.cli import run
 from mjstack.envs import driven_config
 from mjstack.episodes.context import RunContext
@@ -22,6 +23,7 @@ from mjstack.jobs.train import check_train
 from mjstack.mdp.observation import headings
 from mjstack.policy import load_policy
 from mjstack.policy.checkpoint import read_state, write_state
+from mjstack.train.clone_learner import Learner
 from mjstack.train.demonstrations import play_expert
 from mjstack.train.distributed import Ranks
 from mjstack.train.trainer import STATE
@@ -106,15 +108,15 @@ def test_a_training_goes_on_where_it_was_interrupted(
     parts = tmp_path / "parts"
     import mjstack.interrupt as interrupt
 
-    step = clone.Learner._step
+    step = Learner._step
 
-    def stop(self: clone.Learner, rate: float) -> None:
+    def stop(self: Learner, rate: float) -> None:
         step(self, rate)
         if self.done + 1 == after:
             monkeypatch.setattr(interrupt, "_asked", True)
 
-    monkeypatch.setattr(clone.Learner, "_step", stop)
-    monkeypatch.setattr(clone, "_SHOWN", 1)
+    monkeypatch.setattr(Learner, "_step", stop)
+    monkeypatch.setattr(clone_learner, "_SHOWN", 1)
     with handle_interrupts():
         assert run([*REACH, f"job.folder={parts}"]) == 130
     monkeypatch.undo()

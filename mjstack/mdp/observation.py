@@ -76,7 +76,9 @@ def positions(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
         env: The environment.
         objects: The objects; all of the scene that can move if None.
     """
-    names = env.cfg.scene.free if objects is None else objects
+    names = list(env.cfg.scene.free) if objects is None else objects
+    if not names:
+        return env.sim.qpos[:, :0]
     return torch.cat([pose_w(env, name)[:, :3] for name in names], dim=1)
 
 
@@ -108,18 +110,17 @@ def headings(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     if objects is None:
         free = env.cfg.scene.free
         objects = [name for name, thing in free.items() if thing.shape == "box"]
-    columns = []
-    for name in objects:
-        w, x, y, z = pose_w(env, name)[:, 3:].unbind(1)
-        cos = 1.0 - 2.0 * (y * y + z * z)
-        sin = 2.0 * (w * z + x * y)
-        # Of the yaw, then of twice, then of four times. A box that stands on edge has no yaw.
-        length = torch.sqrt(cos * cos + sin * sin).clamp(min=1e-6)
-        cos, sin = cos / length, sin / length
-        for _ in range(2):
-            cos, sin = cos * cos - sin * sin, 2.0 * cos * sin
-        columns += [cos, sin]
-    return torch.stack(columns, dim=1) if columns else env.sim.qpos[:, :0]
+    if not objects:
+        return env.sim.qpos[:, :0]
+    w, x, y, z = torch.stack([pose_w(env, name)[:, 3:] for name in objects], dim=1).unbind(2)
+    cos = 1.0 - 2.0 * (y * y + z * z)
+    sin = 2.0 * (w * z + x * y)
+    # Of the yaw, then of twice, then of four times. A box that stands on edge has no yaw.
+    length = torch.sqrt(cos * cos + sin * sin).clamp(min=1e-6)
+    cos, sin = cos / length, sin / length
+    for _ in range(2):
+        cos, sin = cos * cos - sin * sin, 2.0 * cos * sin
+    return torch.stack((cos, sin), dim=2).flatten(1)
 
 
 @offers(unit=("m/s",) * 3 + ("rad/s",) * 3)

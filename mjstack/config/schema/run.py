@@ -27,6 +27,8 @@ class TimingCfg:
     """Control steps in which an action of a policy is repeated, in training. A driver decides in
     every control step; a policy that was trained so repeats its answers by itself.
     """
+    command_delay: int = spec(0, unit="control steps", ge=0, le=1000)
+    """Control steps between a command and its effect; until then the start's command holds."""
 
     @property
     def step_dt(self) -> float:

@@ -1,0 +1,158 @@
+"""trainer=clone from a dataset: what it reads, and which datasets it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from compositions import load_config
+
+from mjstack.cli import run
+from mjstack.episodes.context import RunContext
+from mjstack.errors import MjstackError
+from mjstack.jobs.train import check_train
+from mjstack.train import clone
+from mjstack.train.dataset import read_demonstrations
+from mjstack.train.demonstrations import play_expert
+from mjstack.train.distributed import Ranks
+
+REACH = ("task=reach", "sim=native", "nworld=3")
+TRAIN = (
+    "job=train",
+    *REACH,
+    "job.hidden=[16]",
+    "job.batches=4",
+    "job.batch_size=32",
+    "job.save_every=2",
+    "gate.success.rate=0.0",
+)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three episodes of job=collect, their observations without noise."""
+    folder = tmp_path_factory.mktemp("demos")
+    quiet = ["observation=real", "+observation.policy.noise=false", "controller=closed_loop"]
+    command = ["job=collect", *REACH, *quiet, "job.episodes=3", f"job.folder={folder}"]
+    assert run(command) == 0
+    return folder / "dataset"
+
+
+def test_a_dataset_has_what_the_expert_would_show(dataset: Path) -> None:
+    """The same starts, so the same steps; torchrun's processes share the episodes."""
+    cfg = load_config([*TRAIN, "job.episodes=3", "job.noisy_episodes=0"])
+    context = RunContext(cfg)
+    sizes = clone.resolve_sizes(cfg.job, "cpu")
+    group = clone.observed_group(cfg.job, sizes)
+    played = play_expert(context, sizes, group, Ranks())
+    read = read_demonstrations(dataset, context, group, played.widths, Ranks())
+    assert torch.equal(read.ends, played.ends)
+    torch.testing.assert_close(read.seen, played.seen)
+    torch.testing.assert_close(read.labels, played.labels)
+    parts = [
+        read_demonstrations(dataset, context, group, played.widths, Ranks(rank, 2))
+        for rank in range(2)
+    ]
+    assert [len(part.ends) for part in parts] == [2, 1]
+    assert torch.equal(parts[1].seen, read.seen[150:300])
+
+
+def as_lerobot(info: dict[str, Any]) -> None:
+    """As somebody else's recorder has it, without our block."""
+    del info["mjstack"]
+
+
+@pytest.mark.parametrize("change", [None, as_lerobot], ids=["ours", "LeRobot's"])
+def test_a_policy_learns_from_a_dataset(
+    change: Callable[[dict], None] | None, dataset: Path, tmp_path: Path
+) -> None:
+    folder = copied(dataset, tmp_path, change)
+    out = tmp_path / "out"
+    assert run([*TRAIN, f"job.dataset={folder}", f"job.folder={out}"]) == 0
+    train = json.loads((out / "report.json").read_text())["gates"][0]
+    assert train["metrics"]["expert_episodes"] == 3
+    assert train["notes"]["demonstrations"] == str(folder)
+
+
+def copied(
+    dataset: Path, tmp_path: Path, change: Callable[[dict[str, Any]], None] | None = None
+) -> Path:
+    """A copy of the dataset, its info.json changed."""
+    folder = tmp_path / "copy"
+    shutil.copytree(dataset, folder)
+    if change is not None:
+        path = folder / "meta/info.json"
+        info = json.loads(path.read_text())
+        change(info)
+        path.write_text(json.dumps(info))
+    return folder
+
+
+def rename(info: dict[str, Any]) -> None:
+    names = info["features"]["observation.policy"]["names"]
+    names[names.index("headings.1")] = "yaw"
+
+
+CHANGES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "robot": (lambda i: i.update(robot_type="so100"), "has robot_type=so100, expected so101"),
+    "rate": (lambda i: i.update(fps=30), "has fps=30, expected 50"),
+    "version": (lambda i: i.update(codebase_version="v2.1"), "v2.1, expected v3.0"),
+    "column": (rename, "has no column headings.1 in observation.policy"),
+    "action": (lambda i: i["features"].pop("action"), "has no column shoulder_pan.pos in action"),
+    "damaged": (lambda i: i.pop("features"), "info.json: cannot be read (KeyError"),
+}
+
+
+def refused(overrides: list[str]) -> str:
+    """The check's one line."""
+    with pytest.raises(MjstackError) as caught:
+        check_train(load_config([*TRAIN, *overrides]))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_dataset_that_does_not_fit_is_one_line(name: str, dataset: Path, tmp_path: Path) -> None:
+    change, says = CHANGES[name]
+    folder = copied(dataset, tmp_path, change)
+    assert says in refused([f"job.dataset={folder}"])
+
+
+def test_no_dataset_and_others_terms_and_tasks(dataset: Path, tmp_path: Path) -> None:
+    empty = [f"job.dataset={tmp_path}"]
+    assert "has no meta/info.json, expected a LeRobotDataset v3" in refused(empty)
+    more = [f"job.dataset={dataset}", "job.leave_out=[]"]
+    assert "has no column joint_vel.0 in observation.policy" in refused(more)
+    other = [f"job.dataset={dataset}", "task.instruction=Wave."]
+    assert "has the task 'Bring the gripper over the red cube.'" in refused(other)
+    used = [f"job.dataset={dataset}", "job.test_seed=0"]
+    assert "expected seeds that training does not use" in refused(used)
+
+
+def test_a_dataset_is_checked_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run([*TRAIN, f"job.dataset={tmp_path}", f"job.folder={out}"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not out.exists()
+
+
+def test_degrees_are_refused(dataset: Path, tmp_path: Path) -> None:
+    folder = copied(dataset, tmp_path)
+    path = folder / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    number = table.column_names.index("action")
+    degrees = np.rad2deg(np.array(table["action"].to_pylist(), np.float32)).reshape(-1)
+    column = pa.FixedSizeListArray.from_arrays(pa.array(degrees), 6)
+    pq.write_table(table.set_column(number, "action", column), path)
+    says = refused([f"job.dataset={folder}"])
+    assert "expected absolute joint targets within" in says
