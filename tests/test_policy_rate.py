@@ -9,6 +9,7 @@ import torch
 from environments import actions, configure, on_new_sim, on_shared_sim, state_of
 from policies import make_policy
 
+from mjstack.adapters.rsl_rl import RslRlVecEnv
 from mjstack.config.schema import Config
 from mjstack.drivers.closed_loop import make_expert
 from mjstack.drivers.policy import PolicyDriver
@@ -106,6 +107,15 @@ def test_a_policy_drives_as_it_was_trained(action: str) -> None:
         torch.testing.assert_close(trained.sim.ctrl, driven.sim.ctrl, rtol=0.0, atol=1e-6)
         torch.testing.assert_close(trained.sim.qpos, driven.sim.qpos, rtol=0.0, atol=1e-6)
     assert (trained.sim.ctrl - trained.sim.ctrl[:1]).abs().max() > 1e-4  # worlds differ
+
+
+def test_runners_spread_the_ends_over_decisions() -> None:
+    """A decision begins in a control step that is a multiple of its length, in any world."""
+    env = RslRlVecEnv(on_shared_sim("native", 3, held()))
+    env.episode_length_buf = torch.tensor([0, 7, 14])
+    assert env.env.episode_step.tolist() == [0, 5, 10]
+    env.step(torch.zeros(3, env.num_actions))
+    assert env.episode_length_buf.tolist() == [5, 10, 15]
 
 
 def test_drivers_decide_in_every_control_step() -> None:

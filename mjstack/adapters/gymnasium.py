@@ -161,7 +161,7 @@ class GymnasiumEnv(gymnasium.Env):
         self.inner = env
         self.group = group
         self._worlds = GymnasiumVectorEnv(env, group=group)
-        self.metadata = {"render_modes": [], "render_fps": round(1.0 / env.cfg.timing.step_dt)}
+        self.metadata = {"render_modes": [], "render_fps": round(1.0 / env.cfg.timing.decision_dt)}
         self.observation_space = self._worlds.single_observation_space
         self.action_space = self._worlds.single_action_space
         # The inner environment starts the next episode in the step that ends one; this is what it

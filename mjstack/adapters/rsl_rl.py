@@ -27,7 +27,7 @@ class RslRlVecEnv(VecEnv):
         env: The environment.
         num_envs: Number of worlds.
         num_actions: Width of the action.
-        max_episode_length: Steps after which an episode times out.
+        max_episode_length: Control steps after which an episode times out.
         device: Where tensors live.
         cfg: The environment's configuration, which loggers store.
     """
@@ -57,16 +57,16 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Step since each world's last reset, shape ``(num_envs,)``, int64.
+        """Control step since each world's last reset, shape ``(num_envs,)``, int64.
 
         Assigning copies into the environment: runners start worlds at random times of an episode so
-        that not all end at once.
+        that not all end at once. These are rounded down to the first step of a decision.
         """
         return self.env.episode_step
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
-        self.env.episode_step.copy_(value)
+        self.env.episode_step.copy_(value - value % self.env.cfg.timing.policy_decimation)
 
     def get_observations(self) -> TensorDict:
         """The current observations.
@@ -81,7 +81,7 @@ class RslRlVecEnv(VecEnv):
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advance every world by one control interval; worlds that end are reset in the same step.
+        """Advance every world by one decision; worlds that end are reset in the same step.
 
         Args:
             actions: Shape ``(num_envs, num_actions)``, float32.

@@ -58,14 +58,14 @@ def export_policy(folder: Path, context: RunContext) -> list[GateResult]:
             "Make room, or set hydra.run.dir to another",
         ) from error
     width = sum(policy.widths.values())
-    shape = f"{policy.network.chunk} x {policy.network.joints}"
+    answer = "numbers of its action terms" if policy.action else "joint targets"
+    shape = f"{policy.network.chunk} x {policy.network.joints} {answer}"
     sizes = {f"{name.replace('.', '_')}_mb": len(data) / 1e6 for name, data in files.items()}
     return [
         GateResult(
             name=NAME,
             status=Status.passed,
-            reason=f"{folder / POLICY}: {width} numbers observed, {shape} joint targets;"
-            f" {folder / MODEL}",
+            reason=f"{folder / POLICY}: {width} numbers observed, {shape}; {folder / MODEL}",
             metrics={"inputs": width, **sizes},
             notes={"policy": str(policy.folder)},
         )

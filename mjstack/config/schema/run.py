@@ -35,6 +35,11 @@ class TimingCfg:
         """Time of a control step [s]."""
         return self.physics_dt * self.decimation
 
+    @property
+    def decision_dt(self) -> float:
+        """Time of a decision of a policy in training [s]."""
+        return self.step_dt * self.policy_decimation
+
 
 @dataclass(slots=True)
 class SolverCfg:
