@@ -70,6 +70,8 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(tmp_path: Path) -> N
     assert np.isfinite(rows["return_"]).all()  # ends are spread out, so that some end early
     assert ((rows["success"] >= 0.0) & (rows["success"] <= 1.0)).all()
     assert (rows["reach"] > 0.0).all()
+    best = int(rows["return_"].argmax())  # there is no success yet
+    assert load_policy(out / "best").training["iteration"] == rows["iteration"][best]
     for name in ("train.png", "train.md", "best/policy.json", "last/policy.json"):
         assert (out / name).stat().st_size > 0, name
 
@@ -257,6 +259,25 @@ def test_the_expert_plays_at_the_beginning(tmp_path: Path) -> None:
     assert report(out)["success"]["metrics"]["episodes"] == 4
     assert "cubes" in report(out)["success"]["notes"]["starts"]
     assert "expert" not in report(out)["success"]["notes"]["starts"]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("tuned", [False, True], ids=["random", "start_from"])
+def test_a_training_on_cuda(tuned: bool, tmp_path: Path) -> None:
+    """Steps and judged rollouts are captured, in a second call too."""
+    out = tmp_path / "training"
+    command = [*TINY, *at_double_speed(), "sim=mjwarp", "graph=require", "nworld=32"]
+    command += ["reset=expert_states", "job.expert_worlds=16"]
+    if tuned:
+        cfg = configure("~observation.policy.terms.last_action")
+        start = write_policy(tmp_path / "clone", cfg, chunk=6, execute=4)
+        command += [f"job.start_from={start}", "job.critic_iterations=1"]
+    assert run([*command, "job.iterations=2", f"job.folder={out}"]) == 0
+    assert run([*command, f"job.folder={out}"]) == 0
+    assert report(out)["train"]["metrics"]["iterations"] == 4
+    assert report(out)["success"]["metrics"]["episodes"] == 32
+    assert len(set(np.load(out / "expert_states.npz")["episode"])) > 8
 
 
 BAD = [

@@ -95,7 +95,7 @@ class Learner:
 
         self.done = 0
         self.seconds = 0.0
-        self.best = (-1.0, -math.inf)
+        self.best = (0.0, -math.inf)
         self.curve: list[dict[str, Any]] = []
         self.change = math.nan
         self._events: EventWriter | None = None
@@ -206,8 +206,9 @@ class Learner:
         self._take_weights()
         self._policy.training = {"trainer": "ppo", "seed": self._plan.cfg.seed, **row}
         save_policy(self._folder / LAST, self._policy)
-        reached = (row["success"], row["return"])
-        if self.best[0] < 0.0 or reached > self.best:
+        ended = row["episodes"] > 0.0
+        reached = (row["success"], row["return"]) if ended else (0.0, -math.inf)
+        if reached >= self.best:
             self.best = reached
             save_policy(self._folder / BEST, self._policy)
         self._write_state()
