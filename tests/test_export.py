@@ -24,20 +24,17 @@ from mjstack.config.schema import Config
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import NOMINAL
+from mjstack.jobs.export import export_facts
 from mjstack.policy import load_policy, save_policy
 from mjstack.policy.onnx import to_onnx
 
+SEEN = ("observation=state", "+observation.policy.terms.joint_vel.history=2")
 EXAMPLE = Path(__file__).parents[1] / "examples" / "policy_native.py"
 
 
-def write_seeing(folder: Path, cfg: Config, *added: str) -> Path:
-    """A policy without noise, which also sees added terms of `mjstack.mdp.observation`."""
-    group = cfg.observation["policy"]
-    more = {
-        name: replace(group.terms["last_action"], func=f"mjstack.mdp.observation.{name}", params={})
-        for name in added
-    }
-    group = replace(group, noise=False, terms=group.terms | more)
+def write_noiseless(folder: Path, cfg: Config) -> Path:
+    """A policy whose observation has no noise, which a program without mjstack could not draw."""
+    group = replace(cfg.observation["policy"], noise=False)
     save_policy(folder, make_policy(replace(cfg, observation={"policy": group}), execute=4))
     return folder
 
@@ -50,7 +47,7 @@ def export(policy: Path, out: Path, *overrides: str) -> int:
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A policy of task reach in ``policy``, and its export in ``out``."""
     folder = tmp_path_factory.mktemp("export")
-    write_seeing(folder / "policy", configure("task=reach"))
+    write_noiseless(folder / "policy", configure("task=reach", *SEEN))
     assert export(folder / "policy", folder / "out", "task=reach") == 0
     return folder
 
@@ -63,8 +60,9 @@ def session_of(folder: Path) -> onnxruntime.InferenceSession:
 def test_onnxruntime_gives_torchs_numbers(exported: Path, batch: int) -> None:
     """Far observations are among them, which the network clamps."""
     network = load_policy(exported / "policy").network
-    network.set_scale("observation", torch.randn(24), torch.rand(24) + 0.1)
-    seen = 4.0 * torch.randn(batch, network.observation_mean.shape[0])
+    width = network.observation_mean.shape[0]
+    network.set_scale("observation", torch.randn(width), torch.rand(width) + 0.1)
+    seen = 4.0 * torch.randn(batch, width)
     session = onnxruntime.InferenceSession(to_onnx(network, {}))
     (found,) = session.run(["action"], {"observation": seen.numpy()})
     np.testing.assert_allclose(found, network(seen).numpy(), rtol=0.0, atol=2e-6)
@@ -86,13 +84,15 @@ def test_the_metadata_is_what_a_program_needs(exported: Path) -> None:
     }
     assert facts["observation"]["widths"] == {
         "joint_pos": 6,
-        "joint_vel": 6,
-        "grasp_point_to_goal": 6,
-        "last_action": 6,
+        "joint_vel": 12,
+        "offsets": 6,
+        "positions": 6,
+        "headings": 4,
+        "goals": 0,
     }
     assert list(facts["observation"]["terms"]) == list(facts["observation"]["widths"])
-    assert facts["columns"]["names"][12] == "grasp_point_to_goal.0.t-1"
-    assert facts["columns"]["units"][6:8] == ["10 rad/s", "10 rad/s"]
+    assert facts["columns"]["names"][5:8] == ["joint_pos.5", "joint_vel.0.t-1", "joint_vel.1.t-1"]
+    assert facts["columns"]["units"][5:8] == ["rad", "10 rad/s", "10 rad/s"]
     assert facts["robot"]["units"] == ["rad"] * 6
     assert facts["normalization"]["action_mean"] == pytest.approx(cfg.robot.start)
     assert facts["training"] == {"seed": 0}
@@ -131,13 +131,27 @@ def test_the_example_drives_as_the_driver_does(task: str, exported: Path, tmp_pa
     policy = exported / "policy"
     out = exported / "out"
     if task == "stack":
-        policy = write_seeing(tmp_path / "policy", cfg, "headings")
+        policy = write_noiseless(tmp_path / "policy", configure(*SEEN))
         out = tmp_path / "out"
         assert export(policy, out) == 0
     play = runpy.run_path(str(EXAMPLE))["play"]
     wanted = drivers_targets(policy, cfg, 40)
     np.testing.assert_allclose(play(str(out), 40), wanted, rtol=0.0, atol=2e-5)
     assert wanted.std(0).max() > 1e-3  # it moves
+
+
+def test_actions_of_a_policys_own_are_described(tmp_path: Path) -> None:
+    """Of other numbers than joint targets, repeated below the control rate."""
+    own = ("action=ee_delta", "timing.policy_decimation=5")
+    cfg = configure("task=reach", *own)
+    policy = make_policy(cfg, chunk=1, execute=5)
+    save_policy(tmp_path / "policy", policy)
+    facts = export_facts(configure("task=reach"), load_policy(tmp_path / "policy"))
+    assert facts["action"]["kind"] == "action terms"
+    assert list(facts["action"]["terms"]) == list(cfg.action)
+    assert facts["action"]["width"] == policy.network.joints == policy.widths["last_action"]
+    assert facts["columns"]["units"][-1] == "1"
+    assert len(facts["columns"]["names"]) == sum(policy.widths.values())
 
 
 def refused(capsys: pytest.CaptureFixture[str]) -> str:

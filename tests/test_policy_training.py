@@ -21,6 +21,7 @@ from mjstack.jobs.train import check_train
 from mjstack.policy import load_policy
 
 
+@pytest.mark.full
 def test_a_full_disk_leaves_the_policies_before_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -242,8 +242,8 @@ def group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
 
 def _term_units(func: str, width: int, joints: tuple[str, ...]) -> Sequence[str]:
     unit = offered(func, "unit") or "unknown"
-    if unit == "joint":
-        return joints
+    if unit == "joint":  # or the actions of a policy, which need not be joint targets
+        return joints if width == len(joints) else ["1"] * width
     if unit == "joint/s":
         return [f"{joint}/s" for joint in joints]
     return [unit] * width if isinstance(unit, str) else unit

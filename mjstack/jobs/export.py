@@ -2,7 +2,7 @@
 MuJoCo.
 """
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -74,7 +74,9 @@ def export_policy(folder: Path, context: RunContext) -> list[GateResult]:
 
 def export_facts(cfg: Config, policy: Policy) -> dict:
     """Everything that a program needs beside the network, in JSON's types, by name."""
-    own = replace(driven_config(cfg), observation={policy.group: policy.observation})
+    own = driven_config(cfg)
+    own.observation = {policy.group: policy.observation}
+    own.action = policy.action or own.action
     env = build_env(own, nworld=1, backend=Backend.native, device="cpu")
     try:
         return policy_facts(policy) | _scene_facts(env, policy)
@@ -118,6 +120,10 @@ def _scene_facts(env: Env, policy: Policy) -> dict:
         "objects": {
             name: {"shape": thing.shape, "size": thing.size, "fixed": thing.fixed}
             for name, thing in cfg.scene.objects.items()
+        },
+        "places": {
+            name: {"xy": place.xy, "random_xy": place.random_xy}
+            for name, place in cfg.scene.places.items()
         },
     }
 
