@@ -163,6 +163,7 @@ PATHS: dict[str, list[str] | None] = {
             "_grasp_offset",
         )
     ],
+    "train/dagger.py": ["MixedDriver.command"],
     "policy/network.py": ["PolicyNetwork.normalized", "PolicyNetwork.forward"],
     "drivers/tilt.py": ["CarryTilt.desired_approach", "CarryTilt.release_approach"],
     "episodes/failures.py": ["FailureMonitor.update", "_of"],

@@ -35,11 +35,14 @@ class Learner:
     The policy is a moving average of the network's weights over the batches.
 
     Attributes:
+        trainer: The trainer's name.
         done: Batches so far.
         seconds: Time of them, in all calls [s].
         best: Smallest validation loss.
         curve: A row for each time that policies were saved.
     """
+
+    trainer = "clone"
 
     def __init__(
         self,
@@ -72,15 +75,8 @@ class Learner:
         self._made_with = made_with
         self._expert = expert
         self._ranks = ranks
-        self._seen = demonstrations.seen
-        self._labels = demonstrations.labels
-        self._last = demonstrations.last()
+        self.take(demonstrations)
         device = self._seen.device
-        episodes = torch.arange(len(demonstrations.ends), device=device)
-        held_out = episodes % _HELD_OUT == min(_HELD_OUT, len(episodes)) - 1
-        held_out = held_out.repeat_interleave(demonstrations.lengths())
-        self._training = (~held_out).nonzero()[:, 0]
-        self._validation = held_out.nonzero()[:, 0]
         self._batch_size = max(1, sizes.batch_size // ranks.size)
 
         # The network, its average and its optimizer
@@ -121,19 +117,34 @@ class Learner:
         self._count = 0
         self._events: EventWriter | None = None
 
-    def learn(self) -> None:
+    def take(self, demonstrations: Demonstrations) -> None:
+        """Learn from these demonstrations from now on. The scale stays that of the first ones."""
+        self._seen = demonstrations.seen
+        self._labels = demonstrations.labels
+        self._last = demonstrations.last()
+        episodes = torch.arange(len(demonstrations.ends), device=self._seen.device)
+        held_out = episodes % _HELD_OUT == min(_HELD_OUT, len(episodes)) - 1
+        held_out = held_out.repeat_interleave(demonstrations.lengths())
+        self._training = (~held_out).nonzero()[:, 0]
+        self._validation = held_out.nonzero()[:, 0]
+
+    def learn(self, first: int = 0, total: int | None = None) -> None:
         """Make the missing batches, saving policies and state now and then.
+
+        Args:
+            first: Batch with which the learning rate begins.
+            total: Batch with which it has fallen to 0; those of the sizes if None.
 
         Raises:
             KeyboardInterrupt: The command was interrupted; the state is saved.
         """
-        total = self._sizes.batches
+        total = self._sizes.batches if total is None else total
         before = self.seconds - time.perf_counter()
-        if self._ranks.writes:
-            self._events = EventWriter(self._folder, self.done, self._context.print_line)
+        self._events = self._open_events()
         with _fast_products(self._seen.device):
             while self.done < total:
-                self._step(0.5 * (1.0 + math.cos(math.pi * self.done / total)))
+                share = (self.done - first) / (total - first)
+                self._step(0.5 * (1.0 + math.cos(math.pi * share)))
                 self.done += 1
                 self.seconds = before + time.perf_counter()
                 saves = self.done % self._sizes.save_every == 0 or self.done == total
@@ -150,6 +161,12 @@ class Learner:
                         raise
         if self._events is not None:
             self._events.close()
+
+    def _open_events(self) -> EventWriter | None:
+        """Where the curves go besides, in the process that writes."""
+        if not self._ranks.writes:
+            return None
+        return EventWriter(self._folder, self.done, self._context.print_line)
 
     def _step(self, rate: float) -> None:
         """One batch, at a share of the learning rate."""
@@ -199,8 +216,8 @@ class Learner:
         self._ranks.sum_(total, count)
         return float(total / count)
 
-    def _save(self) -> None:
-        """Add a row to the curve, and write policies and state."""
+    def _new_row(self) -> dict[str, Any]:
+        """A row of the curve, which the policy's file has too. The next one has other batches."""
         loss = self._validate()
         mean = self._sum / max(1, self._count)
         self._ranks.sum_(mean)
@@ -212,15 +229,20 @@ class Learner:
         }
         self._sum.zero_()
         self._count = 0
-        self.curve.append(row)
         self._policy.training = {
-            "trainer": "clone",
+            "trainer": self.trainer,
             "seed": self._policy.config["seed"],
             "episodes": self._expert["expert_episodes"],
             **row,
         }
-        better = loss <= self.best
-        self.best = min(loss, self.best)
+        return row
+
+    def _save(self) -> None:
+        """Add a row to the curve, and write policies and state."""
+        row = self._new_row()
+        self.curve.append(row)
+        better = row["validation_loss"] <= self.best
+        self.best = min(row["validation_loss"], self.best)
         if self._events is not None:
             self._events.add(row, self.done)
             save_policy(self._folder / LAST, self._policy)

@@ -390,6 +390,22 @@ class CloneJobCfg(TrainJobCfg):
 
 
 @dataclass(slots=True)
+class DaggerJobCfg(CloneJobCfg):
+    """In every round the expert and the policy drive, and the policy learns the expert's answers to
+    all states of all rounds. Sizes are those of a round, and ``noisy_episodes`` are not played.
+    """
+
+    rounds: int = spec(ge=1, le=1000)
+    """Rounds: the expert alone drives in the first one."""
+    beta: float = spec(ge=0.0, le=1.0)
+    """Share of the time in which the expert drives in the second round."""
+    beta_decay: float = spec(ge=0.0, le=1.0)
+    """What it is multiplied by from round to round."""
+    alone: float = spec(gt=0.0, le=1.0)
+    """Share of the worlds in which the policy drives alone: their success is that of a round."""
+
+
+@dataclass(slots=True)
 class PpoSettings:
     """What differs between a random network and one that can do something; as the keys of the job
     of these names.
@@ -472,7 +488,7 @@ class PpoJobCfg(TrainJobCfg):
 
 
 # Trainers with keys of their own; the others have those of clone.
-TRAINER_SCHEMAS = {"ppo": PpoJobCfg}
+TRAINER_SCHEMAS = {"dagger": DaggerJobCfg, "ppo": PpoJobCfg}
 # Jobs with keys of their own; the others have `JobCfg`.
 JOB_SCHEMAS = {
     "study": StudyJobCfg,

@@ -1,0 +1,124 @@
+"""trainer=dagger: rounds of a small training, what it refuses, and how it goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from compositions import load_config
+from test_train import report, weights
+
+import mjstack.interrupt as interrupt
+import mjstack.train.clone_learner as clone
+import mjstack.train.dagger as dagger
+from mjstack.cli import run
+from mjstack.errors import MjstackError
+from mjstack.interrupt import handle_interrupts
+from mjstack.jobs.train import check_train
+from mjstack.policy import load_policy
+
+TINY = (
+    "job=train",
+    "trainer=dagger",
+    "task=reach",
+    "sim=native",
+    "nworld=4",
+    "job.rounds=2",
+    "job.episodes=4",
+    "job.hidden=[32]",
+    "job.batches=20",
+    "job.batch_size=64",
+    "gate.success.rate=0.0",
+)
+
+
+@pytest.mark.full
+def test_rounds_leave_a_policy_and_go_on_bit_for_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Interrupted in the first round, when it is over, and in the second one."""
+    whole = tmp_path / "whole"
+    assert run([*TINY, f"job.folder={whole}"]) == 0
+    gates = report(whole)
+    figures = gates["train"]["metrics"]
+    assert (figures["rounds"], figures["batches"], figures["episodes"]) == (2, 40, 8)
+    rows = np.genfromtxt(whole / "train.csv", delimiter=",", names=True)
+    assert rows["round"].tolist() == [1.0, 2.0]
+    policy = load_policy(whole / "last")
+    assert (policy.network.chunk, policy.execute, policy.training["trainer"]) == (1, 1, "dagger")
+    assert load_policy(whole / "best").training["success"] == rows["success"].max()
+    assert not list(whole.glob("round-*"))
+
+    parts = tmp_path / "parts"
+    step = clone.Learner._step
+
+    def stop(self: clone.Learner, rate: float) -> None:
+        step(self, rate)
+        if self.done + 1 == stops[0]:
+            patch.setattr(interrupt, "_asked", True)
+
+    stops = [7, 20, 33]
+    while stops:
+        with monkeypatch.context() as patch:
+            patch.setattr(clone.Learner, "_step", stop)
+            patch.setattr(clone, "_SHOWN", 1)
+            with handle_interrupts():
+                assert run([*TINY, f"job.folder={parts}"]) == 130
+        del stops[0]
+    assert run([*TINY, f"job.folder={parts}"]) == 0
+    first = weights(whole / "last")
+    assert all(torch.equal(v, first[k]) for k, v in weights(parts / "last").items())
+    other = np.genfromtxt(parts / "train.csv", delimiter=",", names=True)
+    for name in ("success", "validation_loss"):
+        assert rows[name].tolist() == other[name].tolist()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("controller=closed_loop", "controller=closed_loop: expected state_based, because"),
+        ("job.dataset=outputs", "job.dataset=outputs: expected null"),
+        ("job.rounds=0", "job.rounds=0"),
+    ],
+)
+def test_what_cannot_be_trained_is_one_line(override: str, message: str) -> None:
+    with pytest.raises(MjstackError, match=message) as error:
+        check_train(load_config([*TINY, override]))
+    assert "\n" not in str(error.value)
+
+
+def test_the_share_of_the_expert(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worlds in which the policy drives alone get its targets; in the others the expert drives for
+    about its share of the spells.
+    """
+    import mjstack
+
+    cfg = ["task=reach", "action=joint_absolute", "sim=native"]
+    env = mjstack.make_env(cfg, nworld=40)
+    env.reset(seed=0)
+
+    class Constant:
+        phases: list = []  # noqa: RUF012
+        steps = 150
+
+        def __init__(self, value: float) -> None:
+            self.value = torch.full((40, len(env.index.ctrl)), value)
+
+        def command(self) -> torch.Tensor:
+            return self.value
+
+    expert, policy = Constant(1.0), Constant(2.0)
+    driver = dagger.MixedDriver(expert, policy, env, 0.5, 10)  # type: ignore[arg-type]
+    seen = []
+    for step in range(0, 1000, 25):
+        env.episode_step.fill_(step)
+        seen.append(driver.command()[:, 0].clone())
+        env.episode_step.add_(24)
+        assert torch.equal(driver.command()[:, 0], seen[-1])
+    share = (torch.stack(seen) == 1.0).float().mean(0)
+    assert (share[:10] == 0.0).all()
+    assert abs(float(share[10:].mean()) - 0.5) < 0.05
+    assert torch.equal(driver.label, expert.value)
+    env.close()
