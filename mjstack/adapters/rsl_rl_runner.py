@@ -64,9 +64,9 @@ class Runner(OnPolicyRunner):
         ranks = torchrun_ranks()
         self.gpu_world_size = ranks.size
         self.gpu_global_rank = ranks.rank
-        self.is_distributed = ranks.size > 1
+        self.is_distributed = False  # it would send the parameters anew with every iteration
         facts = {"global_rank": ranks.rank, "local_rank": ranks.rank, "world_size": ranks.size}
-        self.cfg["multi_gpu"] = facts if self.is_distributed else None
+        self.cfg["multi_gpu"] = facts if ranks.size > 1 else None
 
 
 class Log:

@@ -118,6 +118,8 @@ class Learner:
         self._before = self.seconds
         if self._ranks.writes:
             self._events = EventWriter(self._folder, self.done, self._context.print_line)
+        if self._ranks.size > 1:
+            self._alg.broadcast_parameters()
         first = True
         while not self._over():
             self._iterate(spread=first)
@@ -157,8 +159,7 @@ class Learner:
         share = min(1.0, self.done / self._job.entropy_iterations)
         self._alg.entropy_coef = start + (end - start) * share
         self._alg.actor.requires_grad_(self.done >= settings.critic_iterations)
-        with redirect_stdout(io.StringIO()):
-            self._runner.learn(1, init_at_random_ep_len=spread)
+        self._runner.learn(1, init_at_random_ep_len=spread)
         self._deviation().data.clamp_(*settings.std[1:])
         if self._plan.start is not None and self.done >= settings.critic_iterations:
             self._adapt_rate()
