@@ -16,15 +16,18 @@ import onnxruntime
 import pytest
 import torch
 from environments import configure
-from policies import make_policy
+from policies import make_policy, write_policy
 
 import mjstack
 from mjstack.cli import run
+from mjstack.config import load_config
 from mjstack.config.schema import Config
+from mjstack.config.session import search_path
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import NOMINAL
-from mjstack.jobs.export import export_facts
+from mjstack.jobs import play as play_job
+from mjstack.jobs.export import check_export, export_facts
 from mjstack.policy import load_policy, save_policy
 from mjstack.policy.onnx import to_onnx
 
@@ -152,6 +155,21 @@ def test_actions_of_a_policys_own_are_described(tmp_path: Path) -> None:
     assert facts["action"]["width"] == policy.network.joints == policy.widths["last_action"]
     assert facts["columns"]["units"][-1] == "1"
     assert len(facts["columns"]["names"]) == sum(policy.widths.values())
+
+
+@pytest.mark.parametrize("job", ["export", "play"])
+def test_a_task_that_brings_a_controller_takes_a_policy(
+    job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    conf = EXAMPLE.parent / "push" / "conf"
+    write_policy(tmp_path / "policy", load_config(["task=push"], config_dir=conf))
+    args = [f"job={job}", "task=push", "sim=native", f"policy={tmp_path / 'policy'}"]
+    cfg = load_config(args, config_dir=conf)
+    assert cfg.controller.name == "closed_loop"
+    monkeypatch.setattr(play_job, "require_offscreen", lambda model: None)
+    with search_path([conf]):
+        checked = {"export": check_export, "play": play_job.check_play}[job](cfg)
+    assert checked.context.cfg.controller.name == "policy"
 
 
 def refused(capsys: pytest.CaptureFixture[str]) -> str:

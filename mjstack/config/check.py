@@ -81,7 +81,7 @@ def _jobs(cfg: Config) -> None:
     for key in ("run", "world"):
         wrong = getattr(cfg, key) is not None and cfg.job.name != "replay"
         _refuse(wrong, cfg, key, "null, because it is for job=replay alone. Add job=replay")
-    plays = cfg.controller.name == "policy" or cfg.job.name == "play"
+    plays = cfg.controller.name == "policy" or cfg.job.name in ("play", "export")
     wrong = cfg.policy is not None and not plays
     expected = "null, because no policy drives the worlds. Add controller=policy"
     _refuse(wrong, cfg, "policy", expected)

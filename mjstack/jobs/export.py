@@ -2,7 +2,7 @@
 MuJoCo.
 """
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import mjstack
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.context import RunContext
+from mjstack.episodes.rollout import POLICY as DRIVER
 from mjstack.errors import FolderError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import run_guarded
@@ -32,7 +33,7 @@ MODEL = "model.mjb"
 def check_export(cfg: Config) -> CheckedJob:
     """Raise for what cannot be exported, before anything is written."""
     require_onnx()
-    context = RunContext(cfg)
+    context = RunContext(replace(cfg, controller=replace(cfg.controller, name=DRIVER)))
     check_task(context)
     title = f"task {cfg.task.name}, policy {context.stage.policy.folder}"
     return CheckedJob(context=context, title=title, work=_export)

@@ -70,7 +70,7 @@ class Config:
     starts: str | None = spec(None)
     """reset=starts_file: a file with one row per world, from which all of them start."""
     policy: str | None = spec(None)
-    """controller=policy, job=play: the folder of a trained policy."""
+    """controller=policy, job=play, job=export: the folder of a trained policy."""
     run: str | None = spec(None)
     """job=replay: the folder of an earlier run."""
     world: str | None = spec(None)
