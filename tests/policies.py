@@ -1,7 +1,14 @@
-"""Policies for tests: small networks with random weights, which drive worlds without success."""
+"""Policies for tests: small networks with random weights, which drive worlds without success; and
+trainings in two processes.
+"""
 
 from __future__ import annotations
 
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -47,3 +54,29 @@ def write_policy(folder: Path, cfg: Config, **options: int | str) -> Path:
     """The folder of such a policy."""
     save_policy(folder, make_policy(cfg, **options))  # type: ignore[arg-type]
     return folder
+
+
+def run_as_torchrun(overrides: Sequence[str], folder: Path) -> list[str]:
+    """Run a command in two processes, as torchrun starts them, with Gloo on a CPU, in the folders
+    ``0`` and ``1``; returns what each has printed.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    started = []
+    for rank in ("0", "1"):
+        own = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": "2"}
+        where = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+        (folder / rank).mkdir()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "mjstack", *overrides],
+            env=os.environ | own | where,
+            cwd=folder / rank,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+    texts = [process.communicate(timeout=300) for process in started]
+    assert [process.returncode for process in started] == [0, 0], texts
+    return [out for out, _ in texts]

@@ -5,10 +5,7 @@ start in an expert's states.
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import socket
-import subprocess
 import sys
 from pathlib import Path
 
@@ -16,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from environments import at_double_speed, configure, mask_of, on_new_sim
-from policies import make_policy, write_policy
+from policies import make_policy, run_as_torchrun, write_policy
 
 import mjstack.interrupt as interrupt
 import mjstack.mdp.starts.expert_states as expert_states
@@ -146,32 +143,9 @@ def test_a_clone_is_tuned(tmp_path: Path) -> None:
 def test_two_processes_learn_one_policy(tmp_path: Path) -> None:
     """As torchrun starts them, with Gloo on a CPU: both average gradients, the first one writes."""
     out = tmp_path / "out"
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [sys.executable, "-m", "mjstack", *REACH, f"job.folder={out}"]
-    started = []
-    for rank in ("0", "1"):
-        own = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": "2"}
-        where = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-        # The second one has nowhere to write
-        folder = tmp_path / rank
-        folder.mkdir()
-        pipe = subprocess.PIPE
-        started.append(
-            subprocess.Popen(
-                command,
-                env=os.environ | own | where,
-                cwd=folder,
-                stdout=pipe,
-                stderr=pipe,
-                text=True,
-            )
-        )
-    texts = [process.communicate(timeout=300) for process in started]
-    assert [process.returncode for process in started] == [0, 0], texts
-    assert "iteration 4" in texts[0][0]
-    assert "iteration" not in texts[1][0]
+    texts = run_as_torchrun([*REACH, f"job.folder={out}"], tmp_path)
+    assert "iteration 4" in texts[0]
+    assert "iteration" not in texts[1]
     assert not list((tmp_path / "1").iterdir())
     rows = np.genfromtxt(out / "train.csv", delimiter=",", names=True)
     assert rows["decisions"].tolist() == [64.0, 128.0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import torch
 from compositions import load_config
 from environments import at_double_speed, configure, on_new_sim
+from policies import run_as_torchrun
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import mjstack.train.clone as clone
@@ -129,6 +131,45 @@ def test_a_training_goes_on_where_it_was_interrupted(
         for folder in (whole, parts)
     ]
     np.testing.assert_allclose(*curves, rtol=1e-5)
+
+
+@pytest.mark.full
+def test_two_processes_learn_one_policy(tmp_path: Path) -> None:
+    """They share the expert's seeds, average gradients, and the first one writes; a state says
+    where each goes on.
+    """
+    out = tmp_path / "out"
+    texts = run_as_torchrun([*REACH, f"job.folder={out}"], tmp_path)
+    assert "seed 0, no noise" in texts[0]
+    assert not texts[1]
+    assert not list((tmp_path / "1").iterdir())
+    assert report(out)["train"]["metrics"]["expert_episodes_played"] == 6
+    state, facts = read_state(out / STATE)
+    assert facts["done"] == 30
+    assert facts["made_with"]["processes"] == 2
+    assert not torch.equal(state["generator.0"], state["generator.1"])
+
+
+@pytest.mark.full
+def test_two_cores_train_reach(tmp_path: Path) -> None:
+    """In two minutes of both; every world reaches its point."""
+    began = time.process_time()
+    out = tmp_path / "training"
+    assert run(["job=train", "task=reach", "sim=native", "nworld=64", f"job.folder={out}"]) == 0
+    assert report(out)["success"]["metrics"]["success_rate"] >= 0.99
+    assert time.process_time() - began < 240.0
+
+
+@pytest.mark.full
+def test_two_cores_train_stack_from_64_episodes(tmp_path: Path) -> None:
+    """In three minutes of both; half of the unseen worlds at least stack."""
+    began = time.process_time()
+    out = tmp_path / "training"
+    few = ["nworld=32", "job.episodes=32", "job.noisy_episodes=32", "gate.success.rate=0.5"]
+    assert run(["job=train", "sim=native", "reset=jitter", *few, f"job.folder={out}"]) == 0
+    assert report(out)["train"]["metrics"]["expert_episodes_played"] == 64
+    assert report(out)["success"]["metrics"]["succeeded"] >= 16
+    assert time.process_time() - began < 360.0
 
 
 def test_a_clone_of_stack_drives_the_batch(tmp_path: Path) -> None:
