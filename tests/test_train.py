@@ -173,11 +173,17 @@ def test_two_cores_train_stack_from_64_episodes(tmp_path: Path) -> None:
 
 
 def test_a_clone_of_stack_drives_the_batch(tmp_path: Path) -> None:
-    """From few episodes at double speed, which take seconds: no success is asked for."""
-    fast = [*at_double_speed(), "reset=jitter"]
+    """From few episodes at double speed, which take seconds: no success is asked for. It sees what
+    a real arm has, with its past, decides ten times a second, and its commands are late.
+    """
+    fast = [*at_double_speed(), "reset=jitter", "timing.command_delay=5"]
+    seen = ["observation@job.observation=real", "+job.observation.policy.terms.joint_pos.history=2"]
     out = tmp_path / "training"
-    assert run([*TINY, *fast, f"job.folder={out}"]) == 0
+    assert run([*TINY, *fast, *seen, "job.execute=5", f"job.folder={out}"]) == 0
     assert report(out)["train"]["metrics"]["expert_episodes"] >= 4
+    policy = load_policy(out / "last")
+    assert policy.widths["joint_pos"] == 12
+    assert policy.execute == 5
     drive = ["controller=policy", f"policy={out}/last", "gates=[batch]", "sim=native", "nworld=2"]
     status = run(
         [*fast, *drive, "gate.batch.failed_worlds=2", f"hydra.run.dir={tmp_path / 'gates'}"]
