@@ -52,8 +52,7 @@ class Learner:
         seconds: Time of them, in all calls [s].
         best: Largest share of successes of the episodes between two saves, and their return.
         curve: A row for each time that policies were saved.
-        change: KL divergence of the policy after the last iteration from the one before; NaN where
-            rsl_rl alone knows it.
+        change: KL divergence of the policy after the last iteration from the one before.
     """
 
     def __init__(self, context: RunContext, plan: Plan, folder: Path, ranks: Ranks) -> None:
@@ -86,12 +85,12 @@ class Learner:
         self._policy = self._make_policy()
         if plan.start is not None:
             self._begin_with(plan.start)
-            rates = (plan.settings.learning_rate, self._job.critic_learning_rate)
-            groups = [
-                {"params": list(network.parameters()), "lr": rate}
-                for network, rate in zip((alg.actor, alg.critic), rates, strict=True)
-            ]
-            alg.optimizer = torch.optim.Adam(groups)
+        rates = (plan.settings.learning_rate, self._job.critic_learning_rate)
+        groups = [
+            {"params": list(network.parameters()), "lr": rate}
+            for network, rate in zip((alg.actor, alg.critic), rates, strict=True)
+        ]
+        alg.optimizer = torch.optim.Adam(groups)
 
         self.done = 0
         self.seconds = 0.0
@@ -159,16 +158,22 @@ class Learner:
         share = min(1.0, self.done / self._job.entropy_iterations)
         self._alg.entropy_coef = start + (end - start) * share
         self._alg.actor.requires_grad_(self.done >= settings.critic_iterations)
+        scale = self._alg.actor.obs_normalizer
+        before = scale._mean.clone(), scale._std.clone()
         self._runner.learn(1, init_at_random_ep_len=spread)
         self._deviation().data.clamp_(*settings.std[1:])
-        if self._plan.start is not None and self.done >= settings.critic_iterations:
+        if self.done >= settings.critic_iterations:
+            # By what learning has changed, not the scale of the observation
+            after = scale._mean, scale._std
+            scale._mean, scale._std = before
             self._adapt_rate()
+            scale._mean, scale._std = after
 
     def _adapt_rate(self) -> None:
-        """Adapt the actor's learning rate to the change of a policy that training started from.
+        """Adapt the actor's learning rate to the change of the policy in the last iteration.
 
-        rsl_rl does so for both networks at once and within bounds, which are too high for an actor
-        whose many actions have little noise.
+        rsl_rl does so after each part of an iteration, for both networks, and within bounds that
+        are too high for an actor whose many actions have little noise.
         """
         actor = self._alg.actor
         storage = self._alg.storage
@@ -244,6 +249,7 @@ class Learner:
             "steps": steps,
             **terms,
             "value_loss": self._log.losses.get("value", math.nan),
+            "kl": self.change,
             "std": float(self._deviation().data.mean()),
             "entropy_weight": self._alg.entropy_coef,
             "learning_rate": self._alg.optimizer.param_groups[0]["lr"],
@@ -270,9 +276,7 @@ class Learner:
                 "class_name": "PPO",
                 "num_learning_epochs": job.epochs,
                 "num_mini_batches": job.minibatches,
-                "learning_rate": plan.settings.learning_rate,
-                "schedule": "adaptive" if plan.start is None else "fixed",
-                "desired_kl": plan.settings.desired_kl,
+                "schedule": "fixed",  # the learner adapts it
                 "gamma": job.gamma,
                 "lam": job.gae_lambda,
                 "clip_param": job.clip,
@@ -373,7 +377,6 @@ class Learner:
             number, _, name = key.partition(".")
             moments.setdefault(int(number), {})[name] = value
         alg.optimizer.load_state_dict(alg.optimizer.state_dict() | {"state": moments})
-        alg.learning_rate = facts["learning_rates"][0]
         for group, rate in zip(alg.optimizer.param_groups, facts["learning_rates"], strict=True):
             group["lr"] = rate
         self._env.sums.copy_(state["rewards"])

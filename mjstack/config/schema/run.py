@@ -462,7 +462,7 @@ class PpoJobCfg(TrainJobCfg):
     minibatches: int = spec(ge=1)
     """Parts into which they are divided."""
     critic_learning_rate: float = spec(gt=0.0)
-    """Of the critic with ``start_from``; else it is the actor's."""
+    """Of the critic."""
     gamma: float = spec(ge=0.0, le=1.0)
     """Discount per decision."""
     gae_lambda: float = spec(ge=0.0, le=1.0)
