@@ -109,7 +109,7 @@ class ParityCfg(GateFuncCfg):
     states: dict[str, str] = spec()
     """States from which both step: a name, and the phase at whose end the state is taken. Empty:
     the first phase, the one after the first grasp (without grasps, the last with a closed gripper),
-    and the last.
+    and the last. A driver without phases has those after each third of its episode instead.
     """
     step1: dict[str, float] = spec(unit="SI", ge=0.0)
     """Largest difference of each field after one physics step."""
