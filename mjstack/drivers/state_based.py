@@ -27,6 +27,7 @@ _CARRY_SPEED = 0.25  # m/s, with an object
 _SLOWING = 0.5  # largest share of the distance that is left, in one step
 _JOINT = 0.25  # rad, m: largest lead of a joint
 _ROLL = 0.1  # rad: largest lead of the roll
+_FLIPPED = 0.3  # cosine of the angle between the approach axis and the desired one
 _GRIP = 0.3  # largest lead of the gripper, of its opening
 
 # The way to a target: how much higher the grasp point stays for all that is not as it should be
@@ -181,6 +182,12 @@ class StateBasedDriver(ClosedLoopDriver):
             start[:, self._roll_column] += due.turn.clamp(-_ROLL, _ROLL) * (due.role == Role.down)
         approach = None if self._tilt is None else self._tilted(state, due, phase)
         posture = self._nominal[phase] if cfg.posture_gain > 0.0 else None
+        if approach is not None:
+            # From a gripper that points elsewhere, the shortest way may end at a joint's limit.
+            flipped = (state.approach * approach).sum(1, keepdim=True) < _FLIPPED
+            roll = start[:, self._roll_column].clone()
+            start = torch.where(flipped, self._nominal[phase], start)
+            start[:, self._roll_column] = roll
         change = self._ik.solve(start, target, posture, approach)[0] - q
         largest = change.abs().amax(1, keepdim=True)
         command = q + change * (_JOINT / largest.clamp(min=1e-6)).clamp(max=1.0)
