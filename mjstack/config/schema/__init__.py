@@ -5,6 +5,7 @@ error before anything runs. Lengths are in m, angles in rad, times in s. Values 
 here.
 """
 
+from mjstack.config.schema.jobs import *
 from mjstack.config.schema.root import Config as Config
 from mjstack.config.schema.run import *
 from mjstack.config.schema.scene import *

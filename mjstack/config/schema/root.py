@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
+from mjstack.config.schema.jobs import JobCfg
 from mjstack.config.schema.run import (
     BatchCfg,
     GateCfg,
-    JobCfg,
     SimCfg,
     SolverCfg,
     TimingCfg,

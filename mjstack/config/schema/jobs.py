@@ -1,0 +1,271 @@
+"""Jobs: what each of them needs to know."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
+
+
+@dataclass(slots=True)
+class JobCfg:
+    """A job: the work of one command."""
+
+    name: str = spec()
+    """Its name."""
+    func: str = spec()
+    """Dotted name of its ``mjstack.jobs.Job``."""
+
+
+@dataclass(slots=True)
+class ScalingJobCfg(JobCfg):
+    """Throughput over numbers of worlds, each in a process."""
+
+    nworlds: list[int] = spec(unit="worlds", ge=1, le=MOST_WORLDS)
+    """Numbers of worlds, each once."""
+    backends: list[str] | None = spec(None, choices=("mjwarp", "native"))
+    """Backends; null: native, and MJWarp where there is CUDA, as far as ``sim`` allows."""
+    repetitions: int = spec(ge=1)
+    """Repetitions of each measurement."""
+    large: int = spec(unit="worlds", ge=1)
+    """A run of more worlds makes ``repetitions_large`` repetitions."""
+    repetitions_large: int = spec(ge=1)
+    """Repetitions of each measurement of a large run."""
+    native_steps: int = spec(unit="steps", ge=1)
+    """Physics steps per repetition on native MuJoCo, whose worlds play no episode."""
+    native_env_steps: int = spec(unit="steps", ge=1)
+    """Environment steps per repetition on native MuJoCo."""
+    run_minutes: float = spec(unit="min", gt=0.0)
+    """A run that takes longer has failed."""
+    max_minutes: float | None = spec(None, unit="min", gt=0.0)
+    """Time budget of a call; the next one goes on. null: unlimited."""
+    retry: bool = spec()
+    """Whether runs that failed are repeated."""
+
+
+@dataclass(slots=True)
+class StudyJobCfg(JobCfg):
+    """Cost and success of settings of the solver."""
+
+    repetitions: int = spec(ge=1)
+    """Repetitions of each variant."""
+    steps: int = spec(unit="steps", ge=1)
+    """Control steps per repetition, or as many as fit into ``max_seconds``."""
+    max_seconds: float = spec(unit="s", gt=0.0)
+    """Time budget of a repetition."""
+    # Variants are untyped until `complete`, so that the command line may add one.
+    variants: dict[str, Any] = spec(factory=dict)
+    """Variants by name: the keys of ``solver`` that each changes."""
+
+
+@dataclass(slots=True)
+class ReachabilityJobCfg(JobCfg):
+    """A map of the positions that the arm reaches, and the largest region for random starts."""
+
+    step: float = spec(unit="m", gt=0.0)
+    """Distance of the map's points."""
+    margin: float = spec(unit="m", ge=0.0)
+    """A region counts as reached if it is still reached with this margin all round."""
+
+
+@dataclass(slots=True)
+class CollectJobCfg(JobCfg):
+    """Demonstrations of the closed-loop expert, as a dataset."""
+
+    episodes: int = spec(unit="episodes", ge=1)
+    """Episodes of the dataset; a call adds the missing ones."""
+    keep_failures: bool = spec()
+    """Whether failed episodes are kept too, marked; they count."""
+    folder: str | None = spec(None)
+    """Folder of the dataset; null: ``outputs/collect/<hash>`` of everything episodes depend on."""
+    buffer_gib: float = spec(unit="GiB", gt=0.0)
+    """Device memory for the steps of one batch of worlds; more worlds are played in turns."""
+
+
+@dataclass(slots=True)
+class TrainJobCfg(JobCfg):
+    """A policy is trained, and judged from starts that training has not used."""
+
+    trainer: str = spec()
+    """Dotted name of its ``mjstack.train.trainer.Trainer``."""
+    folder: str | None = spec(None)
+    """Folder of the training; null: ``outputs/train/<hash>`` of everything training depends on."""
+    test_seed: int = spec(ge=0, le=MOST_SEEDS - 1)
+    """First seed of the starts from which the policy is judged, gate.success.seeds of them."""
+
+
+@dataclass(slots=True)
+class CloneSizes:
+    """How much is trained; as the keys of the job of these names."""
+
+    episodes: int = spec(unit="episodes", ge=1)
+    """Episodes that the expert plays."""
+    noisy_episodes: int = spec(unit="episodes", ge=0)
+    """Episodes more with noise on the executed commands."""
+    hidden: list[int] = spec(ge=1, le=65536)
+    """Widths of the network's hidden layers."""
+    batches: int = spec(ge=1)
+    """Steps of the optimizer."""
+    batch_size: int = spec(ge=1)
+    """Answers of a batch."""
+    save_every: int = spec(unit="batches", ge=1)
+    """Batches between two saved policies."""
+    input_noise: float = spec(ge=0.0)
+    """Noise on the observations that training sees, in their standard deviations."""
+    weight_decay: float = spec(ge=0.0)
+    """Of AdamW."""
+    leave_out: list[str] = spec(factory=list)
+    """Terms of the observation group that the policy does not see."""
+
+
+@dataclass(slots=True)
+class CloneJobCfg(TrainJobCfg):
+    """A network learns to answer as the expert does. What is null is as ``sizes`` has it."""
+
+    observation: dict[str, Any] = spec(factory=dict, finite=False)
+    """What the policy can see; ``observation@job.observation`` chooses it."""
+    group: str = spec()
+    """The group that it sees."""
+    dataset: str | None = spec(None)
+    """Folder of a dataset from which it learns; null: from the expert, who plays now."""
+    observation_noise: bool = spec()
+    """Whether its observations have their noise."""
+    command_noise: float = spec(unit="rad", ge=0.0)
+    """Standard deviation of that noise, which changes slowly."""
+    chunk: int = spec(unit="steps", ge=1, le=1000)
+    """Joint targets of one answer."""
+    execute: int = spec(unit="steps", ge=1, le=1000)
+    """Control steps between two answers."""
+    learning_rate: float = spec(gt=0.0)
+    """Of AdamW at the start; a cosine brings it to 0."""
+    averaging: float = spec(ge=0.0, le=1.0)
+    """Share of the policy's weights that a batch keeps: they are an average."""
+    episodes: int | None = spec(None, unit="episodes", ge=1)
+    """Episodes that the expert plays."""
+    noisy_episodes: int | None = spec(None, unit="episodes", ge=0)
+    """Episodes more with noise on the executed commands; labels stay the expert's."""
+    hidden: list[int] | None = spec(None, ge=1, le=65536)
+    """Widths of the network's hidden layers."""
+    batches: int | None = spec(None, ge=1)
+    """Steps of the optimizer."""
+    batch_size: int | None = spec(None, ge=1)
+    """Answers of a batch."""
+    save_every: int | None = spec(None, unit="batches", ge=1)
+    """Batches between two saved policies."""
+    input_noise: float | None = spec(None, ge=0.0)
+    """Noise on the observations that training sees, in their standard deviations."""
+    weight_decay: float | None = spec(None, ge=0.0)
+    """Of AdamW."""
+    leave_out: list[str] | None = spec(None)
+    """Terms of the group that the policy does not see."""
+    sizes: dict[str, CloneSizes] = spec(factory=dict)
+    """Values of the keys that are null above, for ``cuda`` and for ``cpu``."""
+
+
+@dataclass(slots=True)
+class DaggerJobCfg(CloneJobCfg):
+    """In every round the expert and the policy drive, and the policy learns the expert's answers to
+    all states of all rounds. Sizes are those of a round, and ``noisy_episodes`` are not played.
+    """
+
+    rounds: int = spec(ge=1, le=1000)
+    """Rounds: the expert alone drives in the first one."""
+    beta: float = spec(ge=0.0, le=1.0)
+    """Share of the time in which the expert drives in the second round."""
+    beta_decay: float = spec(ge=0.0, le=1.0)
+    """What it is multiplied by from round to round."""
+    alone: float = spec(gt=0.0, le=1.0)
+    """Share of the worlds in which the policy drives alone: their success is that of a round."""
+
+
+@dataclass(slots=True)
+class PpoSettings:
+    """What differs between a random network and one that can do something; as the keys of the job
+    of these names.
+    """
+
+    std: list[float] = spec(length=3, gt=0.0)
+    """Standard deviation of the actions: at the start, smallest and largest."""
+    entropy: list[float] = spec(length=2, ge=0.0)
+    """Weight of the entropy at the start, and after ``entropy_iterations``."""
+    desired_kl: float = spec(gt=0.0)
+    """Change of the policy per iteration to which the learning rate adapts."""
+    learning_rate: float = spec(gt=0.0)
+    """Of the actor at the start."""
+    critic_iterations: int = spec(ge=0)
+    """First iterations, in which only the critic learns."""
+
+
+@dataclass(slots=True)
+class PpoJobCfg(TrainJobCfg):
+    """A policy learns from the task's rewards, by rsl_rl's PPO. What is null is as ``settings`` has
+    it.
+    """
+
+    observation: dict[str, Any] = spec(factory=dict, finite=False)
+    """What the policy can see; ``observation@job.observation`` chooses it."""
+    group: str = spec()
+    """The group that it sees."""
+    leave_out: list[str] = spec(factory=list)
+    """Terms of the group that the policy does not see."""
+    observation_noise: bool = spec()
+    """Whether its observations have their noise."""
+    critic: list[str] = spec(factory=list)
+    """Observation groups that the critic sees besides the policy's."""
+    start_from: str | None = spec(None)
+    """Folder of a policy that training starts from, with its observation and its actions; null: a
+    random network.
+    """
+    iterations: int | None = spec(None, ge=1)
+    """Iterations of the training, over all calls; null: as ``minutes`` says."""
+    minutes: float | None = spec(None, unit="min", gt=0.0)
+    """Time of the training, over all calls; null: as ``iterations`` says."""
+    max_minutes: float | None = spec(None, unit="min", gt=0.0)
+    """Time budget of a call; the next one goes on. null: unlimited."""
+    save_every: int = spec(unit="iterations", ge=1)
+    """Iterations between two saved policies."""
+    expert_worlds: int = spec(unit="worlds", ge=1)
+    """reset=expert_states: worlds in which the expert plays at the beginning."""
+    hidden: list[int] = spec(ge=1, le=65536)
+    """Widths of the hidden layers of actor and critic."""
+    horizon: int = spec(unit="decisions", ge=1)
+    """Decisions of every world per iteration."""
+    epochs: int = spec(ge=1)
+    """How often an iteration goes through them."""
+    minibatches: int = spec(ge=1)
+    """Parts into which they are divided."""
+    critic_learning_rate: float = spec(gt=0.0)
+    """Of the critic."""
+    gamma: float = spec(ge=0.0, le=1.0)
+    """Discount per decision."""
+    gae_lambda: float = spec(ge=0.0, le=1.0)
+    """Of the generalised advantage estimation."""
+    clip: float = spec(gt=0.0)
+    """Largest change of an action's probability that counts."""
+    reward_limit: float = spec(gt=0.0)
+    """Limit of the rewards, over the standard deviation of their discounted sum."""
+    entropy_iterations: int = spec(ge=1)
+    """Iterations over which the weight of the entropy changes."""
+    std: list[float] | None = spec(None, length=3, gt=0.0)
+    """Standard deviation of the actions: at the start, smallest and largest."""
+    entropy: list[float] | None = spec(None, length=2, ge=0.0)
+    """Weight of the entropy at the start, and after ``entropy_iterations``."""
+    desired_kl: float | None = spec(None, gt=0.0)
+    """Change of the policy per iteration to which the learning rate adapts."""
+    learning_rate: float | None = spec(None, gt=0.0)
+    """Of the actor at the start; it adapts to ``desired_kl``."""
+    critic_iterations: int | None = spec(None, ge=0)
+    """First iterations, in which only the critic learns."""
+    settings: dict[str, PpoSettings] = spec(factory=dict)
+    """Values of the keys that are null above, for ``random`` and for ``start_from``."""
+
+
+# Trainers with keys of their own; the others have those of clone.
+TRAINER_SCHEMAS = {"dagger": DaggerJobCfg, "ppo": PpoJobCfg}
+# Jobs with keys of their own; the others have `JobCfg`.
+JOB_SCHEMAS = {
+    "study": StudyJobCfg,
+    "scaling": ScalingJobCfg,
+    "reachability": ReachabilityJobCfg,
+    "collect": CollectJobCfg,
+    "train": CloneJobCfg,
+}
