@@ -127,10 +127,10 @@ def _run_one(hydra: Hydra, overrides: list[str]) -> int:
     given = _is_set("hydra.run.dir", overrides)
     resumed = None if given else checked.folder
     folder = resumed or _hydra_path(cfg, "run.dir")
-    if int(os.environ.get("RANK", 0)):  # torchrun's processes but the first one
-        if checked.assist is None:
-            raise CompositionError("torchrun: expected job=train. Run this job without torchrun.")
-        checked.assist(checked.context, folder)
+    if checked.assist is None and int(os.environ.get("WORLD_SIZE", 1)) > 1:
+        raise CompositionError("torchrun: expected job=train. Run this job without torchrun.")
+    if checked.assist is not None and int(os.environ.get("RANK", 0)):
+        checked.assist(checked.context, folder)  # the first process writes
         return 0
     own = "" if given else checked.own
     begin_job()
@@ -145,6 +145,8 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
 
     Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
     """
+    if int(os.environ.get("WORLD_SIZE", 1)) > 1:
+        raise CompositionError("torchrun: expected one job, and -m makes several. Leave one out.")
     jobs = _expand(overrides)
     refused = CompositionError(
         "hydra.sweeper.params: expected none. Give the values on the command line, as in"

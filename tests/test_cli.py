@@ -53,6 +53,20 @@ def the_report(folder: Path) -> dict:
     return json.loads(path.read_text())
 
 
+@pytest.mark.parametrize("args", [["gates=[baseline]"], ["-m", "job=train", "seed=1,2"]])
+def test_torchrun_is_for_one_training(
+    args: list[str],
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The first process refuses as well, before it writes."""
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert run([*args, "sim=native"]) == 2
+    assert "torchrun: expected" in capsys.readouterr().err
+    assert not everything(folder)
+
+
 # Refusals of the composition itself are in test_config.py.
 BAD = [
     ["nworld=0"],

@@ -133,6 +133,7 @@ def test_a_clone_is_tuned(tmp_path: Path) -> None:
         assert run([*tuned, f"job.critic_iterations={held}", f"job.folder={out}"]) == 0
         policy = load_policy(out / "last")
         assert policy.action is None
+        assert "NaN" not in (out / "last" / "policy.json").read_text()
         assert (policy.network.chunk, policy.execute, policy.hidden) == (4, 4, [16, 16])
         off = (policy.network(seen) - given.network(seen)[:, :4]).abs().max()
         assert bool(off < 1e-6) == equal
@@ -288,6 +289,19 @@ def test_states_need_a_file_outside_of_a_training() -> None:
         MjstackError, match=r"path=null: expected a file of states, which job=train"
     ):
         on_new_sim("native", 1, configure("reset=expert_states"))
+
+
+def test_states_of_another_scene_are_refused(tmp_path: Path) -> None:
+    env = on_new_sim("native", 1, configure("reset=randomized"))
+    path = states_file(tmp_path / "states.npz", env)
+    arrays = dict(np.load(path))
+    name = next(key for key in arrays if key.startswith("field."))
+    arrays[name] = np.repeat(arrays[name], 2, axis=1)
+    np.savez(path, **arrays)
+    with pytest.raises(MjstackError, match=r"states of this robot and scene: \w+ of shape"):
+        on_new_sim(
+            "native", 1, configure("reset=expert_states", f"reset.expert.params.path={path}")
+        )
 
 
 def test_a_missing_extra_is_one_line(

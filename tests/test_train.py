@@ -150,6 +150,18 @@ def test_two_processes_learn_one_policy(tmp_path: Path) -> None:
     assert not torch.equal(state["generator.0"], state["generator.1"])
 
 
+def test_a_process_may_come_when_the_first_one_has_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "training.json").write_text("{}")
+    cfg = load_config([*REACH, f"job.folder={tmp_path}"])
+    with pytest.raises(MjstackError, match="expected a new or an empty folder"):
+        check_train(cfg)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("RANK", "1")
+    assert check_train(cfg).folder == tmp_path
+
+
 @pytest.mark.full
 def test_two_cores_train_reach(tmp_path: Path) -> None:
     """In two minutes of both; every world reaches its point."""

@@ -24,6 +24,7 @@ from mjstack.jobs.runner import CheckedJob, Job, write_tables
 from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
+from mjstack.train.distributed import torchrun_ranks
 from mjstack.train.expert_states import whole_starts
 from mjstack.train.trainer import LAST, STATE, Trained, Trainer
 
@@ -61,8 +62,9 @@ def check_train(cfg: Config) -> CheckedJob:
         raise ConfigError("job.test_seed", job.test_seed, expected)
     name = config_hash(training_config(cfg))[:12]
     folder = Path(job.folder or f"outputs/train/{name}")
-    check_unused(folder, NAME, STATE, "job.folder")
-    _check_folder(folder, cfg)
+    if torchrun_ranks().writes:  # it may have begun there when the others come
+        check_unused(folder, NAME, STATE, "job.folder")
+        _check_folder(folder, cfg)
     return CheckedJob(
         context=context,
         title=f"task {cfg.task.name}, training",

@@ -193,7 +193,7 @@ def _places(names: Sequence[str], features: Mapping[str, Any]) -> dict[str, Plac
     found: dict[str, Place] = {}
     for name in names:
         feature = features.get(name, {})
-        if str(feature.get("dtype")).startswith("float") and isinstance(feature["names"], list):
+        if str(feature.get("dtype")).startswith("float") and isinstance(feature.get("names"), list):
             for number, column in enumerate(feature["names"]):
                 found.setdefault(str(column), (name, number))
     return found

@@ -207,10 +207,11 @@ class Learner:
         self.curve.append(row)
         if not self._ranks.writes:
             return
+        known = {k: v for k, v in row.items() if not math.isnan(v)}  # JSON has no NaN
         if self._events is not None:
-            self._events.add({k: v for k, v in row.items() if not math.isnan(v)}, self.done)
+            self._events.add(known, self.done)
         self._take_weights()
-        self._policy.training = {"trainer": "ppo", "seed": self._plan.cfg.seed, **row}
+        self._policy.training = {"trainer": "ppo", "seed": self._plan.cfg.seed, **known}
         save_policy(self._folder / LAST, self._policy)
         ended = row["episodes"] > 0.0
         reached = (row["success"], row["return"]) if ended else (0.0, -math.inf)

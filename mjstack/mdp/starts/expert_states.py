@@ -1,7 +1,5 @@
 """Worlds that start in the middle of an expert's episode."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -63,11 +61,11 @@ class ExpertStates:
         for name in STATE:
             view = getattr(env.sim, name)
             if view.shape[1]:
-                self._add(path, name, view, tensors.get(name))
+                self._views.append((view, _matching(path, name, view, tensors.get(name))))
         self._fields: list[tuple[Tensor, Tensor]] = []
         for name, field in env.sim.fields.items():
             if FIELD + name in tensors:
-                values = tensors[FIELD + name].to(field)
+                values = _matching(path, name, field, tensors[FIELD + name])
                 self._fields.append((field, values))
         self._share = share
         self._fall = share - last_share
@@ -89,11 +87,12 @@ class ExpertStates:
                 into = (mask & chosen).view(-1, *[1] * (view.dim() - 1))
                 torch.where(into, values.index_select(0, rows), view, out=view)
 
-    def _add(self, path: str, name: str, view: Tensor, values: Any) -> None:
-        """Take the states of one view, if they are of its width."""
-        width = view.shape[1]
-        if values is None or values.shape[1] != width:
-            found = 0 if values is None else values.shape[1]
-            expected = f"states of this robot and scene: {width} numbers of {name}, not {found}"
-            raise ParameterError("path", path, expected, "Record them anew")
-        self._views.append((view, values.to(view)))
+
+def _matching(path: str, name: str, view: Tensor, values: Tensor | None) -> Tensor:
+    """The values of a view or a model field, if each is of its shape."""
+    wanted = tuple(view.shape[1:])
+    found = None if values is None else tuple(values.shape[1:])
+    if values is None or found != wanted:
+        expected = f"states of this robot and scene: {name} of shape {wanted}, not {found}"
+        raise ParameterError("path", path, expected, "Record them anew")
+    return values.to(view)
