@@ -28,7 +28,7 @@ from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.train.clone_learner import Learner
 from mjstack.train.demonstrations import play_expert
 from mjstack.train.distributed import Ranks
-from mjstack.train.trainer import STATE
+from mjstack.train.trainer import STATE, observed_group
 
 TINY = (
     "job=train",
@@ -213,7 +213,7 @@ def test_noise_moves_the_arm_alone_and_labels_lack_it() -> None:
     )
     context = RunContext(cfg)
     sizes = clone.resolve_sizes(cfg.job, "cpu")
-    data = play_expert(context, sizes, clone.observed_group(cfg.job, sizes), Ranks())
+    data = play_expert(context, sizes, observed_group(cfg.job, sizes.leave_out), Ranks())
     assert data.source == "the expert, seeds 0 to 1"
     assert data.ends.tolist() == [150, 300, 450, 600]
     labels = data.labels.unflatten(0, (4, 150))

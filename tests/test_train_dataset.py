@@ -23,6 +23,7 @@ from mjstack.train import clone
 from mjstack.train.dataset import read_demonstrations
 from mjstack.train.demonstrations import play_expert
 from mjstack.train.distributed import Ranks
+from mjstack.train.trainer import observed_group
 
 REACH = ("task=reach", "sim=native", "nworld=3")
 TRAIN = (
@@ -51,7 +52,7 @@ def test_a_dataset_has_what_the_expert_would_show(dataset: Path) -> None:
     cfg = load_config([*TRAIN, "job.episodes=3", "job.noisy_episodes=0"])
     context = RunContext(cfg)
     sizes = clone.resolve_sizes(cfg.job, "cpu")
-    group = clone.observed_group(cfg.job, sizes)
+    group = observed_group(cfg.job, sizes.leave_out)
     played = play_expert(context, sizes, group, Ranks())
     read = read_demonstrations(dataset, context, group, played.widths, Ranks())
     assert torch.equal(read.ends, played.ends)

@@ -9,17 +9,17 @@ from typing import Any, cast
 
 import torch
 
-from mjstack.config.schema import Backend, CloneJobCfg, CloneSizes, ObservationGroupCfg
+from mjstack.config.schema import Backend, CloneJobCfg, CloneSizes
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.context import RunContext
-from mjstack.errors import ConfigError, FolderError, MjstackError, UnknownName
+from mjstack.errors import ConfigError, FolderError, MjstackError
 from mjstack.managers.observation import ObservationManager
 from mjstack.policy.checkpoint import read_state
 from mjstack.train.clone_learner import Learner
 from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import batches_of, play_expert
 from mjstack.train.distributed import Ranks, joined, torchrun_ranks
-from mjstack.train.trainer import LAST, STATE, Trained, Trainer
+from mjstack.train.trainer import LAST, STATE, Trained, Trainer, observed_group
 
 
 def check_clone(context: RunContext) -> range:
@@ -27,7 +27,7 @@ def check_clone(context: RunContext) -> range:
     cfg = context.cfg
     job = cast(CloneJobCfg, cfg.job)
     sizes = resolve_sizes(job, context.backend[1])
-    group = observed_group(job, sizes)
+    group = observed_group(job, sizes.leave_out)
     with _one_world(context) as env:
         widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
         if job.dataset is not None:
@@ -61,22 +61,6 @@ def resolve_sizes(job: CloneJobCfg, device: str) -> CloneSizes:
     return replace(own, **{name: value for name, value in given.items() if value is not None})
 
 
-def observed_group(job: CloneJobCfg, sizes: CloneSizes) -> ObservationGroupCfg:
-    """The observation group of the policy.
-
-    Raises:
-        MjstackError: There is no such group or term.
-    """
-    if job.group not in job.observation:
-        raise UnknownName("job.group: observation group", job.group, job.observation)
-    group = job.observation[job.group]
-    for name in job.leave_out or []:
-        if name not in group.terms:
-            raise UnknownName(f"job.leave_out: term of {job.group}", name, group.terms)
-    terms = {name: term for name, term in group.terms.items() if name not in sizes.leave_out}
-    return replace(group, noise=job.observation_noise, terms=terms)
-
-
 def train_clone(context: RunContext, folder: Path) -> Trained:
     """Play the expert or read a dataset, and fit a network to its answers; see `Trainer`."""
     with joined(context.backend[1]) as ranks:
@@ -102,7 +86,7 @@ def _train(context: RunContext, folder: Path, ranks: Ranks) -> Trained:
 
     # Demonstrations
     began = time.perf_counter()
-    group = observed_group(job, sizes)
+    group = observed_group(job, sizes.leave_out)
     cfg = replace(cfg, observation={job.group: group})
     if job.dataset is None:
         demonstrations = play_expert(context, sizes, group, ranks)

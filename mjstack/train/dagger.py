@@ -11,7 +11,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import CloneSizes, DaggerJobCfg, ObservationGroupCfg
+from mjstack.config.schema import CloneSizes, DaggerJobCfg
 from mjstack.drivers.driver import Driver, PhaselessDriver
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env
@@ -21,11 +21,11 @@ from mjstack.errors import ConfigError, FolderError, MjstackError
 from mjstack.managers.view import random_uniform
 from mjstack.policy import Policy, save_policy
 from mjstack.policy.checkpoint import read_state, write_state
-from mjstack.train.clone import check_clone, observed_group, resolve_sizes
+from mjstack.train.clone import check_clone, resolve_sizes
 from mjstack.train.clone_learner import Learner
 from mjstack.train.demonstrations import DemonstrationRecorder, Demonstrations
 from mjstack.train.distributed import Ranks, torchrun_ranks
-from mjstack.train.trainer import BEST, LAST, STATE, EventWriter, Trained, Trainer
+from mjstack.train.trainer import BEST, LAST, STATE, EventWriter, Trained, Trainer, observed_group
 
 _SPELL = 0.5  # s, for which the expert or the policy drives before it is drawn anew
 
@@ -203,7 +203,7 @@ def _make_learner(
 ) -> RoundLearner:
     """The learner, its scale that of the first round."""
     job = cast(DaggerJobCfg, context.cfg.job)
-    cfg = replace(context.cfg, observation={job.group: observed_group(job, sizes)})
+    cfg = replace(context.cfg, observation={job.group: observed_group(job, sizes.leave_out)})
     total = replace(sizes, batches=job.rounds * sizes.batches)
     return RoundLearner(context, cfg, total, first, folder, made_with, {}, Ranks())
 
@@ -280,7 +280,7 @@ def _play_round(
     """
     cfg = context.cfg
     job = cast(DaggerJobCfg, cfg.job)
-    group: ObservationGroupCfg = observed_group(job, sizes)
+    group = observed_group(job, sizes.leave_out)
     nworld = min(cfg.nworld, sizes.episodes)
     beta = job.beta * job.beta_decay ** (number - 1) if policy else 1.0
     share = 1.0 if number in (0, job.rounds) else job.alone

@@ -80,7 +80,7 @@ def read_demonstrations(
         context: The run.
         group: The observation of the policy.
         widths: Numbers of each of its terms.
-        ranks: The processes of the training: each reads every so manieth episode.
+        ranks: The processes of the training: each reads its share of the episodes.
 
     Raises:
         DatasetError: A file is missing or damaged.

@@ -151,7 +151,7 @@ def play_expert(
         context: The run; starts and expert are the configured ones.
         sizes: How many episodes.
         group: What a policy will see.
-        ranks: The processes of the training: each plays every so manieth seed.
+        ranks: The processes of the training: each plays its share of the seeds.
     """
     cfg = context.cfg
     job = cast(CloneJobCfg, cfg.job)

@@ -11,7 +11,6 @@ from mjstack.config.functions import resolve_func
 from mjstack.config.schema import (
     Backend,
     Config,
-    ObservationGroupCfg,
     PpoJobCfg,
     TermCfg,
 )
@@ -24,7 +23,7 @@ from mjstack.policy.checkpoint import read_state
 from mjstack.train.distributed import joined, torchrun_ranks
 from mjstack.train.expert_states import record_states, unrecorded, whole_starts, with_states
 from mjstack.train.ppo_learner import Learner, Plan
-from mjstack.train.trainer import LAST, STATE, Trained, Trainer
+from mjstack.train.trainer import LAST, STATE, Trained, Trainer, observed_group
 
 _STATES = "expert_states.npz"  # in the training's folder
 _TARGETS = "mjstack.mdp.action.JointTargets"
@@ -40,7 +39,7 @@ def make_plan(cfg: Config) -> Plan:
     start = None
     name = job.group
     if job.start_from is None:
-        seen = _observed_group(cfg)
+        seen = observed_group(job, job.leave_out)
     else:
         start = load_policy(Path(job.start_from))
         start.check_fit(cfg)
@@ -55,19 +54,6 @@ def make_plan(cfg: Config) -> Plan:
     given = {item.name: getattr(job, item.name) for item in fields(own)}
     settings = replace(own, **{k: value for k, value in given.items() if value is not None})
     return Plan(replace(cfg, observation={name: seen, **others}), start, name, settings)
-
-
-def _observed_group(cfg: Config) -> ObservationGroupCfg:
-    """The observation group of a new policy."""
-    job = cast(PpoJobCfg, cfg.job)
-    if job.group not in job.observation:
-        raise UnknownName("job.group: observation group", job.group, job.observation)
-    group = job.observation[job.group]
-    for name in job.leave_out:
-        if name not in group.terms:
-            raise UnknownName(f"job.leave_out: term of {job.group}", name, group.terms)
-    terms = {name: term for name, term in group.terms.items() if name not in job.leave_out}
-    return replace(group, noise=job.observation_noise, terms=terms)
 
 
 def _acting_as(cfg: Config, policy: Policy) -> Config:

@@ -1,11 +1,13 @@
 """A trainer, as job=train runs it."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from mjstack.config.schema import CloneJobCfg, ObservationGroupCfg, PpoJobCfg
 from mjstack.episodes.context import RunContext
+from mjstack.errors import UnknownName
 
 # In the folder of a training: two policies, and what it needs to go on.
 LAST = "last"
@@ -81,3 +83,23 @@ class Trainer:
     check: Callable[[RunContext], range]
     train: Callable[[RunContext, Path], Trained]
     midway: bool = False
+
+
+def observed_group(job: CloneJobCfg | PpoJobCfg, leave_out: Sequence[str]) -> ObservationGroupCfg:
+    """The observation group of a new policy.
+
+    Args:
+        job: The training.
+        leave_out: Terms of the group that the policy does not see.
+
+    Raises:
+        UnknownName: There is no such group, or no such term as the job names.
+    """
+    if job.group not in job.observation:
+        raise UnknownName("job.group: observation group", job.group, job.observation)
+    group = job.observation[job.group]
+    for name in job.leave_out or []:
+        if name not in group.terms:
+            raise UnknownName(f"job.leave_out: term of {job.group}", name, group.terms)
+    terms = {name: term for name, term in group.terms.items() if name not in leave_out}
+    return replace(group, noise=job.observation_noise, terms=terms)
