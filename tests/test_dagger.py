@@ -81,6 +81,7 @@ def test_rounds_leave_a_policy_and_go_on_bit_for_bit(
         ("controller=closed_loop", "controller=closed_loop: expected state_based, because"),
         ("job.dataset=outputs", "job.dataset=outputs: expected null"),
         ("job.rounds=0", "job.rounds=0"),
+        ("job.episodes=1", "job.episodes=1: expected at least 2"),
     ],
 )
 def test_what_cannot_be_trained_is_one_line(override: str, message: str) -> None:

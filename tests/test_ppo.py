@@ -266,6 +266,7 @@ BAD = [
     (["reset=expert_states", "reset.expert.params.path=/nowhere"], "a file of states; it cannot"),
     (["reset=expert_states", "reset.expert.params.share=2"], "reset.expert.params.share=2"),
     (["job.settings.random.std=[1,2]"], "job.settings.random.std"),
+    (["job.std=[0.5,2.0,1.0]"], "job.std=[0.5, 2.0, 1.0]: expected its value at the start"),
 ]
 
 

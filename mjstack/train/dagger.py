@@ -147,6 +147,9 @@ def check_dagger(context: RunContext) -> range:
         )
     check_clone(context)
     sizes = resolve_sizes(job, context.backend[1])
+    if sizes.episodes < 2:
+        expected = "at least 2, because one of them is for validation"
+        raise ConfigError("job.episodes", sizes.episodes, expected)
     return range(cfg.seed, cfg.seed + (job.rounds + 1) * _batches(sizes, cfg.nworld))
 
 

@@ -88,6 +88,12 @@ def check_ppo(context: RunContext) -> range:
         expected += f" (nworld={cfg.nworld} times job.horizon={job.horizon} are divided)"
         raise ConfigError("job.minibatches", job.minibatches, expected)
     plan = make_plan(cfg)
+    first, least, most = plan.settings.std
+    if not least <= first <= most:
+        expected = (
+            "its value at the start, the smallest and the largest, the first within the others"
+        )
+        raise ConfigError("job.std", plan.settings.std, expected)
     reset = cfg.reset
     if unrecorded(reset):
         for name in reset.keys() - whole_starts(reset).keys():
