@@ -20,7 +20,7 @@ from mjstack.scene.phases import Target, build_phases, source_names
 from mjstack.tasks.check import make_check
 
 _QUARTER = 0.5 * math.pi
-_STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
+STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
 _ROLL_STEP = 0.05  # rad per step
 _DONE = 1e-3  # steps: a phase is over this much before its last step would be
 
@@ -234,33 +234,22 @@ class ClosedLoopDriver:
         command[:, self._roll_column] = column + self._roll
         _, closing, approach = self._ik.forward(command)
         yaw = self._last_seen(self._source, self.phase)[:, 2]
-        wanted = self._face_roll(closing, approach, yaw, self._roll)
-        step = (self._cfg.controller.yaw_alignment * wanted - self._roll).clamp(
-            -_ROLL_STEP, _ROLL_STEP
-        )
-        self._roll += step * self._aligns[self.phase]
-        command[:, self._roll_column] = column + self._roll
-
-    def _face_roll(
-        self, closing: torch.Tensor, approach: torch.Tensor, yaw: torch.Tensor, roll: torch.Tensor
-    ) -> torch.Tensor:
-        """Roll at which the jaws are across a face of an object [rad], shape ``(nworld,)``.
-
-        Args:
-            closing: Closing axis of the gripper, shape ``(nworld, 3)``.
-            approach: Its approach axis, shape ``(nworld, 3)``.
-            yaw: Of the object [rad], shape ``(nworld,)``.
-            roll: Made so far [rad], shape ``(nworld,)``.
-        """
         off = yaw - torch.atan2(closing[:, 1], closing[:, 0])
         off = off - _QUARTER * torch.round(off / _QUARTER)
         # Two faces are in question, a quarter turn apart; what has been turned so far counts for
         # its own.
         both = torch.stack((off, off - torch.copysign(torch.full_like(off, _QUARTER), off)))
         upright = (-approach[:, 2]).clamp(min=0.2)
-        wanted = roll + self._roll_sign * torch.atan2(torch.sin(both), torch.cos(both) * upright)
-        cost = (wanted - _STAY * roll).abs()
-        return torch.where(cost[0] <= cost[1], wanted[0], wanted[1])
+        wanted = self._roll + self._roll_sign * torch.atan2(
+            torch.sin(both), torch.cos(both) * upright
+        )
+        cost = (wanted - STAY * self._roll).abs()
+        wanted = torch.where(cost[0] <= cost[1], wanted[0], wanted[1])
+        step = (self._cfg.controller.yaw_alignment * wanted - self._roll).clamp(
+            -_ROLL_STEP, _ROLL_STEP
+        )
+        self._roll += step * self._aligns[self.phase]
+        command[:, self._roll_column] = column + self._roll
 
     def _find_roll(self) -> tuple[int, float]:
         """Column of the joint that rolls the gripper, and which way it turns the closing axis, seen

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mjstack.config.schema import Config
-from mjstack.drivers.closed_loop import ClosedLoopDriver
+from mjstack.drivers.closed_loop import STAY, ClosedLoopDriver
 from mjstack.errors import ConfigError
 from mjstack.managers.view import EnvView
 from mjstack.math import quat_to_matrix
@@ -27,6 +27,8 @@ _CARRY_SPEED = 0.25  # m/s, with an object
 _SLOWING = 0.5  # largest share of the distance that is left, in one step
 _JOINT = 0.25  # rad, m: largest lead of a joint
 _ROLL = 0.1  # rad: largest lead of the roll
+_BEYOND = 10.0  # what a roll beyond the joint's range costs, per rad
+_UPRIGHT = 1e-3  # horizontal part of an approach axis that points straight down
 _FLIPPED = 0.3  # cosine of the angle between the approach axis and the desired one
 _GRIP = 0.3  # largest lead of the gripper, of its opening
 
@@ -158,6 +160,9 @@ class StateBasedDriver(ClosedLoopDriver):
             if name != aligned
         ]
         tensors = robot(env)
+        rolls = tensors.ctrl_range[self._roll_column].float()
+        self._rolls = (rolls - self._nominal[0, self._roll_column]).unbind(0)
+        self._quarters = 0.5 * math.pi * torch.arange(4, device=device)[:, None]
         self._grip_lead = _GRIP * (tensors.gripper_open - tensors.gripper_closed).abs().float()
         lag = servo_lag(env.sim.model, env.index.ctrl[: self._n_arm].tolist())
         # A servo that lags has to be led by more than it is to move in a step.
@@ -356,8 +361,24 @@ class StateBasedDriver(ClosedLoopDriver):
             return torch.zeros_like(state.opening)
         roll = state.q[:, self._roll_column] - self._nominal[0, self._roll_column]
         yaw = self._seen.gather(1, thing[:, None, None].expand(-1, 1, 3))[:, 0, 2]
-        wanted = self._face_roll(state.closing, state.approach, yaw, roll)
-        return self._cfg.controller.yaw_alignment * wanted - roll
+
+        # The closing axis as it would be at a roll of zero degrees about the approach axis:
+        # horizontal. From there on the way to a face does not depend on the roll now. So the face
+        # that is chosen is still the nearer one after the next step.
+        x, y, z = state.approach.unbind(1)
+        level = torch.where(torch.hypot(x, y) > _UPRIGHT, torch.atan2(x, -y), 0.0)
+        axis = torch.stack((torch.cos(level), torch.sin(level), torch.zeros_like(z)), dim=1)
+        other = torch.linalg.cross(state.approach, axis)
+        now = torch.atan2((state.closing * other).sum(1), (state.closing * axis).sum(1))
+        faces = (yaw - level) + self._quarters
+        there = torch.atan2(-torch.sin(faces), torch.cos(faces) * (-z).clamp(min=0.2))
+        change = there - now
+        change = -self._roll_sign * torch.atan2(torch.sin(change), torch.cos(change))
+        wanted = roll + change
+        low, high = self._rolls
+        beyond = (low - wanted).clamp(min=0.0) + (wanted - high).clamp(min=0.0)
+        nearest = ((wanted - STAY * roll).abs() + _BEYOND * beyond).argmin(0, keepdim=True)
+        return self._cfg.controller.yaw_alignment * wanted.gather(0, nearest)[0] - roll
 
     def _point(self, state: _State, phase: Tensor) -> Tensor:
         """Target of each world's phase, from where its anchor is [m], shape ``(nworld, 3)``."""
