@@ -49,7 +49,8 @@ def play(folder: str, steps: int) -> list[np.ndarray]:
             seen = np.concatenate([value for values in past.values() for value in values])
             (chunk,) = session.run(None, {"observation": np.float32([seen])})[0]
         targets.append(chunk[min(step % execute, len(chunk) - 1)])
-        data.ctrl[robot["ctrl"]] = targets[-1]
+        if step >= facts["timing"]["command_delay"]:
+            data.ctrl[robot["ctrl"]] = targets[-1 - facts["timing"]["command_delay"]]
         mujoco.mj_step(model, data, facts["timing"]["decimation"])
     return targets
 

@@ -169,6 +169,7 @@ MISFITS = [
     (["robot=rebot"], "was trained with robot.name=so101, and here it is rebot"),
     (["task=box"], "was trained with task.name=stack, and here it is box"),
     (["robot.home=[0,0,0.4,1.2,1.6,0.7]"], "was trained with robot.home=[0.0, 0.0, 0.473"),
+    (["timing.command_delay=5"], "was trained with timing.command_delay=0"),
     (["timing.decimation=20", "task.control_hz=25"], "was trained with task.control_hz=50.0"),
     (["scene.objects.red.size=[0.021,0.021,0.021]"], "scene.objects.red=box [0.022"),
 ]

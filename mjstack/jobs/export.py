@@ -117,7 +117,10 @@ def _scene_facts(env: Env, policy: Policy) -> dict:
             for name, value in asdict(cfg.task).items()
             if name in ("name", "instruction", "control_hz", "episode_steps", "params")
         },
-        "timing": {"physics_dt": cfg.timing.physics_dt, "decimation": cfg.timing.decimation},
+        "timing": {
+            name: getattr(cfg.timing, name)
+            for name in ("physics_dt", "decimation", "command_delay")
+        },
         "objects": {
             name: {"shape": thing.shape, "size": thing.size, "fixed": thing.fixed}
             for name, thing in cfg.scene.objects.items()

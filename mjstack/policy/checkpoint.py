@@ -126,6 +126,7 @@ def _requirements(config: Mapping[str, Any]) -> dict[str, Any]:
         ("robot", "gripper_open"),
         ("robot", "gripper_closed"),
         ("task", "control_hz"),
+        ("timing", "command_delay"),
         ("task", "params"),
     ]
     found = {f"{group}.{key}": config[group][key] for group, key in keys}
