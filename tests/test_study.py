@@ -240,7 +240,7 @@ BAD = [
     (["solver.cone=round"], "elliptic, pyramidal"),
     (["solver.gripper_condim=2"], "1, 3, 4, 6"),
     (["job=studies"], "Did you mean 'study'?"),
-    (["job=stud_schema"], "Did you mean 'study'? Available: collect, gates,"),
+    (["job=stud_schema"], "Did you mean 'study'? Available: collect, export,"),
     (["job.repetitions=3"], "job.repetitions"),
     (["job=study", "+job.variants.mine=3"], "job.variants.mine=3: expected a mapping"),
     (["job=study", "+job.variants.mine={iteration: 3}"], "Did you mean 'iterations'?"),
