@@ -326,6 +326,7 @@ STRANGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "large": (lambda f: os.truncate(f / "policy.json", 2**40), "more than 16777216"),
     "text": (edit(lambda d: put(d, "action", "chunk", value="6")), "action.chunk is '6', not a"),
     "a fraction": (edit(lambda d: put(d, "action", "execute", value=4.0)), "execute is 4.0, not"),
+    "long": (edit(lambda d: put(d, "action", "execute", value=1001)), "from 1 to 1000"),
     "NaN": (edit(lambda d: put(d, "action", "chunk", value=math.nan)), "action.chunk is nan, not"),
     "negative": (edit(lambda d: put(d, "network", "hidden", value=[-16])), "hidden is -16, not a"),
     "many digits": (edit(lambda d: put(d, "action", "execute", value=10**30)), "not a whole"),

@@ -34,6 +34,7 @@ _MOST_TEXT = 2**24  # bytes
 _MOST_WEIGHTS = 2**32  # bytes
 _MOST_COUNT = 1_000_000
 _MOST_LAYERS = 100
+_MOST_HELD = 1000  # control steps between two answers
 
 
 @dataclass(kw_only=True, slots=True)
@@ -255,7 +256,7 @@ def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
         group=str(seen["group"]),
         observation=_read_group(seen, path),
         widths=widths,
-        execute=_whole("action.execute", action["execute"]),
+        execute=_whole("action.execute", action["execute"], most=_MOST_HELD),
         action=_read_terms("action", action["terms"], TermCfg, path) or None,
         hidden=hidden,
         config=facts["config"],
@@ -269,9 +270,9 @@ def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
     return policy
 
 
-def _whole(name: str, value: object, least: int = 1) -> int:
-    if type(value) is not int or not least <= value <= _MOST_COUNT:
-        raise ValueError(f"{name} is {value!r}, not a whole number from {least} to {_MOST_COUNT}")
+def _whole(name: str, value: object, least: int = 1, most: int = _MOST_COUNT) -> int:
+    if type(value) is not int or not least <= value <= most:
+        raise ValueError(f"{name} is {value!r}, not a whole number from {least} to {most}")
     return value
 
 
