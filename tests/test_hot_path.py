@@ -143,7 +143,6 @@ PATHS: dict[str, list[str] | None] = {
                 "_observe",
                 "_last_seen",
                 "_turn",
-                "_face_roll",
             )
         ),
         "_put",
