@@ -9,7 +9,8 @@ import pytest
 import torch
 from compositions import load_config
 
-from mjstack.drivers.state_based import Role, StateBasedDriver, find_roles
+from mjstack.drivers.roles import Role, find_roles
+from mjstack.drivers.state_based import StateBasedDriver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError

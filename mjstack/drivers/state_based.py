@@ -4,7 +4,6 @@ asked in any state that somebody else has brought about.
 
 import math
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import NamedTuple
 
 import mujoco
@@ -12,13 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import Config
 from mjstack.drivers.closed_loop import STAY, ClosedLoopDriver
-from mjstack.errors import ConfigError
+from mjstack.drivers.roles import Role, find_roles, follows_anchor
 from mjstack.managers.view import EnvView
 from mjstack.math import quat_to_matrix
 from mjstack.mdp.geometry import gripper_opening, objects_in_hand, pose_w, robot
-from mjstack.scene.phases import Phase, source_names
 from mjstack.tasks.check import make_check
 
 # How fast
@@ -40,7 +37,7 @@ _UP_FIRST = 0.03  # m: so far below its way, the grasp point moves straight up
 _HIGH = 0.06  # m: so far over its target, the grasp point is still in the phase before
 _TURNED = 0.1  # rad: jaws turned by less from a face go down
 
-# What is the case
+# Thresholds of the state
 _OPEN = 0.85  # share of its opening from which a gripper is open, as measured
 _NEAR = 0.004  # m: so near an object, horizontally, open jaws close,
 _NEAR_CLOSED = 0.012  # and closed ones do not open again
@@ -53,18 +50,6 @@ _ABOVE = 0.004  # if it is this little higher than the phases let go of it,
 _BELOW = 0.010  # and no lower than this under its goal
 _LEFT = 0.08  # m: so near an object that was let go of, the gripper keeps its tilt
 _OFF_CENTER = (0.015, 0.015, 0.010)  # m: so far from the grasp point, an object is made up for
-
-
-class Role(IntEnum):
-    """The part of a phase in bringing an object to its goal."""
-
-    over = 0
-    down = 1
-    close = 2
-    carry = 3
-    place = 4
-    open = 5
-    retreat = 6
 
 
 class _State(NamedTuple):
@@ -84,9 +69,10 @@ class _State(NamedTuple):
 
 
 class _Due(NamedTuple):
-    """What is to be done: the role, the phases of the object's roles, the object's number, whether
-    it is held, whether the grasp point is led along with it, whether the way is a funnel, how far
-    the roll is off, and whether objects were let go of before, and the gripper is still beside one.
+    """The next thing to do: the role, the phases of the object's roles, the object's number,
+    whether it is held, whether the grasp point is led along with it, whether the way is a funnel,
+    how far the roll is off, and whether objects were let go of before, and the gripper is still
+    beside one.
     """
 
     role: Tensor
@@ -108,7 +94,8 @@ class StateBasedDriver(ClosedLoopDriver):
     say where the grasp point goes: over the object, down, close, up and over its goal, down, open,
     up. The state says which of these is due in each world. The grasp point stays as high above a
     target as it is away from it horizontally, the jaws are turned or the gripper is not open, and
-    moves straight up where it is too low. What a held object is off the grasp point is made up for.
+    moves straight up where it is too low. A held object that is off the grasp point is made up
+    for.
 
     In a task without goals, such as reach, the grasp point goes to the only target of the phases.
 
@@ -148,7 +135,9 @@ class StateBasedDriver(ClosedLoopDriver):
         targets = [phase.target for phase in plan]
         above = [0.0 if target is None else target.above for target in targets]
         self._above = torch.tensor(above, device=device)
-        self._follows = torch.tensor([_follows(phase, things) for phase in plan], device=device)
+        self._follows = torch.tensor(
+            [follows_anchor(phase, things) for phase in plan], device=device
+        )
         self._off_center = torch.tensor(_OFF_CENTER, device=device)
 
         # The robot
@@ -220,7 +209,7 @@ class StateBasedDriver(ClosedLoopDriver):
         )
 
     def _decide(self, state: _State) -> _Due:
-        """What is due in every world."""
+        """The next thing to do in every world."""
         # The first object that is not done
         delivered, held, between = self._find_delivered(state)
         letting_go = delivered & between & (state.opening < _OPEN)[:, None]
@@ -402,61 +391,3 @@ def servo_lag(model: mujoco.MjModel, actuators: Sequence[int]) -> float:
     dof = model.jnt_dofadr[model.actuator_trnid[actuators, 0]]
     damping = model.dof_damping[dof] - model.actuator_biasprm[actuators, 2]
     return max(1e-6, float((damping / model.actuator_gainprm[actuators, 0]).max()))
-
-
-def find_roles(
-    cfg: Config, phases: Sequence[Phase], goals: Sequence[str]
-) -> tuple[list[str], list[list[int]]]:
-    """The objects of a task, and for each the number of the phase that plays each `Role`.
-
-    Args:
-        cfg: The configuration.
-        phases: Its phases.
-        goals: Objects with goals.
-
-    Raises:
-        ConfigError: The phases do not bring an object to its goal, or there is none and the phases
-            have more than one target.
-    """
-    things = cfg.scene.objects
-    if not goals:
-        moves = [k for k, phase in enumerate(phases) if phase.target is not None]
-        anchor = str(phases[moves[0]].spec.anchor) if moves else ""
-        others = {(phase.spec.anchor or anchor, phase.spec.gripper) for phase in phases}
-        if len(others) != 1 or anchor not in things:
-            raise _refusal(cfg, "has no goals")
-        return [anchor], [[moves[0]] + [moves[-1]] * (len(Role) - 1)]
-    sources = source_names(cfg.scene)
-    rows = []
-    for name in goals:
-        number = sources.index(name)
-        closes = [k for k, phase in enumerate(phases) if phase.grasped == number]
-        carries = [k for k, phase in enumerate(phases) if phase.carried == number]
-        if not closes or not carries or closes[0] == 0:
-            raise _refusal(cfg, f"does not bring {name} to its goal in its phases")
-        close = closes[-1]
-        over = close - 1
-        while over > 0 and phases[over - 1].spec.anchor == name:
-            over -= 1
-        place = carries[-1]
-        carry = carries[-2] if len(carries) > 1 else place
-        after = [k for k in range(place + 1, len(phases)) if phases[k].target is not None]
-        last = after[0] if after else place
-        retreat = after[1] if len(after) > 1 else last
-        rows.append([over, close - 1, close, carry, place, last, retreat])
-    return list(goals), rows
-
-
-def _refusal(cfg: Config, why: str) -> ConfigError:
-    expected = f"another controller, because task {cfg.task.name} {why}"
-    return ConfigError("controller", cfg.controller.name, expected, "Set controller=closed_loop")
-
-
-def _follows(phase: Phase, things: Sequence[str]) -> bool:
-    """Whether the height of a phase's target follows its anchor: an object, but not the one that is
-    carried.
-    """
-    spec = phase.spec
-    if phase.target is None or spec.level == "table" or spec.anchor not in things:
-        return False
-    return things.index(spec.anchor) != phase.carried

@@ -166,7 +166,7 @@ def save_policy(folder: Path, policy: Policy) -> None:
 
 
 def policy_facts(policy: Policy) -> dict[str, Any]:
-    """What a policy sees and gives, its network and its training, in JSON's types."""
+    """Observation, action, network and training of a policy, in JSON's types."""
     return {
         "format": FORMAT,
         "observation": {

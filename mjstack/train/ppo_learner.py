@@ -1,4 +1,4 @@
-"""What trainer *ppo* does: rsl-rl-lib's runner on an environment, and a policy of its actor."""
+"""Trainer *ppo* at work: rsl-rl-lib's runner on an environment, and a policy of its actor."""
 
 import io
 import math
@@ -35,7 +35,7 @@ class Plan:
         cfg: The configuration of its environment.
         start: The policy that it starts from.
         group: Name of the observation group that the policy sees.
-        settings: What differs between a random network and one that can do something.
+        settings: Those of a random network, or of a policy to go on from.
     """
 
     cfg: Config

@@ -122,7 +122,7 @@ class CloneJobCfg(TrainJobCfg):
     """A network learns to answer as the expert does. What is null is as ``sizes`` has it."""
 
     observation: dict[str, Any] = spec(factory=dict, finite=False)
-    """What the policy can see; ``observation@job.observation`` chooses it."""
+    """Groups that the policy may see; ``observation@job.observation`` chooses them."""
     group: str = spec()
     """The group that it sees."""
     dataset: str | None = spec(None)
@@ -172,16 +172,14 @@ class DaggerJobCfg(CloneJobCfg):
     beta: float = spec(ge=0.0, le=1.0)
     """Share of the time in which the expert drives in the second round."""
     beta_decay: float = spec(ge=0.0, le=1.0)
-    """What it is multiplied by from round to round."""
+    """Factor of ``beta`` from round to round."""
     alone: float = spec(gt=0.0, le=1.0)
     """Share of the worlds in which the policy drives alone: their success is that of a round."""
 
 
 @dataclass(slots=True)
 class PpoSettings:
-    """What differs between a random network and one that can do something; as the keys of the job
-    of these names.
-    """
+    """Settings of a random network, or of a policy to go on from. Each is a key of the job."""
 
     std: list[float] = spec(length=3, gt=0.0)
     """Standard deviation of the actions: at the start, smallest and largest."""
@@ -202,7 +200,7 @@ class PpoJobCfg(TrainJobCfg):
     """
 
     observation: dict[str, Any] = spec(factory=dict, finite=False)
-    """What the policy can see; ``observation@job.observation`` chooses it."""
+    """Groups that the policy may see; ``observation@job.observation`` chooses them."""
     group: str = spec()
     """The group that it sees."""
     leave_out: list[str] = spec(factory=list)
