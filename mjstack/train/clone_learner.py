@@ -21,7 +21,14 @@ from mjstack.policy import Policy, PolicyNetwork, save_policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.distributed import Ranks
-from mjstack.train.trainer import BEST, LAST, STATE, EventWriter
+from mjstack.train.trainer import (
+    BEST,
+    LAST,
+    STATE,
+    EventWriter,
+    pack_weights,
+    unpack_weights,
+)
 
 _HELD_OUT = 20  # of so many episodes one is for validation
 _LEAST = 0.1  # scale of a column, of the largest one of its term
@@ -95,6 +102,7 @@ class Learner:
         network.set_scale("observation", mean.cpu(), std.cpu())
         self._network = network.to(device)
         self._average = copy.deepcopy(self._network).requires_grad_(False)
+        self._networks = {"network": self._network, "average": self._average}
         self._optimizer = torch.optim.AdamW(
             self._network.parameters(), lr=job.learning_rate, weight_decay=sizes.weight_decay
         )
@@ -254,11 +262,7 @@ class Learner:
         """Everything that training changes, by name."""
         generators = self._ranks.gather(self._generator.get_state())
         state = {f"generator.{rank}": each for rank, each in enumerate(generators)}
-        for name, network in (("network", self._network), ("average", self._average)):
-            state |= {f"{name}.{k}": v for k, v in network.state_dict().items()}
-        moments = self._optimizer.state_dict()["state"]
-        for number, values in moments.items():
-            state |= {f"optimizer.{number}.{k}": v for k, v in values.items()}
+        state |= pack_weights(self._networks, self._optimizer)
         return state | {"sum": self._sum}
 
     def facts(self) -> dict[str, Any]:
@@ -281,17 +285,7 @@ class Learner:
     def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
         """Go on from the state and facts of an earlier call."""
         self._generator.set_state(state[f"generator.{self._ranks.rank}"])
-        for name, network in (("network", self._network), ("average", self._average)):
-            own = {k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(name)}
-            network.load_state_dict(own)
-        moments: dict[int, dict[str, Tensor]] = {}
-        for key, value in state.items():
-            kind, _, rest = key.partition(".")
-            if kind == "optimizer":
-                number, _, name = rest.partition(".")
-                moments.setdefault(int(number), {})[name] = value
-        optimizer = self._optimizer.state_dict()
-        self._optimizer.load_state_dict({**optimizer, "state": moments})
+        unpack_weights(state, self._networks, self._optimizer)
         self._sum.copy_(state["sum"])
         self.done = facts["done"]
         self.seconds = facts["seconds"]

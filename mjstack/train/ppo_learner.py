@@ -21,7 +21,14 @@ from mjstack.interrupt import check_interrupt
 from mjstack.policy import Policy, PolicyNetwork, save_policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.train.distributed import Ranks
-from mjstack.train.trainer import BEST, LAST, STATE, EventWriter
+from mjstack.train.trainer import (
+    BEST,
+    LAST,
+    STATE,
+    EventWriter,
+    pack_weights,
+    unpack_weights,
+)
 
 _MEASURED = 8192  # decisions by which the change of a policy is measured
 _FACTOR = 1.5  # of a learning rate, per iteration
@@ -346,11 +353,8 @@ class Learner:
         if self._env.device.type == "cuda":
             state["random_cuda"] = torch.cuda.get_rng_state(self._env.device)
         state["rewards"] = self._env.sums
-        for name, network in (("actor", alg.actor), ("critic", alg.critic)):
-            state |= {f"{name}.{k}": v for k, v in network.state_dict().items()}
-        for number, values in alg.optimizer.state_dict()["state"].items():
-            state |= {f"optimizer.{number}.{k}": v for k, v in values.items()}
-        return state
+        networks = {"actor": alg.actor, "critic": alg.critic}
+        return state | pack_weights(networks, alg.optimizer)
 
     def _write_state(self) -> None:
         if not self._ranks.writes:
@@ -367,17 +371,8 @@ class Learner:
     def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
         """Go on from the state and facts of an earlier call. Worlds begin their next episodes."""
         alg = self._alg
-        parts: dict[str, dict[str, Tensor]] = {}
-        for key, value in state.items():
-            kind, _, rest = key.partition(".")
-            parts.setdefault(kind, {})[rest] = value
-        for name, network in (("actor", alg.actor), ("critic", alg.critic)):
-            network.load_state_dict(parts[name])
-        moments: dict[int, dict[str, Tensor]] = {}
-        for key, value in parts.get("optimizer", {}).items():
-            number, _, name = key.partition(".")
-            moments.setdefault(int(number), {})[name] = value
-        alg.optimizer.load_state_dict(alg.optimizer.state_dict() | {"state": moments})
+        networks = {"actor": alg.actor, "critic": alg.critic}
+        unpack_weights(state, networks, alg.optimizer)
         for group, rate in zip(alg.optimizer.param_groups, facts["learning_rates"], strict=True):
             group["lr"] = rate
         self._env.sums.copy_(state["rewards"])

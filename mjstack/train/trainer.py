@@ -5,6 +5,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
 from mjstack.config.schema import CloneJobCfg, ObservationGroupCfg, PpoJobCfg
 from mjstack.episodes.context import RunContext
 from mjstack.errors import UnknownName
@@ -103,3 +106,32 @@ def observed_group(job: CloneJobCfg | PpoJobCfg, leave_out: Sequence[str]) -> Ob
             raise UnknownName(f"job.leave_out: term of {job.group}", name, group.terms)
     terms = {name: term for name, term in group.terms.items() if name not in leave_out}
     return replace(group, noise=job.observation_noise, terms=terms)
+
+
+def pack_weights(networks: Mapping[str, nn.Module], optimizer: Optimizer) -> dict[str, Tensor]:
+    """Weights of networks and moments of an optimizer, by names that start with their own."""
+    state = {
+        f"{name}.{key}": value
+        for name, network in networks.items()
+        for key, value in network.state_dict().items()
+    }
+    for number, values in optimizer.state_dict()["state"].items():
+        state |= {f"optimizer.{number}.{key}": value for key, value in values.items()}
+    return state
+
+
+def unpack_weights(
+    state: Mapping[str, Tensor], networks: Mapping[str, nn.Module], optimizer: Optimizer
+) -> None:
+    """Take back what `pack_weights` has given; other names are left out."""
+    parts: dict[str, dict[str, Tensor]] = {}
+    for key, value in state.items():
+        name, _, rest = key.partition(".")
+        parts.setdefault(name, {})[rest] = value
+    for name, network in networks.items():
+        network.load_state_dict(parts[name])
+    moments: dict[int, dict[str, Tensor]] = {}
+    for key, value in parts.get("optimizer", {}).items():
+        number, _, name = key.partition(".")
+        moments.setdefault(int(number), {})[name] = value
+    optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})
