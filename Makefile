@@ -42,7 +42,7 @@ setup: $(READY_DEV)
 $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) torch
-	$(PIP) --editable '.[video]'
+	$(PIP) --editable '.[video,web]'
 	touch $@
 
 $(READY_DEV): $(READY)
