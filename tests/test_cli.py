@@ -399,6 +399,7 @@ def test_baseline_leaves_a_whole_report(folder: Path) -> None:
     assert job.relative_to(folder).parts[0] == "outputs"
     for name in (
         "report.md",
+        "report.html",
         "run.log",
         *(["scene.png"] if has_gl() else []),
         "trajectories.png",

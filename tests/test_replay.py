@@ -143,6 +143,7 @@ def test_failing_world_fails_again_bit_for_bit(
     assert sorted(path.name for path in (out).iterdir()) == [
         ".hydra",
         "replayed_config.yaml",
+        "report.html",
         "report.json",
         "report.md",
         "run.log",

@@ -137,6 +137,7 @@ def test_runs_resume_and_leave_table_and_plot(
         "scaling.png",
         "report.json",
         "report.md",
+        "report.html",
         "run.log",
         ".hydra/config.yaml",
     ):

@@ -114,6 +114,7 @@ def test_small_region_passes(passed: Path) -> None:
         [
             ".hydra",
             "starts_seed0.csv",
+            "report.html",
             "report.json",
             "report.md",
             "run.log",
@@ -147,7 +148,7 @@ def test_rebot_passes(new_context: Callable[..., RunContext], tmp_path: Path) ->
         result.metrics["distinct_starts"],
     ) == (4, 4, 4)
     assert not (tmp_path / FAILING).exists()
-    assert context.artifacts.pictures == [PICTURE]
+    assert context.page.pictures == [PICTURE]
     assert context.cfg.reset == load_config(["robot=rebot"]).reset  # other gates start as they did
 
 

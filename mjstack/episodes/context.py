@@ -33,6 +33,7 @@ from mjstack.managers.episode import required_fields
 from mjstack.managers.view import offers
 from mjstack.mdp.geometry import source_xy
 from mjstack.policy import Policy, load_policy
+from mjstack.report.html import Page
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import SceneIndex, build_model
 from mjstack.scene.phases import Phase
@@ -119,7 +120,6 @@ class Artifacts:
             *batch*.
         timed_episode: Time of the first seed's episode, from *batch*.
         shown: Title of the one-world episode that pictures show, and its recording.
-        pictures: Files that gates have drawn.
     """
 
     results: dict[str, GateResult] = field(default_factory=dict)
@@ -128,7 +128,6 @@ class Artifacts:
     carry_start: State | None = None
     timed_episode: Episode | None = None
     shown: tuple[str, WorldRecorder] | None = None
-    pictures: list[str] = field(default_factory=list)
 
 
 @dataclass(eq=False)
@@ -148,6 +147,7 @@ class RunContext:
         advance: Told about progress.
         viewers: Look on at the one-world episode that is shown.
         artifacts: Products of gates.
+        page: What the run shows besides its results.
     """
 
     cfg: Config
@@ -160,6 +160,7 @@ class RunContext:
     advance: Advance = lambda what, done, total: None
     viewers: Sequence[Observer] = ()
     artifacts: Artifacts = field(default_factory=Artifacts)
+    page: Page = field(default_factory=Page)
 
     def __post_init__(self) -> None:
         if self.stage is None:

@@ -176,5 +176,5 @@ def save_regions(
         safely_write(folder / PICTURE, save_places, *drawn),
     ]
     if not problems[-1]:
-        context.artifacts.pictures.append(PICTURE)
+        context.page.pictures.append(PICTURE)
     return [problem for problem in problems if problem]

@@ -18,7 +18,9 @@ from mjstack.errors import first_line, name_worlds
 from mjstack.files import to_csv, write_atomic
 from mjstack.interrupt import check_interrupt
 from mjstack.math import wilson_interval
+from mjstack.report.html import Worlds
 from mjstack.report.record import GateResult, Status
+from mjstack.report.svg import Map
 from mjstack.report.table import Table
 from mjstack.report.write import format_percent
 from mjstack.sim import Simulation
@@ -39,9 +41,7 @@ class EpisodeTally:
         check: The task's.
         path: The file of failing episodes; None where nothing is written.
         replayed: Whether job=replay takes the run.
-        seeds: Those that were played.
-        succeeded: For each seed, which worlds succeeded, shape ``(nworld,)``, bool.
-        circumstances: For each seed, if they were recorded.
+        records: Those of the seeds that were played.
         failed: Names of the failing episodes.
         broken: The same by the name of the rule that was broken.
         unreachable: Names of the episodes with a target out of reach.
@@ -63,9 +63,7 @@ class EpisodeTally:
     check: EpisodeCheck
     path: Path | None
     replayed: bool
-    seeds: list[int] = field(default_factory=list)
-    succeeded: list[np.ndarray] = field(default_factory=list)
-    circumstances: list[Circumstances] = field(default_factory=list)
+    records: list[EpisodeRecord] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     broken: dict[str, list[str]] = field(default_factory=dict)
     unreachable: list[str] = field(default_factory=list)
@@ -79,6 +77,22 @@ class EpisodeTally:
     notes: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     details: list[str] = field(default_factory=list)
+
+    @property
+    def seeds(self) -> list[int]:
+        """Those that were played."""
+        return [record.seed for record in self.records]
+
+    @property
+    def succeeded(self) -> list[np.ndarray]:
+        """For each seed, which worlds succeeded, shape ``(nworld,)``, bool."""
+        return [record.succeeded for record in self.records]
+
+    @property
+    def circumstances(self) -> list[Circumstances]:
+        """For each seed, if they were recorded."""
+        held = (record.circumstances for record in self.records)
+        return [one for one in held if one is not None]
 
     @property
     def episodes(self) -> int:
@@ -97,8 +111,7 @@ class EpisodeTally:
 
     def add(self, record: EpisodeRecord, episode: Episode, sim: Simulation) -> None:
         """Count one seed."""
-        self.seeds.append(record.seed)
-        self.succeeded.append(record.succeeded)
+        self.records.append(record)
         self.seconds += episode.timing.seconds
         self.steps += int(sim.step_count.sum())
         if self.first is None:
@@ -108,7 +121,6 @@ class EpisodeTally:
             self.broken.setdefault(rule, []).extend(self.names(record.seed, worlds))
         self.rows += record.failing_rows(self.check.rules)
         if record.circumstances is not None:
-            self.circumstances.append(record.circumstances)
             out = np.flatnonzero(record.circumstances.unreachable).tolist()
             self.unreachable += self.names(record.seed, out)
         measured = record.values | {
@@ -326,7 +338,31 @@ def play_seeds(
                 )
     finally:
         sim.close()
+    if cfg.nworld > 1:
+        context.page.worlds[gate] = _worlds(tally, context)
     return tally
+
+
+def _worlds(tally: EpisodeTally, context: RunContext) -> Worlds:
+    """The episodes as the run's page plots them."""
+    scene = context.cfg.scene
+    table = (scene.table_center[:2], scene.table_half[:2])
+    records = tally.records
+    bits = np.concatenate([record.failed for record in records])
+    rules = tally.check.rules
+    worlds = Worlds(
+        names=[name for r in records for name in tally.names(r.seed, range(len(r.failed)))],
+        broken=[rules.broken(failed) if failed else [] for failed in bits.tolist()],
+        rules=rules.texts,
+        values={
+            name: np.concatenate([record.values[name] for record in records])
+            for name in records[0].values
+        },
+    )
+    for name, (at, _) in context.index.objects.items():
+        xy = np.concatenate([record.start[:, at : at + 2] for record in records])
+        worlds.maps.append(Map(title=name, xy=xy, table=table))
+    return worlds
 
 
 def _write(record: EpisodeRecord, tally: EpisodeTally) -> None:

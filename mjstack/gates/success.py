@@ -83,7 +83,6 @@ def run_success(context: RunContext) -> list[GateResult]:
         there = "had a failure" if regions else "(gate.success.cell_episodes): more seeds have more"
         tally.details.append(f"no region of at least {t.cell_episodes} episodes {there}")
     tally.details += save_regions(own, regions, starts, tally)
-    context.artifacts.pictures += own.artifacts.pictures
     result = tally.result(
         parts,
         good=tally.good / tally.episodes >= t.rate,

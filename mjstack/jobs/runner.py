@@ -27,6 +27,7 @@ from mjstack.gates.runner import log_error
 from mjstack.interrupt import check_interrupt, interrupted
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
 from mjstack.mdp.starts.placement import SCHEMA
+from mjstack.report.html import PAGE, Page, write_page
 from mjstack.report.picture import (
     opens_windows,
     require_video,
@@ -104,13 +105,14 @@ class CheckedJob:
         errors = Console(stderr=True, soft_wrap=True, markup=False)
         report = Report(folder=folder, overrides=list(overrides), resumes=self.resumes)
         cfg = self.context.cfg
+        page = Page(title=f"{cfg.robot.title}, {self.title}")
         # The collector need not look at all that was loaded each time it frees a gate's worlds.
         gc.collect()
         gc.freeze()
 
         def record(result: GateResult) -> None:
             report.gates.append(result)
-            write_report(report)
+            _write(report, page)
             log.info("%s: %s %s", result.name, result.status, result.reason)
             bar.finish(result)
 
@@ -119,7 +121,7 @@ class CheckedJob:
             where = f"{escape(self.title)} -> {escape(str(folder))}"
             console.print(f"[bold]{escape(cfg.robot.title)}[/], {where}")
             report.provenance = run_provenance(self.context)
-            write_report(report)
+            _write(report, page)
             with ProgressBar(console) as bar:
                 context = replace(
                     self.context,
@@ -131,11 +133,12 @@ class CheckedJob:
                     advance=bar.advance,
                     viewers=[Hook(_viewer(self.context))] if cfg.view else [],
                     artifacts=Artifacts(),
+                    page=page,
                 )
                 self.work(context, folder)
             report.conclude()
-            write_report(report)
-            report.pictures = [*_draw(context, console), *context.artifacts.pictures]
+            _write(report, page)
+            report.pictures = [*_draw(context, console), *context.page.pictures]
             check_interrupt()
         # However it ends, the finished results are in the report.
         except (Exception, SystemExit, KeyboardInterrupt) as error:
@@ -151,13 +154,19 @@ class CheckedJob:
                     problem = log_error(error)
                     log.error("%s", problem)
                 errors.print(f"mjstack: {problem}")
-        for finish in (write_report, partial(_print_summary, console)):
+        for finish in (partial(_write, page=page), partial(_print_summary, console)):
             try:
                 finish(report)
             except Exception as error:
                 log_error(error)
         gc.unfreeze()
         return report
+
+
+def _write(report: Report, page: Page) -> None:
+    """Write the report, and its page, whose failure takes no result back."""
+    write_report(report)
+    safely_write(report.folder / PAGE, write_page, report, page)
 
 
 def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
@@ -200,7 +209,8 @@ def write_tables(
         if problem := safely_write(picture, draw):
             context.print_line(problem)
         else:
-            context.artifacts.pictures.append(picture.name)
+            context.page.pictures.append(picture.name)
+    context.page.tables.append(replace(table, title=table.title or title))
     write_atomic(folder / f"{name}.csv", csv)
     shown = [picture.name] if picture.exists() else []
     write_atomic(folder / f"{name}.md", to_document(title, [table], notes, shown))
@@ -281,5 +291,5 @@ def _viewer(context: RunContext) -> StepHook:
 def _print_summary(console: Console, report: Report) -> None:
     console.print(summarize(report.gates).to_console(STATUS_COLOR))
     if (report.folder / "report.md").exists():  # the disk may be full
-        console.print(f"report: {escape(str(report.folder))}/report.md")
+        console.print(f"report: {escape(str(report.folder))}/report.md and report.html")
     console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status}[/]")

@@ -100,7 +100,6 @@ def _run(trainer: Trainer, context: RunContext, folder: Path) -> None:
     if context.artifacts.results[NAME].status is Status.passed:
         own = judged_context(context, folder / LAST)
         run_guarded(own, "success", run_success)
-        context.artifacts.pictures += own.artifacts.pictures
 
 
 def judged_context(context: RunContext, policy: Path) -> RunContext:

@@ -84,7 +84,7 @@ def to_markdown(report: Report) -> str:
         title = f"{gate.name}: {gate.status}"
         tables = [*gate.tables, *_tables(gate)]
         parts.append(to_document(title, tables, gate.details, text=gate.reason, level=2))
-    rows = [[key, _words(value)] for key, value in report.provenance.items()]
+    rows = [[key, words(value)] for key, value in report.provenance.items()]
     facts = Table(header=["fact", "value"], rows=rows)
     return "\n".join([*parts, to_document("Provenance", [facts], level=2)])
 
@@ -112,20 +112,15 @@ def _tables(gate: GateResult) -> list[Table]:
     """
     metrics = dict(gate.metrics)
     thresholds = dict(gate.thresholds)
-    tables = []
-    groups = [name[:-7] for name in metrics if name.endswith(".median")]
-    repeated = [name for name in groups if all(f"{name}.{end}" in metrics for end in _SPREAD)]
-    if repeated:
-        rows = []
-        for name in repeated:
-            spread = [metrics.pop(f"{name}.{end}") for end in _SPREAD]
-            rows.append([_label(name), *(_with_unit(name, value) for value in spread)])
-        header = ["figure", "median", "smallest", "largest"]
-        tables.append(Table(title="Figures", header=header, rows=rows))
-
-    limited = _with_limits(metrics, thresholds)
-    if limited.rows:
-        tables.append(limited)
+    tables = [table] if (table := take_repeated(metrics)).rows else []
+    cells = {
+        row: {column: " / ".join(map(format_value, pair)) for column, pair in pairs.items()}
+        for row, pairs in take_limited(metrics, thresholds).items()
+    }
+    if cells:
+        columns = list(dict.fromkeys(column for row in cells.values() for column in row))
+        rows = [[name, *(row.get(c, "") for c in columns)] for name, row in cells.items()]
+        tables.append(Table(title="Found / allowed", header=["state", *columns], rows=rows))
     rest: dict[str, Mapping[str, object]] = {
         "measured": metrics,
         "required": thresholds,
@@ -133,14 +128,29 @@ def _tables(gate: GateResult) -> list[Table]:
     }
     for name, values in rest.items():
         if values:
-            rows = [[_label(key), _with_unit(key, value)] for key, value in values.items()]
+            rows = [[label(key), with_unit(key, value)] for key, value in values.items()]
             tables.append(Table(title=name.capitalize(), header=[name, "value"], rows=rows))
     return tables
 
 
-def _with_limits(metrics: dict[str, float], thresholds: dict[str, float]) -> Table:
-    """Metrics per state beside their limits, taken out of both mappings."""
-    cells: dict[str, dict[str, str]] = {}
+def take_repeated(metrics: dict[str, float]) -> Table:
+    """Median and range of repeated figures, taken out of the mapping."""
+    groups = [name[:-7] for name in metrics if name.endswith(".median")]
+    rows = []
+    for name in groups:
+        if all(f"{name}.{end}" in metrics for end in _SPREAD):
+            spread = [metrics.pop(f"{name}.{end}") for end in _SPREAD]
+            rows.append([label(name), *(with_unit(name, value) for value in spread)])
+    return Table(title="Figures", header=["figure", "median", "smallest", "largest"], rows=rows)
+
+
+def take_limited(
+    metrics: dict[str, float], thresholds: dict[str, float]
+) -> dict[str, dict[str, tuple[float, float]]]:
+    """Metrics per state with their limits, taken out of both mappings: by state and group, and then
+    by quantity, what was found and what is allowed.
+    """
+    cells: dict[str, dict[str, tuple[float, float]]] = {}
     used = set()
     for name in list(metrics):
         state, _, quantity = name.partition(".")
@@ -149,40 +159,35 @@ def _with_limits(metrics: dict[str, float], thresholds: dict[str, float]) -> Tab
             continue
         used.add(quantity)
         group, _, column = quantity.rpartition(".")
-        row = cells.setdefault(", ".join(_label(part) for part in (state, group) if part), {})
-        row[column] = f"{format_value(float(metrics.pop(name)))} / {format_value(float(limit))}"
+        row = cells.setdefault(", ".join(label(part) for part in (state, group) if part), {})
+        row[column] = float(metrics.pop(name)), float(limit)
     for quantity in used:
         del thresholds[quantity]
-    columns = list(dict.fromkeys(column for row in cells.values() for column in row))
-    return Table(
-        title="Found / allowed",
-        header=["state", *columns],
-        rows=[[name, *(row.get(c, "") for c in columns)] for name, row in cells.items()],
-    )
+    return cells
 
 
-def _ending(name: str) -> str:
+def unit_ending(name: str) -> str:
     """The end of a name that tells its unit; empty where there is none."""
     return next((end for end in _UNITS if name.endswith(end)), "")
 
 
-def _label(name: str) -> str:
+def label(name: str) -> str:
     """A metric's name in words, without its unit.
 
     ``final.red.position_m`` is "final, red: position".
     """
-    *groups, last = name.removesuffix(_ending(name)).replace("_", " ").split(".")
+    *groups, last = name.removesuffix(unit_ending(name)).replace("_", " ").split(".")
     return f"{', '.join(groups)}: {last}" if groups else last
 
 
-def _with_unit(name: str, value: object) -> str:
+def with_unit(name: str, value: object) -> str:
     """A value with the unit that its name ends on."""
-    end = _ending(name)
+    end = unit_ending(name)
     number = isinstance(value, float | int) and not isinstance(value, bool)
     return f"{format_value(value)} {_UNITS[end]}" if end and number else format_value(value)
 
 
-def _words(value: object) -> str:
+def words(value: object) -> str:
     """A value of the provenance; versions become a list."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {item}" for name, item in value.items())

@@ -1,0 +1,198 @@
+"""The page of a run: it needs nothing but itself, reads like tables, and trusts no text."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjstack.report.html import Page, Worlds, to_html
+from mjstack.report.record import GateResult, Report, Status
+from mjstack.report.svg import Map
+from mjstack.report.table import Table
+
+VOID = {"br", "img", "link", "meta"}
+IMPLIED = {"td", "th", "tr"}  # HTML ends these by itself
+
+
+class Reader(HTMLParser):
+    """Reads a page: addresses, tables as cells, text, and tags left open."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.tables: list[list[list[str]]] = []
+        self.open: list[str] = []
+        self.tags: set[str] = set()
+        self.in_cell = False
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.addresses += [str(v) for name, v in attrs if name in ("src", "href", "action")]
+        if tag not in VOID | IMPLIED and not self.get_starttag_text().endswith("/>"):
+            self.open.append(tag)
+        if tag == "table":
+            self.tables.append([])
+        if tag == "tr":
+            self.tables[-1].append([])
+        self.in_cell = tag in ("td", "th") or (self.in_cell and tag not in ("tr", "table"))
+        if tag in ("td", "th"):
+            self.tables[-1][-1].append("")
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in IMPLIED:
+            assert self.open.pop() == tag
+        self.in_cell = self.in_cell and tag not in ("td", "th", "table")
+
+    def handle_data(self, data: str) -> None:
+        if self.in_cell:
+            self.tables[-1][-1][-1] += data
+
+
+def png(path: Path) -> None:
+    """Write a picture of one pixel."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    header = struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0\0")) + chunk(b"IEND", b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+
+
+def batch(count: int) -> tuple[GateResult, Worlds]:
+    """A gate and its episodes, of which those divisible by 5 failed."""
+    rng = np.random.default_rng(0)
+    broken = [["STACKED"] if world % 5 == 0 else [] for world in range(count)]
+    table = ([0.3, 0.0, 0.0], [0.2, 0.3, 0.02])
+    worlds = Worlds(
+        names=[str(world) for world in range(count)],
+        broken=broken,
+        rules={"STACKED": "not stacked"},
+        values={
+            "xy_err_m": rng.uniform(0.0, 0.02, count),
+            "steps": np.full(count, 600.0),
+            "lost_m": np.where(np.arange(count) == 1, np.nan, rng.uniform(0.0, 1.0, count)),
+        },
+        maps=[Map(title="red", xy=rng.uniform(0.1, 0.2, (count, 2)), table=table)],
+    )
+    gate = GateResult(
+        name="batch",
+        status=Status.failed,
+        reason="some failed",
+        metrics={"xy_err_max_m": 0.02, "dz_m": 0.04, "final.red.m": 1.0, "final.blue.m": 2.0},
+        thresholds={"xy_err_m": 0.015, "dz_min_m": 0.03, "dz_max_m": 0.05, "window_steps": 50},
+    )
+    return gate, worlds
+
+
+def page(tmp_path: Path, count: int = 64) -> str:
+    gate, worlds = batch(count)
+    parity = GateResult(
+        name="parity",
+        status=Status.passed,
+        metrics={"lifted.step1.qpos": 2e-7, "lifted.step1.qvel": 4e-4, "placed.step1.qpos": 8e-7},
+        thresholds={"step1.qpos": 1e-6, "step1.qvel": 1e-4},
+    )
+    png(tmp_path / "scene.png")
+    report = Report(
+        folder=tmp_path,
+        overrides=["robot=so101"],
+        provenance={"date": "today", "device": "cpu", "versions": {"mujoco": "4.0.0"}},
+        gates=[parity, gate],
+        pictures=["scene.png", "missing.png"],
+    )
+    shown = Page(worlds={"batch": worlds}, episode="episode.html")
+    shown.tables.append(Table(title="Rates", header=["worlds", "rate"], rows=[["1", "2"]]))
+    return to_html(report, shown)
+
+
+def test_the_page_asks_for_nothing_but_itself(tmp_path: Path) -> None:
+    text = page(tmp_path)
+    reader = Reader(text)
+    assert reader.open == []
+    assert not reader.tags & {"script", "iframe", "object"}
+    outside = {a for a in reader.addresses if not a.startswith(("data:", "#"))}
+    assert outside == {"episode.html"}  # a link, not a source
+    assert not re.search(r"https?:|url\(|@import", text)
+    assert text.count("data:image/png;base64,") == 1
+
+
+def test_gates_are_tables(tmp_path: Path) -> None:
+    tables = Reader(page(tmp_path)).tables
+    (differences,) = (t for t in tables if t[0][:1] == ["state"])
+    assert differences[0] == ["state", "qpos", "qvel"]
+    assert differences[1] == ["lifted, step1", "2e-07of 1e-06", "0.0004of 0.0001"]
+    assert differences[2] == ["placed, step1", "8e-07of 1e-06", ""]
+    assert [["", "m"], ["red", "1"], ["blue", "2"]] in tables
+    assert ["dz", "0.04 m", "0.03 m to 0.05 m"] in [row for t in tables for row in t]
+    assert ["xy err max", "0.02 m", "0.015 m"] in [row for t in tables for row in t]
+    assert [["required", ""], ["window steps", "50"]] in tables
+    (rules,) = (t for t in tables if t[0][:1] == ["rule"])
+    assert rules[1][:3] == ["STACKED", "not stacked", "13"]
+
+
+def test_histograms_count_every_world(tmp_path: Path) -> None:
+    text = page(tmp_path)
+    plots = re.findall(r"<figure><figcaption>(.*?)</figcaption>(.*?)</figure>", text)
+    found = {}
+    for name, plot in plots:
+        tips = re.findall(r": (\d+)(?:, (\d+) failed)?</title>", plot)
+        found[name] = (sum(int(n) for n, _ in tips), sum(int(bad or 0) for _, bad in tips))
+    assert found["xy err"] == (64, 13)
+    assert found["lost, 1 not finite"] == (63, 13)
+    assert "steps" not in found  # all the same
+    assert "threshold 0.015 m" in text
+
+
+def test_maps_show_every_failed_world_of_a_large_batch(tmp_path: Path) -> None:
+    text = page(tmp_path, 20_000)
+    assert text.count("<path class=x") == 4000
+    assert "4,000 of 20,000 are drawn" in text
+    assert len(text) < 1e6
+
+
+def test_text_is_not_markup(tmp_path: Path) -> None:
+    bad = "<script>alert(1)</script>'\"&"
+    gate = GateResult(
+        name=bad,
+        status=Status.failed,
+        reason=bad,
+        metrics={bad: 1.0},
+        thresholds={f"{bad}x": 1.0},
+        notes={bad: bad},
+        details=[bad],
+        tables=[Table(title=bad, header=[bad], rows=[[bad]])],
+    )
+    two = np.array([0.0, 1.0])
+    maps = [Map(title=bad, xy=np.zeros((2, 2)), table=([0.3, 0.0], [0.2, 0.3]))]
+    worlds = Worlds(
+        names=[bad] * 2, broken=[[bad], []], rules={bad: bad}, values={bad: two}, maps=maps
+    )
+    report = Report(folder=tmp_path, overrides=[bad], provenance={bad: bad}, gates=[gate])
+    shown = Page(title=bad, worlds={bad: worlds}, tables=gate.tables, note=bad)
+    reader = Reader(to_html(report, shown))
+    assert "script" not in reader.tags
+    assert reader.open == []
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_have_a_page(tmp_path: Path, value: float) -> None:
+    gate, worlds = batch(8)
+    worlds.values["xy_err_m"][:] = value
+    worlds.maps[0].xy[:] = value
+    gate.metrics["lifted.step1.qpos"] = gate.thresholds["step1.qpos"] = value
+    text = to_html(Report(folder=tmp_path, gates=[gate]), Page(worlds={"batch": worlds}))
+    assert str(float(value)) in text
