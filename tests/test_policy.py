@@ -4,6 +4,7 @@ line, and every gate takes a policy.
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import math
 import os
@@ -20,6 +21,7 @@ from environments import configure, on_new_sim, one_second_episode
 from policies import make_policy, write_policy
 from safetensors.torch import load, save
 
+import mjstack
 from mjstack.cli import run
 from mjstack.config.schema import ObservationTermCfg
 from mjstack.drivers.policy import PolicyDriver
@@ -61,6 +63,18 @@ def test_a_saved_policy_gives_the_same_bits(tmp_path: Path) -> None:
         assert getattr(loaded, name) == getattr(policy, name), name
     assert loaded.joints == configure().robot.joints
     assert {"mjstack", "mujoco", "torch"} == set(loaded.versions)
+
+
+def test_a_checkout_that_is_not_installed_saves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nothing(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    policy = make_policy(configure())
+    monkeypatch.setattr(importlib.metadata, "distribution", nothing)
+    save_policy(tmp_path, policy)
+    assert load_policy(tmp_path).versions["mjstack"] == mjstack.__version__
 
 
 def test_a_second_policy_replaces_the_first_at_once(

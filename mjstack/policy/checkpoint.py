@@ -10,15 +10,16 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import torch
 from safetensors import safe_open
 from safetensors.torch import load, save
 from torch import Tensor
 
+import mjstack
 from mjstack.config.complete import typed
 from mjstack.config.fingerprint import POLICY_FILE, config_content
 from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg, TermCfg
@@ -146,7 +147,7 @@ def save_policy(folder: Path, policy: Policy) -> None:
     digest = sha256(weights).hexdigest()
     facts = {
         **policy_facts(policy),
-        "versions": {name: version(name) for name in ("mjstack", "mujoco", "torch")},
+        "versions": {each.__name__: each.__version__ for each in (mjstack, mujoco, torch)},
         "weights_sha256": digest,
         "config": policy.config,
     }
