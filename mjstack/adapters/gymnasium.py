@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from mjstack.envs import Env
-from mjstack.errors import ArgumentError, MissingExtra, UnknownName
+from mjstack.errors import ArgumentError, ConfigError, MissingExtra, UnknownName
 
 try:
     import gymnasium
@@ -39,7 +39,8 @@ class GymnasiumVectorEnv(VectorEnv):
 
     Attributes:
         inner: The environment.
-        group: The observation group that is returned, as one array; None for all, in a dict.
+        group: The observation group that is returned, as one array; None for all and the images,
+            in a dict.
     """
 
     def __init__(self, env: Env, *, group: str | None = "policy") -> None:
@@ -47,6 +48,7 @@ class GymnasiumVectorEnv(VectorEnv):
 
         Raises:
             UnknownName: There is no such observation group.
+            ConfigError: With images, a camera does not draw the ends of episodes.
         """
         self.inner = env
         self.group = group
@@ -58,6 +60,13 @@ class GymnasiumVectorEnv(VectorEnv):
         }
         if group is not None and group not in boxes:
             raise UnknownName("observation group", group, boxes)
+        boxes |= {name: _image_box(image) for name, image in env.images.items()}
+        cameras = env.cfg.scene.cameras
+        lacking = [name for name, camera in cameras.items() if not camera.terminal]
+        if group is None and lacking:
+            expected = "true, because final_obs has the images of all cameras"
+            key = f"scene.cameras.{lacking[0]}.terminal"
+            raise ConfigError(key, False, expected, "Set it, or choose a group")
         self.single_observation_space = spaces.Dict(boxes) if group is None else boxes[group]
         manager = env.action_manager
         low, high = (bound.float().cpu().numpy() for bound in (manager.low, manager.high))
@@ -226,8 +235,15 @@ class GymnasiumEnv(gymnasium.Env):
 
 
 def _numpy(obs: dict[str, torch.Tensor], group: str | None) -> Observation:
-    arrays = {name: value.cpu().numpy() for name, value in obs.items()}
+    # Copies, because images are the environment's own memory.
+    arrays = {name: value.to("cpu", copy=True).numpy() for name, value in obs.items()}
     return arrays if group is None else arrays[group]
+
+
+def _image_box(image: torch.Tensor) -> spaces.Box:
+    low, high = {torch.uint8: (0, 255), torch.int32: (-1, 2**31 - 1)}.get(image.dtype, (0, np.inf))
+    dtype: Any = str(image.dtype).removeprefix("torch.")
+    return spaces.Box(low, high, tuple(image.shape[1:]), dtype)
 
 
 def _row(obs: Observation, world: int) -> Observation:

@@ -18,8 +18,9 @@ except ImportError as error:
 class RslRlVecEnv(VecEnv):
     """All worlds of an environment for the runners of rsl-rl-lib 5.
 
-    Every observation group is an entry of the `TensorDict`. The runner's configuration says who
-    sees which, such as ``"obs_groups": {"actor": ["policy"], "critic": ["policy", "privileged"]}``.
+    Every observation group and every image is an entry of the `TensorDict`. The runner's
+    configuration says who sees which, such as
+    ``"obs_groups": {"actor": ["policy"], "critic": ["policy", "privileged"]}``.
 
     Actions are clamped to the action manager's bounds, because a Gaussian policy has none.
 
@@ -76,6 +77,7 @@ class RslRlVecEnv(VecEnv):
         """
         return self._tensordict(
             {name: group.clone() for name, group in self.env.observation_manager.groups.items()}
+            | self.env.images
         )
 
     def step(
@@ -115,4 +117,6 @@ class RslRlVecEnv(VecEnv):
         self.env.close()
 
     def _tensordict(self, obs: dict[str, torch.Tensor]) -> TensorDict:
+        # Storage keeps what it gets until after the next step, which draws anew.
+        obs = obs | {name: image.clone() for name, image in self.env.images.items()}
         return TensorDict(obs, batch_size=[self.num_envs], device=self.device)

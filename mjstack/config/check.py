@@ -9,7 +9,7 @@ from typing import Any
 
 from mjstack.config.fields import check_fields
 from mjstack.config.functions import offered
-from mjstack.config.schema import SHAPES, BoxCfg, Config, SceneCfg, TermCfg
+from mjstack.config.schema import OUTPUTS, SHAPES, BoxCfg, Config, SceneCfg, TermCfg
 from mjstack.errors import ConfigError, UnknownName
 
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
@@ -38,6 +38,7 @@ def validate(cfg: Config) -> None:
     _jobs(cfg)
     _robot(cfg)
     _scene(cfg)
+    _cameras(cfg)
     _phases(cfg)
     _gates(cfg)
 
@@ -134,6 +135,32 @@ def _scene(cfg: Config) -> None:
         _refuse(wrong, cfg, f"scene.objects.{one}.xy", expected)
     if scene.box is not None:
         _box(cfg, scene.box)
+
+
+def _cameras(cfg: Config) -> None:
+    """Poses, rates and names of the cameras."""
+    for name, camera in cfg.scene.cameras.items():
+        key = f"scene.cameras.{name}"
+        wrong = not re.fullmatch(r"[a-z][a-z0-9_]*", name)
+        _refuse(wrong, cfg, "scene.cameras", "names of small letters, digits and _")
+        pose = camera.pose
+        if pose is None:
+            expected = f"a pose, because robot.wrist_camera of {cfg.robot.name} is null"
+            raise ConfigError(f"{key}.pose", None, expected)
+        along = [b - a for a, b in zip(pose.pos, pose.target, strict=True)]
+        wrong = math.hypot(*along) < 1e-6
+        _refuse(wrong, cfg, f"{key}.pose.target", "a point away from pos")
+        x, y, z = along
+        a, b, c = pose.up
+        side = math.hypot(y * c - z * b, z * a - x * c, x * b - y * a)
+        wrong = side < 1e-3 * math.hypot(*along) * math.hypot(*pose.up) or not any(pose.up)
+        _refuse(wrong, cfg, f"{key}.pose.up", "a direction across that from pos to target")
+        wrong = len(set(camera.outputs)) != len(camera.outputs) or not camera.outputs
+        _refuse(wrong, cfg, f"{key}.outputs", f"some of {', '.join(OUTPUTS)}, each once")
+        steps = cfg.task.control_hz / (camera.rate or cfg.task.control_hz)
+        wrong = steps < 1.0 - 1e-9 or not math.isclose(steps, round(steps), rel_tol=1e-9)
+        expected = f"{cfg.task.control_hz:g} Hz over an integer, as that is the control rate"
+        _refuse(wrong, cfg, f"{key}.rate", expected)
 
 
 def _on_table(scene: SceneCfg, key: str, xy: list[float], edge: Sequence[float]) -> None:

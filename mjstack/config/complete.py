@@ -67,6 +67,8 @@ def complete(cfg: Config) -> None:
         _complete_groups("job.observation", seen)
         cfg.job.observation = seen
     _complete_robot(cfg.robot)
+    for camera in cfg.scene.cameras.values():
+        camera.pose = camera.pose or cfg.robot.wrist_camera
     _choose_phases(cfg)
 
 

@@ -26,6 +26,7 @@ from mjstack.config.session import (
 )
 from mjstack.errors import CompositionError, MjstackError, UnknownName, first_line, suggest
 
+LISTS = ("cameras", "experiment")  # groups of which several may be chosen
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 
 
@@ -51,7 +52,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
                     f"~{key}: expected a term of {', '.join(TERM_GROUPS)}, such as ~reward.success."
                     f" Keys and groups at the top are always there: set {key}=VALUE."
                 )
-        elif isinstance(parsed.value(), list) and key in list_choices() and key != "experiment":
+        elif isinstance(parsed.value(), list) and key in list_choices() and key not in LISTS:
             raise CompositionError(f"{override}: expected one choice, no list.")
         elif key == "gate":
             raise CompositionError(

@@ -97,15 +97,20 @@ def decided_every_step(cfg: Config) -> Config:
     return replace(cfg, timing=replace(cfg.timing, policy_decimation=1))
 
 
+def without_cameras(cfg: Config) -> Config:
+    """The configuration of an environment that draws nothing, in the scene of one that does."""
+    return replace(cfg, scene=replace(cfg.scene, cameras={}))
+
+
 def driven_config(cfg: Config, reset: dict[str, TermCfg] | None = None) -> Config:
     """The configuration of an environment in which a driver plays one whole episode.
 
     The driver's action terms take the place of the configured ones, and ``reset`` that of the
     configured reset terms, and it acts in every control step. Nothing ends an episode early or
-    rewards it: the check judges the whole.
+    rewards it: the check judges the whole. Nothing is drawn.
     """
     return replace(
-        decided_every_step(cfg),
+        without_cameras(decided_every_step(cfg)),
         action=cfg.controller.action,
         observation={},
         termination={},

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mjstack.config.schema import Config
+from mjstack.envs.camera_schedule import CameraSchedule
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
@@ -37,7 +38,11 @@ class Env:
     3. success, terminations and rewards look at the new state;
     4. observations are computed: for the worlds that end here, this is the terminal observation;
     5. finished episodes go into the statistics;
-    6. the worlds that ended are reset, and observed again.
+    6. the worlds that ended are reset, and observed again;
+    7. the cameras of ``scene.cameras`` are drawn, once for all worlds.
+
+    A camera that is slower than the control rate is drawn in the first step of a world's episode
+    and then in every so many of its steps. Images of other steps are the last ones drawn.
 
     With ``timing.policy_decimation`` 1 to 4 are repeated so many times with the same action, each
     time for a control step. Rewards are summed. A world whose episode ends before the last of them
@@ -60,6 +65,9 @@ class Env:
         termination_manager: How they end.
         reward_manager: What they are worth.
         graph: What `step` repeats, captured or not.
+        images: What the cameras have drawn last, by output and camera, such as ``images.front``;
+            see `Cameras.allocate`. It is their own memory, which every step writes.
+        cameras: What draws them, with the names in their segmentation; None without cameras.
     """
 
     def __init__(
@@ -119,6 +127,9 @@ class Env:
             self.reward_manager.names, self.termination_manager.names, sim.device
         )
         self._reset_managers(self._all_worlds)
+        self._draws = CameraSchedule(self, cfg.scene.cameras)
+        self.images = self._draws.images
+        self.cameras = self._draws.cameras
         self.episode.fill_(-1)
         self._outputs = Outputs(
             self.reward_manager, self.termination_manager, self.observation_manager, self.success
@@ -149,7 +160,7 @@ class Env:
             mask: Which worlds, shape ``(nworld,)``, bool; all if None.
 
         Returns:
-            Observations by group, each ``(nworld, dim)``, float32; and an empty dict.
+            Observations by group, each ``(nworld, dim)``, float32, and `images`; and an empty dict.
 
         Raises:
             ArgumentError: The seed or the mask cannot be used.
@@ -176,7 +187,8 @@ class Env:
             self._started = True
         self._reset_managers(mask)
         observed = self.observation_manager.refresh(mask)
-        return {name: group.clone() for name, group in observed.items()}, {}
+        self._draws.draw_started(None if everywhere else mask)
+        return {name: group.clone() for name, group in observed.items()} | self.images, {}
 
     def step(
         self, action: Tensor
@@ -188,14 +200,15 @@ class Env:
 
         Returns:
             ``obs``: by group, ``(nworld, dim)``, float32; of worlds that ended, the first of the
-                new episode.
+                new episode. And `images`, not copied: the next step writes into them.
             ``reward``: ``(nworld,)``, float32; the sum over the control steps.
             ``terminated``: ended by what happened, ``(nworld,)``, bool.
             ``truncated``: ended by the clock alone, ``(nworld,)``, bool.
-            ``extras``: ``final_obs`` (as ``obs``, before the reset: valid where an episode ended)
-                and ``success`` (at the end of this step, before the reset).
+            ``extras``: ``final_obs`` (as ``obs``, before the reset: valid where an episode ended;
+                images of cameras with ``terminal`` alone) and ``success`` (at the end of this step,
+                before the reset).
 
-        All of them are the caller's to keep.
+        All of them but images are the caller's to keep.
 
         Raises:
             ArgumentError: The action has a wrong shape, dtype or device, or is not finite.
@@ -211,7 +224,10 @@ class Env:
             self._steps += 1
             if self._check_faults and self._all_worlds.is_cuda and self._steps % FAULT_WINDOW == 0:
                 self.raise_faults()
-            return self._outputs.returned()
+            obs, reward, terminated, truncated, extras = self._outputs.returned()
+            obs |= self.images
+            extras["final_obs"] |= self._draws.final_images
+            return obs, reward, terminated, truncated, extras
 
     def advance(self) -> None:
         """The part of `step` that is the same at every step: it acts on the action that was
@@ -225,6 +241,7 @@ class Env:
             self._step_physics()
             ended = self._evaluate(ended, last=left == 0)
         current_term.label = ""
+        self._draws.draw_step()
 
     def captured(self, work: Callable[[], None], name: str) -> StepGraph:
         """Work of this environment as a graph on CUDA; elsewhere as it is.
@@ -279,6 +296,7 @@ class Env:
         self._closed = True
         self.sim.synchronize()
         self.graph.drop()
+        self._draws.close()
         self.sim.close()
 
     def __str__(self) -> str:
@@ -378,6 +396,7 @@ class Env:
 
         def keep() -> None:
             self._outputs.write_final(self.success, broken)
+            self._draws.draw_ended(done)
 
         def count() -> None:
             if ending:

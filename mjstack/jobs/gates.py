@@ -1,10 +1,10 @@
 """Job *gates*: a configuration and a folder in, gates run, a report left behind."""
 
 import contextlib
-import re
-import sys
 from dataclasses import replace
 from pathlib import Path
+
+import torch
 
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.tilt import turn_sign
@@ -18,17 +18,15 @@ from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
 from mjstack.jobs.runner import CheckedJob, Job, check_showing
 from mjstack.managers.episode import required_fields
+from mjstack.report.gl import require_offscreen
 from mjstack.sim import resolve_backend
+from mjstack.sim.cameras import check_image_memory
+from mjstack.sim.memory import available_memory
 from mjstack.sim.native import NativeSimulation
 
 # Bytes of a whole run (environment, plan, check) over those of its native worlds: measured 3.2 to
 # 4.6, for both drivers.
 _SHARE = 4
-_LIMITS = (
-    "/proc/meminfo",
-    "/sys/fs/cgroup/memory.max",
-    "/sys/fs/cgroup/memory/memory.limit_in_bytes",
-)
 
 
 def check_machine(cfg: Config) -> RunContext:
@@ -62,13 +60,6 @@ def _check_memory(context: RunContext) -> None:
         raise ConfigError("nworld", nworld, expected)
 
 
-def available_memory() -> int:
-    """Memory that this process may still take, in bytes: the system's, or its container's."""
-    text = "".join(path.read_text() for path in map(Path, _LIMITS) if path.exists())
-    found = re.findall(r"(?m)^(?:MemAvailable: +(\d+) kB|(\d+))$", text)
-    return min((1024 * int(kib or 0) or int(limit) for kib, limit in found), default=sys.maxsize)
-
-
 def _check_starts(context: RunContext) -> None:
     """Raise if worlds cannot start as a gate has them, by the key that says so."""
     cfg = context.cfg
@@ -94,6 +85,7 @@ def check_task(context: RunContext) -> None:
     if cfg.task.check is not None:
         _ = context.check  # reads its thresholds
     check_env(context, cfg)
+    check_cameras(context)
     if cfg.controller.name == POLICY:
         check_driver(context)
         return
@@ -115,6 +107,20 @@ def check_task(context: RunContext) -> None:
         from mjstack.kinematics.chain import build_chain
 
         build_chain(context.model, cfg.robot)
+
+
+def check_cameras(context: RunContext) -> None:
+    """Raise if the images of all worlds do not fit into memory, or cannot be drawn here."""
+    cfg = context.cfg
+    if not cfg.scene.cameras:
+        return
+    backend, device = context.backend
+    native = backend is Backend.native
+    check_image_memory(
+        context.model, cfg.scene.cameras, cfg.nworld, torch.device(device), mjwarp=not native
+    )
+    if native:
+        require_offscreen(context.model)
 
 
 def check_driver(context: RunContext) -> None:

@@ -16,7 +16,8 @@ from mjstack.errors import ConfigError
 from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job, check_showing
-from mjstack.report.picture import require_offscreen, save_video
+from mjstack.report.gl import require_offscreen
+from mjstack.report.picture import save_video
 from mjstack.report.record import GateResult, Status
 from mjstack.report.write import safely_write
 

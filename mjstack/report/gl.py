@@ -1,7 +1,15 @@
-"""Chooses how MuJoCo draws offscreen, when mujoco is imported: it decides then."""
+"""How MuJoCo draws offscreen: chosen when mujoco is imported, which decides then."""
+
+from __future__ import annotations
 
 import os
 import sys
+from typing import TYPE_CHECKING
+
+from mjstack.errors import MjstackError
+
+if TYPE_CHECKING:
+    import mujoco
 
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 
@@ -35,3 +43,31 @@ def choose_gl() -> None:
         os.environ["MUJOCO_GL"] = "disable"
     elif not asked and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         os.environ["MUJOCO_GL"] = found[0] if found else "disable"
+
+
+def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    """MuJoCo's offscreen renderer of a model. Its OpenGL context belongs to this thread.
+
+    Raises:
+        MjstackError: This machine cannot draw offscreen.
+    """
+    import mujoco
+
+    try:
+        return mujoco.Renderer(model, height, width)
+    except Exception as error:  # OpenGL loaders fail in their own ways
+        gl = os.environ.get("MUJOCO_GL", "not set")
+        raise MjstackError(
+            f"offscreen rendering fails (MUJOCO_GL={gl}: {type(error).__name__}), expected OpenGL"
+            " by EGL or OSMesa",
+            "Set MUJOCO_GL=egl or osmesa",
+        ) from error
+
+
+def require_offscreen(model: mujoco.MjModel) -> None:
+    """Try to draw.
+
+    Raises:
+        MjstackError: This machine cannot draw offscreen.
+    """
+    open_renderer(model, 16, 16).close()

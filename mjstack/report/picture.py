@@ -3,7 +3,6 @@ video.
 """
 
 import math
-import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,8 +14,9 @@ import mujoco
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from mjstack.errors import MissingExtra, MjstackError
+from mjstack.errors import MissingExtra
 from mjstack.interrupt import check_interrupt
+from mjstack.report.gl import open_renderer
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -56,7 +56,7 @@ def _render(
         MjstackError: This machine cannot draw offscreen.
     """
     data = mujoco.MjData(model)
-    renderer = _renderer(model, width, height)
+    renderer = open_renderer(model, height, width)
     x, _, z = model.geom_pos[model.geom("table").id].tolist()
     tall = max(0.0, float(model.stat.center[2]) - z - 0.03)  # m that an arm stands out
     camera = mujoco.MjvCamera()
@@ -71,26 +71,6 @@ def _render(
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
             yield renderer.render()
-
-
-def _renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
-    try:
-        return mujoco.Renderer(model, height, width)
-    except Exception as error:  # OpenGL loaders fail in their own ways
-        gl = os.environ.get("MUJOCO_GL", "not set")
-        raise MjstackError(
-            f"offscreen rendering fails (MUJOCO_GL={gl}: {type(error).__name__})",
-            "Set MUJOCO_GL=egl or osmesa",
-        ) from error
-
-
-def require_offscreen(model: mujoco.MjModel) -> None:
-    """Try to draw.
-
-    Raises:
-        MjstackError: This machine cannot draw offscreen.
-    """
-    _renderer(model, 16, 16).close()
 
 
 def save_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:

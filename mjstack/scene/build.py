@@ -6,11 +6,13 @@ import itertools
 import math
 
 import mujoco
+import numpy as np
 
-from mjstack.config.schema import BoxCfg, Config, ObjectCfg
-from mjstack.errors import SourceError
+from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
+from mjstack.errors import SourceError, UnknownName
 from mjstack.robots import robot_spec
 
+TABLE = "table"
 WORLD = "world"  # MuJoCo's name of the body that never moves
 _NETFORCE = 3  # the contact sensor's reduction to one force and torque, in the world frame
 
@@ -20,8 +22,8 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
 
     Args:
         cfg: The configuration.
-        visuals: Keep geoms that only pictures need. The physics is the same without them, and steps
-            faster.
+        visuals: Keep geoms that only pictures need, as cameras do. The physics is the same without
+            them, and steps faster.
 
     Raises:
         SourceError: The robot's file does not fit the scene, such as one with a geom named table.
@@ -76,7 +78,7 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         condim=3,
     )
     world.add_geom(
-        name="table",
+        name=TABLE,
         type=mujoco.mjtGeom.mjGEOM_BOX,
         pos=scene.table_center,
         size=scene.table_half,
@@ -105,11 +107,19 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
             intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NETFORCE, 1],
         )
 
-    # Visuals
-    if visuals:
-        world.add_light(pos=[0.2, -0.6, 1.6], dir=[0.1, 0.4, -1.0], diffuse=[0.6, 0.6, 0.6])
+    # Cameras, and what only pictures need
+    for name, camera in scene.cameras.items():
+        _add_camera(spec, name, camera, scene)
+    if visuals or scene.cameras:
+        # Light that no camera sees as white, and without highlights, which OpenGL and a ray caster
+        # draw differently
+        matte = [0.0, 0.0, 0.0]
+        world.add_light(
+            pos=[0.2, -0.6, 1.6], dir=[0.1, 0.4, -1.0], diffuse=[0.55, 0.55, 0.55], specular=matte
+        )
         spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
-        spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
+        spec.visual.headlight.diffuse = [0.3, 0.3, 0.3]
+        spec.visual.headlight.specular = matte
         spec.visual.global_.offwidth = 1280
         spec.visual.global_.offheight = 960
         spec.visual.quality.shadowsize = 1024  # without a GPU, MuJoCo's 4096 doubles the time
@@ -143,6 +153,30 @@ def _add_object(world: mujoco.MjsBody, name: str, thing: ObjectCfg, top: float) 
     )
     if thing.shape == "capsule":  # MuJoCo's stands along z; this one lies along x
         geom.quat = [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0]
+
+
+def _add_camera(spec: mujoco.MjSpec, name: str, camera: CameraCfg, scene: SceneCfg) -> None:
+    """Add a camera to what carries it."""
+    pose = camera.pose
+    assert pose is not None, "configurations are complete"
+    origin = np.zeros(3)
+    mount = pose.mount
+    if mount == TABLE:
+        mount = WORLD
+        origin[:] = [*scene.table_center[:2], scene.table_top]
+    body = spec.body(mount)
+    if body is None:
+        known = [TABLE, *(each.name for each in spec.bodies if each.name)]
+        raise UnknownName(f"scene.cameras.{name}.pose.mount: body", mount, known)
+    # A camera looks along its -z, and its y points up in the image.
+    axes = np.zeros((3, 3))
+    axes[2] = np.subtract(pose.pos, pose.target)
+    axes[0] = np.cross(pose.up, axes[2])
+    axes[1] = np.cross(axes[2], axes[0])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, axes.T.ravel())
+    body.add_camera(name=name, pos=origin + pose.pos, quat=quat, fovy=camera.fovy)
 
 
 def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:

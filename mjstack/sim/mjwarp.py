@@ -2,15 +2,18 @@
 
 import logging
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 
 import mujoco
 import torch
 
+from mjstack.config.schema import CameraCfg
 from mjstack.errors import UnsupportedModel, first_line
 from mjstack.sim import fused, fused_smooth
+from mjstack.sim.cameras import Cameras
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
+from mjstack.sim.mjwarp_cameras import MjwarpCameras
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
 from mjstack.sim.simulation import Simulation, named_options
 from mjstack.sim.sizes import BatchSizes
@@ -181,6 +184,10 @@ class MjwarpSimulation(Simulation):
             **named_options(opt),
             "box_box": "primitive" if primitive else "convex",
         }
+
+    def make_cameras(self, cameras: Mapping[str, CameraCfg]) -> Cameras:
+        """See `Simulation`; compiles the renderer."""
+        return MjwarpCameras(self.model, self._m, self._d, self.fields, cameras)
 
     def bare_step(self) -> StepGraph:
         """One plain ``mujoco_warp.step``, captured and replayed with nothing else: what the rest is

@@ -3,16 +3,19 @@
 import copy
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import mujoco
 import numpy as np
 import torch
 from mujoco.batch import Batch
 
+from mjstack.config.schema import CameraCfg
 from mjstack.errors import UnsupportedModel, first_line
 from mjstack.interrupt import check_interrupt
+from mjstack.sim.cameras import Cameras
 from mjstack.sim.model_fields import Fields, SimpleBodies, check_fields
+from mjstack.sim.native_cameras import NativeCameras
 from mjstack.sim.simulation import Overflow, Simulation, named_options
 
 _COUNTS = ("ncon", "nefc")
@@ -181,6 +184,10 @@ class NativeSimulation(Simulation):
         option = self.model.opt
         numbers = {name: getattr(option, name) for name in ("timestep", "impratio", "tolerance")}
         return {**numbers, **named_options(option), "box_box": "primitive"}
+
+    def make_cameras(self, cameras: Mapping[str, CameraCfg]) -> Cameras:
+        """See `Simulation`; their OpenGL contexts open with the first image."""
+        return NativeCameras(self.model, self.qpos.numpy(), self._fields, cameras)
 
     def synchronize(self) -> None:
         """Nothing to wait for: `step` returns when every thread has."""

@@ -1,13 +1,16 @@
 """The base of every physics backend: torch views of batched state, and how to step it."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from enum import IntFlag
 
 import mujoco
 import torch
 
+from mjstack.config.schema import CameraCfg
 from mjstack.errors import ArgumentError, RebindError
 from mjstack.math import describe_tensor
+from mjstack.sim.cameras import Cameras
 from mjstack.sim.graph import StepGraph
 from mjstack.sim.model_fields import Fields
 from mjstack.sim.sizes import BatchSizes
@@ -202,6 +205,14 @@ class Simulation(ABC):
         Raises:
             ArgumentError: The mask is not a bool tensor of shape ``(nworld,)`` on the simulation's
                 device.
+        """
+
+    @abstractmethod
+    def make_cameras(self, cameras: Mapping[str, CameraCfg]) -> Cameras:
+        """Cameras that draw these worlds; the model has them by name.
+
+        Raises:
+            ConfigError: Their images do not fit into the device's memory.
         """
 
     def graph_of(self, n: int = 1, *, kinematics: bool = False) -> StepGraph | None:

@@ -7,6 +7,7 @@ from omegaconf import MISSING
 
 from mjstack.config.fields import spec
 
+OUTPUTS = ("rgb", "depth", "segmentation")
 _ROUND = (2, "radius and half length")
 SHAPES = {  # and the sizes of each
     "box": (3, "half sizes"),
@@ -104,6 +105,39 @@ class PlaceCfg:
 
 
 @dataclass(slots=True)
+class CameraPoseCfg:
+    """A camera's place, and the point it looks at, in the frame of what carries it."""
+
+    mount: str = spec()
+    """``table``: the middle of the table's top, with the world's axes. ``world``, or a body of the
+    robot or the scene."""
+    pos: list[float] = spec(unit="m", length=3)
+    """Position of the camera."""
+    target: list[float] = spec(unit="m", length=3)
+    """The point in the middle of the image."""
+    up: list[float] = spec(factory=lambda: [0.0, 0.0, 1.0], length=3)
+    """The direction that points up in the image."""
+
+
+@dataclass(slots=True)
+class CameraCfg:
+    """A camera, whose images are observations. Vertical field of view and size give its rays."""
+
+    pose: CameraPoseCfg | None = None
+    """Its pose. null: ``robot.wrist_camera``, on the gripper."""
+    size: list[int] = spec(factory=lambda: [128, 128], unit="pixels", length=2, ge=1, le=4096)
+    """Height and width of the image."""
+    fovy: float = spec(45.0, unit="deg", ge=1.0, le=170.0)
+    """Vertical field of view."""
+    rate: float | None = spec(None, unit="Hz", gt=0.0)
+    """Images per second. null: one in every control step."""
+    outputs: list[str] = spec(factory=lambda: ["rgb"], choices=OUTPUTS)
+    """Its observations: ``rgb`` colours, ``depth`` [m], ``segmentation`` numbers of things."""
+    terminal: bool = False
+    """Whether the last image of an episode is drawn too, for ``final_obs``."""
+
+
+@dataclass(slots=True)
 class SceneCfg:
     """A table, objects and places on it, and perhaps a box."""
 
@@ -125,6 +159,8 @@ class SceneCfg:
     """Whether sensors measure what presses on each object beside the jaws."""
     box: BoxCfg | None = None
     """A receiving box."""
+    cameras: dict[str, CameraCfg] = field(default_factory=dict)
+    """Cameras by name. Without any, the model has nothing that only pictures need."""
     grasp_offset: float = spec(0.0, unit="m")
     """How far above an object's centre the grasp point is for phases ``in_hand``."""
 
@@ -243,6 +279,8 @@ class RobotCfg:
     """Height above an object at which a grasp begins."""
     finger_room: float = spec(0.01, unit="m", ge=0.0)
     """Free room around an object for the open jaws."""
+    wrist_camera: CameraPoseCfg | None = None
+    """Pose of a camera on the gripper. null: there is none."""
     placements: dict[str, PlacementsCfg] = field(default_factory=dict)
     """Where the objects of each scene stand for this robot."""
 

@@ -1,0 +1,70 @@
+"""When the cameras of an environment are drawn, and into which buffers."""
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from mjstack.config.schema import CameraCfg
+from mjstack.managers.view import EnvView
+from mjstack.sim.cameras import Cameras, Masks
+
+
+class CameraSchedule:
+    """Draws each camera at its rate, counted from the start of each world's episode.
+
+    Attributes:
+        cameras: What draws; None without cameras.
+        images: Images by output and camera, see `Cameras.allocate`.
+        final_images: Those of the last state of an episode, of cameras with ``terminal``.
+    """
+
+    def __init__(self, env: EnvView, cameras: Mapping[str, CameraCfg]) -> None:
+        """Allocate the buffers, if there are cameras.
+
+        Raises:
+            ConfigError: They do not fit into the device's memory.
+        """
+        self._env = env
+        timing = env.cfg.timing
+        self._held = timing.policy_decimation
+        self.cameras: Cameras | None = env.sim.make_cameras(cameras) if cameras else None
+        self._terminal = [name for name, camera in cameras.items() if camera.terminal]
+        # Control steps from one image to the next
+        self._steps = {
+            name: 1 if camera.rate is None else round(1.0 / (camera.rate * timing.step_dt))
+            for name, camera in cameras.items()
+        }
+        self.images: dict[str, Tensor] = {}
+        self.final_images: dict[str, Tensor] = {}
+        if self.cameras is not None:
+            self.images = self.cameras.allocate()
+            self.final_images = self.cameras.allocate(terminal=True)
+
+    def draw_started(self, mask: Tensor | None) -> None:
+        """Draw the worlds that have been started outside of a step, shape ``(nworld,)``, bool; None
+        for all.
+        """
+        self._draw(self.images, dict.fromkeys(self._steps, mask))
+
+    def draw_step(self) -> None:
+        """Draw the cameras that are due after a step and its resets."""
+        step = self._env.episode_step
+        masks = {
+            name: None if every <= self._held else step % every < self._held
+            for name, every in self._steps.items()
+        }
+        self._draw(self.images, masks)
+
+    def draw_ended(self, done: Tensor) -> None:
+        """Draw the worlds that are about to be reset, shape ``(nworld,)``, bool."""
+        if self._terminal and (done.is_cuda or bool(done.any())):
+            self._draw(self.final_images, dict.fromkeys(self._terminal, done))
+
+    def close(self) -> None:
+        """Give what drawing needs back."""
+        if self.cameras is not None:
+            self.cameras.close()
+
+    def _draw(self, out: Mapping[str, Tensor], masks: Masks) -> None:
+        if self.cameras is not None and masks:
+            self.cameras.draw(out, masks)

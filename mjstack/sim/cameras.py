@@ -1,0 +1,145 @@
+"""Cameras of a batch: what they draw, where it goes, and the memory it takes."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+
+import mujoco
+import torch
+from torch import Tensor
+
+from mjstack.config.schema import CameraCfg
+from mjstack.errors import ConfigError
+from mjstack.sim.memory import free_memory
+
+VISIBLE_GROUPS = (0, 1, 2)  # of geoms, as in MuJoCo's viewer; collision geoms are in group 3
+PREFIXES = {"rgb": "images", "depth": "depth", "segmentation": "segmentation"}
+_TYPES = {
+    "rgb": (torch.uint8, (3,)),
+    "depth": (torch.float32, (1,)),
+    "segmentation": (torch.int32, ()),
+}
+# Bytes of a pixel in MJWarp's own buffers, and of a geom in its bounding volume hierarchy
+_RENDERED = {"rgb": 4, "depth": 4, "segmentation": 8}
+_PER_GEOM = 110
+
+Masks = Mapping[str, Tensor | None]
+"""Worlds of each camera, shape ``(nworld,)``, bool; None for all. A camera that is left out is not
+drawn."""
+
+
+class Cameras(ABC):
+    """Draws the worlds of a simulation, as its poses are.
+
+    Attributes:
+        mjwarp: Whether MJWarp draws.
+        cameras: The cameras by name.
+        labels: Names of the things that segmentation tells apart: its numbers are places in this
+            list, and -1 where the ray hits nothing. A body is a thing, and so is each geom that is
+            fixed to the world.
+    """
+
+    mjwarp = False
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        nworld: int,
+        device: torch.device,
+        cameras: Mapping[str, CameraCfg],
+    ) -> None:
+        """Take the model, which has cameras of these names.
+
+        Raises:
+            ConfigError: The images of so many worlds do not fit into the device's memory.
+        """
+        self.cameras = cameras
+        self._nworld = nworld
+        self._device = device
+        check_image_memory(model, cameras, nworld, device, mjwarp=self.mjwarp)
+        of_geoms = [_thing(model, geom) for geom in range(model.ngeom)]
+        self.labels = list(dict.fromkeys(of_geoms))
+        self._label_of_geom = [self.labels.index(name) for name in of_geoms]
+
+    def allocate(self, *, terminal: bool = False) -> dict[str, Tensor]:
+        """Buffers for every output of every camera, zero.
+
+        Args:
+            terminal: Of the cameras alone that draw the ends of episodes.
+
+        Returns:
+            By name: ``images.CAMERA`` ``(nworld, height, width, 3)``, uint8; ``depth.CAMERA``
+            ``(nworld, height, width, 1)``, float32, metres along the camera's axis, 0 where the ray
+            hits nothing; ``segmentation.CAMERA`` ``(nworld, height, width)``, int32.
+        """
+        return {
+            f"{PREFIXES[output]}.{name}": torch.zeros(
+                (self._nworld, *camera.size, *_TYPES[output][1]),
+                dtype=_TYPES[output][0],
+                device=self._device,
+            )
+            for name, camera, output in _outputs(self.cameras)
+            if camera.terminal or not terminal
+        }
+
+    @abstractmethod
+    def draw(self, out: Mapping[str, Tensor], masks: Masks) -> None:
+        """Draw cameras into buffers of `allocate`. The images of other worlds stay.
+
+        Args:
+            out: The buffers.
+            masks: Which cameras are drawn in which worlds.
+
+        Raises:
+            MjstackError: This machine cannot draw.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give what drawing needs back."""
+
+
+def image_bytes(
+    model: mujoco.MjModel, cameras: Mapping[str, CameraCfg], nworld: int, *, mjwarp: bool
+) -> int:
+    """Bytes of all images, and of what MJWarp needs to draw them."""
+    size = 0
+    for _, camera, output in _outputs(cameras):
+        dtype, shape = _TYPES[output]
+        pixel = (1 + camera.terminal) * dtype.itemsize * math.prod(shape)
+        size += math.prod(camera.size) * (pixel + mjwarp * _RENDERED[output])
+    drawn = sum(int(group) in VISIBLE_GROUPS for group in model.geom_group)
+    return nworld * (size + mjwarp * drawn * _PER_GEOM)
+
+
+def check_image_memory(
+    model: mujoco.MjModel,
+    cameras: Mapping[str, CameraCfg],
+    nworld: int,
+    device: torch.device,
+    *,
+    mjwarp: bool,
+) -> None:
+    """Raise a `ConfigError` if the images do not fit into the memory that the device has left."""
+    size = image_bytes(model, cameras, nworld, mjwarp=mjwarp)
+    free = free_memory(device)
+    if size > free:
+        sizes = {name: f"{camera.size[0]}x{camera.size[1]}" for name, camera in cameras.items()}
+        shown = ", ".join(f"{name} {pixels}" for name, pixels in sizes.items())
+        expected = (
+            f"images that fit into the memory of {device}, where {nworld} worlds need"
+            f" {size / 2**30:.3g} GiB and {free / 2**30:.3g} GiB are free"
+        )
+        raise ConfigError("scene.cameras", shown, expected, "Lower nworld, or the cameras' size")
+
+
+def _outputs(cameras: Mapping[str, CameraCfg]) -> Iterator[tuple[str, CameraCfg, str]]:
+    for name, camera in cameras.items():
+        for output in camera.outputs:
+            yield name, camera, output
+
+
+def _thing(model: mujoco.MjModel, geom: int) -> str:
+    """The thing that a geom belongs to."""
+    body = model.geom_bodyid[geom]
+    return (model.body(body).name or f"body_{body}") if body else model.geom(geom).name or "world"

@@ -1,0 +1,192 @@
+"""Cameras of MuJoCo Warp: its ray caster, and kernels that bring what it draws into tensors."""
+
+# No `from __future__ import annotations` here: Warp reads the annotations as objects.
+from collections.abc import Collection, Mapping
+
+import mujoco
+import torch
+from torch import Tensor
+
+from mjstack.config.schema import CameraCfg
+from mjstack.sim.cameras import PREFIXES, VISIBLE_GROUPS, Cameras, Masks
+from mjstack.sim.warp_setup import mjw, torch_stream_scope, wp
+
+_AWAY = 1e6  # m above everything: where cameras that draw nothing look up from
+
+
+class MjwarpCameras(Cameras):
+    """`Cameras` through MJWarp's renderer, which draws all cameras of all worlds in one launch.
+
+    It has no mask. A camera of a world that is not drawn is moved away, where its rays end at once,
+    and what it draws there is not copied. All of it can be captured: shapes are fixed, and nothing
+    is read.
+    """
+
+    mjwarp = True
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        m: mjw.Model,
+        d: mjw.Data,
+        fields: Collection[str],
+        cameras: Mapping[str, CameraCfg],
+    ) -> None:
+        """Build the renderer, and compile it.
+
+        Args:
+            model: The compiled model.
+            m: The same on the device.
+            d: The worlds.
+            fields: Model fields that differ from world to world.
+            cameras: The cameras by name.
+        """
+        self._m = m
+        self._d = d
+        self._wp_device = device = m.geom_type.device
+        super().__init__(model, d.nworld, torch.device(wp.device_to_torch(device)), cameras)
+        wanted = {
+            output: [output in camera.outputs for camera in cameras.values()] for output in PREFIXES
+        }
+        ambient = "light_ambient" in fields or bool(model.light_ambient.any())
+        specular = (
+            "light_specular" in fields
+            or bool(model.light_specular.any())
+            or any(model.vis.headlight.specular)
+        )
+        with wp.ScopedDevice(device):
+            # What the model has not is compiled out.
+            self._context = mjw.create_render_context(
+                model,
+                d.nworld,
+                cam_res=[(width, height) for height, width in (c.size for c in cameras.values())],
+                render_rgb=wanted["rgb"],
+                render_depth=wanted["depth"],
+                render_seg=wanted["segmentation"],
+                use_textures=model.ntex > 0,
+                enabled_geom_groups=list(VISIBLE_GROUPS),
+                cam_active=list(cameras),
+                use_precomputed_rays="cam_fovy" not in fields,
+                enable_vertex_normals=model.nmesh > 0,
+                enable_emission=bool(model.mat_emission.any()),
+                enable_per_light_ambient=ambient,
+                enable_specular=specular,
+            )
+            self._labels = wp.array(self._label_of_geom, dtype=int)
+        self._numbers = {name: number for number, name in enumerate(cameras)}
+        self._due = torch.ones((d.nworld, len(cameras)), dtype=torch.bool, device=self._device)
+        self.draw(self.allocate(), dict.fromkeys(cameras))
+
+    def draw(self, out: Mapping[str, Tensor], masks: Masks) -> None:
+        """See `Cameras`."""
+        rc = self._context
+        whole = all(name in masks and masks[name] is None for name in self.cameras)
+        for name, number in self._numbers.items():
+            mask = masks.get(name)
+            if mask is None:
+                self._due[:, number] = name in masks
+            else:
+                self._due[:, number] = mask
+        due = wp.from_torch(self._due)
+        with torch_stream_scope(self._wp_device):
+            mjw.camlight(self._m, self._d)
+            if not whole:
+                wp.launch(
+                    send_away,
+                    dim=due.shape,
+                    inputs=[due, rc.cam_id_map, _AWAY],
+                    outputs=[self._d.cam_xpos, self._d.cam_xmat],
+                )
+            mjw.refit_bvh(self._m, self._d, rc)
+            mjw.render(self._m, self._d, rc)
+            for name in masks:
+                self._copy(out, name, due)
+
+    def close(self) -> None:
+        """See `Cameras`; the memory goes with the last reference."""
+
+    def _copy(self, out: Mapping[str, Tensor], name: str, due: wp.array) -> None:
+        """Copy what a camera has drawn into its buffers."""
+        rc = self._context
+        camera = self.cameras[name]
+        number = self._numbers[name]
+        copies = {
+            "rgb": (copy_rgb, [rc.rgb_data, rc.rgb_adr]),
+            "depth": (copy_depth, [rc.depth_data, rc.depth_adr]),
+            "segmentation": (copy_labels, [rc.seg_data, rc.seg_adr, self._labels]),
+        }
+        for output in camera.outputs:
+            kernel, inputs = copies[output]
+            image = out[f"{PREFIXES[output]}.{name}"]
+            wp.launch(
+                kernel,
+                dim=(self._nworld, *camera.size),
+                inputs=[due, number, *inputs],
+                outputs=[wp.from_torch(image)],
+            )
+
+
+@wp.kernel(enable_backward=False)
+def send_away(
+    due: wp.array2d[bool],
+    camera_of: wp.array[int],
+    height: float,
+    xpos: wp.array2d[wp.vec3],
+    xmat: wp.array2d[wp.mat33],
+) -> None:
+    """Put the cameras that draw nothing above everything, looking up."""
+    world, number = wp.tid()  # type: ignore[misc]
+    if not due[world, number]:
+        camera = camera_of[number]
+        xpos[world, camera] = wp.vec3(0.0, 0.0, height)
+        xmat[world, camera] = wp.mat33(1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
+
+
+@wp.kernel(enable_backward=False)
+def copy_rgb(
+    due: wp.array2d[bool],
+    number: int,
+    drawn: wp.array2d[wp.uint32],
+    first: wp.array[int],
+    out: wp.array4d[wp.uint8],
+) -> None:
+    """Red, green and blue of the worlds that are due, from words of alpha, red, green and blue."""
+    world, y, x = wp.tid()  # type: ignore[misc]
+    if due[world, number]:
+        word = drawn[world, first[number] + y * out.shape[2] + x]
+        out[world, y, x, 0] = wp.uint8(word >> wp.uint32(16))
+        out[world, y, x, 1] = wp.uint8(word >> wp.uint32(8))
+        out[world, y, x, 2] = wp.uint8(word)
+
+
+@wp.kernel(enable_backward=False)
+def copy_depth(
+    due: wp.array2d[bool],
+    number: int,
+    drawn: wp.array2d[float],
+    first: wp.array[int],
+    out: wp.array4d[float],
+) -> None:
+    """Depth of the worlds that are due."""
+    world, y, x = wp.tid()  # type: ignore[misc]
+    if due[world, number]:
+        out[world, y, x, 0] = drawn[world, first[number] + y * out.shape[2] + x]
+
+
+@wp.kernel(enable_backward=False)
+def copy_labels(
+    due: wp.array2d[bool],
+    number: int,
+    drawn: wp.array2d[wp.vec2i],
+    first: wp.array[int],
+    labels: wp.array[int],
+    out: wp.array3d[int],
+) -> None:
+    """Labels of the geoms that the worlds which are due show; -1 where there is none."""
+    world, y, x = wp.tid()  # type: ignore[misc]
+    if due[world, number]:
+        geom = drawn[world, first[number] + y * out.shape[2] + x][0]
+        if geom >= 0:
+            out[world, y, x] = labels[geom]
+        else:
+            out[world, y, x] = -1

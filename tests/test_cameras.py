@@ -1,0 +1,364 @@
+"""Cameras: images as observations on both backends, when they are drawn, and what cannot be."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from compositions import load_config, make_env
+from environments import has_gl
+from gymnasium.utils.env_checker import check_env
+
+from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
+from mjstack.adapters.rsl_rl import RslRlVecEnv
+from mjstack.envs import Env
+from mjstack.errors import ConfigError, MjstackError
+from mjstack.jobs import gates
+from mjstack.jobs.runner import check_job
+from mjstack.scene import build_model
+from mjstack.sim import cameras as sim_cameras
+
+CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+GL = pytest.mark.skipif(not has_gl(), reason="MuJoCo does not draw offscreen here")
+NATIVE = pytest.param("native", marks=GL)
+MJWARP_CUDA = pytest.param("mjwarp-cuda", marks=[pytest.mark.gpu, CUDA])
+ALL = ("rgb", "depth", "segmentation")
+Make = Callable[..., Env]
+
+
+def small(*names: str, outputs: tuple[str, ...] = ("rgb",), size: int = 32) -> list[str]:
+    """Overrides that turn on cameras with small images."""
+    return [
+        f"cameras=[{','.join(names)}]",
+        *(f"scene.cameras.{name}.size=[{size},{size}]" for name in names),
+        *(f"scene.cameras.{name}.outputs=[{','.join(outputs)}]" for name in names),
+    ]
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    made: list[Env] = []
+
+    def build(backend: str, *overrides: str, nworld: int = 2) -> Env:
+        engine = "native" if backend == "native" else "mjwarp"
+        device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
+        made.append(make_env([f"sim={engine}", *overrides], nworld=nworld, device=device))
+        return made[-1]
+
+    yield build
+    for env in made:
+        env.close()
+
+
+def still(env: Env) -> torch.Tensor:
+    return torch.zeros((env.nworld, env.action_manager.action_dim), device=env.device)
+
+
+def brightness(env: Env, key: str) -> list[float]:
+    return [float(image.float().mean()) for image in env.images[key]]
+
+
+# Images
+
+
+@GL
+@pytest.mark.parametrize("mjwarp", ["mjwarp", MJWARP_CUDA])
+def test_images_of_both_backends(make: Make, mjwarp: str) -> None:
+    overrides = ["reset=randomized", *small("front", "wrist", outputs=ALL)]
+    found = {}
+    for backend in ("native", mjwarp):
+        env = make(backend, *overrides)
+        first, _ = env.reset(seed=3)
+        assert set(env.images) == {
+            f"{prefix}.{camera}"
+            for prefix, camera in product(("images", "depth", "segmentation"), ("front", "wrist"))
+        }
+        obs, *_, extras = env.step(still(env))
+        assert set(first) == set(obs) == {"policy", "privileged", *env.images}
+        assert set(extras["final_obs"]) == {"policy", "privileged"}
+        found[backend] = {name: image.cpu() for name, image in env.images.items()}
+        labels = env.cameras.labels
+    for camera in ("front", "wrist"):
+        a, b = (
+            [images[f"{prefix}.{camera}"] for prefix in ("images", "depth", "segmentation")]
+            for images in found.values()
+        )
+        for (image, kind), other in zip(
+            zip(
+                a,
+                [
+                    ((2, 32, 32, 3), torch.uint8),
+                    ((2, 32, 32, 1), torch.float32),
+                    ((2, 32, 32), torch.int32),
+                ],
+                strict=True,
+            ),
+            b,
+            strict=True,
+        ):
+            assert (image.shape, image.dtype) == (other.shape, other.dtype) == kind
+        same = a[2] == b[2]
+        assert same.float().mean() > 0.99
+        assert (a[0].float() - b[0].float())[same].abs().mean() < 5.0
+        assert (a[1] - b[1])[same].abs().median() < 1e-4
+        assert not torch.equal(a[0][0], a[0][1])  # worlds differ
+        seen = {labels[number] for number in a[2].unique().tolist() if number >= 0}
+        assert {"red", "blue", "table"} <= seen if camera == "front" else {"table"} <= seen
+        for number in a[2].unique().tolist():
+            union = ((a[2] == number) | (b[2] == number)).sum()
+            assert union < 60 or ((a[2] == number) & (b[2] == number)).sum() > 0.9 * union
+    # The red cube is red, in rgb order.
+    image = found["native"]["images.front"]
+    red = image[found["native"]["segmentation.front"] == labels.index("red")].float().mean(0)
+    assert (red[0] > 2.0 * red[1:]).all()
+
+
+def test_without_cameras_nothing_is_drawn_or_kept() -> None:
+    off = load_config()
+    on = load_config(["cameras=[front,wrist]"])
+    model = build_model(off)
+    assert [model.camera(number).name for number in range(model.ncam)] == ["wrist_cam"]  # its own
+    assert model.nlight == 0
+    assert model.ngeom < build_model(on).ngeom
+    assert off.scene.cameras == {}
+
+
+@pytest.mark.parametrize("robot", ["so101", pytest.param("rebot", marks=pytest.mark.full)])
+@pytest.mark.parametrize("backend", ["native", pytest.param("mjwarp", marks=pytest.mark.full)])
+def test_physics_is_the_same_to_the_bit(make: Make, robot: str, backend: str) -> None:
+    ends = []
+    for cameras in ([], small("wrist", size=4)):
+        env = make(backend, f"robot={robot}", "reset=randomized", *cameras)
+        sim = env.sim
+        env.reset_manager.reset(torch.ones(2, dtype=torch.bool))
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(5):
+            noise = torch.rand(sim.ctrl.shape, generator=generator, dtype=sim.ctrl.dtype)
+            sim.ctrl.add_(0.2 * noise - 0.1)
+            sim.step(10)
+        ends.append((sim.qpos.clone(), sim.qvel.clone(), sim.contact_count.clone()))
+    for a, b in zip(*ends, strict=True):
+        assert torch.equal(a, b)
+    assert ends[0][2].any()
+
+
+# When they are drawn
+
+
+@pytest.mark.parametrize("backend", [NATIVE, pytest.param("mjwarp", marks=pytest.mark.full)])
+def test_a_slow_camera_is_drawn_every_few_steps_and_at_resets(make: Make, backend: str) -> None:
+    env = make(
+        backend,
+        "termination.time_out.params.steps=7",
+        "scene.cameras.front.rate=10.0",
+        "scene.cameras.top.terminal=true",
+        *small("front", "top", size=8),
+    )
+    env.reset(seed=0)
+    env.episode_step[1] = 4  # worlds are at different steps
+    drawn = []
+    ends = []
+    for _ in range(8):
+        for image in env.images.values():
+            image.fill_(7)
+        obs, _, _, truncated, extras = env.step(still(env))
+        assert obs["images.front"] is env.images["images.front"]
+        assert all(value != 7.0 for value in brightness(env, "images.top"))
+        drawn.append([value != 7.0 for value in brightness(env, "images.front")])
+        final = extras["final_obs"]
+        assert set(final) == {"policy", "privileged", "images.top"}
+        ends.append([bool(image.any()) for image in final["images.top"]])
+        assert [*truncated] == [env.episode_step[world] == 0 for world in (0, 1)]
+    # World 0: steps 5 and 0 (reset in the 7th); world 1: 5, 0, and 5 again.
+    assert [step for step, (one, _) in enumerate(drawn, 1) if one] == [5, 7]
+    assert [step for step, (_, two) in enumerate(drawn, 1) if two] == [1, 3, 8]
+    assert [any(row) for row in ends] == [False, False, *[True] * 6]
+    assert [row[0] for row in ends] == [False] * 6 + [True] * 2
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("backend", [NATIVE, "mjwarp", MJWARP_CUDA])
+def test_a_masked_reset_draws_its_worlds_alone(make: Make, backend: str) -> None:
+    env = make(backend, *small("front", "wrist", outputs=ALL, size=8), nworld=3)
+    env.reset(seed=0)
+    whole = {name: image.clone() for name, image in env.images.items()}
+    for image in env.images.values():
+        image.fill_(7)
+    env.reset(seed=None, mask=torch.tensor([False, True, False], device=env.device))
+    for name, image in env.images.items():
+        assert (image[::2] == 7).all(), name
+        assert not (image[1] == 7).all(), name
+    env.reset(seed=0)
+    for name, image in env.images.items():
+        assert torch.equal(image, whole[name]), name
+
+
+@pytest.mark.full
+def test_a_policy_that_decides_seldom_gets_an_image_per_decision(make: Make) -> None:
+    env = make(
+        "mjwarp",
+        "timing.policy_decimation=2",
+        "scene.cameras.wrist.rate=10.0",
+        *small("front", "wrist", size=8),
+    )
+    env.reset(seed=0)
+    drawn = []
+    for _ in range(5):
+        for image in env.images.values():
+            image.fill_(7)
+        env.step(still(env))
+        drawn.append([brightness(env, f"images.{name}")[0] != 7.0 for name in ("front", "wrist")])
+    # Every 5 steps, so after 5 (seen at 6) and 10 steps.
+    assert drawn == [[True, False], [True, False], [True, True], [True, False], [True, True]]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("backend", ["mjwarp", MJWARP_CUDA])
+def test_a_diverged_world_harms_no_other(make: Make, backend: str) -> None:
+    env = make(backend, *small("front"), nworld=3)
+    env.reset(seed=0)
+    whole = env.images["images.front"].clone()
+    env.sim.qpos[1] = math.nan
+    env.sim.kinematics()
+    env._draws.draw_started(None)
+    assert torch.equal(env.images["images.front"][::2], whole[::2])
+
+
+@pytest.mark.gpu
+@CUDA
+def test_replayed_steps_draw_what_eager_steps_draw(make: Make) -> None:
+    ends = []
+    for graph in ("off", "require"):
+        env = make(
+            "mjwarp-cuda",
+            f"graph={graph}",
+            "termination.time_out.params.steps=4",
+            "scene.cameras.wrist.rate=25.0",
+            *small("front", "wrist", outputs=ALL),
+            nworld=64,
+        )
+        env.reset(seed=0)
+        for _ in range(9):
+            env.step(still(env))
+        ends.append({name: image.clone() for name, image in env.images.items()})
+        assert env.graph.captured == (graph == "require")
+    for name, image in ends[0].items():
+        assert (image == ends[1][name]).float().mean() > 0.99, name
+
+
+# Adapters
+
+
+@GL
+@pytest.mark.full
+def test_gymnasium_gets_images_and_keeps_them(make: Make) -> None:
+    terminal = "scene.cameras.front.terminal=true"
+    overrides = ["task.episode_steps=3", *small("front", outputs=ALL, size=8)]
+    with pytest.raises(ConfigError, match=r"scene.cameras.front.terminal=false: expected true"):
+        GymnasiumVectorEnv(make("native", *overrides), group=None)
+    check_env(GymnasiumEnv(make("native", *overrides, terminal, nworld=1), group=None))
+    env = GymnasiumVectorEnv(make("native", *overrides, terminal), group=None)
+    first, _ = env.reset(seed=0)
+    kept = first["images.front"].copy()
+    for _ in range(3):
+        assert first in env.observation_space
+        obs, *_, infos = env.step(env.action_space.sample())
+    assert np.array_equal(first["images.front"], kept)
+    assert obs in env.observation_space
+    assert infos["final_obs"][1] in env.single_observation_space
+    assert infos["final_obs"][1]["images.front"].any()
+
+
+@pytest.mark.full
+def test_rsl_rl_gets_images_and_keeps_them(make: Make) -> None:
+    env = RslRlVecEnv(make("mjwarp", *small("wrist", size=16)))
+    first = env.get_observations()
+    kept = first["images.wrist"].clone()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(3):
+        action = torch.rand((2, env.num_actions), generator=generator)
+        after, *_ = env.step(action)
+    assert torch.equal(first["images.wrist"], kept)
+    assert not torch.equal(after["images.wrist"], kept)
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ("scene.cameras.front.size=[0,64]", "2 integers from 1 to 4096 [pixels]"),
+        ("scene.cameras.front.size=[64]", "2 integers from 1 to 4096 [pixels]"),
+        ("scene.cameras.front.fovy=0", "a number from 1 to 170 [deg]"),
+        ("scene.cameras.front.rate=30", "50 Hz over an integer"),
+        ("scene.cameras.front.rate=100", "50 Hz over an integer"),
+        ("scene.cameras.front.outputs=[]", "some of rgb, depth, segmentation, each once"),
+        ("scene.cameras.front.outputs=[rgb,rgb]", "some of rgb, depth, segmentation, each once"),
+        ("scene.cameras.front.outputs=[heat]", "some of rgb, depth, segmentation"),
+        ("scene.cameras.front.pose.target=[0.55,0,0.42]", "a point away from pos"),
+        ("scene.cameras.front.pose.up=[-0.57,0,-0.38]", "a direction across that"),
+        ("scene.cameras.front.pose.mount=lid", "body 'lid' does not exist."),
+        ("robot.wrist_camera=null", "scene.cameras.wrist.pose=null: expected a pose"),
+        ("robot.wrist_camera.mount=lid", "scene.cameras.wrist.pose.mount: body 'lid'"),
+    ],
+)
+def test_a_bad_value_is_one_line(overrides: str, message: str) -> None:
+    with pytest.raises(MjstackError) as caught:
+        build_model(load_config(["cameras=[front,wrist]", overrides]))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_camera_is_one_line() -> None:
+    with pytest.raises(MjstackError, match=r"'side' does not exist\. Available: front, top, wrist"):
+        load_config(["cameras=side"])
+
+
+@pytest.mark.parametrize("backend", ["native", "mjwarp"])
+def test_images_that_do_not_fit_into_memory_are_one_line(
+    backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sim_cameras, "free_memory", lambda device: 10**9)
+    monkeypatch.setattr(gates, "require_offscreen", lambda model: None)
+    config = [f"sim={backend}", "gates=[baseline]", "cameras=front"]
+    check_job(load_config([*config, "nworld=1000"]))
+    with pytest.raises(ConfigError) as caught:
+        check_job(load_config([*config, "nworld=100000", "scene.cameras.front.size=[64,64]"]))
+    assert str(caught.value) == (
+        "scene.cameras=front 64x64: expected images that fit into the memory of cpu, where 100000"
+        f" worlds need {'1.14' if backend == 'native' else '3.95'} GiB and 0.931 GiB are free."
+        " Lower nworld, or the cameras' size."
+    )
+
+
+def run(*overrides: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "mjstack", *overrides]
+    return subprocess.run(
+        command, capture_output=True, text=True, env=os.environ | environment, check=False
+    )
+
+
+@pytest.mark.full
+def test_a_headless_machine_is_one_line_and_nothing_is_written(tmp_path: Any) -> None:
+    folder = tmp_path / "out"
+    done = run(
+        "sim=native",
+        "cameras=front",
+        "gates=[baseline]",
+        f"hydra.run.dir={folder}",
+        MUJOCO_GL="disable",
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "offscreen rendering fails (MUJOCO_GL=disable" in done.stderr
+    assert "expected OpenGL by EGL or OSMesa" in done.stderr
+    assert not folder.exists()
