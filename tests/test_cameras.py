@@ -8,21 +8,28 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from compositions import load_config, make_env
-from environments import has_gl
+from environments import at_double_speed, has_gl
 from gymnasium.utils.env_checker import check_env
 
 from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
 from mjstack.adapters.rsl_rl import RslRlVecEnv
 from mjstack.envs import Env
-from mjstack.errors import ConfigError, MjstackError
+from mjstack.episodes.context import RunContext
+from mjstack.errors import ConfigError, MjstackError, RunError
+from mjstack.gates.capacity import run_capacity
+from mjstack.gates.images import agree, compare_images
+from mjstack.gates.parity import run_parity
+from mjstack.gates.throughput import run_throughput
 from mjstack.jobs import gates
 from mjstack.jobs.runner import check_job
+from mjstack.report.record import GateResult, Status
 from mjstack.scene import build_model
 from mjstack.sim import cameras as sim_cameras
 
@@ -252,6 +259,129 @@ def test_replayed_steps_draw_what_eager_steps_draw(make: Make) -> None:
         assert env.graph.captured == (graph == "require")
     for name, image in ends[0].items():
         assert (image == ends[1][name]).float().mean() > 0.99, name
+
+
+# Gates
+
+
+def painted(offset: int, color: int) -> dict[str, np.ndarray]:
+    """Two images of a 20 x 20 thing on another, at an offset and of a colour."""
+    things = np.zeros((2, 64, 64), np.int32)
+    things[:, 20:40, 20 + offset : 40 + offset] = 1
+    colors = np.where(things[..., None] == 1, color, 50).repeat(3, -1).astype(np.uint8)
+    return {
+        "images.c": colors,
+        "depth.c": things[..., None].astype(np.float32),
+        "segmentation.c": things,
+    }
+
+
+def test_agreement_of_images() -> None:
+    labels = ["floor", "cube"]
+    same = agree("c", painted(0, 200), painted(0, 200), labels, 100)
+    assert (same.same, same.iou, same.color, same.depth) == (
+        1.0,
+        {"floor": 1.0, "cube": 1.0},
+        0.0,
+        0.0,
+    )
+    moved = agree("c", painted(0, 200), painted(1, 200), labels, 100)
+    assert moved.iou["cube"] == pytest.approx(19 / 21)
+    assert moved.color == 0.0  # where both show the same thing
+    assert moved.same == pytest.approx(1 - 40 / 4096)
+    darker = agree("c", painted(0, 200), painted(0, 190), labels, 100)
+    assert darker.color == pytest.approx(10 * 400 / 4096)
+    assert agree("c", painted(0, 200), painted(1, 200), labels, 801).iou.keys() == {"floor"}
+    other = painted(0, 200)
+    other["segmentation.c"] = other["segmentation.c"] + 2
+    assert agree("c", painted(0, 200), other, labels, 100).color == np.inf
+
+
+@GL
+@pytest.mark.full
+@pytest.mark.parametrize("robot", ["so101", "rebot"])
+def test_parity_compares_images_here_and_elsewhere(robot: str, tmp_path: Path) -> None:
+    overrides = [
+        f"robot={robot}",
+        "gates=[parity]",
+        "sim=mjwarp",
+        "sim.device=cpu",
+        *at_double_speed(robot),
+        *small("front", "top", "wrist", size=128),
+    ]
+    (result,) = run_parity(RunContext(load_config(overrides), folder=tmp_path))
+    assert result.status is Status.passed
+    assert result.metrics["images.front.iou.red"] > 0.99
+    assert 0.0 < result.metrics["images.wrist.color_of_255"] < 3.0
+    assert (tmp_path / "parity_images.png").stat().st_size > 10_000
+    # The same file on another machine, and one that shows something else
+    file = tmp_path / "parity_images.npz"
+    cfg = load_config([*overrides, *cfg_images(file)])
+    again = RunContext(cfg)
+    apart = GateResult(name="parity", status=Status.passed)
+    assert compare_images(again, apart) == []
+    for name in ("images.front.iou.red", "images.wrist.color_of_255"):
+        assert apart.metrics[name] == result.metrics[name]
+    with np.load(file) as saved:
+        arrays = dict(saved)
+    arrays["images.top"] += 20
+    arrays["segmentation.front"] = np.roll(arrays["segmentation.front"], 3, axis=2)
+    np.savez(file, **arrays)
+    problems = compare_images(again, GateResult(name="parity", status=Status.passed))
+    assert any(problem.startswith("camera front: IoU of red is 0.") for problem in problems)
+    assert any(problem.startswith("camera top: colours differ by") for problem in problems)
+    # Files that cannot be compared are one line, before anything is written.
+    with pytest.raises(RunError, match=r"was drawn with cameras=\['front', 'top', 'wrist'\]"):
+        check_job(load_config([*overrides[:4], *small("front"), *cfg_images(file)]))
+    with pytest.raises(
+        RunError, match=r"scene.cameras.front.size=\[128, 128\], expected \[64, 64\]"
+    ):
+        check_job(load_config([*overrides, *cfg_images(file), "scene.cameras.front.size=[64,64]"]))
+    file.write_bytes(b"nothing")
+    with pytest.raises(RunError, match=r"parity_images\.npz: cannot be read"):
+        check_job(load_config([*overrides, *cfg_images(file)]))
+
+
+def cfg_images(file: Path) -> list[str]:
+    return [f"gate.parity.images={file}"]
+
+
+def test_parity_images_without_cameras_are_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"gate\.parity\.images=x\.npz: expected null, because there"
+    ):
+        load_config(["gate.parity.images=x.npz"])
+
+
+@GL
+@pytest.mark.full
+def test_throughput_and_capacity_count_images() -> None:
+    overrides = [
+        "gates=[capacity,throughput]",
+        "sim=native",
+        "nworld=4",
+        "gate.throughput.measurements=[env_step,cameras]",
+        "gate.throughput.repetitions=2",
+        "gate.throughput.env_steps=3",
+        "gate.throughput.action_share=0.1",
+        "gate.capacity.random_steps=3",
+        *at_double_speed(),
+        *small("front", "wrist", size=16),
+    ]
+    context = RunContext(load_config(overrides))
+    result = run_throughput(context)[0]
+    assert result.status is Status.passed
+    m = result.metrics
+    images_s = m["cameras.images_per_s.median"]
+    images_ms = m["cameras.images_ms_per_step.median"]
+    assert images_s == pytest.approx(4 * 2 * 1e3 / images_ms, rel=0.5)
+    assert m["cameras.ms_per_env_step.median"] > m["cameras.images_ms_per_step.min"]
+    assert m["env_step.env_steps_per_s.median"] > m["cameras.env_steps_per_s.median"]
+    assert "env_step.images_per_s.median" not in m
+    size = 4 * 2 * 16 * 16 * 3 / 1e6
+    assert m["cameras.images_mb"] == pytest.approx(size)
+    (capacity,) = run_capacity(context)
+    assert capacity.metrics["memory.images_mb"] == pytest.approx(size)
 
 
 # Adapters

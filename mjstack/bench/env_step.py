@@ -13,6 +13,8 @@ The managers alone work on worlds that stand still, which end for other reasons,
 work that the whole step may run beside other work. Hence both ratios, and the residual when both
 parts are subtracted from the whole: where it is far from 0, the repetitions differed by more than
 the managers.
+
+With cameras, the images of all worlds and cameras are timed too, however slow a camera is.
 """
 
 from functools import partial
@@ -33,6 +35,7 @@ from mjstack.config.functions import offered
 from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
 from mjstack.episodes.rollout import State, restore, snapshot
+from mjstack.sim.cameras import image_bytes
 
 _COST = 4.0  # of a repetition over that of its whole steps from the start, when fewer things touch
 
@@ -45,8 +48,10 @@ def measure_env_step(
     seconds: float | None = None,
     meter: EnergyMeter = NO_METER,
     advance: Advance | None = None,
+    share: float = 1.0,
+    name: str = "env_step",
 ) -> Measurement:
-    """Play random actions, uniform over their whole range, in interleaved repetitions.
+    """Play random actions in interleaved repetitions.
 
     Args:
         env: The environment.
@@ -55,23 +60,27 @@ def measure_env_step(
         seconds: Shortens the repetitions so that all of them take about this long [s].
         meter: Measures the energy of the whole steps.
         advance: Told about progress.
+        share: Share of the action range from which actions are drawn evenly, about its middle.
+        name: The measurement's name.
 
     Returns:
         Samples of the whole step (``ms_per_env_step``), its physics and its managers.
-        ``managers_over_physics`` is the whole's time over that of physics, less 1.
+        ``managers_over_physics`` is the whole's time over that of physics, less 1. With cameras,
+        also the time and the rate of their images, which the whole step has in it, and the bytes of
+        all images.
 
     Raises:
         FaultError: Physics was lost.
     """
     sim = env.sim
     decimation = env.cfg.timing.decimation
-    parts = _Parts(env)
+    parts = _Parts(env, share)
     step_seconds = parts.warm_up()
     if seconds is not None:
         steps = steps_that_fit(steps, seconds, _COST * (repetitions + 1) * step_seconds)
 
     # The repetitions
-    times: list[tuple[float, float, float]] = []
+    times: list[tuple[float, float, float, float]] = []
     ended = 0.0
     start = snapshot(sim)
     for repetition in range(repetitions + 1):
@@ -82,24 +91,40 @@ def measure_env_step(
         ended += episodes
         times.append(spent)
         if advance is not None:
-            advance("env.step, repetitions", repetition, repetitions)
+            advance(f"{name}, repetitions", repetition, repetitions)
 
     # The result
-    out = Measurement(name="env_step")
-    whole = [env_seconds for env_seconds, _, _ in times]
+    out = Measurement(name=name)
+    whole = [env_seconds for env_seconds, *_ in times]
     graph = env.graph if parts.on_cuda else sim.graph_of(decimation, kinematics=True)
     captured = env.graph.captured and parts.captured
     out.add_repetitions(sim, env.cfg, whole, steps, meter, graph, captured=captured)
     ms = 1e3 / steps
     out.samples |= {
-        "physics_ms_per_step": [ms * p for _, p, _ in times],
-        "managers_ms_per_step": [ms * m for _, _, m in times],
-        "managers_over_physics": [e / p - 1.0 for e, p, _ in times],
-        "managers_alone_over_physics": [m / p for _, p, m in times],
-        "residual_ms_per_step": [ms * (e - p - m) for e, p, m in times],
+        "physics_ms_per_step": [ms * p for _, p, _, _ in times],
+        "managers_ms_per_step": [ms * m for _, _, m, _ in times],
+        "managers_alone_over_physics": [m / p for _, p, m, _ in times],
+        "residual_ms_per_step": [ms * (e - p - m - i) for e, p, m, i in times],
     }
     out.facts["episodes_ended"] = int(ended)
     out.problem = describe_lost(parts.lost) or parts.problem or out.problem
+    cameras = env.cfg.scene.cameras
+    if cameras:
+        images = len(cameras) * env.nworld * steps
+        out.samples |= {
+            "images_ms_per_step": [ms * i for _, _, _, i in times],
+            "images_per_s": [images / i for _, _, _, i in times],
+            "images_over_physics": [i / p for _, p, _, i in times],
+        }
+        mjwarp = sim.backend == "mjwarp"
+        size = image_bytes(sim.model, cameras, env.nworld, mjwarp=mjwarp)
+        out.facts["images_mb"] = size / 1e6
+        out.headline = (
+            f"{out.median('env_steps_per_s'):,.0f} env-steps/s with images,"
+            f" {out.median('images_per_s'):,.0f} images/s"
+        )
+        return out
+    out.samples["managers_over_physics"] = [e / p - 1.0 for e, p, *_ in times]
     out.headline = (
         f"{out.median('env_steps_per_s'):,.0f} env-steps/s, managers"
         f" {100.0 * out.median('managers_over_physics'):+.1f} % (alone"
@@ -116,13 +141,14 @@ class _Parts:
         problem: The terminations by which physics was lost in the whole steps; empty where none.
     """
 
-    def __init__(self, env: Env) -> None:
+    def __init__(self, env: Env, share: float) -> None:
         """Prepare random actions, with a generator that no one else uses."""
         manager = env.action_manager
         self._env = env
         self._generator = torch.Generator().manual_seed(0)
-        self._low = manager.low.float().cpu()
-        self._span = manager.high.float().cpu() - self._low
+        low = manager.low.float().cpu()
+        self._span = share * (manager.high.float().cpu() - low)
+        self._low = 0.5 * (low + manager.high.float().cpu() - self._span)
         self.on_cuda = env.device.type == "cuda"
         self.lost = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
         self.problem = ""
@@ -130,7 +156,8 @@ class _Parts:
     @property
     def captured(self) -> bool:
         """Whether physics and managers were replayed."""
-        return all(half.captured for half in self._halves)
+        used = self._parts if self._env.images else self._parts[:2]
+        return all(part.captured for part in used)
 
     def warm_up(self) -> float:
         """Start worlds at random ages, compile and capture; return the seconds of a step."""
@@ -139,21 +166,21 @@ class _Parts:
         ages = torch.randint(env.max_episode_steps, (env.nworld,), generator=self._generator)
         env.episode_step.copy_(ages)
         seconds = [timed(env.sim, partial(env.step, action)) for action in self._actions(WARM_UP)]
-        self._halves = env.halves()
+        self._parts = env.parts()
         if self.on_cuda:  # a repetition may be too short to warm them up
-            for half in self._halves:
+            for part in self._parts:
                 for _ in range(WARM_UP):
-                    half()
+                    part()
         return seconds[-1]
 
     def play(
         self, start: State, steps: int, meter: EnergyMeter
-    ) -> tuple[State, tuple[float, float, float], float]:
+    ) -> tuple[State, tuple[float, float, float, float], float]:
         """Play one repetition.
 
         Returns:
-            The state after the whole steps; seconds of env, physics and managers; and the number
-            of episodes that ended.
+            The state after the whole steps; seconds of env, physics, managers and images; and the
+            number of episodes that ended.
         """
         env = self._env
         sim = env.sim
@@ -181,7 +208,8 @@ class _Parts:
         managers = timed(sim, lambda: self._managers(actions))
         env.raise_faults()
         self._set_ages(*later_ages)
-        return end, (whole, physics, managers), counted["episodes"]
+        images = timed(sim, lambda: self._images(steps)) if env.images else 0.0
+        return end, (whole, physics, managers, images), counted["episodes"]
 
     def _actions(self, count: int) -> list[torch.Tensor]:
         shape = (count, self._env.nworld, len(self._span))
@@ -197,12 +225,16 @@ class _Parts:
     def _physics(self, targets: list[torch.Tensor]) -> None:
         for target in targets:
             self._env.sim.ctrl.copy_(target)
-            self._halves[0]()
+            self._parts[0]()
 
     def _managers(self, actions: list[torch.Tensor]) -> None:
         for action in actions:
             self._env.action_manager.process(action)
-            self._halves[1]()
+            self._parts[1]()
+
+    def _images(self, steps: int) -> None:
+        for _ in range(steps):
+            self._parts[2]()
 
     def _ages(self) -> tuple[torch.Tensor, torch.Tensor]:
         return self._env.episode_step.clone(), self._env.episode.clone()

@@ -240,6 +240,9 @@ def _gates(cfg: Config) -> None:
         wrong = set(getattr(gate.parity, name)) != set(PARITY_FIELDS)
         expected = f"a number for each of {', '.join(PARITY_FIELDS)}"
         _refuse(wrong, cfg, f"gate.parity.{name}", expected)
+    wrong = gate.parity.images is not None and not cfg.scene.cameras
+    expected = "null, because there are no cameras. Set cameras to those of that run"
+    _refuse(wrong, cfg, "gate.parity.images", expected)
     from_file = reads_starts_file(cfg.reset)
     expected = "1, because with reset=starts_file worlds start alike under every seed"
     _refuse(from_file and gate.success.seeds > 1, cfg, "gate.success.seeds", expected)

@@ -11,6 +11,7 @@ import torch
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.envs.buffers import probe_env_sizes
+from mjstack.envs.camera_schedule import without_cameras
 from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError
 from mjstack.managers.episode import required_fields
@@ -95,11 +96,6 @@ def decided_every_step(cfg: Config) -> Config:
     the rate of a policy is.
     """
     return replace(cfg, timing=replace(cfg.timing, policy_decimation=1))
-
-
-def without_cameras(cfg: Config) -> Config:
-    """The configuration of an environment that draws nothing, in the scene of one that does."""
-    return replace(cfg, scene=replace(cfg.scene, cameras={}))
 
 
 def driven_config(cfg: Config, reset: dict[str, TermCfg] | None = None) -> Config:

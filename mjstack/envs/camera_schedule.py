@@ -1,10 +1,11 @@
 """When the cameras of an environment are drawn, and into which buffers."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from torch import Tensor
 
-from mjstack.config.schema import CameraCfg
+from mjstack.config.schema import CameraCfg, Config
 from mjstack.managers.view import EnvView
 from mjstack.sim.cameras import Cameras, Masks
 
@@ -68,3 +69,8 @@ class CameraSchedule:
     def _draw(self, out: Mapping[str, Tensor], masks: Masks) -> None:
         if self.cameras is not None and masks:
             self.cameras.draw(out, masks)
+
+
+def without_cameras(cfg: Config) -> Config:
+    """The configuration of an environment that draws nothing, in the scene of one that does."""
+    return replace(cfg, scene=replace(cfg.scene, cameras={}))

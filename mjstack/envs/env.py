@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import torch
@@ -263,9 +264,9 @@ class Env:
         """Have every graph captured anew, after a change of something that a graph has baked in."""
         self._version += 1
 
-    def halves(self) -> tuple[StepGraph, StepGraph]:
-        """The physics of a control step, and everything else of it: two graphs, for measurements.
-        They act on the action that was processed last.
+    def parts(self) -> tuple[StepGraph, StepGraph, StepGraph]:
+        """The physics of a control step, the managers, and the images of all cameras: three graphs,
+        for measurements. The first two act on the action that was processed last.
         """
 
         def managers() -> None:
@@ -273,7 +274,8 @@ class Env:
             self._evaluate()
 
         physics = self.captured(self._step_physics, "the physics")
-        return physics, self.captured(managers, "the managers")
+        images = self.captured(partial(self._draws.draw_started, None), "the images")
+        return physics, self.captured(managers, "the managers"), images
 
     def read_statistics(self) -> dict[str, float]:
         """Means over the episodes that ended since the last call; see `EpisodeStatistics.read`.

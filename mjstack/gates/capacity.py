@@ -9,7 +9,7 @@ from functools import partial, reduce
 
 import numpy as np
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import Backend, Config
 from mjstack.envs.buffers import (
     Peaks,
     Workload,
@@ -24,6 +24,7 @@ from mjstack.episodes.rollout import FEEDBACK
 from mjstack.errors import Unreachable, name_worlds
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, resolve_sizes
+from mjstack.sim.cameras import image_bytes
 from mjstack.sim.sizes import apply_configured, resolve_env_sizes
 
 
@@ -108,6 +109,15 @@ def run_capacity(context: RunContext) -> list[GateResult]:
     result.notes |= {"backend": task_run.description, "sizes_from": task.sizes.source}
     for group in (task, env):
         _report(context, group, result)
+    cameras = cfg.scene.cameras
+    if cameras:
+        mjwarp = context.backend[0] is Backend.mjwarp
+        size = image_bytes(context.model, cameras, cfg.nworld, mjwarp=mjwarp)
+        result.metrics["memory.images_mb"] = size / 1e6
+        result.details.append(
+            f"environments: images of {', '.join(cameras)} take {size / 1e6:,.0f} MB in"
+            f" {cfg.nworld} worlds, beside the buffers"
+        )
     if task_run.sizes is None:
         result.notes["rerun"] = "sizes were not tried: native MuJoCo has no fixed buffers"
     elif task.lost or env.lost:

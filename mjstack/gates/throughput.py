@@ -13,9 +13,11 @@ from mjstack.bench.episode import measure_episode
 from mjstack.bench.physics import measure_physics
 from mjstack.bench.timing import EnergyMeter, Measurement
 from mjstack.config.schema import Backend
-from mjstack.envs import build_env, decided_every_step
+from mjstack.envs import build_env, decided_every_step, without_cameras
 from mjstack.episodes.context import RunContext, lacks_episode
+from mjstack.errors import MjstackError
 from mjstack.gates.runner import log_error
+from mjstack.report.gl import require_offscreen
 from mjstack.report.record import GateResult, Status
 
 CUDA = "throughput_cuda"
@@ -70,6 +72,10 @@ def _measure(context: RunContext, name: str, backend: Backend, device: str) -> G
     if "env_step" in t.measurements:
         found["env_step"] = _guarded(
             "env_step", _on_environment, context, backend, device, result, limits
+        )
+    if "cameras" in t.measurements and cfg.scene.cameras and _draws(context, backend, found):
+        found["cameras"] = _guarded(
+            "cameras", _on_environment, context, backend, device, result, limits, cameras=True
         )
     if not on_cuda:
         result.notes["gpu_power_and_memory"] = "not measured: no GPU"
@@ -154,12 +160,15 @@ def _on_environment(
     device: str,
     result: GateResult,
     limits: dict[str, Any],
+    *,
+    cameras: bool = False,
 ) -> Measurement:
-    """Measurement *env_step*, on an environment with room for random actions."""
+    """Measurement *env_step* or *cameras*, on an environment with room for random actions."""
     gc.collect()
     began = time.perf_counter()
+    cfg = decided_every_step(context.cfg)
     env = build_env(
-        decided_every_step(context.cfg),
+        cfg if cameras else without_cameras(cfg),
         model=context.model,
         backend=backend,
         device=device,
@@ -169,7 +178,12 @@ def _on_environment(
     result.notes.setdefault("backend", env.sim.description)
     try:
         found = measure_env_step(
-            env, steps=context.cfg.gate.throughput.env_steps, **limits, advance=context.advance
+            env,
+            steps=cfg.gate.throughput.env_steps,
+            **limits,
+            advance=context.advance,
+            share=cfg.gate.throughput.action_share,
+            name="cameras" if cameras else "env_step",
         )
         found.facts["build_and_compile_s"] = build_seconds
         if env.sim.sizes is not None:
@@ -177,6 +191,17 @@ def _on_environment(
         return found
     finally:
         env.close()
+
+
+def _draws(context: RunContext, backend: Backend, found: dict[str, Measurement]) -> bool:
+    """Whether a backend can draw here; if not, *cameras* is missing."""
+    if backend is Backend.native:
+        try:
+            require_offscreen(context.model)
+        except MjstackError as error:
+            found["cameras"] = Measurement(name="cameras", missing=str(error).rstrip("."))
+            return False
+    return True
 
 
 def _guarded(

@@ -14,6 +14,7 @@ from mjstack.episodes.context import RunContext
 from mjstack.episodes.earlier_run import archive_starts
 from mjstack.episodes.rollout import CLOSED_LOOP, POLICY, STATE_BASED
 from mjstack.errors import ConfigError, KeyedError, Unreachable
+from mjstack.gates.images import load_images
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
 from mjstack.jobs.runner import CheckedJob, Job, check_showing
@@ -41,6 +42,9 @@ def check_machine(cfg: Config) -> RunContext:
         expected = "gates with baseline or parity, whose world is shown"
         raise ConfigError(key, "true", expected, "Add one of them to gates")
     check_showing(cfg)
+    if "parity" in cfg.gates and cfg.gate.parity.images is not None:
+        load_images(cfg)
+        require_offscreen(context.model)
     _check_starts(context)
     if context.backend[0] is Backend.native and {"batch", "success", "throughput"} & set(cfg.gates):
         _check_memory(context)

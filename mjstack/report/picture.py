@@ -171,6 +171,27 @@ def save_trajectories(
         height.legend(frameon=False)
 
 
+def save_images(
+    path: Path, rows: Mapping[str, Sequence[np.ndarray]], columns: Sequence[str]
+) -> None:
+    """Save images, each of shape ``(height, width, 3)``, uint8, in named rows and columns."""
+    size = (2.6 * len(columns), 2.6 * len(rows))
+    drawn, axes = plt.subplots(
+        len(rows), len(columns), layout="constrained", figsize=size, squeeze=False
+    )
+    try:
+        for line, (name, images) in zip(axes, rows.items(), strict=True):
+            line[0].set_ylabel(name)
+            for axis, image in zip(line, images, strict=True):
+                axis.imshow(image)
+                axis.set(xticks=[], yticks=[])
+        for axis, name in zip(axes[0], columns, strict=True):
+            axis.set_title(name)
+        drawn.savefig(path, dpi=100)
+    finally:
+        plt.close(drawn)
+
+
 def save_curves(
     path: Path,
     at: Sequence[float],

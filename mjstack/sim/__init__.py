@@ -1,6 +1,6 @@
 """Physics backends behind one protocol."""
 
-from mjstack.sim.build import make_simulation, resolve_backend, resolve_device
+from mjstack.sim.build import draw_states, make_simulation, resolve_backend, resolve_device
 from mjstack.sim.simulation import (
     LOST_PHYSICS,
     Overflow,
@@ -17,6 +17,7 @@ __all__ = [
     "Simulation",
     "SolverLimit",
     "describe_overflow",
+    "draw_states",
     "make_simulation",
     "resolve_backend",
     "resolve_device",

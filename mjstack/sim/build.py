@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -96,6 +96,49 @@ def make_simulation(
         fields=fields,
         step=cfg.sim.step,
     )
+
+
+def draw_states(
+    model: mujoco.MjModel,
+    cfg: Config,
+    qpos: torch.Tensor,
+    *,
+    backend: Backend | None = None,
+    device: str | None = None,
+    fields: Mapping[str, torch.Tensor] | None = None,
+) -> tuple[dict[str, torch.Tensor], list[str]]:
+    """Images of states, each in a world for itself: a picture depends on nothing else.
+
+    Args:
+        model: The compiled model.
+        cfg: The configuration, with its cameras.
+        qpos: The states, shape ``(n, nq)``.
+        backend: Overrides the configured backend.
+        device: Overrides the configured device.
+        fields: Model fields of each state by name, each ``(n, ...)``.
+
+    Returns:
+        Images by output and camera as of `Cameras.allocate`, and the names of the things in their
+        segmentation.
+
+    Raises:
+        MjstackError: They do not fit into memory, or this machine cannot draw.
+    """
+    fields = fields or {}
+    sim = make_simulation(
+        model, cfg, len(qpos), backend=backend, device=device, fields=tuple(fields)
+    )
+    sim.qpos.copy_(qpos)
+    for name, values in fields.items():
+        sim.fields[name].copy_(values)
+    sim.kinematics()
+    cameras = sim.make_cameras(cfg.scene.cameras)
+    images = cameras.allocate()
+    cameras.draw(images, dict.fromkeys(cfg.scene.cameras))
+    sim.synchronize()
+    cameras.close()
+    sim.close()
+    return images, cameras.labels
 
 
 def cuda_name(device: str) -> str:

@@ -119,6 +119,19 @@ class ParityCfg(GateFuncCfg):
     """Largest difference of an object's position after the whole task."""
     object_rotation_deg: float = spec(unit="deg", ge=0.0)
     """Largest difference of an object's orientation after the whole task."""
+    images: str | None = None
+    """With cameras: ``parity_images.npz`` of a run elsewhere, whose images are compared with native
+    MuJoCo's instead of images that MJWarp draws here."""
+    image_states: int = spec(unit="states", ge=1)
+    """With cameras: states of the reference episode that both backends draw."""
+    image_iou: float = spec(ge=0.0, le=1.0)
+    """Smallest intersection over union of a thing in the images of both backends."""
+    image_pixels: int = spec(unit="pixels", ge=1)
+    """Things with fewer pixels in all images of a camera are not compared."""
+    image_color: float = spec(unit="of 255", ge=0.0)
+    """Largest mean difference of colours, where both show the same thing."""
+    image_depth: float = spec(unit="m", ge=0.0)
+    """Largest median difference of depths, where both show the same thing."""
 
 
 @dataclass(slots=True)
@@ -155,8 +168,8 @@ class BatchGateCfg(GateFuncCfg):
 class ThroughputCfg(GateFuncCfg):
     """How throughput is measured."""
 
-    measurements: list[str] = spec(choices=("physics", "episode", "env_step"))
-    """Measurements that are made."""
+    measurements: list[str] = spec(choices=("physics", "episode", "env_step", "cameras"))
+    """Measurements that are made; ``cameras`` where there are some."""
     repetitions: int = spec(ge=1)
     """Repetitions of each measurement."""
     episodes: int = spec(ge=1)
@@ -164,7 +177,10 @@ class ThroughputCfg(GateFuncCfg):
     steps: int = spec(unit="steps", ge=1)
     """physics: control steps per repetition."""
     env_steps: int = spec(unit="steps", ge=1)
-    """env_step: steps per repetition."""
+    """env_step and cameras: steps per repetition."""
+    action_share: float = spec(gt=0.0, le=1.0)
+    """env_step and cameras: share of the action range from which actions are drawn, about its
+    middle."""
     max_seconds: float = spec(unit="s", gt=0.0)
     """Time budget of each measurement on CUDA."""
     cpu_max_seconds: float = spec(unit="s", gt=0.0)
