@@ -13,7 +13,7 @@ import sys
 import traceback
 from argparse import Namespace
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -35,16 +35,19 @@ from mjstack.config.session import (
     lacking_folders,
     list_items,
     search_path,
+    search_path_args,
 )
 from mjstack.errors import (
     CompositionError,
     MjstackError,
+    RankError,
     UnknownName,
     describe_error,
     suggest,
 )
 from mjstack.files import check_unused, claim_folder, write_atomic
 from mjstack.interrupt import EXIT_CODE, begin_job
+from mjstack.process import is_rank
 from mjstack.report.record import Report, Status
 from mjstack.report.table import Console, Table
 
@@ -56,13 +59,16 @@ _OTHER_CONFIG = {"--config-name", "-cn", "--config-path", "-cp", "--experimental
 
 _checked: dict[tuple[str, ...], "CheckedJob"] = {}  # by their overrides, until Hydra runs them
 _results: list[Report] = []  # of the jobs that ran in this process
+_assisting = False  # whether this rank has begun with its part of a job
 
 
 def run(args: list[str]) -> int:
     """Run a command line and return its exit status."""
     errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+    global _assisting
     _checked.clear()
     _results.clear()
+    _assisting = False
     try:
         if "--version" in args:
             print(f"mjstack {mjstack.__version__}")
@@ -80,8 +86,10 @@ def run(args: list[str]) -> int:
         if os.environ.get("MJSTACK_DEBUG"):
             traceback.print_exception(error)
         problem = describe_error(error, "MJSTACK_DEBUG=1 shows the traceback")
-        errors.print(f"mjstack: {problem}")
-        return 1 if _results else MjstackError.exit_code
+        who = f"rank {os.environ['RANK']}: " if int(os.environ.get("RANK", 0)) else ""
+        if not (isinstance(error, RankError) and (error.told or (error.gone and who))):
+            errors.print(f"mjstack: {who}{problem}")
+        return 1 if _results or _assisting else MjstackError.exit_code
 
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
@@ -119,22 +127,64 @@ def _show(hydra: Hydra, flags: Namespace, overrides: list[str]) -> None:
 
 
 def _run_one(hydra: Hydra, overrides: list[str]) -> int:
-    """Compose, check and run one job."""
+    """Compose, check and run one job, perhaps as one of several ranks."""
+    # They load torch.
+    from mjstack.distributed import joined, launch
+    from mjstack.jobs import check_ranks, count_devices
+
+    if not is_rank():
+        cfg, checked = _compose_one(hydra, overrides)
+        if (count := count_devices(checked.context.cfg)) > 1:
+            _check_spreads(checked)
+            return launch([*overrides, *search_path_args()], count)
+        return _run_checked(hydra, cfg, checked, overrides)
+    with joined() as ranks:
+        problem = ""
+        try:
+            cfg, checked = ranks.alike(lambda: _compose_one(hydra, overrides))
+            ranks.alike(lambda: _check_spreads(checked))
+            ranks.alike(lambda: check_ranks(checked.context))
+            return _run_checked(hydra, cfg, checked, overrides)
+        except RankError:
+            raise
+        except Exception as error:
+            problem = describe_error(error, "MJSTACK_DEBUG=1 shows the traceback")
+            raise
+        finally:
+            ranks.end(problem)
+
+
+def _compose_one(hydra: Hydra, overrides: list[str]) -> tuple[DictConfig, "CheckedJob"]:
     cfg = compose(hydra, overrides)
     if cfg.hydra.mode is RunMode.MULTIRUN:
         raise CompositionError("hydra.mode=MULTIRUN: expected RUN without -m. Replace it by -m.")
-    checked = _check(cfg, overrides)
+    return cfg, _check(cfg, overrides)
+
+
+def _check_spreads(checked: "CheckedJob") -> None:
+    if not checked.spreads:
+        raise CompositionError(
+            "torchrun, devices: expected a job whose worlds ranks share: gates, train, collect, or"
+            " replay of world=failing. Run this job in one process."
+        )
+
+
+def _run_checked(hydra: Hydra, cfg: DictConfig, checked: "CheckedJob", overrides: list[str]) -> int:
+    """Run a job in its folder; of several ranks the first one makes it, and alone writes."""
+    ranks = checked.context.ranks
     given = _is_set("hydra.run.dir", overrides)
     resumed = None if given else checked.folder
     folder = resumed or _hydra_path(cfg, "run.dir")
-    if checked.assist is None and int(os.environ.get("WORLD_SIZE", 1)) > 1:
-        raise CompositionError("torchrun: expected job=train. Run this job without torchrun.")
-    if checked.assist is not None and int(os.environ.get("RANK", 0)):
-        checked.assist(checked.context, folder)  # the first process writes
-        return 0
     own = "" if given else checked.own
     begin_job()
-    with claim_folder(folder, checked.resumes, own, numbered=not (given or resumed)) as claimed:
+    if not ranks.writes:
+        global _assisting
+        _assisting = True
+        checked.assist(ranks.from_first(lambda: folder))
+        return 0
+    with ExitStack() as stack:
+        claim = claim_folder(folder, checked.resumes, own, numbered=not (given or resumed))
+        claimed = ranks.from_first(lambda: stack.enter_context(claim))
         cfg.hydra.run.dir = str(claimed)
         hydra.run(CONFIG_NAME, run_job, overrides)
     return max(result.exit_code for result in _results)
@@ -145,7 +195,7 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
 
     Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
     """
-    if int(os.environ.get("WORLD_SIZE", 1)) > 1:
+    if is_rank():
         raise CompositionError("torchrun: expected one job, and -m makes several. Leave one out.")
     jobs = _expand(overrides)
     refused = CompositionError(
@@ -162,7 +212,11 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     taken: dict[Path, int] = {}
     for number, job in enumerate(jobs):
         cfg = compose(hydra, job, sweep=master)
-        _check(cfg, job)
+        checked = _check(cfg, job)
+        if checked.context.cfg.devices is not None:
+            raise CompositionError(
+                "devices: expected null with -m. To give each job a GPU, add hydra/launcher=gpus."
+            )
         with open_dict(cfg):
             cfg.hydra.job.num = number
             cfg.hydra.job.id = str(number)

@@ -94,6 +94,20 @@ class PolicyError(MjstackError):
     """A policy's folder that cannot be read, or that was trained for something else."""
 
 
+class RankError(MjstackError):
+    """Another process of the job has failed or gone.
+
+    Attributes:
+        told: Whether rank 0 says so.
+        gone: Whether it cannot be waited for any more.
+    """
+
+    def __init__(self, problem: str, *, told: bool = False, gone: bool = False) -> None:
+        super().__init__(problem)
+        self.told = told
+        self.gone = gone
+
+
 class FolderError(MjstackError):
     """A folder that has another run, or that another process is writing."""
 

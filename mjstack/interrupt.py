@@ -50,6 +50,12 @@ def interrupted() -> bool:
     return _asked
 
 
+def withdraw_interrupt() -> None:
+    """Forget that the command was asked to stop: the cause is another one."""
+    global _asked
+    _asked = False
+
+
 def check_interrupt() -> None:
     """Stop here if the command was asked to. Called where nothing is half done.
 

@@ -28,7 +28,7 @@ from stubs import episodes_of, fake_demonstrations, pairs
 
 from mjstack.cli import run
 from mjstack.config.check import validate
-from mjstack.config.fingerprint import config_hash
+from mjstack.config.fingerprint import config_hash, differences
 from mjstack.config.schema import Backend, Config
 from mjstack.datasets import DatasetWriter, Feature
 from mjstack.envs import build_env, demonstration_config
@@ -41,7 +41,6 @@ from mjstack.jobs.collection import FILE, CollectPlan
 from mjstack.jobs.demonstration import (
     Played,
     StepRecorder,
-    differences,
     episode_config,
     make_spec,
 )

@@ -12,7 +12,7 @@ import mjstack
 ROOT = Path(mjstack.__file__).parent
 # A module may import from its own layer and from earlier ones.
 LAYERS = [
-    {"errors", "math", "rng", "files", "interrupt"},
+    {"errors", "math", "rng", "files", "interrupt", "process", "distributed"},
     {"config"},
     {"robots"},
     {"scene"},

@@ -149,7 +149,7 @@ def test_two_processes_learn_one_policy(tmp_path: Path) -> None:
     assert "iteration" not in texts[1]
     assert not list((tmp_path / "1").iterdir())
     rows = np.genfromtxt(out / "train.csv", delimiter=",", names=True)
-    assert rows["decisions"].tolist() == [64.0, 128.0]
+    assert rows["decisions"].tolist() == [32.0, 64.0]  # nworld is of both
 
 
 def states_file(path: Path, env: Env, count: int = 3) -> Path:

@@ -17,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import mjstack.train.clone as clone
 import mjstack.train.clone_learner as clone_learner
 from mjstack.cli import run
+from mjstack.distributed import Ranks
 from mjstack.envs import driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.errors import MjstackError
@@ -27,7 +28,6 @@ from mjstack.policy import load_policy
 from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.train.clone_learner import Learner
 from mjstack.train.demonstrations import play_expert
-from mjstack.train.distributed import Ranks
 from mjstack.train.trainer import STATE, observed_group
 
 TINY = (
@@ -135,7 +135,7 @@ def test_a_training_goes_on_where_it_was_interrupted(
 
 @pytest.mark.full
 def test_two_processes_learn_one_policy(tmp_path: Path) -> None:
-    """They share the expert's seeds, average gradients, and the first one writes; a state says
+    """They share the expert's worlds, average gradients, and the first one writes; a state says
     where each goes on.
     """
     out = tmp_path / "out"
@@ -157,8 +157,7 @@ def test_a_process_may_come_when_the_first_one_has_begun(
     cfg = load_config([*REACH, f"job.folder={tmp_path}"])
     with pytest.raises(MjstackError, match="expected a new or an empty folder"):
         check_train(cfg)
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setattr("mjstack.distributed._current", Ranks(1, 2))
     assert check_train(cfg).folder == tmp_path
 
 
@@ -213,7 +212,7 @@ def test_noise_moves_the_arm_alone_and_labels_lack_it() -> None:
     )
     context = RunContext(cfg)
     sizes = clone.resolve_sizes(cfg.job, "cpu")
-    data = play_expert(context, sizes, observed_group(cfg.job, sizes.leave_out), Ranks())
+    data = play_expert(context, sizes, observed_group(cfg.job, sizes.leave_out))
     assert data.source == "the expert, seeds 0 to 1"
     assert data.ends.tolist() == [150, 300, 450, 600]
     labels = data.labels.unflatten(0, (4, 150))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,13 @@ import torch
 from compositions import load_config
 
 from mjstack.cli import run
+from mjstack.distributed import Ranks
 from mjstack.episodes.context import RunContext
 from mjstack.errors import MjstackError
 from mjstack.jobs.train import check_train
 from mjstack.train import clone
 from mjstack.train.dataset import read_demonstrations
 from mjstack.train.demonstrations import play_expert
-from mjstack.train.distributed import Ranks
 from mjstack.train.trainer import observed_group
 
 REACH = ("task=reach", "sim=native", "nworld=3")
@@ -53,13 +54,13 @@ def test_a_dataset_has_what_the_expert_would_show(dataset: Path) -> None:
     context = RunContext(cfg)
     sizes = clone.resolve_sizes(cfg.job, "cpu")
     group = observed_group(cfg.job, sizes.leave_out)
-    played = play_expert(context, sizes, group, Ranks())
-    read = read_demonstrations(dataset, context, group, played.widths, Ranks())
+    played = play_expert(context, sizes, group)
+    read = read_demonstrations(dataset, context, group, played.widths)
     assert torch.equal(read.ends, played.ends)
     torch.testing.assert_close(read.seen, played.seen)
     torch.testing.assert_close(read.labels, played.labels)
     parts = [
-        read_demonstrations(dataset, context, group, played.widths, Ranks(rank, 2))
+        read_demonstrations(dataset, replace(context, ranks=Ranks(rank, 2)), group, played.widths)
         for rank in range(2)
     ]
     assert [len(part.ends) for part in parts] == [2, 1]

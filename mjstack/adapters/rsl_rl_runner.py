@@ -8,9 +8,9 @@ from torch import Tensor
 
 from mjstack.adapters.rsl_rl import RslRlVecEnv
 from mjstack.config.schema import PpoJobCfg
+from mjstack.distributed import Ranks, current_ranks
 from mjstack.envs import Env
 from mjstack.policy.network import FARTHEST
-from mjstack.train.distributed import Ranks, torchrun_ranks
 
 # isort: split
 from rsl_rl.models import MLPModel
@@ -61,7 +61,7 @@ class Runner(OnPolicyRunner):
     """rsl_rl's runner in processes that have joined already, on any device."""
 
     def _configure_multi_gpu(self) -> None:
-        ranks = torchrun_ranks()
+        ranks = current_ranks()
         self.gpu_world_size = ranks.size
         self.gpu_global_rank = ranks.rank
         self.is_distributed = False  # it would send the parameters anew with every iteration

@@ -14,6 +14,7 @@ from mjstack.errors import ConfigError, UnknownName
 
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
+_DEVICES = re.compile(r"all|[1-9]\d*")
 _WORLD = re.compile(r"((batch|success):)?(\d+:)?\d+")
 
 
@@ -83,6 +84,11 @@ def _jobs(cfg: Config) -> None:
         wrong = getattr(cfg, key) is not None and cfg.job.name != "replay"
         _refuse(wrong, cfg, key, "null, because it is for job=replay alone. Add job=replay")
     plays = cfg.controller.name == "policy" or cfg.job.name in ("play", "export")
+    wrong = cfg.resume is not None and cfg.job.name != "gates"
+    expected = "null, because it is for job=gates. Other jobs that can go on do so by themselves"
+    _refuse(wrong, cfg, "resume", expected)
+    wrong = cfg.devices is not None and not _DEVICES.fullmatch(cfg.devices)
+    _refuse(wrong, cfg, "devices", "all, or a number of GPUs of at least 1")
     wrong = cfg.policy is not None and not plays
     expected = "null, because no policy drives the worlds. Add controller=policy"
     _refuse(wrong, cfg, "policy", expected)

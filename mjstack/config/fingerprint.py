@@ -11,9 +11,11 @@ from typing import Any
 
 from mjstack.config.check import reads_starts_file
 from mjstack.config.schema import Config
+from mjstack.config.session import list_items
 from mjstack.errors import ConfigError
 
 CONTENT = "sha256:"  # in front of what stands for a file
+_OF_THE_CALL = ("resume", "devices")  # they change no result
 POLICY_FILE = "policy.json"  # of a policy's folder; it names the weights by their SHA-256
 
 
@@ -27,6 +29,8 @@ def config_content(cfg: Config) -> dict[str, Any]:
     config: dict[str, Any] = json.loads(json.dumps(asdict(cfg)))
     if cfg.robot.file is not None:
         config["robot"]["file"] = _content("robot.file", cfg.robot.file)
+    for key in _OF_THE_CALL:
+        del config[key]
     if cfg.policy is None:  # hashes without one are older than it
         del config["policy"]
     else:
@@ -46,6 +50,19 @@ def config_content(cfg: Config) -> dict[str, Any]:
 def config_hash(config: Mapping[str, Any]) -> str:
     """SHA-256 of a configuration in JSON's types."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
+
+
+def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
+    """Keys in which two configurations differ, such as ``seed=1, expected 2``."""
+    before, now = (
+        {key: value for key, value in list_items(one) if value == {} or not isinstance(value, dict)}
+        for one in (theirs, ours)
+    )
+    return [
+        f"{key}={before.get(key, 'missing')}, expected {now.get(key, 'none')}"
+        for key in before | now
+        if before.get(key) != now.get(key)
+    ]
 
 
 def _content(key: str, path: str) -> str:

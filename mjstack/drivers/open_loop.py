@@ -121,7 +121,10 @@ class OpenLoopPlanner:
         self.nominal = self._seed[len(self._nodes) - 1 :: len(self._nodes)]
 
     def plan(
-        self, sources_xy: np.ndarray, progress: Callable[[int], None] | None = None
+        self,
+        sources_xy: np.ndarray,
+        progress: Callable[[int], None] | None = None,
+        names: Sequence[int] | None = None,
     ) -> JointTrajectory:
         """Plan one trajectory per world; worlds that start alike share the work.
 
@@ -129,6 +132,7 @@ class OpenLoopPlanner:
             sources_xy: Position of each object and place at the start [m], shape ``(nworld,
                 sources, 2)``; see `source_names`.
             progress: Called with the number of worlds done.
+            names: Numbers of the worlds, for the error; from 0 on if None.
 
         Raises:
             Unreachable: A target is out of reach; names the world (the first one), the phase and
@@ -138,6 +142,7 @@ class OpenLoopPlanner:
         if self._last is not None and np.array_equal(self._last[0], sources_xy):
             return self._last[1]  # the gates of one run play the same batch
         nworld = sources_xy.shape[0]
+        numbers = range(nworld) if names is None else names
         flat = sources_xy.reshape(nworld, -1)
         _, first, kind = np.unique(flat, axis=0, return_index=True, return_inverse=True)
         twin = first[kind.reshape(-1)]
@@ -150,12 +155,16 @@ class OpenLoopPlanner:
             if progress is not None:
                 progress(int(done[len(found) - 1]))
 
-        with self.processes(len(worlds)):
-            if self._pool is not None:
-                plan_in_parallel(self._pool, worlds, sources_xy, take)
-            else:
-                for world in worlds:
-                    take(world, *self.plan_world(world, sources_xy[world]))
+        try:
+            with self.processes(len(worlds)):
+                if self._pool is not None:
+                    plan_in_parallel(self._pool, worlds, sources_xy, take)
+                else:
+                    for world in worlds:
+                        take(world, *self.plan_world(world, sources_xy[world]))
+        except Unreachable as unreachable:
+            unreachable.world = numbers[unreachable.world]
+            raise
         knots, error = (
             np.array(parts) for parts in zip(*(found[world] for world in twin), strict=True)
         )

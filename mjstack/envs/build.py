@@ -27,6 +27,7 @@ def make_env(
     seed: int | None = None,
     device: str | None = None,
     config_dir: str | os.PathLike | None = None,
+    first_world: int = 0,
 ) -> Env:
     """Build an environment as the command line would configure it.
 
@@ -38,6 +39,8 @@ def make_env(
         device: ``auto``, ``cpu`` or ``cuda:N``.
         config_dir: A folder with more choices, such as ``push/conf`` with ``task/push.yaml``. The
             folder beside it is importable afterwards.
+        first_world: Number of the first world, where other processes have the ones before. World k
+            starts alike in any of them.
 
     Returns:
         The environment, on MJWarp where there is CUDA, else on native MuJoCo (``sim=...`` chooses).
@@ -52,7 +55,8 @@ def make_env(
         raise ArgumentError("overrides", reprlib.repr(overrides), expected)
     given = {"nworld": nworld, "seed": seed, "sim.device": device}
     more = [f"{key}={value}" for key, value in given.items() if value is not None]
-    return build_env(load_config([*overrides, *more], config_dir=config_dir))
+    cfg = load_config([*overrides, *more], config_dir=config_dir)
+    return build_env(cfg, first_world=first_world)
 
 
 @torch.inference_mode(False)  # buffers made in inference mode could not be written outside it
@@ -64,6 +68,7 @@ def build_env(
     backend: Backend | None = None,
     device: str | None = None,
     sizes: BatchSizes | None = None,
+    first_world: int = 0,
 ) -> Env:
     """Build an environment with its simulation. Gates, whose simulation is shared, build `Env` on
     that.
@@ -77,6 +82,7 @@ def build_env(
         sizes: Overrides MJWarp's buffer sizes, which by default have room for random actions. With
             ``batch=auto`` they are measured first, in worlds that are gone again before these are
             made.
+        first_world: Number of the first world; see `Env`.
     """
     model = build_model(cfg) if model is None else model
     nworld = cfg.nworld if nworld is None else nworld
@@ -88,7 +94,7 @@ def build_env(
     sim = make_simulation(
         model, cfg, nworld, backend=backend, device=device, fields=fields, sizes=sizes
     )
-    return Env(sim, SceneIndex(model, cfg.robot, cfg.scene), cfg)
+    return Env(sim, SceneIndex(model, cfg.robot, cfg.scene), cfg, first_world=first_world)
 
 
 def decided_every_step(cfg: Config) -> Config:

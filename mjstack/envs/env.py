@@ -72,7 +72,13 @@ class Env:
     """
 
     def __init__(
-        self, sim: Simulation, index: SceneIndex, cfg: Config, *, check_faults: bool = True
+        self,
+        sim: Simulation,
+        index: SceneIndex,
+        cfg: Config,
+        *,
+        check_faults: bool = True,
+        first_world: int = 0,
     ) -> None:
         """Build the managers on a simulation, and check every term once.
 
@@ -84,6 +90,8 @@ class Env:
                 are used.
             check_faults: Raise when physics was lost. Gates, which judge such worlds themselves, do
                 without.
+            first_world: Number of the first world, where other processes have the ones before: a
+                world's random numbers depend on its number.
 
         Raises:
             MjstackError: A term cannot be found, built or used; the message names it.
@@ -95,7 +103,7 @@ class Env:
         self.device = sim.device
         self.seed = cfg.seed
         self.key = torch.full((1,), cfg.seed, dtype=torch.int64, device=sim.device)
-        self.world = torch.arange(sim.nworld, device=sim.device)
+        self.world = torch.arange(first_world, first_world + sim.nworld, device=sim.device)
         self.episode = torch.full_like(self.world, -1)
         self.episode_step = torch.zeros_like(self.world)
         self.given_places: dict[str, Tensor] = {}

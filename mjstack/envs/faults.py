@@ -85,7 +85,8 @@ class FaultLatch:
                 if largest := max(filter(_HUGE.__lt__, action), default=0.0):
                     culprits += f", after an action of {largest:.3g}"
                     fix = _FIXES["actions were not finite"]
-                raise FaultError(f"{what} in {name_worlds(worlds, env.nworld)}{culprits}", fix)
+                numbers = env.world[torch.tensor(worlds, device=env.device)].tolist()
+                raise FaultError(f"{what} in {name_worlds(numbers, env.nworld)}{culprits}", fix)
 
     def _terms(self, what: str, world: int) -> list[str]:
         """Names of the terms behind a number that is not finite, as far as their last values

@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 
 from mjstack.config.schema import Backend, Config
+from mjstack.distributed import Ranks, current_ranks
 from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.drivers.policy import PolicyDriver
@@ -45,6 +46,12 @@ TextHook = Callable[[str], None]
 
 needs_episode = offers(needs_episode=True)
 """Marks a gate that plays judged episodes. It is skipped for a task that has none."""
+spread = offers(spread="worlds")
+"""Marks a gate whose ranks play their worlds and gather the results. Of others rank 0 alone plays
+all worlds.
+"""
+each_rank = offers(spread="ranks")
+"""Marks a gate that measures the worlds of a rank, in all of them at the same time."""
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -146,6 +153,7 @@ class RunContext:
         record: Gets each result as soon as there is one.
         advance: Told about progress.
         viewers: Look on at the one-world episode that is shown.
+        ranks: The processes of the run. Those that write nothing have no folder.
         artifacts: Products of gates.
         page: What the run shows besides its results.
     """
@@ -161,6 +169,7 @@ class RunContext:
     viewers: Sequence[Observer] = ()
     artifacts: Artifacts = field(default_factory=Artifacts)
     page: Page = field(default_factory=Page)
+    ranks: Ranks = field(default_factory=current_ranks)
 
     def __post_init__(self) -> None:
         if self.stage is None:
@@ -186,6 +195,11 @@ class RunContext:
     def planner(self) -> OpenLoopPlanner:
         """The planner, its nominal plan made."""
         return self.stage.planner
+
+    @property
+    def worlds(self) -> range:
+        """Numbers of the worlds that this rank plays."""
+        return self.ranks.share(self.cfg.nworld)
 
     @property
     def phases(self) -> list[Phase]:
@@ -245,7 +259,7 @@ class RunContext:
             reset: How worlds differ at the start.
             seed: Seed, if not the configured one.
             worlds: Their numbers, which random numbers depend on: ``[17]`` starts one world as
-                world 17 of any batch starts.
+                world 17 of any batch starts. By default they are numbered from 0 on.
         """
         cfg = driven_config(self.cfg, reset)
         env = Env(sim, self.index, cfg, check_faults=False)
@@ -267,7 +281,9 @@ class RunContext:
             return StateBasedDriver(env, self.planner.nominal)
         sources = source_xy(env).double().cpu().numpy()
         trajectory = self.planner.plan(
-            sources, lambda done: self.advance("planning", done, sim.nworld)
+            sources,
+            lambda done: self.advance("planning", done, sim.nworld),
+            names=env.world.tolist(),
         ).to(sim.device, sim.ctrl.dtype)
         return OpenLoopDriver(trajectory, self.planner.phases)
 

@@ -13,6 +13,7 @@ from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import MjstackError, RunError
 from mjstack.files import reading, write_atomic
 
+REPORT = "report.json"
 STEM = "starts_played"
 
 
@@ -31,35 +32,35 @@ class EarlierRun:
     provenance: dict[str, Any]
 
     @classmethod
-    def read(cls, name: str) -> "EarlierRun":
-        """Read a run's folder.
+    def read(cls, name: str, key: str = "run") -> "EarlierRun":
+        """Read a run's folder, which a configuration key names.
 
         Raises:
             RunError: There is no such run; the message says what is missing.
         """
         folder = Path(name)
         saved = folder / ".hydra" / "config.yaml"
-        report = folder / "report.json"
+        report = folder / REPORT
         for path in (saved, report):
             if not path.is_file():
                 raise RunError(
-                    f"run={name}: has no {path.relative_to(folder)}, expected the folder of a run,"
-                    " such as outputs/2026-11-21/04-02-05 (of a sweep: one of its jobs'). Name"
+                    f"{key}={name}: has no {path.relative_to(folder)}, expected the folder of a"
+                    " run, such as outputs/2026-11-21/04-02-05 (of a sweep: one of its jobs'). Name"
                     " another folder."
                 )
         try:
             cfg = load_saved(saved)
         except MjstackError as error:
             raise RunError(
-                f"run={name}: .hydra/config.yaml is no configuration of this mjstack: {error}"
+                f"{key}={name}: .hydra/config.yaml is no configuration of this mjstack: {error}"
             ) from error
         with reading(report, RunError, "Name another folder"):
             provenance = dict(json.loads(report.read_text())["provenance"])
             provenance["versions"] = dict(provenance["versions"])
         if cfg.job.name != "gates":
             raise RunError(
-                f"run={name}: is a run of job={cfg.job.name}, expected one of job=gates. Name that"
-                " run's folder."
+                f"{key}={name}: is a run of job={cfg.job.name}, expected one of job=gates. Name"
+                " that run's folder."
             )
         return cls(folder=folder, cfg=cfg, provenance=provenance)
 

@@ -3,7 +3,8 @@ people.
 """
 
 import re
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ FAILING = "failing_worlds.csv"
 SUCCESS_FAILING = "success_failing_worlds.csv"  # where the batch gate has the other one
 REGIONS = "success_regions.csv"
 PICTURE = "success.png"
+_MEASURED = "measured."
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -75,8 +77,36 @@ class Circumstances:
     def arrays(self) -> dict[str, Any]:
         """The arrays by their names in the file."""
         held = asdict(self) | {"sign_names": [sign.name for sign in Sign]}
-        del held["objects"]
-        return held
+        return held | {"object_names": held.pop("objects")}
+
+    @classmethod
+    def read(cls, held: Mapping[str, np.ndarray]) -> "Circumstances":
+        """The circumstances in a file's arrays.
+
+        Raises:
+            KeyError: One is missing.
+        """
+        return cls(
+            objects=held["object_names"].tolist(),
+            phase_names=held["phase_names"].tolist(),
+            **{name: held[name] for name in cls._columns()},
+        )
+
+    @classmethod
+    def join(cls, parts: Sequence["Circumstances"]) -> "Circumstances":
+        """Those of all worlds, from those of neighbours."""
+        return cls(
+            objects=parts[0].objects,
+            phase_names=parts[0].phase_names,
+            **{
+                name: np.concatenate([getattr(part, name) for part in parts])
+                for name in cls._columns()
+            },
+        )
+
+    @classmethod
+    def _columns(cls) -> list[str]:
+        return [item.name for item in fields(cls) if item.name not in ("objects", "phase_names")]
 
     def cells(self, world: int) -> dict[str, object]:
         """A world's cells of the table of failing episodes, by column."""
@@ -109,6 +139,10 @@ class EpisodeRecord:
         qpos: Final positions, shape ``(nworld, nq)``, in the backend's precision.
         start: Positions at the start, of the same shape.
         circumstances: Starts, retries and signs of failure; None where nothing looked on.
+        measured: Measurements beside the check's, by name with unit, each ``(nworld,)``.
+        seconds: Wall time of the steps, in the slowest rank [s].
+        steps: Physics steps of all worlds.
+        ranks: The first world of each rank that has played some, and its host and device.
     """
 
     seed: int
@@ -119,11 +153,49 @@ class EpisodeRecord:
     qpos: np.ndarray
     start: np.ndarray
     circumstances: Circumstances | None = None
+    measured: dict[str, np.ndarray] = field(default_factory=dict)
+    seconds: float = 0.0
+    steps: int = 0
+    ranks: dict[int, str] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, folder: Path, seed: int, gate: str = "batch") -> "EpisodeRecord | None":
-        """Read the record of a gate's seed in a run's folder, without circumstances; None if the
-        gate did not get there.
+    def join(cls, parts: Sequence["EpisodeRecord"]) -> "EpisodeRecord":
+        """The record of all worlds, from those of ranks, in the order of their worlds."""
+        first = parts[0]
+        if len(parts) == 1:
+            return first
+        seen = [part.circumstances for part in parts if part.circumstances is not None]
+
+        def joined(name: str) -> dict[str, np.ndarray]:
+            held = [getattr(part, name) for part in parts]
+            return {key: np.concatenate([each[key] for each in held]) for key in held[0]}
+
+        return cls(
+            seed=first.seed,
+            backend=first.backend,
+            device=first.device,
+            failed=np.concatenate([part.failed for part in parts]),
+            values=joined("values"),
+            qpos=np.concatenate([part.qpos for part in parts]),
+            start=np.concatenate([part.start for part in parts]),
+            circumstances=Circumstances.join(seen) if seen else None,
+            measured=joined("measured"),
+            seconds=max(part.seconds for part in parts),
+            steps=sum(part.steps for part in parts),
+            ranks={world: where for part in parts for world, where in part.ranks.items()},
+        )
+
+    @classmethod
+    def read(
+        cls, folder: Path, seed: int, gate: str = "batch", *, whole: bool = False
+    ) -> "EpisodeRecord | None":
+        """Read the record of a gate's seed in a run's folder; None if the gate did not get there.
+
+        Args:
+            folder: The folder.
+            seed: The seed.
+            gate: The gate.
+            whole: With all that the gate's result needs, which records of old versions lack.
 
         Raises:
             RunError: The file cannot be read.
@@ -140,6 +212,8 @@ class EpisodeRecord:
                 qpos=held["qpos"],
                 start=held["start_qpos"],
             )
+            if whole:
+                record._read_rest(held)
             record._check()
         return record
 
@@ -147,6 +221,9 @@ class EpisodeRecord:
         """Raise a `ValueError` where types or shapes are not those that a gate writes."""
         rows = (len(self.failed), self.qpos.shape[-1])
         shapes = {"qpos": rows, "start": rows, "failed": rows[:1]}
+        for name, array in (self.values | self.measured).items():
+            if array.shape != rows[:1]:
+                raise ValueError(f"{name} is of shape {array.shape}")
         for name, shape in shapes.items():
             array = getattr(self, name)
             if array.shape != shape or array.dtype.kind != ("i" if name == "failed" else "f"):
@@ -155,6 +232,19 @@ class EpisodeRecord:
         if not re.fullmatch(r"(native|mjwarp) on (cpu|cuda:\d+)", where):
             raise ValueError(f"played by {where}")
 
+    def _read_rest(self, held: Mapping[str, np.ndarray]) -> None:
+        """Take from a file's arrays what a replay does not need."""
+        self.measured = {
+            name.removeprefix(_MEASURED): held[name] for name in held if name.startswith(_MEASURED)
+        }
+        self.seconds = held["seconds"].item()
+        self.steps = held["steps"].item()
+        self.ranks = dict(
+            zip(held["rank_first_world"].tolist(), held["rank_place"].tolist(), strict=True)
+        )
+        if "sign" in held:
+            self.circumstances = Circumstances.read(held)
+
     @property
     def succeeded(self) -> np.ndarray:
         """Worlds that broke no rule, shape ``(nworld,)``, bool."""
@@ -162,11 +252,14 @@ class EpisodeRecord:
 
     def write(self, folder: Path, gate: str = "batch") -> None:
         """Write the gate's file of this seed in one step."""
-        names = ("seed", "backend", "device", "failed", "qpos")
+        names = ("seed", "backend", "device", "failed", "qpos", "seconds", "steps")
         arrays: dict[str, Any] = {
             **{name: getattr(self, name) for name in names},
             "start_qpos": self.start,
             **{f"value.{name}": values for name, values in self.values.items()},
+            **{f"{_MEASURED}{name}": values for name, values in self.measured.items()},
+            "rank_first_world": list(self.ranks),
+            "rank_place": list(self.ranks.values()),
             **({} if self.circumstances is None else self.circumstances.arrays()),
         }
         write_npz(folder / _file_name(gate, self.seed), arrays)

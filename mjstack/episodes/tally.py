@@ -1,10 +1,13 @@
 """Episodes of a gate, played and counted seed after seed, and the record of each seed."""
 
+import itertools
 import logging
 import math
 import shlex
-from collections.abc import Callable, Sequence
+import socket
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,7 @@ from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor, describe_sign
 from mjstack.episodes.record import FAILING, SUCCESS_FAILING, Circumstances, EpisodeRecord
 from mjstack.episodes.rollout import Episode, Observer
-from mjstack.errors import first_line, name_worlds
+from mjstack.errors import RunError, first_line, name_worlds
 from mjstack.files import to_csv, write_atomic
 from mjstack.interrupt import check_interrupt
 from mjstack.math import wilson_interval
@@ -27,6 +30,7 @@ from mjstack.sim import Simulation
 from mjstack.tasks.check import EpisodeCheck
 
 log = logging.getLogger(__name__)
+_SHOWN = 20_000  # episodes on the page; of more, the failing ones
 _NAMED = 100  # episodes a line in report.md; the table of failing ones has all
 
 
@@ -41,17 +45,22 @@ class EpisodeTally:
         check: The task's.
         path: The file of failing episodes; None where nothing is written.
         replayed: Whether job=replay takes the run.
-        records: Those of the seeds that were played.
+        seeds: Those that were played.
+        succeeded: For each seed, which worlds succeeded, shape ``(nworld,)``, bool.
+        circumstances: For each seed, if they were recorded.
+        shown: Episodes that the run's page shows: seed, worlds, and their bits, values and starts.
         failed: Names of the failing episodes.
         broken: The same by the name of the rule that was broken.
         unreachable: Names of the episodes with a target out of reach.
         low: Smallest of everything measured, by name.
         high: Largest of everything measured, by name.
-        ends: Hashes of the final states.
+        ends: Hashes of the final states, an array for each seed.
         rows: Cells of the table of failing episodes, by column.
         seconds: Wall time of the steps [s].
         steps: Physics steps of all worlds.
-        first: The first seed's episode.
+        first: The first seed's episode, of this rank's worlds; None where the seed was read back.
+        again: Seeds that an earlier call has played.
+        places: Where worlds were played: the host and device of each rank, by its first world.
         notes: Backend and buffer sizes in words.
         problems: Why the gate fails at any rate of success.
         details: Remarks.
@@ -63,36 +72,25 @@ class EpisodeTally:
     check: EpisodeCheck
     path: Path | None
     replayed: bool
-    records: list[EpisodeRecord] = field(default_factory=list)
+    seeds: list[int] = field(default_factory=list)
+    succeeded: list[np.ndarray] = field(default_factory=list)
+    circumstances: list[Circumstances] = field(default_factory=list)
+    shown: list[tuple[int, np.ndarray, dict[str, np.ndarray]]] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     broken: dict[str, list[str]] = field(default_factory=dict)
     unreachable: list[str] = field(default_factory=list)
     low: dict[str, float] = field(default_factory=dict)
     high: dict[str, float] = field(default_factory=dict)
-    ends: set[int] = field(default_factory=set)
+    ends: list[np.ndarray] = field(default_factory=list)
     rows: list[dict[str, object]] = field(default_factory=list)
     seconds: float = 0.0
     steps: int = 0
     first: Episode | None = None
+    again: list[int] = field(default_factory=list)
+    places: dict[int, str] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     details: list[str] = field(default_factory=list)
-
-    @property
-    def seeds(self) -> list[int]:
-        """Those that were played."""
-        return [record.seed for record in self.records]
-
-    @property
-    def succeeded(self) -> list[np.ndarray]:
-        """For each seed, which worlds succeeded, shape ``(nworld,)``, bool."""
-        return [record.succeeded for record in self.records]
-
-    @property
-    def circumstances(self) -> list[Circumstances]:
-        """For each seed, if they were recorded."""
-        held = (record.circumstances for record in self.records)
-        return [one for one in held if one is not None]
 
     @property
     def episodes(self) -> int:
@@ -109,31 +107,50 @@ class EpisodeTally:
         """95 % interval of the success rate."""
         return wilson_interval(self.good, self.episodes)
 
-    def add(self, record: EpisodeRecord, episode: Episode, sim: Simulation) -> None:
-        """Count one seed."""
-        self.records.append(record)
-        self.seconds += episode.timing.seconds
-        self.steps += int(sim.step_count.sum())
-        if self.first is None:
-            self.first = episode
+    @property
+    def distinct_ends(self) -> int:
+        """Number of distinct final states."""
+        return len(np.unique(np.concatenate(self.ends)))
+
+    def add(self, record: EpisodeRecord) -> None:
+        """Count one seed. Some 9 bytes of a world that has not failed are kept, and its
+        circumstances.
+        """
+        self.seeds.append(record.seed)
+        self.succeeded.append(record.succeeded)
+        self.seconds += record.seconds
+        self.steps += record.steps
+        self.places = record.ranks
         self.failed += self.names(record.seed, np.flatnonzero(record.failed).tolist())
         for rule, worlds in self.check.rules.failing(record.failed).items():
             self.broken.setdefault(rule, []).extend(self.names(record.seed, worlds))
         self.rows += record.failing_rows(self.check.rules)
+        room = max(0, _SHOWN - sum(len(worlds) for _, worlds, _ in self.shown))
+        shown = np.flatnonzero((record.failed != 0) | (np.arange(len(record.failed)) < room))
+        held = {"failed": record.failed, "start": record.start, **record.values}
+        self.shown.append((record.seed, shown, {k: v[shown] for k, v in held.items()}))
         if record.circumstances is not None:
+            self.circumstances.append(record.circumstances)
             out = np.flatnonzero(record.circumstances.unreachable).tolist()
             self.unreachable += self.names(record.seed, out)
-        measured = record.values | {
-            "waypoint_error_m": episode.waypoint_error,
-            "peak_contacts": sim.peak_contacts.cpu().numpy(),
-            "peak_constraint_rows": sim.peak_constraints.cpu().numpy(),
-        }
-        for name, values in measured.items():  # NaN, which a diverged world has, is handed on
+        for name, values in (
+            record.values | record.measured
+        ).items():  # NaN, which a diverged world has, is handed on
             self.low[name] = float(np.minimum(self.low.get(name, math.inf), values.min()))
             self.high[name] = float(np.maximum(self.high.get(name, -math.inf), values.max()))
         # Rounded: on CUDA even identical worlds differ in the last digits. Adding 0 makes -0 the
         # same as 0.
-        self.ends.update(hash(row.tobytes()) for row in np.round(record.qpos, 4) + 0.0)
+        rounded = np.round(record.qpos, 4) + 0.0
+        self.ends.append(np.array([hash(row.tobytes()) for row in rounded]))
+
+    def write_failing(self) -> None:
+        """Write the table of failing episodes, if there are any.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        if self.rows and self.path is not None:
+            write_atomic(self.path, to_csv(self.rows))
 
     def names(self, seed: int, worlds: Sequence[int]) -> list[str]:
         """Names of a seed's episodes, as ``world=`` of job=replay takes them."""
@@ -235,6 +252,16 @@ class EpisodeTally:
     def tables(self) -> list[Table]:
         """Tables of the report: seeds, and first signs of failure."""
         tables = []
+        if self.places:
+            worlds = len(self.succeeded[0])
+            rows = [
+                [f"{first:,} to {end - 1:,}", where]
+                for (first, where), end in zip(
+                    self.places.items(), [*list(self.places)[1:], worlds], strict=True
+                )
+            ]
+            title = f"Which rank played which world (seed {self.seeds[-1]})"
+            tables.append(Table(title=title, header=["worlds", "where"], rows=rows))
         if self.several:
             header = ["seed", "episodes", "succeeded", "rate", "95 % interval"]
             rows = [
@@ -295,7 +322,8 @@ def play_seeds(
         path=None if folder is None else folder / name,
         replayed=cfg.job.name == "gates",
     )
-    sim = context.batch_simulation(cfg.nworld)
+    ranks = context.ranks
+    sim = context.batch_simulation(len(context.worlds))
     tally.notes = {
         "backend": sim.description,
         "sizes": str(sim.sizes or "native MuJoCo has no fixed buffers"),
@@ -306,31 +334,30 @@ def play_seeds(
     try:
         for seed in range(cfg.seed, last + 1):
             try:
-                monitors = [FailureMonitor()] if circumstances else []
-                looking = [*monitors, *observers(seed)]
-                episode = context.play(sim, cfg.reset, looking, seed=seed)
-                record = EpisodeRecord(
-                    seed=seed,
-                    backend=sim.backend,
-                    device=str(sim.device),
-                    failed=episode.failed,
-                    values=episode.values,
-                    qpos=sim.qpos.cpu().numpy().copy(),
-                    start=episode.start,
-                )
-                for monitor in monitors:
-                    record.circumstances = Circumstances.of(episode, monitor)
-                tally.add(record, episode, sim)
+                record = ranks.from_first(partial(_read, context, gate, seed))
+                if record is None:
+                    monitors = [FailureMonitor()] if circumstances else []
+                    looking = [*monitors, *observers(seed)]
+                    episode = context.play(
+                        sim, cfg.reset, looking, seed=seed, worlds=context.worlds
+                    )
+                    part = _record(context, sim, seed, episode, monitors)
+                    record = EpisodeRecord.join(ranks.gather(part))
+                    tally.first = episode if tally.first is None else tally.first
+                else:
+                    tally.again.append(seed)
+                tally.add(record)
             except Exception as error:
                 check_interrupt()
-                if seed == cfg.seed:
+                if not tally.seeds or ranks.size > 1:
                     raise
                 log.exception("seed %d broke", seed)
                 why = first_line(error)
                 left = f"seed {seed}" if seed == last else f"seeds {seed} to {last}"
                 tally.problems.append(f"{left} not played: {why} (run.log has the traceback)")
                 break
-            _write(record, tally)
+            if seed not in tally.again:
+                _write(record, tally)
             if count > 1:
                 context.print_line(
                     f"{gate}, seed {seed}: {int(record.succeeded.sum())} of {cfg.nworld} worlds"
@@ -338,6 +365,10 @@ def play_seeds(
                 )
     finally:
         sim.close()
+    if tally.again:
+        seeds = ", ".join(_runs(tally.again))
+        tally.details.append(f"an earlier call has played seeds {seeds}")
+        tally.write_failing()
     if cfg.nworld > 1:
         context.page.worlds[gate] = _worlds(tally, context)
     return tally
@@ -347,22 +378,76 @@ def _worlds(tally: EpisodeTally, context: RunContext) -> Worlds:
     """The episodes as the run's page plots them."""
     scene = context.cfg.scene
     table = (scene.table_center[:2], scene.table_half[:2])
-    records = tally.records
-    bits = np.concatenate([record.failed for record in records])
     rules = tally.check.rules
+    held = {
+        name: np.concatenate([values[name] for _, _, values in tally.shown])
+        for name in tally.shown[0][2]
+    }
+    start = held.pop("start")
+    bits = held.pop("failed").tolist()
+    if len(bits) < tally.episodes:
+        tally.details.append(
+            f"report.html shows {len(bits):,} of the {tally.episodes:,} {tally.noun}: the first"
+            " ones, and all that failed"
+        )
     worlds = Worlds(
-        names=[name for r in records for name in tally.names(r.seed, range(len(r.failed)))],
-        broken=[rules.broken(failed) if failed else [] for failed in bits.tolist()],
+        names=[n for seed, which, _ in tally.shown for n in tally.names(seed, which.tolist())],
+        broken=[rules.broken(failed) if failed else [] for failed in bits],
         rules=rules.texts,
-        values={
-            name: np.concatenate([record.values[name] for record in records])
-            for name in records[0].values
-        },
+        values=held,
     )
     for name, (at, _) in context.index.objects.items():
-        xy = np.concatenate([record.start[:, at : at + 2] for record in records])
-        worlds.maps.append(Map(title=name, xy=xy, table=table))
+        worlds.maps.append(Map(title=name, xy=start[:, at : at + 2], table=table))
     return worlds
+
+
+def _read(context: RunContext, gate: str, seed: int) -> EpisodeRecord | None:
+    """What an earlier call of a run that is gone on with has left of a seed."""
+    if context.cfg.resume is None or context.folder is None:
+        return None
+    record = EpisodeRecord.read(context.folder, seed, gate, whole=True)
+    if record is not None and len(record.failed) != context.cfg.nworld:
+        raise RunError(
+            f"resume={context.folder}: has {len(record.failed)} worlds of seed {seed}, expected"
+            f" {context.cfg.nworld}. Name another folder."
+        )
+    return record
+
+
+def _record(
+    context: RunContext,
+    sim: Simulation,
+    seed: int,
+    episode: Episode,
+    monitors: Sequence[FailureMonitor],
+) -> EpisodeRecord:
+    """The record of this rank's worlds."""
+    place = f"rank {context.ranks.rank}: {socket.gethostname()}, {sim.device}"
+    return EpisodeRecord(
+        seed=seed,
+        backend=sim.backend,
+        device=str(sim.device),
+        failed=episode.failed,
+        values=episode.values,
+        qpos=sim.qpos.cpu().numpy().copy(),
+        start=episode.start,
+        circumstances=Circumstances.of(episode, monitors[0]) if monitors else None,
+        measured={
+            "waypoint_error_m": episode.waypoint_error,
+            "peak_contacts": sim.peak_contacts.cpu().numpy().copy(),
+            "peak_constraint_rows": sim.peak_constraints.cpu().numpy().copy(),
+        },
+        seconds=episode.timing.seconds,
+        steps=int(sim.step_count.sum()),
+        ranks={context.worlds.start: place} if context.ranks.size > 1 else {},
+    )
+
+
+def _runs(numbers: Sequence[int]) -> Iterator[str]:
+    """Ascending numbers in words, neighbours as ``3 to 7``."""
+    for _, group in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
+        run = [number for _, number in group]
+        yield str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}"
 
 
 def _write(record: EpisodeRecord, tally: EpisodeTally) -> None:
@@ -373,8 +458,7 @@ def _write(record: EpisodeRecord, tally: EpisodeTally) -> None:
         return
     try:
         record.write(tally.path.parent, tally.gate)
-        if tally.rows:
-            write_atomic(tally.path, to_csv(tally.rows))
+        tally.write_failing()
     except OSError as error:
         log.exception("the record of seed %d was not written", record.seed)
         tally.details.append(

@@ -1,11 +1,12 @@
 """Gate *batch*: every world does the task, or is named with the rule it broke."""
 
-from mjstack.episodes.context import RunContext, needs_episode
+from mjstack.episodes.context import RunContext, needs_episode, spread
 from mjstack.episodes.rollout import Snapshots
 from mjstack.episodes.tally import play_seeds
 from mjstack.report.record import GateResult
 
 
+@spread
 @needs_episode
 def run_batch(context: RunContext) -> list[GateResult]:
     """Play the task in nworld worlds that start differently, under every seed, and judge each."""
@@ -25,17 +26,17 @@ def run_batch(context: RunContext) -> list[GateResult]:
     context.artifacts.carry_start = snapshots.states.get(carry)
     context.artifacts.timed_episode = tally.first
 
-    metrics: dict[str, float] = {"distinct_final_states": len(tally.ends)}
+    metrics: dict[str, float] = {"distinct_final_states": tally.distinct_ends}
     if not tally.failed:  # worlds that fail have no speed
         speed = tally.steps / tally.seconds
         metrics |= {"episode_s": tally.seconds, "world_steps_per_s": speed}
-    if tally.episodes > 1 and len(tally.ends) < t.distinct_fraction * tally.episodes:
+    if tally.episodes > 1 and tally.distinct_ends < t.distinct_fraction * tally.episodes:
         tally.problems.append(
-            f"only {len(tally.ends)} distinct final states of {tally.episodes} {tally.noun}:"
+            f"only {tally.distinct_ends} distinct final states of {tally.episodes} {tally.noun}:"
             " identical worlds prove nothing, use reset=jitter"
         )
     result = tally.result(
-        [f"{tally.summary}, {len(tally.ends)} distinct"],
+        [f"{tally.summary}, {tally.distinct_ends} distinct"],
         good=len(tally.failed) <= t.failed_worlds,
         metrics=metrics,
         thresholds={"failed_worlds": t.failed_worlds, "distinct_fraction": t.distinct_fraction},

@@ -19,7 +19,7 @@ from mjstack.envs.buffers import (
     random_actions,
     recommend_sizes,
 )
-from mjstack.episodes.context import RunContext, needs_episode
+from mjstack.episodes.context import RunContext, each_rank, needs_episode
 from mjstack.episodes.rollout import FEEDBACK
 from mjstack.errors import Unreachable, name_worlds
 from mjstack.report.record import GateResult, Status
@@ -42,6 +42,7 @@ class _Group:
     broken: list[str] = field(default_factory=list)  # problems at the recommended sizes
 
 
+@each_rank
 @needs_episode
 def run_capacity(context: RunContext) -> list[GateResult]:
     """Find the buffer sizes that the driven task, randomised starts and random actions need, and

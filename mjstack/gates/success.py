@@ -2,6 +2,7 @@
 fails.
 """
 
+import itertools
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,12 +13,12 @@ from mjstack.config.check import places_objects, reads_starts_file
 from mjstack.config.schema import Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
-from mjstack.episodes.context import RunContext, needs_episode
+from mjstack.episodes.context import RunContext, needs_episode, spread
 from mjstack.episodes.record import starts_name
 from mjstack.episodes.regions import find_regions, regions_table, save_regions
 from mjstack.episodes.rollout import CLOSED_LOOP, FEEDBACK, Observer
 from mjstack.episodes.tally import play_seeds
-from mjstack.mdp.starts.starts_file import write_starts
+from mjstack.mdp.starts.starts_file import start_rows, write_rows, write_starts
 from mjstack.report.record import GateResult
 from mjstack.report.write import format_percent, safely_write
 
@@ -34,6 +35,7 @@ def success_config(cfg: Config) -> Config:
     return replace(cfg, reset=reset, controller=replace(cfg.controller, name=name))
 
 
+@spread
 @needs_episode
 def run_success(context: RunContext) -> list[GateResult]:
     """Play the task from random starts under every seed, and hold the share of episodes that
@@ -49,7 +51,7 @@ def run_success(context: RunContext) -> list[GateResult]:
         count=t.seeds,
         noun="episodes",
         circumstances=True,
-        observers=lambda seed: [_StartsWriter(own.folder, seed, unwritten)],
+        observers=lambda seed: [_StartsWriter(own, seed, unwritten)],
     )
     tally.details = unwritten + tally.details
     kept = tally.circumstances
@@ -96,19 +98,25 @@ def run_success(context: RunContext) -> list[GateResult]:
 class _StartsWriter(Observer):
     """Writes how worlds start into a file of the run, unless they start from that very file."""
 
-    def __init__(self, folder: Path | None, seed: int, unwritten: list[str]) -> None:
+    def __init__(self, context: RunContext, seed: int, unwritten: list[str]) -> None:
         """``unwritten`` gets the problem if the file cannot be written."""
+        folder = context.folder
         self._path = None if folder is None else folder / starts_name(seed)
+        self._ranks = context.ranks
         self._unwritten = unwritten
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
         path = self._path
         starts = env.cfg.starts
+        parts = self._ranks.gather(start_rows(env)) if self._ranks.size > 1 else []
         if path is None or (starts is not None and path.resolve() == Path(starts).resolve()):
             return
         # Where the disk is full, the episodes are played all the same
-        if problem := safely_write(path, partial(write_starts, env)):
+        write = (
+            partial(write_rows, itertools.chain(*parts)) if parts else partial(write_starts, env)
+        )
+        if problem := safely_write(path, write):
             self._unwritten.append(problem)
 
 

@@ -14,7 +14,7 @@ from mjstack.bench.physics import measure_physics
 from mjstack.bench.timing import EnergyMeter, Measurement
 from mjstack.config.schema import Backend
 from mjstack.envs import build_env, decided_every_step, without_cameras
-from mjstack.episodes.context import RunContext, lacks_episode
+from mjstack.episodes.context import RunContext, each_rank, lacks_episode
 from mjstack.errors import MjstackError
 from mjstack.gates.runner import log_error
 from mjstack.report.gl import require_offscreen
@@ -24,6 +24,7 @@ CUDA = "throughput_cuda"
 _UNVERIFIED = "a figure counts only where the task was verified"
 
 
+@each_rank
 def run_throughput(context: RunContext) -> list[GateResult]:
     """Measure the CPU-side backend as ``throughput`` and MJWarp on CUDA as ``throughput_cuda``.
 

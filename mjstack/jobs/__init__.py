@@ -1,5 +1,5 @@
 """The jobs of the command line, by the name in `conf/job/`."""
 
-from mjstack.jobs.runner import CheckedJob, Job, check_job
+from mjstack.jobs.runner import CheckedJob, Job, check_job, check_ranks, count_devices
 
-__all__ = ["CheckedJob", "Job", "check_job"]
+__all__ = ["CheckedJob", "Job", "check_job", "check_ranks", "count_devices"]

@@ -11,7 +11,7 @@ from typing import cast
 
 import torch
 
-from mjstack.config.fingerprint import config_hash
+from mjstack.config.fingerprint import config_hash, differences
 from mjstack.config.schema import Backend, CollectJobCfg, Config
 from mjstack.datasets import DatasetSpec, lerobot, require_pyarrow
 from mjstack.datasets.reader import check_same, read_info
@@ -20,7 +20,7 @@ from mjstack.episodes.context import RunContext, require_episode
 from mjstack.errors import ConfigError, DatasetError
 from mjstack.files import check_unused, lock_folder, write_atomic
 from mjstack.jobs.collection import DATASET, FILE, Collection, CollectPlan, read_batches
-from mjstack.jobs.demonstration import ACTION, STATE, differences, episode_config
+from mjstack.jobs.demonstration import ACTION, STATE, episode_config
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.report.record import GateResult, Status

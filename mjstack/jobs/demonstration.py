@@ -14,7 +14,6 @@ from mjstack.config.check import places_objects
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import offered
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
-from mjstack.config.session import list_items
 from mjstack.datasets import DatasetSpec, Feature
 from mjstack.datasets.spec import term_columns
 from mjstack.drivers.driver import Driver
@@ -166,19 +165,6 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     if any(may_meet(cfg.scene, params["xy"], params.get("gap", GAP)) for params in placed):
         config["starts_schema"] = SCHEMA  # the others are drawn as ever
     return config
-
-
-def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
-    """Keys in which two configurations differ, such as ``seed=1, expected 2``."""
-    before, now = (
-        {key: value for key, value in list_items(one) if value == {} or not isinstance(value, dict)}
-        for one in (theirs, ours)
-    )
-    return [
-        f"{key}={before.get(key, 'missing')}, expected {now.get(key, 'none')}"
-        for key in before | now
-        if before.get(key) != now.get(key)
-    ]
 
 
 def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSpec:

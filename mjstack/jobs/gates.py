@@ -3,21 +3,23 @@
 import contextlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from mjstack.config.fingerprint import config_content, differences
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.tilt import turn_sign
 from mjstack.envs import build_env
 from mjstack.envs.build import driven_config
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.earlier_run import archive_starts
+from mjstack.episodes.earlier_run import REPORT, EarlierRun, archive_starts, archived_starts
 from mjstack.episodes.rollout import CLOSED_LOOP, POLICY, STATE_BASED
-from mjstack.errors import ConfigError, KeyedError, Unreachable
+from mjstack.errors import ConfigError, KeyedError, RunError, Unreachable
 from mjstack.gates.images import load_images
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
-from mjstack.jobs.runner import CheckedJob, Job, check_showing
+from mjstack.jobs.runner import CheckedJob, Job, check_showing, run_provenance
 from mjstack.managers.episode import required_fields
 from mjstack.report.gl import require_offscreen
 from mjstack.sim import resolve_backend
@@ -155,11 +157,72 @@ def check_env(context: RunContext, cfg: Config, **keys: str) -> None:
 def check_gates(cfg: Config) -> CheckedJob:
     """Raise for what this machine cannot do, before anything is written."""
     title = f"task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)}"
-    return CheckedJob(context=check_machine(cfg), title=title, work=_run_gates)
+    context = check_machine(cfg)
+    earlier: list[str] = []
+    if cfg.resume is not None and context.ranks.writes:
+        earlier = _check_resumed(context, cfg.resume)
+    return CheckedJob(
+        context=context,
+        title=title,
+        work=_run_gates,
+        folder=None if cfg.resume is None else Path(cfg.resume),
+        own=REPORT,
+        earlier=earlier,
+        spreads=True,
+    )
+
+
+def _check_resumed(context: RunContext, name: str) -> list[str]:
+    """Raise if a folder has no run of this configuration, of which episodes can be kept.
+
+    Returns:
+        The calls that have played it so far.
+
+    Raises:
+        RunError: It has none, or one of another configuration or model.
+    """
+    run = EarlierRun.read(name, "resume")
+    theirs, ours = (_played_config(cfg) for cfg in (run.cfg, context.cfg))
+    if found := differences(theirs, ours):
+        more = f", and {len(found) - 3} more keys" if len(found) > 3 else ""
+        raise RunError(
+            f"resume={name}: has a run of another configuration: {'; '.join(found[:3])}{more}.",
+            "Name another folder, or set these keys back",
+        )
+    if run.provenance.get("model_sha256") != run_provenance(context)["model_sha256"]:
+        raise RunError(
+            f"resume={name}: the compiled model is not the same as in that run, expected the same"
+            " physics.",
+            "Name another folder",
+        )
+    then = run.provenance
+    call = ", ".join(str(then.get(key)) for key in ("date", "git_commit", "device"))
+    return [*then.get("earlier_calls", []), call]
+
+
+def _played_config(cfg: Config) -> dict[str, Any]:
+    """Everything that the episodes of batch and success depend on; more seeds may be asked for."""
+    config = config_content(cfg)
+    for key in ("gates", "view", "video", "graph"):
+        del config[key]
+    backend, _ = resolve_backend(cfg)
+    config["sim"] = {"backend": backend, "step": cfg.sim.step}
+    for name in [*config["gate"]]:
+        if name not in ("batch", "success"):
+            del config["gate"][name]
+    for gate in config["gate"].values():
+        del gate["seeds"]
+    return config
 
 
 def _run_gates(context: RunContext, folder: Path) -> None:
-    run_gates(replace(context, cfg=archive_starts(context.cfg, folder)))
+    if context.ranks.writes and context.cfg.resume is None:
+        cfg = archive_starts(context.cfg, folder)
+    elif context.cfg.resume is not None:
+        cfg = archived_starts(context.cfg, folder)
+    else:  # rank 0 makes the copies
+        cfg = context.cfg
+    run_gates(replace(context, cfg=cfg))
 
 
 JOB = Job(check_gates, shows=True)

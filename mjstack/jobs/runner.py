@@ -5,23 +5,25 @@ import hashlib
 import logging
 import os
 import re
+import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import mujoco
 import numpy as np
+import torch
 from rich.markup import escape
 
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import find_object
-from mjstack.config.schema import Config
+from mjstack.config.schema import Backend, Config
 from mjstack.episodes.context import Artifacts, RunContext
 from mjstack.episodes.rollout import Hook, StepHook
-from mjstack.errors import ConfigError
+from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import log_error
 from mjstack.interrupt import check_interrupt, interrupted
@@ -39,8 +41,9 @@ from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
 from mjstack.report.table import Console, Table, to_document
 from mjstack.report.write import safely_write, summarize, write_report
-from mjstack.sim import Simulation
-from mjstack.sim.build import cuda_driver, cuda_name
+from mjstack.sim import Simulation, resolve_backend
+from mjstack.sim.build import cuda_driver, cuda_name, cuda_uuid
+from mjstack.sim.native import available_cores
 
 log = logging.getLogger(__name__)
 
@@ -82,8 +85,8 @@ class CheckedJob:
         folder: The default folder of a job that resumes; None for a folder of the hour.
         own: A file by which it knows that folder.
         resumes: Its name in report.json, by which it knows any folder that it goes on with.
-        assist: The part in a process of torchrun that writes nothing; None where one process does
-            all.
+        earlier: The calls that the run goes on with, in words.
+        spreads: Whether ranks share the work: `work` is called in each of them.
     """
 
     context: RunContext
@@ -92,7 +95,30 @@ class CheckedJob:
     folder: Path | None = None
     own: str = ""
     resumes: str = ""
-    assist: Callable[[RunContext, Path], object] | None = None
+    earlier: Sequence[str] = ()
+    spreads: bool = False
+
+    def assist(self, folder: Path) -> None:
+        """Do this rank's part of the work: rank 0 alone writes and prints.
+
+        Raises:
+            KeyboardInterrupt: The command was interrupted.
+            Exception: The work has failed.
+        """
+        quiet = replace(
+            self.context,
+            print_line=lambda line: None,
+            begin=lambda name: check_interrupt(),
+            advance=lambda what, done, total: check_interrupt(),
+            artifacts=Artifacts(),
+        )
+        quiet.ranks.gather(self._place())
+        self.work(quiet, folder)
+        check_interrupt()
+
+    def _place(self) -> str:
+        """Where this rank plays."""
+        return f"{socket.gethostname()}, {_device_name(*self.context.backend)}"
 
     def run(self, folder: Path, overrides: Sequence[str] = ()) -> Report:
         """Do the work and write its report after each result into the folder.
@@ -121,6 +147,11 @@ class CheckedJob:
             where = f"{escape(self.title)} -> {escape(str(folder))}"
             console.print(f"[bold]{escape(cfg.robot.title)}[/], {where}")
             report.provenance = run_provenance(self.context)
+            if self.earlier:
+                report.provenance["earlier_calls"] = list(self.earlier)
+            if self.context.ranks.size > 1:
+                places = self.context.ranks.gather(self._place())
+                report.provenance["ranks"] = [f"rank {r}: {p}" for r, p in enumerate(places)]
             _write(report, page)
             with ProgressBar(console) as bar:
                 context = replace(
@@ -142,16 +173,17 @@ class CheckedJob:
             check_interrupt()
         # However it ends, the finished results are in the report.
         except (Exception, SystemExit, KeyboardInterrupt) as error:
-            if interrupted() or isinstance(error, KeyboardInterrupt):
+            cause = self.context.ranks.cause(error)
+            if interrupted() or isinstance(cause, KeyboardInterrupt):
                 report.status = Status.interrupted
                 console.print("interrupted; the finished gates are in the report")
             else:
                 report.status = Status.failed
-                if isinstance(error, OSError):
-                    problem = f"{folder} cannot be written: {error.strerror}. Free space, or set"
+                if isinstance(cause, OSError):
+                    problem = f"{folder} cannot be written: {cause.strerror}. Free space, or set"
                     problem += " hydra.run.dir."
                 else:
-                    problem = log_error(error)
+                    problem = log_error(cause)
                     log.error("%s", problem)
                 errors.print(f"mjstack: {problem}")
         for finish in (partial(_write, page=page), partial(_print_summary, console)):
@@ -167,6 +199,64 @@ def _write(report: Report, page: Page) -> None:
     """Write the report, and its page, whose failure takes no result back."""
     write_report(report)
     safely_write(report.folder / PAGE, write_page, report, page)
+
+
+def count_devices(cfg: Config) -> int:
+    """How many ranks ``devices`` asks for; one if it is null.
+
+    Raises:
+        ConfigError: There are not as many GPUs, or cores where there is no GPU.
+    """
+    if cfg.devices is None:
+        return 1
+    backend, device = resolve_backend(cfg)
+    on_cuda = device.startswith("cuda")
+    there = torch.cuda.device_count() if on_cuda else available_cores()
+    if cfg.devices == "all":
+        return there if on_cuda else 1  # one process uses all cores
+    if int(cfg.devices) > there:
+        kind = "CUDA device" if on_cuda else "core"
+        have = f"{there} {kind}{'s' * (there != 1)}"
+        expected = f"at most {there}, as this machine has {have} for sim={backend}"
+        raise ConfigError("devices", cfg.devices, expected)
+    return int(cfg.devices)
+
+
+def check_ranks(context: RunContext) -> None:
+    """Raise if the ranks of a job do not fit together. Called in each of them.
+
+    Raises:
+        MjstackError: Versions or configurations differ, two ranks have one GPU, or there are fewer
+            worlds than ranks.
+    """
+    ranks = context.ranks
+    cfg = context.cfg
+    _, device = context.backend
+    host = socket.gethostname()
+    facts = collect_provenance()
+    own: dict[str, Any] = {**cast(dict, facts["versions"]), "mjstack's commit": facts["git_commit"]}
+    own["configuration"] = config_hash(config_content(cfg))[:12]
+    gpu = cuda_uuid(device) if device.startswith("cuda") else ""
+    each = ranks.gather((host, own, gpu))
+    for rank, (there, found, _) in enumerate(each):
+        for name, value in each[0][1].items():
+            if found.get(name) != value:
+                raise MjstackError(
+                    f"rank {rank} ({there}) has {name} {found.get(name)} and rank 0"
+                    f" ({each[0][0]}) {value}, expected the same in all ranks",
+                    "Install and start the same everywhere",
+                )
+    if gpu:
+        holders: dict[tuple[str, str], int] = {}
+        for rank, (there, _, which) in enumerate(each):
+            if (other := holders.setdefault((there, which), rank)) != rank:
+                raise MjstackError(
+                    f"ranks {other} and {rank} ({there}) have one GPU, {which}, expected one each",
+                    "Start as many ranks as there are GPUs, with sim.device=auto",
+                )
+    if cfg.nworld < ranks.size:
+        expected = f"at least {ranks.size}, a world for each rank"
+        raise ConfigError("nworld", cfg.nworld, expected)
 
 
 def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
@@ -219,23 +309,27 @@ def write_tables(
 def run_provenance(context: RunContext) -> Provenance:
     """Versions, machine, device, and hashes of configuration and model."""
     backend, device = context.backend
-    name = "Warp's CPU device"
-    if device.startswith("cuda"):
-        name = cuda_name(device)
-    elif backend == "native":
-        name = f"native MuJoCo on {os.cpu_count()} cores"
     # The numbers of the compiled model: the physics sees these, not the files
     buffer = np.empty(mujoco.mj_sizeModel(context.model), np.uint8)
     mujoco.mj_saveModel(context.model, None, buffer)
     config = config_content(context.cfg)
     return collect_provenance() | {
-        "device": f"{device}: {name}",
+        "device": _device_name(backend, device),
         "driver": cuda_driver() if device.startswith("cuda") else "no CUDA device",
         "config_sha256": config_hash(config),
         "model_sha256": hashlib.sha256(buffer.tobytes().hex().encode()).hexdigest(),
         "starts_schema": SCHEMA,
         **({"policy": config["policy"]} if context.cfg.policy else {}),
     }
+
+
+def _device_name(backend: Backend, device: str) -> str:
+    name = "Warp's CPU device"
+    if device.startswith("cuda"):
+        name = cuda_name(device)
+    elif backend is Backend.native:
+        name = f"native MuJoCo on {available_cores()} cores"
+    return f"{device}: {name}"
 
 
 def _draw(context: RunContext, console: Console) -> list[str]:

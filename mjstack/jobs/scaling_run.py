@@ -3,7 +3,6 @@
 import json
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,18 +12,12 @@ from mjstack.config.session import search_path_args
 from mjstack.errors import is_out_of_memory
 from mjstack.files import write_atomic
 from mjstack.interrupt import check_interrupt
+from mjstack.process import own_command
 
 PASS = "pass"
 NOT_RUN = "not run"
 RESULT = "run.json"
 _POLL = 0.1  # s, between two looks at the process
-# The working folder is not imported from (-P), only the folder that has this mjstack. On Linux the
-# process ends with this one (PR_SET_PDEATHSIG), which a second Ctrl-C ends at once.
-_START = (
-    "import ctypes, sys; sys.platform == 'linux' and ctypes.CDLL(None).prctl(1, 9);"
-    f" sys.path.insert(0, {str(Path(__file__).parents[2])!r});"
-    " from mjstack.__main__ import main; main()"
-)
 
 Row = dict[str, Any]
 """One run of the job: ``nworld``, ``backend``, ``status`` (pass, fail, out of memory or not run),
@@ -74,11 +67,11 @@ def run_process(
         shutil.rmtree(folder)  # an earlier try's
     folder.mkdir(parents=True)
     target = str(folder).replace("\\", "\\\\").replace("'", "\\'")
-    command = [sys.executable, "-P", "-c", _START, *overrides, *search_path_args()]
+    command = own_command([*overrides, *search_path_args(), f"hydra.run.dir='{target}'"])
     began = time.monotonic()
     with (folder / "output.log").open("w") as log:
         process = subprocess.Popen(
-            [*command, f"hydra.run.dir='{target}'"],
+            command,
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=subprocess.STDOUT,

@@ -24,7 +24,6 @@ from mjstack.jobs.runner import CheckedJob, Job, write_tables
 from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
-from mjstack.train.distributed import torchrun_ranks
 from mjstack.train.expert_states import whole_starts
 from mjstack.train.trainer import LAST, STATE, Trained, Trainer
 
@@ -62,7 +61,7 @@ def check_train(cfg: Config) -> CheckedJob:
         raise ConfigError("job.test_seed", job.test_seed, expected)
     name = config_hash(training_config(cfg))[:12]
     folder = Path(job.folder or f"outputs/train/{name}")
-    if torchrun_ranks().writes:  # it may have begun there when the others come
+    if context.ranks.writes:  # it may have begun there when the others come
         check_unused(folder, NAME, STATE, "job.folder")
         _check_folder(folder, cfg)
     return CheckedJob(
@@ -72,7 +71,7 @@ def check_train(cfg: Config) -> CheckedJob:
         folder=folder,
         own=STATE,
         resumes=NAME,
-        assist=trainer.train,
+        spreads=True,
     )
 
 
@@ -94,9 +93,10 @@ def _check_folder(folder: Path, cfg: Config) -> None:
 
 def _run(trainer: Trainer, context: RunContext, folder: Path) -> None:
     """Train, and judge the last policy."""
-    _check_folder(folder, context.cfg)  # hydra.run.dir may name one
-    write_atomic(folder / CONFIG, json.dumps(training_config(context.cfg), indent=1) + "\n")
-    run_guarded(context, NAME, partial(_train, trainer, folder))
+    if context.ranks.writes:
+        _check_folder(folder, context.cfg)  # hydra.run.dir may name one
+        write_atomic(folder / CONFIG, json.dumps(training_config(context.cfg), indent=1) + "\n")
+    run_guarded(context, NAME, partial(_train, trainer, folder), "worlds")
     if context.artifacts.results[NAME].status is Status.passed:
         own = judged_context(context, folder / LAST)
         run_guarded(own, "success", run_success)
@@ -125,7 +125,8 @@ def _train(trainer: Trainer, folder: Path, context: RunContext) -> list[GateResu
     """The training as a result of the report."""
     began = time.perf_counter()
     trained = trainer.train(context, folder)
-    _write_curve(context, trained)
+    if context.ranks.writes:
+        _write_curve(context, trained)
     seconds = time.perf_counter() - began
     last = trained.curve[-1]
     figures = ", ".join(f"{name.replace('_', ' ')} {last[name]:.4g}" for name in trained.lines)

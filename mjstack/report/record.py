@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mjstack.report.table import Table
 
-Provenance = dict[str, str | int | dict[str, str] | None]
+Provenance = dict[str, str | int | list[str] | dict[str, str] | None]
 
 
 class Status(StrEnum):

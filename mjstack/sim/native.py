@@ -40,8 +40,9 @@ _STEPS = 4096  # of a thread in one call of MuJoCo's, which no interrupt ends: s
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores that this process may use: under torchrun its share of the machine's."""
+    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return max(1, (found or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
 
 
 class NativeSimulation(Simulation):

@@ -12,13 +12,12 @@ import torch
 from mjstack.config.schema import Backend, CloneJobCfg, CloneSizes
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.context import RunContext
-from mjstack.errors import ConfigError, FolderError, MjstackError
+from mjstack.errors import FolderError, MjstackError
 from mjstack.managers.observation import ObservationManager
 from mjstack.policy.checkpoint import read_state
 from mjstack.train.clone_learner import Learner
 from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import batches_of, play_expert
-from mjstack.train.distributed import Ranks, joined, torchrun_ranks
 from mjstack.train.trainer import LAST, STATE, Trained, Trainer, observed_group
 
 
@@ -32,14 +31,7 @@ def check_clone(context: RunContext) -> range:
         widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
         if job.dataset is not None:
             return check_dataset(Path(job.dataset), env, group, widths)
-    batches = batches_of(job, sizes, cfg.nworld)
-    if len(batches) < torchrun_ranks().size:
-        raise ConfigError(
-            "nworld",
-            cfg.nworld,
-            f"fewer, so that the {torchrun_ranks().size} processes of torchrun have a batch each",
-        )
-    return range(cfg.seed, cfg.seed + len(batches))
+    return range(cfg.seed, cfg.seed + len(batches_of(job, sizes, cfg.nworld)))
 
 
 @contextmanager
@@ -63,16 +55,12 @@ def resolve_sizes(job: CloneJobCfg, device: str) -> CloneSizes:
 
 def train_clone(context: RunContext, folder: Path) -> Trained:
     """Play the expert or read a dataset, and fit a network to its answers; see `Trainer`."""
-    with joined(context.backend[1]) as ranks:
-        return _train(context, folder, ranks)
-
-
-def _train(context: RunContext, folder: Path, ranks: Ranks) -> Trained:
     # An earlier call's training, which may be complete
     cfg = context.cfg
     job = cast(CloneJobCfg, cfg.job)
     sizes = resolve_sizes(job, context.backend[1])
     device = context.backend[1].partition(":")[0]
+    ranks = context.ranks
     made_with = {"sizes": asdict(sizes), "device": device, "processes": ranks.size}
     earlier = read_state(folder / STATE) if (folder / STATE).exists() else None
     if earlier and (theirs := earlier[1]["made_with"]) != made_with:
@@ -89,11 +77,11 @@ def _train(context: RunContext, folder: Path, ranks: Ranks) -> Trained:
     group = observed_group(job, sizes.leave_out)
     cfg = replace(cfg, observation={job.group: group})
     if job.dataset is None:
-        demonstrations = play_expert(context, sizes, group, ranks)
+        demonstrations = play_expert(context, sizes, group)
     else:
         with _one_world(context) as env:
             widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
-        demonstrations = read_demonstrations(Path(job.dataset), context, group, widths, ranks)
+        demonstrations = read_demonstrations(Path(job.dataset), context, group, widths)
     if len(demonstrations.ends) < 2:
         raise MjstackError(
             f"{demonstrations.source}: {len(demonstrations.ends)} of {demonstrations.played}"
@@ -110,7 +98,7 @@ def _train(context: RunContext, folder: Path, ranks: Ranks) -> Trained:
     }
 
     # Batches
-    learner = Learner(context, cfg, sizes, demonstrations, folder, made_with, facts, ranks)
+    learner = Learner(context, cfg, sizes, demonstrations, folder, made_with, facts)
     if earlier:
         learner.restore(*earlier)
     learner.learn()

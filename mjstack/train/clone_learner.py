@@ -15,12 +15,12 @@ from torch import Tensor
 
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import CloneJobCfg, CloneSizes, Config
+from mjstack.distributed import Ranks
 from mjstack.episodes.context import RunContext
 from mjstack.interrupt import check_interrupt
 from mjstack.policy import Policy, PolicyNetwork, save_policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.train.demonstrations import Demonstrations
-from mjstack.train.distributed import Ranks
 from mjstack.train.trainer import (
     BEST,
     LAST,
@@ -60,19 +60,17 @@ class Learner:
         folder: Path,
         made_with: dict[str, Any],
         expert: dict[str, Any],
-        ranks: Ranks,
     ) -> None:
         """Make the network.
 
         Args:
-            context: The run, for its progress.
+            context: The run, for its progress and its ranks.
             cfg: The configuration with the policy's observation.
             sizes: How much is trained.
             demonstrations: The expert's episodes.
             folder: Where policies and state are.
             made_with: Sizes and device. An earlier call must have had the same.
             expert: Figures of the demonstrations.
-            ranks: The processes of the training.
         """
         self._context = context
         job = cast(CloneJobCfg, cfg.job)
@@ -81,7 +79,7 @@ class Learner:
         self._folder = folder
         self._made_with = made_with
         self._expert = expert
-        self._ranks = ranks
+        self._ranks = ranks = context.ranks
         self.take(demonstrations)
         device = self._seen.device
         self._batch_size = max(1, sizes.batch_size // ranks.size)
@@ -160,6 +158,7 @@ class Learner:
                     self._save()
                 if saves or self.done % _SHOWN == 0:
                     try:
+                        self._ranks.stop_together()
                         self._context.advance("batches", self.done, total)
                         check_interrupt()
                     except KeyboardInterrupt:

@@ -24,7 +24,6 @@ from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.train.clone import check_clone, resolve_sizes
 from mjstack.train.clone_learner import Learner
 from mjstack.train.demonstrations import DemonstrationRecorder, Demonstrations
-from mjstack.train.distributed import Ranks, torchrun_ranks
 from mjstack.train.trainer import BEST, LAST, STATE, EventWriter, Trained, Trainer, observed_group
 
 _SPELL = 0.5  # s, for which the expert or the policy drives before it is drawn anew
@@ -140,7 +139,7 @@ def check_dagger(context: RunContext) -> range:
     if job.dataset is not None:
         expected = "null, because trainer=dagger asks the expert itself"
         raise ConfigError("job.dataset", job.dataset, expected, "Set trainer=clone")
-    if (processes := torchrun_ranks().size) > 1:
+    if (processes := context.ranks.size) > 1:
         raise MjstackError(
             f"torchrun has started {processes} processes, and trainer=dagger runs in one",
             "Start it without torchrun, or set trainer=clone",
@@ -208,7 +207,7 @@ def _make_learner(
     job = cast(DaggerJobCfg, context.cfg.job)
     cfg = replace(context.cfg, observation={job.group: observed_group(job, sizes.leave_out)})
     total = replace(sizes, batches=job.rounds * sizes.batches)
-    return RoundLearner(context, cfg, total, first, folder, made_with, {}, Ranks())
+    return RoundLearner(context, cfg, total, first, folder, made_with, {})
 
 
 def _trained(folder: Path, facts: dict[str, Any]) -> Trained:

@@ -19,7 +19,6 @@ from mjstack.episodes.context import RunContext
 from mjstack.errors import DatasetError
 from mjstack.mdp.geometry import robot
 from mjstack.train.demonstrations import Demonstrations
-from mjstack.train.distributed import Ranks
 
 _ACTION = "action"
 _SUCCESS = "next.success"
@@ -71,16 +70,14 @@ def read_demonstrations(
     context: RunContext,
     group: ObservationGroupCfg,
     widths: dict[str, int],
-    ranks: Ranks,
 ) -> Demonstrations:
     """The episodes of a dataset that succeeded, on the device of the training.
 
     Args:
         folder: The dataset.
-        context: The run.
+        context: The run. Each rank reads its share of the episodes.
         group: The observation of the policy.
         widths: Numbers of each of its terms.
-        ranks: The processes of the training: each reads its share of the episodes.
 
     Raises:
         DatasetError: A file is missing or damaged.
@@ -102,6 +99,7 @@ def read_demonstrations(
     good = columns["task_index"][ends - 1, 0] == task
     if _SUCCESS in columns:
         good &= columns[_SUCCESS][ends - 1, 0] != 0.0
+    ranks = context.ranks
     own = [(a, b) for a, b in zip(starts[good], ends[good], strict=True)][ranks.rank :: ranks.size]
     keep = np.concatenate([np.arange(a, b) for a, b in own]) if own else np.arange(0)
     device = context.backend[1]

@@ -17,7 +17,6 @@ from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import Observer, play_episode
 from mjstack.managers.observation import ObservationManager
 from mjstack.managers.view import random_uniform
-from mjstack.train.distributed import Ranks
 
 NOISE_SECONDS = 0.5  # in which the noise of a joint is forgotten
 
@@ -143,28 +142,27 @@ def batches_of(job: CloneJobCfg, sizes: CloneSizes, nworld: int) -> list[tuple[i
 
 
 def play_expert(
-    context: RunContext, sizes: CloneSizes, group: ObservationGroupCfg, ranks: Ranks
+    context: RunContext, sizes: CloneSizes, group: ObservationGroupCfg
 ) -> Demonstrations:
     """Play the expert, and keep the episodes that the task's check accepts.
 
     Args:
-        context: The run; starts and expert are the configured ones.
+        context: The run; starts and expert are the configured ones. Each rank plays its worlds.
         sizes: How many episodes.
         group: What a policy will see.
-        ranks: The processes of the training: each plays its share of the seeds.
     """
     cfg = context.cfg
     job = cast(CloneJobCfg, cfg.job)
     nworld = min(cfg.nworld, max(sizes.episodes, sizes.noisy_episodes))
-    every = list(enumerate(batches_of(job, sizes, nworld), start=cfg.seed))
-    batches = every[ranks.rank :: ranks.size]
-    most = sum(count for _, (count, _) in batches)
+    batches = list(enumerate(batches_of(job, sizes, nworld), start=cfg.seed))
+    worlds = context.ranks.share(nworld)
+    most = sum(len(range(worlds.start, min(worlds.stop, count))) for _, (count, _) in batches)
     seen = labels = torch.zeros(0)
     widths: dict[str, int] = {}
     kept = steps = 0
-    with closing(context.batch_simulation(nworld)) as sim:
+    with closing(context.batch_simulation(len(worlds))) as sim:
         for seed, (count, noise) in batches:
-            env = context.start(sim, cfg.reset, seed=seed)
+            env = context.start(sim, cfg.reset, seed=seed, worlds=worlds)
             driver = NoisyDriver(context.driver(env), env, noise)
             recorder = DemonstrationRecorder(job.group, group)
             label = f"steps of the expert, seed {seed}"
@@ -175,14 +173,15 @@ def play_expert(
                 seen = recorder.seen.new_zeros((most, steps, recorder.seen.shape[2]))
                 labels = recorder.labels.new_zeros((most, steps, recorder.labels.shape[2]))
             good = (episode.result.failed == 0).nonzero()[:, 0]
-            good = good[good < count]
+            good = good[good < count - worlds.start]
             into = slice(kept, kept + len(good))
             seen[into] = recorder.seen[:, good].transpose(0, 1)
             labels[into] = recorder.labels[:, good].transpose(0, 1)
             kept += len(good)
             what = f"noise of {noise:g} rad" if noise else "no noise"
+            succeeded = sum(context.ranks.gather(len(good)))
             context.print_line(
-                f"train: seed {seed}, {what}: {len(good)} of {count} episodes of the expert"
+                f"train: seed {seed}, {what}: {succeeded} of {count} episodes of the expert"
                 " succeeded"
             )
     return Demonstrations(
@@ -191,5 +190,5 @@ def play_expert(
         ends=steps * torch.arange(1, kept + 1, device=seen.device),
         widths=widths,
         played=most,
-        source=f"the expert, seeds {every[0][0]} to {every[-1][0]}",
+        source=f"the expert, seeds {batches[0][0]} to {batches[-1][0]}",
     )

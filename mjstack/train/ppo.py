@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import cast
 
 import torch
-import torch.distributed as dist
 
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import (
@@ -20,7 +19,6 @@ from mjstack.errors import ConfigError, PolicyError, UnknownName
 from mjstack.managers.term import check_params
 from mjstack.policy import Policy, load_policy
 from mjstack.policy.checkpoint import read_state
-from mjstack.train.distributed import joined, torchrun_ranks
 from mjstack.train.expert_states import record_states, unrecorded, whole_starts, with_states
 from mjstack.train.ppo_learner import Learner, Plan
 from mjstack.train.trainer import LAST, STATE, Trained, Trainer, observed_group
@@ -83,9 +81,10 @@ def check_ppo(context: RunContext) -> range:
     job = cast(PpoJobCfg, cfg.job)
     if job.iterations is None and job.minutes is None:
         raise ConfigError("job.iterations", None, "a number, or a limit in job.minutes")
-    if cfg.nworld * job.horizon < 2 * job.minibatches:
-        expected = f"at most {cfg.nworld * job.horizon // 2}, so that each has two decisions"
-        expected += f" (nworld={cfg.nworld} times job.horizon={job.horizon} are divided)"
+    worlds = cfg.nworld // context.ranks.size
+    if worlds * job.horizon < 2 * job.minibatches:
+        expected = f"at most {worlds * job.horizon // 2}, so that each has two decisions"
+        expected += f" (nworld={worlds} times job.horizon={job.horizon} are divided)"
         raise ConfigError("job.minibatches", job.minibatches, expected)
     plan = make_plan(cfg)
     first, least, most = plan.settings.std
@@ -112,7 +111,7 @@ def check_ppo(context: RunContext) -> range:
             plan.start.check_widths(env.observation_manager.term_dims[plan.group])
     finally:
         env.close()
-    return range(cfg.seed, cfg.seed + torchrun_ranks().size)
+    return range(cfg.seed, cfg.seed + 1)
 
 
 def train_ppo(context: RunContext, folder: Path) -> Trained:
@@ -120,24 +119,26 @@ def train_ppo(context: RunContext, folder: Path) -> Trained:
     cfg = context.cfg
     job = cast(PpoJobCfg, cfg.job)
     device = torch.device(context.backend[1])
-    with joined(context.backend[1]) as ranks:
-        states = folder / _STATES
-        if unrecorded(cfg.reset):
-            if ranks.writes and not states.exists():
+    ranks = context.ranks
+    states = folder / _STATES
+    if unrecorded(cfg.reset):
+
+        def record() -> None:
+            if not states.exists():
                 record_states(context, job.expert_worlds, states)
-            if ranks.size > 1:
-                dist.barrier()
-        plan = make_plan(with_states(cfg, states))
-        cards = [device] if device.type == "cuda" else []
-        with torch.random.fork_rng(devices=cards):
-            torch.manual_seed(cfg.seed + ranks.rank)
-            learner = Learner(context, plan, folder, ranks)
-            try:
-                if (folder / STATE).exists():
-                    learner.restore(*read_state(folder / STATE))
-                learner.learn()
-            finally:
-                learner.close()
+
+        ranks.from_first(record)
+    plan = make_plan(with_states(cfg, states))
+    cards = [device] if device.type == "cuda" else []
+    with torch.random.fork_rng(devices=cards):
+        torch.manual_seed(cfg.seed + ranks.rank)
+        learner = Learner(context, plan, folder)
+        try:
+            if (folder / STATE).exists():
+                learner.restore(*read_state(folder / STATE))
+            learner.learn()
+        finally:
+            learner.close()
     last = learner.curve[-1]
     return Trained(
         metrics={

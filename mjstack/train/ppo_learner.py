@@ -4,8 +4,9 @@ import io
 import math
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,7 +21,6 @@ from mjstack.episodes.context import RunContext
 from mjstack.interrupt import check_interrupt
 from mjstack.policy import Policy, PolicyNetwork, save_policy
 from mjstack.policy.checkpoint import write_state
-from mjstack.train.distributed import Ranks
 from mjstack.train.trainer import (
     BEST,
     LAST,
@@ -62,23 +62,25 @@ class Learner:
         change: KL divergence of the policy after the last iteration from the one before.
     """
 
-    def __init__(self, context: RunContext, plan: Plan, folder: Path, ranks: Ranks) -> None:
+    def __init__(self, context: RunContext, plan: Plan, folder: Path) -> None:
         """Build the environment and rsl_rl's runner.
 
         Args:
-            context: The run, for its model, its device and its progress.
+            context: The run, for its model, its device, its progress and its ranks.
             plan: The training.
             folder: Where policies and state are.
-            ranks: The processes of the training.
         """
         self._context = context
         self._plan = plan
         self._job = cast(PpoJobCfg, plan.cfg.job)
         self._folder = folder
-        self._ranks = ranks
+        self._ranks = ranks = context.ranks
+        worlds = context.worlds
         backend, device = context.backend
         env = build_env(
-            replace(plan.cfg, seed=plan.cfg.seed + ranks.rank),
+            plan.cfg,
+            nworld=len(worlds),
+            first_world=worlds.start,
             model=context.model,
             backend=backend,
             device=device,
@@ -135,6 +137,7 @@ class Learner:
             if self.done % self._job.save_every == 0 or self._over():
                 self._save()
             try:
+                self._ranks.stop_together()
                 self._show()
                 check_interrupt()
             except KeyboardInterrupt:
@@ -152,11 +155,7 @@ class Learner:
             or self.seconds >= 60.0 * (job.minutes or math.inf)
             or in_call >= 60.0 * (job.max_minutes or math.inf)
         )
-        if self._ranks.size == 1:
-            return over
-        flag = torch.tensor([float(over)], device=self._env.device)
-        self._ranks.sum_(flag)
-        return bool(flag > 0.0)
+        return self._ranks.any(over)
 
     def _iterate(self, *, spread: bool) -> None:
         """One iteration; in the first one of a call the ends of the episodes are spread out."""
@@ -234,9 +233,9 @@ class Learner:
     def _row(self) -> dict[str, Any]:
         """Figures since the last row. Values of reward terms are means over the episodes' steps."""
         env = self._env.env
-        found = env.read_statistics()
+        found = _mean(self._ranks.gather(env.read_statistics()))
         steps = found.get("steps", math.nan)
-        each = self._job.horizon * env.nworld * self._ranks.size
+        each = self._job.horizon * self._plan.cfg.nworld
         earlier = self.curve[-1] if self.curve else {"decisions": 0, "training_s": 0.0}
         decisions = each * self.done
         spent = max(1e-9, self.seconds - earlier["training_s"])
@@ -380,10 +379,28 @@ class Learner:
             torch.set_rng_state(state["random"])
             if "random_cuda" in state and self._env.device.type == "cuda":
                 torch.cuda.set_rng_state(state["random_cuda"], self._env.device)
-        self._env.env.episode.copy_(state["episode"])
+        episode = state["episode"]
+        if len(episode) != self._env.env.nworld:  # of another number of ranks, or another share
+            episode = episode.max()
+        self._env.env.episode.copy_(episode)
         self._env.env.reset()
         self.done = facts["done"]
         self.seconds = facts["seconds"]
         self.best = (facts["best"][0], facts["best"][1])
         self.curve = facts["curve"]
         self._context.print_line(f"train: goes on after iteration {self.done}")
+
+
+def _mean(parts: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Statistics of the episodes of all ranks, from those of each."""
+    if len(parts) == 1:
+        return parts[0]
+    counts = [part["episodes"] for part in parts]
+    total = sum(counts)
+    names = dict.fromkeys(name for part in parts for name in part if name != "episodes")
+    means = {
+        name: sum(n * part[name] for n, part in zip(counts, parts, strict=True) if n) / total
+        for name in names
+        if total
+    }
+    return {"episodes": total, **means}

@@ -73,6 +73,12 @@ class Config:
     """controller=policy, job=play, job=export: the folder of a trained policy."""
     run: str | None = spec(None)
     """job=replay: the folder of an earlier run."""
+    resume: str | None = spec(None)
+    """job=gates: the folder of an earlier run of this configuration; seeds that batch and success
+    have finished there are read back, and the others are played."""
+    devices: str | None = spec(None)
+    """GPUs that share the job's worlds, a process for each: all, or how many. null: as torchrun
+    has it, or one."""
     world: str | None = spec(None)
     """job=replay: a world of it, such as 17, or 3:17 for world 17 of seed 3; success:3:17 where
     batch ran too."""

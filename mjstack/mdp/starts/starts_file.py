@@ -3,7 +3,7 @@
 import csv
 import math
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import mujoco
@@ -261,6 +261,25 @@ def write_starts(env: EnvView, path: str | Path) -> None:
         ArgumentError: The worlds have moved on.
         OSError: The file cannot be written.
     """
+    write_rows(start_rows(env), path)
+
+
+def write_rows(rows: Iterable[dict[str, object]], path: str | Path) -> None:
+    """Write rows of `start_rows`, of one environment or of several, one after the other.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    numbered = [row | {"world": world} for world, row in enumerate(rows)]
+    write_atomic(Path(path), to_csv(numbered))
+
+
+def start_rows(env: EnvView) -> list[dict[str, object]]:
+    """How the worlds of an environment have just started, by the columns of a starts file.
+
+    Raises:
+        ArgumentError: The worlds have moved on.
+    """
     if bool((env.episode_step != 0).any()) or bool((env.episode < 0).any()):
         found = "worlds that have moved on, or not started"
         raise ArgumentError("env", found, "worlds at their start", "Call env.reset() before")
@@ -286,8 +305,7 @@ def write_starts(env: EnvView, path: str | Path) -> None:
     for name in _drawn_places(env):
         add(_xy(name), place_xy(env, name))
     # Python's and numpy's shortest text of a number is read back to the same bits.
-    rows = [dict(zip(table, cells, strict=True)) for cells in zip(*table.values(), strict=True)]
-    write_atomic(Path(path), to_csv(rows))
+    return [dict(zip(table, cells, strict=True)) for cells in zip(*table.values(), strict=True)]
 
 
 def _drawn_places(env: EnvView) -> list[str]:

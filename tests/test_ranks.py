@@ -1,0 +1,309 @@
+"""A job in several ranks: world k is world k, one report, failures by rank, and runs that are gone
+on with in another number of ranks.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compositions import load_config
+from environments import one_second_episode
+
+import mjstack
+from mjstack.cli import run
+from mjstack.config.schema import Config
+from mjstack.distributed import Ranks, current_ranks
+from mjstack.episodes.context import RunContext
+from mjstack.episodes.record import EpisodeRecord
+from mjstack.errors import ConfigError, MjstackError
+from mjstack.jobs import check_ranks, count_devices
+
+SHORT = ["sim=native", "gates=[batch]", *one_second_episode()]
+OF_CALL = {"seconds", "rank_first_world", "rank_place"}  # of a record
+
+TRAP = """\
+import os, signal
+
+def spring(env, mask):
+    if os.environ.get("RANK") == "1" and env.seed == 2:
+        if "KILL" in os.environ:
+            os.kill(os.getpid(), signal.SIGKILL)
+        raise RuntimeError("the trap")
+"""
+
+
+def start(ranks: int, args: Sequence[str], folder: Path, **env: str) -> subprocess.Popen[str]:
+    """A command in ranks of this machine; its output goes to one pipe."""
+    root = str(Path(mjstack.__file__).parents[1])
+    launcher = ["-m", "torch.distributed.run", f"--nproc-per-node={ranks}", "-m"]
+    return subprocess.Popen(
+        [sys.executable, *(launcher if ranks else ["-m"]), "mjstack", *args],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": root, "OMP_NUM_THREADS": "1"} | env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def play(ranks: int, args: Sequence[str], folder: Path, status: int | None = 0, **env: str) -> str:
+    """The output of such a command when it has ended."""
+    process = start(ranks, args, folder, **env)
+    text, _ = process.communicate(timeout=400)
+    assert status is None or process.returncode == status, text
+    return text
+
+
+def report_of(folder: Path) -> dict:
+    return json.loads((folder / "report.json").read_text())
+
+
+def assert_same_episodes(one: Path, other: Path) -> None:
+    """Records and tables of two runs agree bit for bit."""
+    names = sorted(path.name for path in one.glob("*.npz"))
+    assert names
+    assert names == sorted(path.name for path in other.glob("*.npz"))
+    for name in names:
+        with np.load(one / name) as ours, np.load(other / name) as theirs:
+            assert ours.files == theirs.files
+            for key in set(ours.files) - OF_CALL:
+                np.testing.assert_array_equal(ours[key], theirs[key], err_msg=f"{name}: {key}")
+    for path in one.glob("*.csv"):
+        assert path.read_bytes() == (other / path.name).read_bytes()
+
+
+def test_two_ranks_play_what_one_plays(tmp_path: Path) -> None:
+    """Five worlds: the shares differ. Batch and success, whose starts are drawn; every gate has one
+    result, and says where its worlds were.
+    """
+    args = [*SHORT, "gates=[baseline,batch,success]", "nworld=5", "gate.batch.seeds=2"]
+    text = play(0, [*args, "devices=2", f"hydra.run.dir={tmp_path}/two"], tmp_path, 1)
+    assert run([*args, f"hydra.run.dir={tmp_path}/one"]) == 1  # the episodes are too short
+    assert_same_episodes(tmp_path / "one", tmp_path / "two")
+    assert len(list(csv.reader((tmp_path / "two/starts_seed0.csv").open()))) == 6
+
+    assert text.count("status: fail") == 1  # one process prints
+    one, two = (report_of(tmp_path / name) for name in ("one", "two"))
+    assert [gate["name"] for gate in two["gates"]] == ["baseline", "batch", "success"]
+    for ours, theirs in zip(one["gates"][1:], two["gates"][1:], strict=True):
+        speeds = {"episode_s", "world_steps_per_s"}
+        assert {k: v for k, v in ours["metrics"].items() if k not in speeds} == {
+            k: v for k, v in theirs["metrics"].items() if k not in speeds
+        }
+        (table,) = [table for table in theirs["tables"] if "Which rank" in table["title"]]
+        assert [row[0] for row in table["rows"]] == ["0 to 1", "2 to 4"]
+        assert [row[1].split(":")[0] for row in table["rows"]] == ["rank 0", "rank 1"]
+    assert two["gates"][0]["notes"]["ranks"] == "rank 0 alone"
+    assert len(two["provenance"]["ranks"]) == 2
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("backend", ["native", "mjwarp"])
+def test_three_ranks(backend: str, tmp_path: Path) -> None:
+    """Uneven shares, and the feedback of the closed loop, on either backend of a CPU."""
+    args = [
+        *SHORT,
+        f"sim={backend}",
+        "sim.device=cpu",
+        "gates=[batch,success]",
+        "nworld=5",
+        "controller=closed_loop",
+    ]
+    for ranks in (1, 2, 3):
+        play(ranks, [*args, f"hydra.run.dir={tmp_path}/{ranks}"], tmp_path, 1)
+    assert_same_episodes(tmp_path / "1", tmp_path / "2")
+    assert_same_episodes(tmp_path / "1", tmp_path / "3")
+
+
+@pytest.fixture
+def trap(tmp_path: Path) -> list[str]:
+    """Overrides of a run whose second rank breaks under seed 2."""
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "trap.py").write_text(TRAP)
+    more = ["nworld=5", "gate.batch.seeds=4", "+reset.trap={func: trap.spring}"]
+    return [*SHORT, "--config-dir", str(tmp_path / "conf"), *more]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("env", "why"), [({}, "the trap"), ({"KILL": "1"}, "was killed")])
+def test_a_rank_that_breaks(env: dict[str, str], why: str, trap: list[str], tmp_path: Path) -> None:
+    """The run fails with the rank and the reason, within seconds; finished seeds are kept, and one
+    process goes on with them.
+    """
+    folder = tmp_path / "run"
+    began = time.monotonic()
+    text = play(2, [*trap, f"hydra.run.dir={folder}"], tmp_path, 1, **env)
+    assert time.monotonic() - began < 60.0
+    (gate,) = report_of(folder)["gates"]
+    assert gate["status"] == "fail"
+    assert re.match(r"rank 1 of 2 \(.*\).*" + why, gate["reason"])
+    assert f"resume={folder}" in gate["reason"]
+    assert f"mjstack: {gate['reason'].split('.')[0]}" in text
+    assert sorted(path.name for path in folder.glob("*.npz")) == [
+        "worlds_seed0.npz",
+        "worlds_seed1.npz",
+    ]
+
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("*.npz")}
+    play(0, [*trap, f"resume={folder}"], tmp_path, 1)
+    play(0, [*trap, f"hydra.run.dir={tmp_path}/whole"], tmp_path, 1)
+    assert_same_episodes(tmp_path / "whole", folder)
+    assert {path: path.stat().st_mtime_ns for path in before} == before  # read back
+    report = report_of(folder)
+    (gate,) = report["gates"]
+    assert gate["metrics"]["episodes"] == 20
+    assert "an earlier call has played seeds 0 to 1" in gate["details"]
+    assert len(report["provenance"]["earlier_calls"]) == 1
+
+
+@pytest.mark.full
+def test_ctrl_c_stops_all_ranks(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    args = [*SHORT, "nworld=4", "gate.batch.seeds=10000", f"hydra.run.dir={folder}", "devices=2"]
+    process = start(0, args, tmp_path)
+    until = time.monotonic() + 120.0
+    while not (folder / "worlds_seed1.npz").exists() and time.monotonic() < until:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    began = time.monotonic()
+    text, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, text
+    assert time.monotonic() - began < 20.0
+    assert text.count("interrupted") == 2  # the line, and the status
+    assert "Traceback" not in text
+    assert report_of(folder)["status"] == "interrupted"
+
+
+# Gates that resume
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of two seeds of batch and one of success."""
+    folder = tmp_path_factory.mktemp("resume") / "run"
+    args = [*SHORT, "gates=[batch,success]", "nworld=3", "gate.batch.seeds=2"]
+    assert run([*args, f"hydra.run.dir={folder}"]) == 1
+    return folder
+
+
+def test_finished_seeds_are_read_back(finished: Path) -> None:
+    """Every figure of a read record is that of the played one; more seeds may be asked for."""
+    played = report_of(finished)
+    args = [*SHORT, "gates=[batch,success]", "nworld=3", f"resume={finished}"]
+    written = (finished / "worlds_seed1.npz").stat().st_mtime_ns
+    assert run([*args, "gate.batch.seeds=2"]) == 1
+    again = report_of(finished)
+    for ours, theirs in zip(played["gates"], again["gates"], strict=True):
+        assert ours["metrics"] == theirs["metrics"]
+        assert ours["reason"] == theirs["reason"]
+        assert ours["tables"] == theirs["tables"]
+    assert (finished / "worlds_seed1.npz").stat().st_mtime_ns == written
+    assert run([*args, "gate.batch.seeds=3"]) == 1
+    assert report_of(finished)["gates"][0]["metrics"]["episodes"] == 9
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["nworld=4"], "nworld=3, expected 4"),
+        (["nworld=3", "seed=1"], "seed=0, expected 1"),
+        (["nworld=3", "job=collect"], "resume="),
+    ],
+)
+def test_another_configuration_is_refused(
+    overrides: list[str], says: str, finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (finished / "report.json").read_bytes()
+    assert run([*SHORT, "gates=[batch,success]", *overrides, f"resume={finished}"]) == 2
+    assert says in capsys.readouterr().err
+    assert (finished / "report.json").read_bytes() == before
+
+
+def test_a_record_of_an_older_version_is_refused(finished: Path, tmp_path: Path) -> None:
+    """It lacks what a result needs; a replay reads it all the same."""
+    with np.load(finished / "worlds_seed0.npz") as held:
+        rest = {key: held[key] for key in held.files if not key.startswith("measured.")}
+        del rest["steps"]
+    np.savez(tmp_path / "worlds_seed0.npz", **rest)
+    assert EpisodeRecord.read(tmp_path, 0) is not None
+    with pytest.raises(MjstackError, match="cannot be read"):
+        EpisodeRecord.read(tmp_path, 0, whole=True)
+
+
+# Ranks that do not fit together
+
+
+@pytest.mark.parametrize(("count", "size"), [(7, 1), (7, 2), (7, 3), (3, 3), (65536, 8)])
+def test_shares(count: int, size: int) -> None:
+    """Every world is in one share, and no share has two more than another."""
+    shares = [Ranks(rank, size).share(count) for rank in range(size)]
+    assert [world for share in shares for world in share] == list(range(count))
+    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+
+
+class Others(Ranks):
+    """Two ranks, of which the other one tells something else."""
+
+    change: dict[str, str]
+
+    def gather(self, value: tuple) -> list:  # type: ignore[override]
+        host, facts, gpu = value
+        return [value, (host, facts | self.change, gpu)]
+
+
+def test_unequal_versions_are_refused() -> None:
+    ranks = Others(0, 2)
+    Others.change = {}
+    context = RunContext(load_config(["sim=native"]), ranks=ranks)
+    check_ranks(context)
+    Others.change = {"torch": "1.0"}
+    with pytest.raises(MjstackError, match=r"rank 1 \(.*\) has torch 1\.0 and rank 0 \(.*\) \d"):
+        check_ranks(context)
+    Others.change = {}
+    context = replace(context, cfg=replace(context.cfg, nworld=1))
+    with pytest.raises(ConfigError, match="nworld=1: expected at least 2, a world for each rank"):
+        check_ranks(context)
+
+
+@pytest.mark.parametrize("value", ["0", "some", "-1", "1.5"])
+def test_devices_is_a_number_or_all(value: str) -> None:
+    with pytest.raises(ConfigError, match=f"devices={value}: expected all, or a number"):
+        load_config([f"devices={value}"])
+
+
+def test_more_devices_than_there_are() -> None:
+    def cfg(value: str) -> Config:
+        return load_config(["sim=native", f"devices={value}"])
+
+    assert count_devices(cfg("1")) == 1
+    assert count_devices(cfg("all")) == 1  # on a CPU one process uses all cores
+    with pytest.raises(ConfigError, match=r"devices=9999: expected at most \d+, as this machine"):
+        count_devices(cfg("9999"))
+
+
+@pytest.mark.full
+def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("0.0.0.0", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        own = {"RANK": "0", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+        text = play(0, SHORT, tmp_path, 2, **own)
+    lines = [line for line in text.splitlines() if line.startswith("mjstack:")]
+    assert len(lines) == 1
+    assert f"MASTER_PORT={port}: is in use" in lines[0]
+    assert current_ranks() == Ranks()
+    assert not list(tmp_path.iterdir())
