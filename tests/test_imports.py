@@ -49,6 +49,8 @@ HOMES = {
     "tensordict": ("adapters/",),
     "pyarrow": ("datasets/",),
     "safetensors": ("policy/",),
+    "viser": ("report/web.py",),
+    "trimesh": ("report/web.py",),
     "onnx": ("policy/onnx.py",),
     "rich": ("jobs/", "cli.py", "bench/", "report/table.py", "managers/term.py"),
 }

@@ -142,6 +142,7 @@ def test_failing_world_fails_again_bit_for_bit(
         )
     assert sorted(path.name for path in (out).iterdir()) == [
         ".hydra",
+        "episode.html",
         "replayed_config.yaml",
         "report.html",
         "report.json",
@@ -598,7 +599,10 @@ WRONG = [
     (["run={run}", "world=2:1"], "a seed from 0 to 1"),
     (["run={run}", "world=-1"], "world=-1"),
     (["run={run}", "world=1.5"], "world=1.5"),
-    (["run={run}", "world=1", "nworld=3"], "nworld=3: expected only run, world, sim, view, video"),
+    (
+        ["run={run}", "world=1", "nworld=3"],
+        "nworld=3: expected only run, world, sim, view, video, web",
+    ),
     (["run={run}", "world=1", "sim.device=cuda:77"], "cuda:77"),
 ]
 
@@ -613,7 +617,7 @@ BAD = [
     (["run={run}", "world=7"], "a world from 0 to 4"),
     (
         ["run={run}", "world=1", "robot=rebot"],
-        "robot=rebot: expected only run, world, sim, view, video",
+        "robot=rebot: expected only run, world, sim, view, video, web",
     ),
     (["run={run}", "world=1", "~reset.cubes"], "reset.cubes"),
     (["run={run}", "world=1", "sim=native", "sim.device=cuda:0"], "cuda:0"),

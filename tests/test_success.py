@@ -113,6 +113,7 @@ def test_small_region_passes(passed: Path) -> None:
     assert sorted(path.name for path in passed.iterdir()) == sorted(
         [
             ".hydra",
+            "episode.html",
             "starts_seed0.csv",
             "report.html",
             "report.json",

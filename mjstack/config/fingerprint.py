@@ -15,7 +15,7 @@ from mjstack.config.session import list_items
 from mjstack.errors import ConfigError
 
 CONTENT = "sha256:"  # in front of what stands for a file
-_OF_THE_CALL = ("resume", "devices")  # they change no result
+_OF_THE_CALL = ("resume", "devices", "web")  # they change no result
 POLICY_FILE = "policy.json"  # of a policy's folder; it names the weights by their SHA-256
 
 

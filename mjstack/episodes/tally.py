@@ -15,6 +15,7 @@ import numpy as np
 from mjstack.config.session import search_path_args
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor, describe_sign
+from mjstack.episodes.motion import MotionRecorder, records_motion, show_batch
 from mjstack.episodes.record import FAILING, SUCCESS_FAILING, Circumstances, EpisodeRecord
 from mjstack.episodes.rollout import Episode, Observer
 from mjstack.errors import RunError, first_line, name_worlds
@@ -330,14 +331,17 @@ def play_seeds(
     }
 
     # Seed after seed
+    records = records_motion(context)
     last = cfg.seed + count - 1
     try:
         for seed in range(cfg.seed, last + 1):
             try:
                 record = ranks.from_first(partial(_read, context, gate, seed))
+                recorders = []
                 if record is None:
                     monitors = [FailureMonitor()] if circumstances else []
-                    looking = [*monitors, *observers(seed)]
+                    recorders = [MotionRecorder()] if records and seed == cfg.seed else []
+                    looking = [*monitors, *observers(seed), *recorders]
                     episode = context.play(
                         sim, cfg.reset, looking, seed=seed, worlds=context.worlds
                     )
@@ -358,6 +362,8 @@ def play_seeds(
                 break
             if seed not in tally.again:
                 _write(record, tally)
+            for recorder in recorders:
+                show_batch(context, gate, recorder, record.failed)
             if count > 1:
                 context.print_line(
                     f"{gate}, seed {seed}: {int(record.succeeded.sum())} of {cfg.nworld} worlds"

@@ -1,7 +1,8 @@
 """Gate *baseline*: one native world does the task."""
 
 from mjstack.episodes.context import RunContext, judge_one, needs_episode
-from mjstack.report.record import GateResult
+from mjstack.episodes.motion import show_world
+from mjstack.report.record import GateResult, Status
 
 
 @needs_episode
@@ -27,6 +28,9 @@ def run_baseline(context: RunContext) -> list[GateResult]:
         metrics["path_error_m"] = context.planner.path_error()
         thresholds["waypoint_error_m"] = cfg.controller.ik_tolerance
     context.artifacts.shown = ("baseline world", nominal.world)
+    show_world(
+        context, "baseline", "baseline, native", nominal.world, failed=status is Status.failed
+    )
     return [
         GateResult(
             name="baseline",

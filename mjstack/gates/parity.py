@@ -8,6 +8,7 @@ import torch
 from mjstack.config.check import PARITY_FIELDS
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.context import RunContext, judge_one, needs_episode
+from mjstack.episodes.motion import show_world
 from mjstack.episodes.rollout import NOMINAL, State, WorldRecorder, restore
 from mjstack.gates.images import compare_images
 from mjstack.math import quat_angle
@@ -65,6 +66,7 @@ def _compare(context: RunContext, mjwarp: Simulation) -> GateResult:
     headline = context.check.headline(judged)
     context.print_line(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
     context.artifacts.shown = ("parity world", world)
+    show_world(context, "parity", "parity, MJWarp", world, failed=status is Status.failed)
     ends = [f"final.{name}.position_m" for name in context.index.objects]
     apart = max((result.metrics[end] for end in ends), default=0.0)
     good = f"{headline}; objects end at most {1e3 * apart:.2f} mm from native's"

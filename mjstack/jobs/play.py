@@ -10,6 +10,7 @@ import numpy as np
 
 from mjstack.config.schema import Config
 from mjstack.episodes.context import RunContext, judge_one
+from mjstack.episodes.motion import show_world
 from mjstack.episodes.replay import simulate_one
 from mjstack.episodes.rollout import POLICY, WorldRecorder, play_episode, rollout
 from mjstack.errors import ConfigError
@@ -66,14 +67,17 @@ def play_worlds(context: RunContext) -> list[GateResult]:
             looking = [*context.viewers, recorder]
             label = f"steps of world {world}"
             told = "not judged: the task has no check"
+            failed = False
             if cfg.task.check is None:
                 rollout(env, driver, looking, advance=context.advance, label=label)
             else:
                 episode = play_episode(env, driver, looking, advance=context.advance, label=label)
                 status, told, metrics = judge_one(context, episode)
-                good += status is Status.passed
+                failed = status is Status.failed
+                good += not failed
                 told = told or f"succeeded, {context.check.headline(metrics)}"
             recorders.append(recorder)
+            show_world(context, f"{NAME}_{world}", str(world), recorder, failed=failed)
             details.append(f"world {world}: {told}")
             context.print_line(details[-1])
     result = GateResult(

@@ -16,6 +16,7 @@ from mjstack.envs import driven_config
 from mjstack.episodes.context import RunContext, judge_one, require_episode
 from mjstack.episodes.earlier_run import EarlierRun, archived_starts, copy_names
 from mjstack.episodes.failures import FailureMonitor, describe_sign
+from mjstack.episodes.motion import show_world
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.replay import ReplayedWorld, replay_world, start_of_world
 from mjstack.errors import ConfigError, DeviceError, RunError
@@ -123,7 +124,9 @@ def _plan(cfg: Config) -> ReplayPlan:
         run=run,
         gate=gate,
         # The folder may be a stranger's: what a replay does not play is not built.
-        context=RunContext(replace(driven_config(played), sim=sim, view=cfg.view, video=cfg.video)),
+        context=RunContext(
+            replace(driven_config(played), sim=sim, view=cfg.view, video=cfg.video, web=cfg.web)
+        ),
         seed=seed,
         world=world,
         where=where,
@@ -205,8 +208,10 @@ def _replay(
     status, reason, metrics = judge_one(context, done.episode)
     kept, compared = _compare(plan, done, backend, device, changes, context)
     reason = f"{reason or f'succeeded, {context.check.headline(metrics)}'}; {compared}"
+    bad = status is Status.failed
     if not kept:
         status = Status.failed
+    show_world(context, f"replay_{backend}", f"{plan.world}, {backend}", done.recorder, failed=bad)
     if first:
         title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})"
         context.artifacts.shown = (title, done.recorder)
@@ -286,4 +291,4 @@ def _compare(
     return bool(reasons), f"{agrees} {ends}{why}"
 
 
-JOB = Job(check_replay, keys=("job", "run", "world", "sim", "view", "video"), shows=True)
+JOB = Job(check_replay, keys=("job", "run", "world", "sim", "view", "video", "web"), shows=True)

@@ -40,6 +40,13 @@ from mjstack.report.picture import (
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
 from mjstack.report.table import Console, Table, to_document
+from mjstack.report.web import (
+    EPISODE,
+    choose_worlds,
+    frame_stride,
+    lacks_viser,
+    save_episode,
+)
 from mjstack.report.write import safely_write, summarize, write_report
 from mjstack.sim import Simulation, resolve_backend
 from mjstack.sim.build import cuda_driver, cuda_name, cuda_uuid
@@ -169,7 +176,8 @@ class CheckedJob:
                 self.work(context, folder)
             report.conclude()
             _write(report, page)
-            report.pictures = [*_draw(context, console), *context.page.pictures]
+            report.pictures = [*_draw(context, console), *page.pictures]
+            page.note = _save_episode(context)
             check_interrupt()
         # However it ends, the finished results are in the report.
         except (Exception, SystemExit, KeyboardInterrupt) as error:
@@ -358,6 +366,25 @@ def _draw(context: RunContext, console: Console) -> list[str]:
         else:
             console.print(escape(f"video: {folder}/{name}"))
     return pictures
+
+
+def _save_episode(context: RunContext) -> str:
+    """Write the 3-D page of the run's worlds, if there were any; return why there is none."""
+    cfg = context.cfg
+    page = context.page
+    folder = cast(Path, context.folder)
+    if not cfg.web.episode:
+        return "web.episode=false: no 3-D page"
+    worlds = choose_worlds(page.worlds3d)
+    problem = lacks_viser()
+    if worlds and not problem:
+        frame_dt = frame_stride(cfg.timing.step_dt) * cfg.timing.step_dt
+        shown = (context.stage.visual_model, worlds, frame_dt)
+        problem = safely_write(folder / EPISODE, save_episode, *shown)
+        page.episode = "" if problem else EPISODE
+    if problem:
+        context.print_line(problem)
+    return problem
 
 
 def _viewer(context: RunContext) -> StepHook:

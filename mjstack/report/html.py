@@ -13,6 +13,7 @@ import numpy as np
 from mjstack.report.record import GateResult, Report
 from mjstack.report.svg import Map, histogram, table_map
 from mjstack.report.table import Table, format_value
+from mjstack.report.web import World
 from mjstack.report.write import (
     label,
     summarize,
@@ -89,6 +90,7 @@ class Page:
     Attributes:
         title: Robot and task.
         worlds: Episodes by gate.
+        worlds3d: Worlds in motion, by the part of the run that played them.
         tables: Tables of the run, such as of job=scaling.
         pictures: Files that parts of the run have drawn.
         episode: Name of the file with the episode in 3-D; empty without one.
@@ -97,6 +99,7 @@ class Page:
 
     title: str = "mjstack run"
     worlds: dict[str, Worlds] = field(default_factory=dict)
+    worlds3d: dict[str, list[World]] = field(default_factory=dict)
     tables: list[Table] = field(default_factory=list)
     pictures: list[str] = field(default_factory=list)
     episode: str = ""
@@ -127,7 +130,11 @@ def to_html(report: Report, page: Page) -> str:
     ]
     if page.episode:
         link = escape(page.episode)
-        head.append(f"<p><a class=go href='{link}'>The episode in 3-D: {link}</a></p>")
+        head.append(
+            f"<p><a class=go href='{link}'>Play it in 3-D: {link}</a>"
+            " <small>red tables: failed worlds; blue ones: their copies on native MuJoCo</small>"
+            "</p>"
+        )
     elif page.note:
         head.append(f"<p class=dim>{escape(page.note)}</p>")
     pictures = [_picture(report.folder / name) for name in report.pictures]

@@ -11,6 +11,7 @@ from mjstack.config.schema.run import (
     SimCfg,
     SolverCfg,
     TimingCfg,
+    WebCfg,
 )
 from mjstack.config.schema.scene import ModelCfg, RobotCfg, SceneCfg
 from mjstack.config.schema.task import ControllerCfg, TaskCfg
@@ -67,6 +68,8 @@ class Config:
     every world."""
     video: bool = spec()
     """Write an mp4 of the same; job=play without view does so."""
+    web: WebCfg = field(default_factory=WebCfg)
+    """Worlds in a browser."""
     starts: str | None = spec(None)
     """reset=starts_file: a file with one row per world, from which all of them start."""
     policy: str | None = spec(None)

@@ -95,6 +95,14 @@ class SimCfg:
 
 
 @dataclass(slots=True)
+class WebCfg:
+    """Worlds in a browser, which the extra ``web`` shows."""
+
+    episode: bool = True
+    """Write episode.html, which plays worlds of the run in 3-D."""
+
+
+@dataclass(slots=True)
 class GateFuncCfg:
     """A gate: a function of the run's context, and its parameters."""
 

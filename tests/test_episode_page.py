@@ -1,0 +1,293 @@
+"""The 3-D page of a run's worlds: geometry and poses are MuJoCo's, and a browser shows them."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+import urllib.parse
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import msgspec
+import mujoco
+import numpy as np
+import pytest
+import zstandard
+from browser import EXECUTABLE, Tab, browse
+
+import mjstack.report.web as web
+from mjstack.cli import run
+from mjstack.episodes.context import RunContext
+from mjstack.episodes.motion import MotionRecorder
+from mjstack.episodes.rollout import Hook
+from mjstack.report.web import Shapes, World, choose_worlds, save_episode
+from mjstack.sim import Simulation
+
+PRIMITIVES = """
+<mujoco>
+  <asset>
+    <mesh name="tetra" vertex="0 0 0 .1 0 0 0 .1 0 0 0 .1"/>
+    <material name="green" rgba="0 1 0 1"/>
+  </asset>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body pos="1 2 3" euler="10 20 30">
+      <freejoint/>
+      <geom type="box" size=".1 .2 .3" pos=".1 0 0" euler="0 0 45" rgba="1 0 0 1"/>
+      <geom type="cylinder" size=".1 .3" rgba="0 0 1 1"/>
+      <geom type="capsule" size=".1 .3" rgba="0 1 1 1"/>
+      <geom type="sphere" size=".2" rgba="1 1 0 1"/>
+      <geom type="ellipsoid" size=".1 .2 .3" rgba="1 0 1 1"/>
+      <geom type="mesh" mesh="tetra" material="green"/>
+      <geom type="box" size="9 9 9" group="3"/>
+      <geom type="box" size="9 9 9" rgba="0 0 0 0"/>
+      <body pos="0 0 1"><geom type="box" size=".01 .01 .01" rgba=".5 .5 .5 1"/></body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def messages(path: Path) -> list[tuple[float, dict[str, Any]]]:
+    """What a page plays: time [s] and message."""
+    (held,) = re.findall(r'__VISER_EMBED_DATA__="([^"]+)"', path.read_text())
+    packed = base64.b64decode(held)
+    plain = zstandard.ZstdDecompressor().decompress(packed[8:])
+    size = int.from_bytes(plain[:8], "little")
+    scene = msgspec.msgpack.decode(plain[8 : 8 + size])
+    buffers = []
+    at = 8 + size
+    for length in scene["binaryBufferLengths"]:
+        at += -at % 8
+        buffers.append(plain[at : at + length])
+        at += length
+
+    def restore(value: Any) -> Any:
+        if isinstance(value, dict):
+            marks = [key for key in value if key.startswith("__binary")]
+            if marks:
+                kind = value.get("dtype", "float32")
+                return np.frombuffer(buffers[value[marks[0]]], kind)
+            return {key: restore(part) for key, part in value.items()}
+        return [restore(part) for part in value] if isinstance(value, list) else value
+
+    return [(time, restore(message)) for time, message in scene["messages"]]
+
+
+def outside(path: Path) -> list[str]:
+    """Addresses that a page's tags load from."""
+    text = re.sub(r'__VISER_EMBED_DATA__="[^"]+"', "", path.read_text())
+    tags = re.findall(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=[\"']?([^\"'> ]+)", text)
+    return [tag for tag in tags if not tag.startswith("data:")]
+
+
+def test_shapes_are_mujocos() -> None:
+    """Vertices lie on the surfaces, in the frame of the body that moves them."""
+    model = mujoco.MjModel.from_xml_string(PRIMITIVES)
+    shapes = Shapes(model)
+    assert shapes.bodies == [0, 1]  # a body without joints is part of the one that holds it
+    found = {rgba[:3]: vertices for number, rgba, vertices, _ in shapes if number == 1}
+    assert len(found) == 7  # neither the hidden nor the invisible one
+    box = (
+        (found[1, 0, 0] - [0.1, 0.0, 0.0])
+        @ np.array([[1, -1, 0], [1, 1, 0], [0, 0, 2**0.5]])
+        / 2**0.5
+    )
+    assert np.allclose(np.abs(box), [0.1, 0.2, 0.3])
+    cylinder = found[0, 0, 1]
+    assert np.allclose(np.abs(cylinder[:, 2]), 0.3)
+    assert np.linalg.norm(cylinder[:, :2], axis=1).max() == pytest.approx(0.1)
+    capsule = found[0, 1, 1]
+    to_axis = capsule - np.clip(capsule[:, 2], -0.3, 0.3)[:, None] * [0, 0, 1]
+    assert np.allclose(np.linalg.norm(to_axis, axis=1), 0.1, atol=1e-6)
+    assert np.ptp(capsule[:, 2]) == pytest.approx(0.8)
+    assert np.allclose(np.linalg.norm(found[1, 1, 0], axis=1), 0.2)
+    assert np.allclose(np.linalg.norm(found[1, 0, 1] / [0.1, 0.2, 0.3], axis=1), 1.0)
+    assert np.allclose(np.ptp(found[0, 1, 0], 0), 0.1, atol=2e-3)
+    places, turns = shapes.poses(model.qpos0[None])
+    assert np.allclose(places[0], [[0, 0, 0], [1, 2, 3]])
+    assert np.allclose(turns[0, 1], model.qpos0[3:])
+
+
+def motion(stage: Callable[..., RunContext], worlds: int, frames: int) -> list[World]:
+    """Worlds whose first cube rises and whose arm turns."""
+    model = stage("so101").stage.visual_model
+    qpos = np.repeat(model.qpos0[None], frames, 0)
+    at = stage("so101").index.object_qpos[0]
+    qpos[:, at + 2] += np.linspace(0.0, 0.2, frames)
+    qpos[:, stage("so101").index.robot_qpos[0]] += np.linspace(0.0, 1.0, frames)
+    return [World(label=str(w), qpos=qpos.copy(), failed=w == 0) for w in range(worlds)]
+
+
+def test_a_page_holds_every_frame(stage: Callable[..., RunContext], tmp_path: Path) -> None:
+    path = tmp_path / "episode.html"
+    worlds = motion(stage, 3, 5)
+    worlds[2].qpos[3:] = np.nan  # it diverged
+    model = stage("so101").stage.visual_model
+    save_episode(path, model, worlds, 0.04)
+    assert outside(path) == []
+    assert path.stat().st_size < 2e6
+    shapes = Shapes(model)
+    heights = shapes.poses(worlds[0].qpos)[0][:, :, 2]
+    rising = int(np.ptp(heights, 0).argmax())
+    sent = messages(path)
+    names = {
+        message["name"]: message["props"]
+        for _, message in sent
+        if message["type"] == "BatchedMeshesMessage"
+    }
+    assert len(names) == len(list(shapes))
+    numbers = [number for number, *_ in shapes]
+    name = f"/{numbers.index(rising)}"
+    updates = [
+        (time, message["updates"]["batched_positions"])
+        for time, message in sent
+        if message.get("name") == name and "batched_positions" in message.get("updates", {})
+    ]
+    assert [time for time, _ in updates] == pytest.approx([0.04, 0.08, 0.12, 0.16])
+    for (_, held), height, last in zip(
+        updates, heights[1:, rising], heights[[1, 2, 2, 2], rising], strict=True
+    ):
+        places = held.reshape(3, 3)
+        assert np.allclose(places[:, 2], [height, height, last], atol=1e-4)
+        assert len(np.unique(places[:, :2], axis=0)) == 3  # side by side
+    tables = [
+        message["props"]["batched_colors"].reshape(3, 3)
+        for _, message in sent
+        if message.get("name") == "/0" and message["type"] == "BatchedMeshesMessage"
+    ]
+    assert tables[0][0].tolist() != tables[0][1].tolist() == tables[0][2].tolist()
+
+
+def test_sixty_four_worlds_are_shared_by_the_gates() -> None:
+    def some(name: str, count: int) -> list[World]:
+        return [World(label=f"{name}{n}", qpos=np.zeros((1, 1))) for n in range(count)]
+
+    chosen = choose_worlds(
+        {"baseline": some("a", 1), "batch": some("b", 64), "success": some("c", 9)}
+    )
+    labels = [world.label for world in chosen]
+    assert labels == [*(f"b{n}" for n in range(30)), *(f"c{n}" for n in range(9)), "a0"]
+    assert len(choose_worlds({"batch": some("b", 64)})) == 64
+    assert choose_worlds({}) == []
+
+
+def test_the_recorder_takes_frames_from_the_start_on(
+    stage: Callable[..., RunContext], make_sim: Callable[..., Simulation]
+) -> None:
+    context = stage("so101")
+    sim = make_sim("native", 3)
+    every: list[np.ndarray] = []
+    recorder = MotionRecorder()
+    keep = Hook(lambda step, sim: every.append(sim.qpos.numpy().copy()))
+    episode = context.play(sim, context.cfg.reset, [recorder, keep])
+    held = recorder.positions([2, 0])
+    stride = web.frame_stride(context.cfg.timing.step_dt)
+    assert np.array_equal(held[:, 0], episode.start[[2, 0]])
+    ends = np.stack(every, 1)[[2, 0], stride - 1 :: stride]
+    assert np.array_equal(held[:, 1:], ends)
+
+
+def test_without_viser_a_run_says_how_to_have_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(web, "find_spec", lambda name: None)
+    out = tmp_path / "out"
+    assert run(["gates=[baseline]", f"hydra.run.dir={out}"]) == 0
+    line = "episode.html needs viser, which is not installed: run pip install 'mjstack[web]'."
+    assert line in " ".join(capsys.readouterr().out.split())
+    assert not (out / "episode.html").exists()
+    assert "mjstack[web]" in (out / "report.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def failing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run on MJWarp with worlds that fail."""
+    out = tmp_path_factory.mktemp("run") / "out"
+    args = ["gates=[baseline,batch]", "nworld=6", "sim=mjwarp", "sim.device=cpu"]
+    args += ["reset=randomized", "task.check.xy_err=0.0025", f"hydra.run.dir={out}"]
+    assert run(args) == 1
+    return out
+
+
+@pytest.mark.full
+def test_failing_worlds_stand_beside_their_native_copies(failing: Path) -> None:
+    (gate,) = json.loads((failing / "report.json").read_text())["gates"][1:]
+    lost = int(gate["metrics"]["episodes"] - gate["metrics"]["succeeded"])
+    assert 0 < lost < 6
+    sent = messages(failing / "episode.html")
+    labels = [m["props"]["text"] for _, m in sent if m["type"] == "LabelMessage"]
+    assert len(labels) == 6 + lost + 1
+    numbers = [int(label.split(":")[0].split(",")[0]) for label in labels[:-1]]
+    for one in range(lost):
+        assert numbers[2 * one] == numbers[2 * one + 1]
+        assert ", native" in labels[2 * one + 1]
+        assert labels[2 * one].endswith(": STACKED")
+    assert labels[-1] == "baseline, native"
+    assert "href='episode.html'" in (failing / "report.html").read_text()
+
+
+@pytest.mark.full
+def test_pages_stay_small(tmp_path: Path) -> None:
+    """One world within 2 MB, 64 that start at random within 15 MB."""
+    for gates, nworld, most in (("baseline", 1, 2e6), ("batch", 64, 15e6)):
+        out = tmp_path / gates
+        args = [f"gates=[{gates}]", f"nworld={nworld}", "reset=randomized", "sim=native"]
+        run([*args, f"hydra.run.dir={out}"])
+        assert 1e5 < (out / "episode.html").stat().st_size < most
+
+
+@pytest.fixture
+def tab() -> Iterator[Tab]:
+    """A tab of a real browser."""
+    if EXECUTABLE is None:
+        pytest.skip("no Chromium is installed here")
+    with browse(1000, 700) as opened:
+        yield opened
+
+
+def colored(tab: Tab) -> dict[str, int]:
+    """How many pixels are of the arm's and of the cubes' colours."""
+    image = matplotlib.image.imread(io.BytesIO(tab.picture()), format="png")
+    r, g, b = (image[60:-60, :, k] for k in range(3))
+    return {
+        "arm": int(((r > 0.4) & (g > 0.35) & (b < 0.6 * g)).sum()),
+        "red": int(((r > 0.55) & (g < 0.4) & (b < 0.4)).sum()),
+        "blue": int(((b > 0.5) & (r < 0.4) & (g < 0.55)).sum()),
+    }
+
+
+@pytest.mark.full
+def test_a_browser_plays_the_episode(
+    stage: Callable[..., RunContext], tmp_path: Path, tab: Tab
+) -> None:
+    """It loads without an error, asks for nothing else, and shows the arm and the cubes."""
+    path = tmp_path / "episode.html"
+    save_episode(path, stage("so101").stage.visual_model, motion(stage, 2, 250), 0.04)
+    address = f"file://{urllib.parse.quote(str(path))}"
+    tab.open(address)
+    tab.wait("document.querySelector('canvas') !== null")
+    clock = "parseFloat([...document.querySelectorAll('input')].map(i => i.value)[0])"
+    tab.wait(f"{clock} > 0.5")  # it plays
+    seen = colored(tab)
+    assert seen["arm"] > 500
+    assert seen["red"] > 40
+    assert seen["blue"] > 40
+    assert tab.problems == []
+    assert tab.requests == [address]
+
+
+@pytest.mark.full
+def test_a_browser_opens_the_report_in_a_second(failing: Path, tab: Tab) -> None:
+    address = f"file://{urllib.parse.quote(str(failing / 'report.html'))}"
+    assert tab.open(address) < 1.0
+    assert tab.problems == []
+    assert tab.requests == [address]
+    assert tab.run("document.querySelectorAll('table').length") >= 5
+    assert tab.run("document.querySelectorAll('svg').length") >= 5
+    assert tab.run("[...document.images].every(i => i.naturalWidth > 100)")
+    assert tab.run("document.documentElement.scrollWidth <= innerWidth")
