@@ -261,6 +261,138 @@ def test_replayed_steps_draw_what_eager_steps_draw(make: Make) -> None:
         assert (image == ends[1][name]).float().mean() > 0.99, name
 
 
+# Looks
+
+LOOKS = ("cam_fovy", "cam_pos", "cam_quat", "geom_rgba", "light_diffuse", "light_dir", "light_pos")
+
+
+def looks_of(env: Env) -> dict[str, torch.Tensor]:
+    assert set(LOOKS) <= env.sim.fields.keys()
+    return {name: env.sim.fields[name].cpu().clone() for name in LOOKS}
+
+
+@pytest.mark.parametrize("backend", ["native", pytest.param("mjwarp", marks=pytest.mark.full)])
+def test_looks_follow_seed_world_and_episode(make: Make, backend: str) -> None:
+    config = ["looks=randomized", "reset=randomized", *small("front", "top", size=2)]
+    mask = torch.tensor([True, False, True])
+    env = make(backend, *config, nworld=3)
+    ends = []
+    for _ in range(2):
+        env.reset_manager.reset(~mask | mask)
+        first = looks_of(env)
+        env.episode += mask
+        env.reset_manager.reset(mask)
+        second = looks_of(env)
+        env.episode.fill_(-1)
+        ends.append((first, second))
+    for name in LOOKS:
+        first, second = (end[name] for end in ends[0])
+        nominal = torch.from_numpy(getattr(env.sim.model, name)).to(first)
+        assert torch.equal(first, ends[1][0][name]), name
+        assert torch.equal(second, ends[1][1][name]), name
+        assert torch.equal(first[1], second[1]), name
+        for one, other in ((first[0], first[1]), (first[0], second[0]), (first[0], nominal)):
+            assert not torch.allclose(one, other, atol=1e-4), name
+    # World 0 of one world, with another camera, looks the same.
+    one = make(backend, *config[:2], *small("front", size=2), nworld=1)
+    one.episode.fill_(-1)
+    one.reset_manager.reset(torch.ones(1, dtype=torch.bool))
+    alone = looks_of(one)
+    front = one.sim.model.camera("front").id
+    for name in LOOKS:
+        whole = ends[0][0][name][0]
+        if name.startswith("cam"):
+            assert torch.equal(alone[name][0, front], whole[env.sim.model.camera("front").id])
+        else:
+            assert torch.equal(alone[name][0], whole), name
+
+
+def test_looks_stay_in_their_ranges(make: Make) -> None:
+    names = ["pos", "brightness", "tint"]
+    values = dict(zip(names, ("0.3", "[0.5,0.8]", "0.0"), strict=True))
+    env = make(
+        "native",
+        "looks=randomized",
+        *(f"reset.light.params.{name}={value}" for name, value in values.items()),
+        *small("top", size=2),
+        nworld=200,
+    )
+    model = env.sim.model
+    env.reset_manager.reset(torch.ones(200, dtype=torch.bool))
+    fields = {name: env.sim.fields[name].numpy() for name in LOOKS}
+    factor = fields["light_diffuse"] / model.light_diffuse
+    assert factor.min() == pytest.approx(0.5, abs=0.01)
+    assert factor.max() == pytest.approx(0.8, abs=0.01)
+    assert np.ptp(factor, axis=2).max() < 1e-6  # no tint
+    moved = np.abs(fields["light_pos"] - model.light_pos)
+    assert 0.28 < moved.max() <= 0.3
+    # Lights stay aimed at one point on the table.
+    top = env.cfg.scene.table_top
+    down = (fields["light_pos"][..., 2:] - top) / -fields["light_dir"][..., 2:]
+    aimed = fields["light_pos"] + down * fields["light_dir"]
+    assert np.ptp(aimed, axis=0).max() < 1e-5
+    assert np.abs(np.linalg.norm(fields["light_dir"], axis=-1) - 1).max() < 1e-6
+    number = model.camera("top").id
+    assert 0.009 < np.abs(fields["cam_pos"] - model.cam_pos)[:, number].max() <= 0.01
+    dots = np.abs((fields["cam_quat"] * model.cam_quat).sum(-1))[:, number]
+    angle = 2 * np.arccos(dots.clip(0, 1))
+    assert 0.03 < angle.max() < 0.03 * math.sqrt(3)
+    scale = (fields["cam_fovy"] / model.cam_fovy)[:, number]
+    assert scale.min() == pytest.approx(0.95, abs=2e-3)
+    assert scale.max() == pytest.approx(1.05, abs=2e-3)
+    red = model.geom("red").id
+    spread = fields["geom_rgba"][:, red] - model.geom_rgba[red]
+    assert 0.07 < np.abs(spread).max() <= 0.08 + 1e-6
+    assert not spread[:, 3].any()
+    robot = model.geom_bodyid == model.body("base").id
+    assert np.array_equal(
+        fields["geom_rgba"][:, robot], model.geom_rgba[None, robot].repeat(200, 0)
+    )
+
+
+@GL
+@pytest.mark.full
+@pytest.mark.parametrize("mjwarp", ["mjwarp", MJWARP_CUDA])
+def test_both_backends_draw_the_same_looks(make: Make, mjwarp: str) -> None:
+    found = []
+    for backend in ("native", mjwarp):
+        outputs = small("front", "wrist", outputs=ALL, size=96)
+        env = make(backend, "looks=randomized", "reset=randomized", *outputs, nworld=4)
+        env.reset(seed=1)
+        found.append({name: image.cpu() for name, image in env.images.items()})
+    for camera in ("front", "wrist"):
+        a, b = ([f[f"{kind}.{camera}"] for kind in ("images", "segmentation")] for f in found)
+        same = a[1] == b[1]
+        assert same.float().mean() > 0.995
+        assert (a[0].float() - b[0].float()).abs()[same].mean() < 4.0
+        means = a[0].float().mean(dim=(1, 2))
+        assert torch.cdist(means, means).fill_diagonal_(99.0).min() > 2.0  # worlds differ
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["looks=randomized"], "reset.light: the scene has no lights, because nothing is drawn"),
+        (
+            ["looks=randomized", "cameras=front", "reset.table_color.params.things=[tabel]"],
+            "things=['tabel']: expected names of things. Did you mean 'table'?",
+        ),
+        (
+            ["looks=randomized", "cameras=front", "reset.light.params.brightness=[2,1]"],
+            "reset.light.params.brightness=[2, 1]: expected two positive numbers",
+        ),
+        (
+            ["looks=randomized", "cameras=front", "reset.object_colors.params.spread=2"],
+            "reset.object_colors.params.spread=2: expected a number from 0 to 1",
+        ),
+    ],
+)
+def test_looks_that_cannot_be_are_one_line(overrides: list[str], message: str) -> None:
+    with pytest.raises(MjstackError) as caught:
+        make_env(["sim=native", *overrides], nworld=1)
+    assert message in str(caught.value)
+
+
 # Gates
 
 

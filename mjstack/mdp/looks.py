@@ -1,0 +1,209 @@
+"""Reset terms that change what cameras see: light, colours, and the cameras themselves.
+
+Each draws new values for every episode, as all reset terms do. Physics does not read them.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from mjstack.config.fields import Fraction, NotNegative
+from mjstack.errors import MjstackError, ParameterError, suggest
+from mjstack.managers.view import EnvView, random_uniform, rows_of, uses_fields
+from mjstack.math import quat_mul
+from mjstack.mdp.starts.randomization import bounds
+from mjstack.scene.index import Columns, Rows
+
+
+class _Look:
+    """A part of the model, its nominal values, and where they are written."""
+
+    label = "reset.look"
+
+    def __init__(self, env: EnvView, field: str, elements: Sequence[int]) -> None:
+        view = env.sim.fields[field]
+        self._view = view
+        self._columns = Columns(elements, env.device)
+        values = getattr(env.sim.model, field)[list(elements)]
+        self.nominal = torch.from_numpy(values.copy()).to(view)
+
+    def write(self, mask: Tensor, value: Tensor, at: Rows) -> None:
+        """Write the masked worlds' values, a row for each of ``at``."""
+        self._columns.write_masked(self._view, mask, value, at)
+
+
+@uses_fields("light_pos", "light_dir", "light_diffuse")
+class Light:
+    """Moves every light, still aimed at the same point, and changes its brightness and colour."""
+
+    label = "reset.light"
+
+    def __init__(
+        self,
+        env: EnvView,
+        *,
+        pos: NotNegative = 0.0,
+        brightness: Sequence[float] = (1.0, 1.0),
+        tint: Fraction = 0.0,
+    ) -> None:
+        """Take the ranges.
+
+        Args:
+            env: The environment.
+            pos: Half-width of the move along each axis [m].
+            brightness: Smallest and largest factor.
+            tint: Half-width of a further factor of each colour, about 1.
+        """
+        model = env.sim.model
+        _require_pictures(model.nlight, "lights")
+        lights = range(model.nlight)
+        self._pos, self._dir, self._diffuse = (
+            _Look(env, name, lights) for name in ("light_pos", "light_dir", "light_diffuse")
+        )
+        self._move = pos
+        self._brightness = bounds("brightness", brightness)
+        self._tint = tint
+        # The points on the table at which they are aimed; a light that points elsewhere is turned
+        # about a point 1 m away.
+        top = env.cfg.scene.table_top
+        down = self._dir.nominal[:, 2:]
+        far = (top - self._pos.nominal[:, 2:]) / torch.where(down < -0.1, down, -1.0)
+        far = torch.where((down < -0.1) & (far > 0.1), far, 1.0)
+        self._aim = self._pos.nominal + far * self._dir.nominal
+
+    def __call__(self, env: EnvView, mask: Tensor) -> None:
+        """Write light_pos, light_dir and light_diffuse."""
+        at = rows_of(mask)
+        count = len(self._aim)
+        draw = random_uniform(env, self.label, 7 * count, at=at).unflatten(1, (count, 7))
+        draw = draw.to(self._aim.dtype)
+        pos = self._pos.nominal + self._move * draw[..., :3]
+        aim = torch.nn.functional.normalize(self._aim - pos, dim=-1)
+        low, high = self._brightness
+        factor = low + 0.5 * (high - low) * (draw[..., 3:4] + 1.0)
+        color = factor * (1.0 + self._tint * draw[..., 4:])
+        self._pos.write(mask, pos, at)
+        self._dir.write(mask, aim, at)
+        self._diffuse.write(mask, (self._diffuse.nominal * color).clamp(0.0, 1.0), at)
+
+
+@uses_fields("geom_rgba")
+class Colors:
+    """Changes the colours of things: the scene's objects, its table, its floor."""
+
+    label = "reset.colors"
+
+    def __init__(
+        self, env: EnvView, *, spread: Fraction, things: Sequence[str] | None = None
+    ) -> None:
+        """Take the things.
+
+        Args:
+            env: The environment.
+            spread: Half-width of the change of red, green and blue, which stay between 0 and 1.
+            things: Names of objects, or of geoms that are fixed to the world, such as table and
+                floor. null: all objects. All geoms of a thing get one colour.
+
+        Raises:
+            ParameterError: There is no such thing.
+        """
+        model = env.sim.model
+        fixed = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] == 0]
+        known = {model.geom(geom).name: [geom] for geom in fixed if model.geom(geom).name}
+        known |= env.index.geoms
+        names = list(env.index.geoms if things is None else things)
+        for name in names:
+            if name not in known:
+                raise ParameterError(
+                    "things", list(names), f"names of things. {suggest(name, known)}"
+                )
+        self._spread = spread
+        self._looks = [_Look(env, "geom_rgba", known[name]) for name in names]
+
+    def __call__(self, env: EnvView, mask: Tensor) -> None:
+        """Write geom_rgba."""
+        at = rows_of(mask)
+        draw = random_uniform(env, self.label, 3 * len(self._looks), at=at)
+        for number, look in enumerate(self._looks):
+            change = self._spread * draw[:, None, 3 * number : 3 * number + 3]
+            value = look.nominal.expand(len(draw), -1, -1).clone()
+            value[..., :3] = (value[..., :3] + change).clamp(0.0, 1.0)
+            look.write(mask, value, at)
+
+
+@uses_fields("cam_pos", "cam_quat")
+class CameraPoses:
+    """Moves and turns every camera."""
+
+    label = "reset.camera_poses"
+
+    def __init__(self, env: EnvView, *, pos: NotNegative = 0.0, angle: NotNegative = 0.0) -> None:
+        """Take the half-widths.
+
+        Args:
+            env: The environment.
+            pos: Of the move along each axis of what carries the camera [m].
+            angle: Of the turn about each axis of the camera [rad].
+        """
+        self._names = _cameras(env)
+        cameras = range(len(self._names))
+        self._pos = _Look(env, "cam_pos", cameras)
+        self._quat = _Look(env, "cam_quat", cameras)
+        self._move = pos
+        self._angle = angle
+
+    def __call__(self, env: EnvView, mask: Tensor) -> None:
+        """Write cam_pos and cam_quat."""
+        at = rows_of(mask)
+        draw = _draw_cameras(env, self.label, self._names, 6, at).to(self._pos.nominal.dtype)
+        half = 0.5 * self._angle * draw[..., 3:]
+        turn = torch.cat((torch.ones_like(half[..., :1]), half), dim=-1)
+        turn = torch.nn.functional.normalize(turn, dim=-1)
+        quat = self._quat.nominal.expand(len(draw), -1, -1)
+        self._pos.write(mask, self._pos.nominal + self._move * draw[..., :3], at)
+        self._quat.write(mask, quat_mul(quat, turn), at)
+
+
+@uses_fields("cam_fovy")
+class FieldOfView:
+    """Scales the vertical field of view of every camera."""
+
+    label = "reset.camera_fovy"
+
+    def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
+        """Take the smallest and largest factor."""
+        self._names = _cameras(env)
+        self._fovy = _Look(env, "cam_fovy", range(len(self._names)))
+        self._ends = bounds("scale", scale)
+
+    def __call__(self, env: EnvView, mask: Tensor) -> None:
+        """Write cam_fovy."""
+        at = rows_of(mask)
+        low, high = self._ends
+        draw = _draw_cameras(env, self.label, self._names, 1, at)[..., 0]
+        factor = low + 0.5 * (high - low) * (draw.to(self._fovy.nominal.dtype) + 1.0)
+        self._fovy.write(mask, self._fovy.nominal * factor, at)
+
+
+def _cameras(env: EnvView) -> list[str]:
+    """Names of the model's cameras, in its order."""
+    model = env.sim.model
+    _require_pictures(model.nlight, "cameras")
+    return [model.camera(number).name for number in range(model.ncam)]
+
+
+def _require_pictures(found: int, what: str) -> None:
+    """Raise where the model has nothing that only pictures need."""
+    if not found:
+        raise MjstackError(
+            f"the scene has no {what}, because nothing is drawn", "Set cameras=front"
+        )
+
+
+def _draw_cameras(env: EnvView, label: str, names: Sequence[str], size: int, at: Rows) -> Tensor:
+    """Numbers of each camera by its name, so that another camera changes none of them, shape
+    ``(n, cameras, size)``.
+    """
+    draws = [random_uniform(env, f"{label}.{name}", size, at=at) for name in names]
+    return torch.stack(draws, dim=1)
