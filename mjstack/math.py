@@ -5,8 +5,15 @@ Quaternions are (w, x, y, z), the last dimension is the vector's own.
 
 import math
 from collections.abc import Sequence
+from functools import cache
 
 import torch
+
+# The third row of a rotation matrix is 2xz - 2wy, 2yz + 2wx, 1 - 2xx - 2yy: columns of w, x, y, z in
+# the products, the left factors first; their signs; and what is added.
+_Z_ROW_FACTORS = torch.tensor([1, 2, 1, 2, 1, 2, 3, 3, 1, 0, 0, 2])
+_Z_ROW_SIGNS = torch.tensor([[2.0, 2.0, -2.0], [-2.0, 2.0, -2.0]])
+_Z_ROW_ADDED = torch.tensor([0.0, 0.0, 1.0])
 
 
 def quat_mul(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -53,16 +60,19 @@ def quat_z_row(quat: torch.Tensor) -> torch.Tensor:
     """Third row of the rotation matrix: the world-z components of the body's axes, shape ``(...,
     3)``.
     """
-    w = quat[..., :1]
-    xy = quat[..., 1:3]
-    z = quat[..., 3:]
-    x = quat[..., 1:2]
-    y = quat[..., 2:3]
-    turned = torch.cat((-y, x), dim=-1)
-    return torch.cat(
-        (2.0 * torch.addcmul(xy * z, turned, w), 1.0 - 2.0 * xy.square().sum(-1, keepdim=True)),
-        dim=-1,
-    )
+    factors, signs, added = _z_row_constants(quat.device, quat.dtype)
+    first, second = quat.index_select(-1, factors).unflatten(-1, (2, 2, 3)).unbind(-3)
+    return (first * second * signs).sum(-2) + added
+
+
+@cache
+def _z_row_constants(
+    device: torch.device, dtype: torch.dtype
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The constants of `quat_z_row`, copied once: a captured step may not copy from the host."""
+    with torch.inference_mode(False):
+        signs, added = (each.to(device, dtype, copy=True) for each in (_Z_ROW_SIGNS, _Z_ROW_ADDED))
+        return _Z_ROW_FACTORS.to(device), signs, added
 
 
 def quat_to_matrix(quat: torch.Tensor) -> torch.Tensor:
@@ -125,13 +135,19 @@ def not_finite(*parts: torch.Tensor) -> torch.Tensor:
     Returns:
         Shape ``(n,)``, bool.
     """
-    # A finite sum has finite summands only.
-    if not parts[0].is_cuda and all(bool(part.sum().isfinite()) for part in parts):
+    if not parts[0].is_cuda and all_finite(*parts):
         return torch.zeros(len(parts[0]), dtype=torch.bool, device=parts[0].device)
     # 0 times a number that is not finite is NaN, which a sum keeps. It takes fewer kernels than to
     # ask each number.
     first, *others = ((part * 0.0).sum(1) for part in parts)
     return sum(others, first) != 0.0
+
+
+def all_finite(*parts: torch.Tensor) -> bool:
+    """Whether a short look at tensors on the CPU shows that every number is finite: a finite sum
+    has finite summands only.
+    """
+    return not parts[0].is_cuda and all(math.isfinite(part.sum().item()) for part in parts)
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:

@@ -29,17 +29,22 @@ def philox(counter: np.ndarray, key: tuple[int, int]) -> np.ndarray:
         Four random 32-bit words held in uint64, shape ``(4, n)``.
     """
     mask = np.uint64(_MASK)
+    half = np.uint64(32)
     keys = np.array(key, dtype=np.uint64) + np.arange(10, dtype=np.uint64)[:, None] * _WEYL & mask
     # Words 0 and 2 are multiplied, words 1 and 3 are mixed in: both pairs go through each round
-    # together.
-    multiplied = counter[::2]
-    mixed = counter[1::2]
-    for round_key in keys:
-        product = multiplied * _MULTIPLIERS[:, None]
-        multiplied = (product >> np.uint64(32))[::-1] ^ mixed
-        multiplied ^= round_key[:, None]
-        mixed = (product & mask)[::-1]
-    return np.stack((multiplied, mixed), axis=1).reshape(4, -1)
+    # together, in the memory of the first one.
+    words = counter.copy()
+    multiplied = words[::2]
+    mixed = words[1::2]
+    product = np.empty_like(multiplied)
+    swapped = product[::-1]
+    for round_key in keys[:, :, None]:
+        np.multiply(multiplied, _MULTIPLIERS[:, None], out=product)
+        np.right_shift(swapped, half, out=multiplied)
+        multiplied ^= mixed
+        multiplied ^= round_key
+        np.bitwise_and(swapped, mask, out=mixed)
+    return words
 
 
 def uniform(
@@ -65,15 +70,18 @@ def uniform(
         Shape ``(n, size)``, float32.
     """
     blocks = -(-size // 4)
-    rows = torch.stack((world, episode, step)).cpu().numpy() & _MASK
     counter = np.empty((4, world.shape[0], blocks), dtype=np.uint64)
-    counter[:3] = rows[:, :, None]
+    for word, numbers in zip(counter, (world, episode, step), strict=False):
+        word[:] = (numbers.cpu().numpy() & _MASK)[:, None]
     counter[3] = np.arange(blocks)
     words = philox(counter.reshape(4, -1), (seed & _MASK, stream & _MASK))
     # 24 bits fill a float32 mantissa exactly, so that no rounding can reach 1.
-    drawn = (words >> np.uint64(8)).astype(np.float32) * np.float32(2.0 / (1 << 24))
-    numbers = np.moveaxis(drawn.reshape(counter.shape), 0, -1).reshape(-1, 4 * blocks)[:, :size]
-    return torch.from_numpy(numbers - np.float32(1.0)).to(world.device)
+    words >>= np.uint64(8)
+    drawn = np.empty((world.shape[0], blocks, 4), dtype=np.float32)
+    drawn[:] = np.moveaxis(words.reshape(counter.shape), 0, -1)
+    drawn *= np.float32(2.0 / (1 << 24))
+    drawn -= np.float32(1.0)
+    return torch.from_numpy(drawn.reshape(-1, 4 * blocks)[:, :size]).to(world.device)
 
 
 def check_seed(seed: int, *, masked: bool) -> int:

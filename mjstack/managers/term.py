@@ -139,9 +139,12 @@ current_term = CurrentTerm()
 
 @contextmanager
 def step_cache() -> Iterator[None]:
-    """While nothing changes the state: what two terms have in common is computed once."""
+    """While nothing changes the state: what two terms have in common is computed once. An inner one
+    knows what the outer one has computed so far, and keeps the rest to itself, because it may be
+    a branch of a captured graph.
+    """
     outer = current_term.values
-    current_term.values = {}
+    current_term.values = dict(outer or {})
     try:
         yield
     finally:
@@ -214,16 +217,15 @@ class Term:
         self.has_memory = self._reset is not None
         # Two groups may ask for the same: a function of the state gives both the same answer.
         # Others may keep something.
-        self._shared_by = None if is_class or masked else (func, repr(sorted(self.params.items())))
+        shared_by = (id(env), func, repr(sorted(self.params.items())))
+        self._shared_by = None if is_class or masked else shared_by
 
     def __call__(self, *args: Any) -> Any:
         """Call the term with the environment, and a mask if it takes one."""
         current_term.label = self.label
         if self._shared_by is None:
             return self.call(*args, **self._call_params)
-        return shared(
-            (id(args[0]), *self._shared_by), partial(self.call, *args, **self._call_params)
-        )
+        return shared(self._shared_by, partial(self.call, *args, **self._call_params))
 
     def reset(self, mask: torch.Tensor) -> None:
         """Let a term with a memory forget the masked worlds."""

@@ -106,31 +106,47 @@ def random_uniform(
         Shape ``(nworld, size)``, or a row for each of ``at``, in the type of the simulation's
         floats.
     """
-    stream = zlib.crc32(name.encode())
+    dtype = env.sim.qpos.dtype
     if env.device.type == "cuda":
-        # One kernel; it loads Warp, which native runs do not need.
-        from mjstack.sim.draws import draw_uniform
+        return _draw_on_device(env, name, size, low, high, step).to(dtype)
+    draw = unit_draw(env, name, size, step, at).to(dtype)
+    if (low, high) == (-1.0, 1.0):  # then all of the below is exact, and changes nothing
+        return draw
+    return low + 0.5 * (high - low) * (draw + 1.0)
 
-        return draw_uniform(
-            key=env.key,
-            stream=stream,
-            world=env.world,
-            episode=env.episode,
-            step=step,
-            size=size,
-            low=low,
-            high=high,
-        )
-    step = torch.zeros_like(env.world) if step is None else step
-    draw = uniform(
-        seed=env.seed,
-        world=env.world[at],
-        episode=env.episode[at],
-        step=step[at],
-        stream=stream,
-        size=size,
+
+def unit_draw(
+    env: EnvView, name: str, size: int, step: torch.Tensor | None = None, at: Rows = ALL
+) -> torch.Tensor:
+    """The numbers of `random_uniform` from -1 to 1 in float32, in which they are drawn."""
+    if env.device.type == "cuda":
+        return _draw_on_device(env, name, size, -1.0, 1.0, step)
+    worlds = [env.world, env.episode, torch.zeros_like(env.world) if step is None else step]
+    if isinstance(at, torch.Tensor):
+        worlds = [numbers[at] for numbers in worlds]
+    world, episode, step = worlds
+    stream = zlib.crc32(name.encode())
+    return uniform(
+        seed=env.seed, world=world, episode=episode, step=step, stream=stream, size=size
     )
-    return low + 0.5 * (high - low) * (draw.to(env.sim.qpos.dtype) + 1.0)
+
+
+def _draw_on_device(
+    env: EnvView, name: str, size: int, low: float, high: float, step: torch.Tensor | None
+) -> torch.Tensor:
+    """One kernel; it loads Warp, which native runs do not need."""
+    from mjstack.sim.draws import draw_uniform
+
+    return draw_uniform(
+        key=env.key,
+        stream=zlib.crc32(name.encode()),
+        world=env.world,
+        episode=env.episode,
+        step=step,
+        size=size,
+        low=low,
+        high=high,
+    )
 
 
 def rows_of(mask: torch.Tensor) -> Rows:
@@ -138,6 +154,16 @@ def rows_of(mask: torch.Tensor) -> Rows:
     what costs by the world.
     """
     return ALL if mask.is_cuda else mask.nonzero().squeeze(1)
+
+
+def zero_rows(mask: torch.Tensor, *buffers: torch.Tensor) -> None:
+    """Write 0 into the masked worlds of buffers, each of shape ``(nworld, n)``."""
+    at = rows_of(mask)
+    for buffer in buffers:
+        if isinstance(at, torch.Tensor):
+            buffer.index_fill_(0, at, 0.0)
+        else:
+            buffer.masked_fill_(mask[:, None], 0.0)
 
 
 def episode_draw(

@@ -10,7 +10,7 @@ from torch import Tensor
 from mjstack.errors import UnknownName
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, episode_draw
-from mjstack.math import lowest_point
+from mjstack.math import lowest_point, not_finite
 from mjstack.scene.index import ALL, RobotTensors, Rows, SceneIndex
 from mjstack.sim.simulation import Simulation
 
@@ -38,8 +38,8 @@ def gripper_opening(env: EnvView) -> Tensor:
     n_gripper)``.
     """
     tensors = robot(env)
-    q = tensors.qpos.read(env.sim.qpos)[:, env.index.n_arm :]
-    return (q - tensors.gripper_closed) / (tensors.gripper_open - tensors.gripper_closed)
+    q = env.sim.part("qpos", tensors.gripper_qpos)
+    return (q - tensors.gripper_closed) / tensors.gripper_travel
 
 
 def pose_w(env: EnvView, name: str) -> Tensor:
@@ -48,8 +48,7 @@ def pose_w(env: EnvView, name: str) -> Tensor:
     """
     if name in env.index.fixed:
         return env.index.constant(env.index.fixed[name], env.sim.qpos).expand(env.nworld, -1)
-    address, _ = env.index.object_address(name)
-    return env.sim.qpos[:, address : address + 7]
+    return env.sim.part("qpos", env.index.object_columns(name)[0])
 
 
 def write_object(
@@ -58,12 +57,20 @@ def write_object(
     """Put the masked worlds' object at x and y [m], turned by a quaternion (wxyz); its height
     stays. Where ``at`` has their numbers, the values have their rows alone.
     """
-    view = pose_w(env, name)
+    address, _ = env.index.object_address(name)
+    view = env.sim.qpos[:, address : address + 7]
     if isinstance(at, Tensor):
         view[at, :2] = xy
         view[at, 3:] = quat
         return
     torch.where(mask[:, None], torch.cat((xy, view[:, 2:3], quat), dim=1), view, out=view)
+
+
+def lost_state(env: EnvView) -> Tensor:
+    """Whether a position or velocity is NaN or infinite, shape ``(nworld,)``, bool. Not to be
+    written into.
+    """
+    return shared((id(env), lost_state), lambda: not_finite(env.sim.qpos, env.sim.qvel))
 
 
 def nearness(offset: Tensor, scale: float) -> Tensor:

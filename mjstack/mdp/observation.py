@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, offers
 from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot
 
@@ -10,7 +11,7 @@ from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot
 @offers(unit="joint")
 def joint_pos(env: EnvView) -> Tensor:
     """Joint positions [rad, m], arm then gripper, shape ``(nworld, n)``."""
-    return robot(env).qpos.read(env.sim.qpos)
+    return env.sim.part("qpos", robot(env).qpos)
 
 
 @offers(unit="joint")
@@ -22,14 +23,18 @@ def joint_pos_relative(env: EnvView) -> Tensor:
 @offers(unit="joint/s")
 def joint_vel(env: EnvView) -> Tensor:
     """Joint velocities [rad/s, m/s], shape ``(nworld, n)``."""
-    return robot(env).qvel.read(env.sim.qvel)
+    return env.sim.part("qvel", robot(env).qvel)
 
 
 @offers(unit="m")
 def grasp_point_pos(env: EnvView) -> Tensor:
-    """Midpoint between the jaws [m], world frame, shape ``(nworld, 3)``."""
-    first, second = env.index.grasp_sites
-    return 0.5 * (env.sim.site_xpos[:, first] + env.sim.site_xpos[:, second])
+    """Midpoint between the jaws [m], world frame, shape ``(nworld, 3)``. Not to be written into."""
+
+    def compute() -> Tensor:
+        first, second = (env.sim.part("site_xpos", site) for site in env.index.grasp_sites)
+        return 0.5 * (first + second)
+
+    return shared((id(env), grasp_point_pos), compute)
 
 
 @offers(unit="m")
@@ -42,7 +47,8 @@ def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> 
         height: How far above [m].
     """
     offset = pose_w(env, object)[:, :3] - grasp_point_pos(env)
-    offset[:, 2] += height
+    if height:
+        offset[:, 2] += height
     return offset
 
 
@@ -126,8 +132,7 @@ def headings(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
 @offers(unit=("m/s",) * 3 + ("rad/s",) * 3)
 def object_velocity(env: EnvView, *, object: str) -> Tensor:
     """Linear [m/s, world frame] and angular [rad/s, body frame] velocity, shape ``(nworld, 6)``."""
-    _, address = env.index.object_address(object)
-    return env.sim.qvel[:, address : address + 6]
+    return env.sim.part("qvel", env.index.object_columns(object)[1])
 
 
 @offers(unit="N")

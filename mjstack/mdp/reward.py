@@ -45,4 +45,4 @@ def action_rate(env: EnvView) -> Tensor:
 
 def joint_vel(env: EnvView) -> Tensor:
     """Squared joint velocities [rad^2/s^2], summed."""
-    return robot(env).qvel.read(env.sim.qvel).square().sum(1)
+    return env.sim.part("qvel", robot(env).qvel).square().sum(1)

@@ -1,13 +1,14 @@
 """Termination terms: functions or classes that return ``(nworld,)`` bool."""
 
-import torch
+import math
+
 from torch import Tensor
 
 from mjstack.config.fields import Count, NotNegative
 from mjstack.managers.view import EnvView, offers
-from mjstack.math import not_finite
-from mjstack.mdp.geometry import pose_w, robot
+from mjstack.mdp.geometry import lost_state, robot
 from mjstack.mdp.observation import joint_pos
+from mjstack.scene.index import Columns
 from mjstack.sim import LOST_PHYSICS
 
 
@@ -27,17 +28,20 @@ class ObjectOffTable:
     def __init__(self, env: EnvView) -> None:
         """Read the table's place."""
         scene = env.cfg.scene
-        self._center = env.index.constant(scene.table_center[:2], env.sim.qpos)
-        self._half = env.index.constant(scene.table_half[:2], env.sim.qpos)
-        self._top = scene.table_top
+        count = len(env.index.objects)
+        # x, y and z of every object that moves
+        columns = [qpos + i for qpos in env.index.object_qpos for i in range(3)]
+        self._columns = Columns(columns, env.device)
+        half = [*scene.table_half[:2], math.inf]
+        constant = env.index.constant
+        self._center = constant([*scene.table_center[:2], 0.0] * count, env.sim.qpos)
+        self._low = constant([-half[0], -half[1], scene.table_top] * count, env.sim.qpos)
+        self._high = constant(half * count, env.sim.qpos)
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with an object off the table, shape ``(nworld,)``."""
-        off = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
-        for name in env.index.objects:
-            pos = pose_w(env, name)[:, :3]
-            off |= ((pos[:, :2] - self._center).abs() > self._half).any(1) | (pos[:, 2] < self._top)
-        return off
+        offset = env.sim.part("qpos", self._columns) - self._center
+        return ((offset < self._low) | (offset > self._high)).any(1)
 
 
 class JointLimit:
@@ -66,7 +70,7 @@ class JointLimit:
 @offers(ends_on="non_finite")
 def non_finite(env: EnvView) -> Tensor:
     """When a position or velocity is NaN or infinite: such a world cannot go on."""
-    return not_finite(env.sim.qpos, env.sim.qvel)
+    return lost_state(env)
 
 
 @offers(ends_on="overflow")

@@ -21,16 +21,20 @@ ALL = slice(None)
 class Columns:
     """Some columns of a batched view. Where they lie side by side, reading them costs nothing and
     writing is one copy.
+
+    Attributes:
+        indices: The columns, in the order in which values are given.
+        at: They as a slice where they lie side by side, else as a tensor.
     """
 
     def __init__(self, indices: Sequence[int] | np.ndarray, device: torch.device) -> None:
-        """Take the columns, in the order in which values are given."""
+        """Take the columns."""
         self.indices = tuple(int(i) for i in indices)
         first = self.indices[0] if self.indices else 0
         stop = first + len(self.indices)
-        self._at: slice | torch.Tensor = slice(first, stop)
+        self.at: Rows = slice(first, stop)
         if self.indices != tuple(range(first, stop)):
-            self._at = torch.tensor(self.indices, dtype=torch.int64, device=device)
+            self.at = torch.tensor(self.indices, dtype=torch.int64, device=device)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -39,13 +43,13 @@ class Columns:
         """The columns, shape ``(nworld, n, ...)``. It may be the view's own memory: do not write
         into it.
         """
-        if isinstance(self._at, slice):
-            return view[:, self._at]
-        return view.index_select(1, self._at)
+        if isinstance(self.at, slice):
+            return view[:, self.at]
+        return view.index_select(1, self.at)
 
     def write(self, view: torch.Tensor, value: torch.Tensor) -> None:
         """Write all worlds."""
-        view[:, self._at] = value
+        view[:, self.at] = value
 
     def write_masked(
         self, view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor, at: Rows = ALL
@@ -55,14 +59,14 @@ class Columns:
         """
         value = value.to(view.dtype)
         if isinstance(at, torch.Tensor):
-            view[at if isinstance(self._at, slice) else at[:, None], self._at] = value
+            view[at if isinstance(self.at, slice) else at[:, None], self.at] = value
             return
         rows = mask.view(-1, *[1] * (view.dim() - 1))
         part = self.read(view)
-        if isinstance(self._at, slice):
+        if isinstance(self.at, slice):
             torch.where(rows, value, part, out=part)
         else:
-            view[:, self._at] = torch.where(rows, value, part)
+            view[:, self.at] = torch.where(rows, value, part)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +83,8 @@ class RobotTensors:
         start: Start of environments, clear of the table, shape ``(n,)``.
         gripper_open: Command of the open gripper, shape ``(n_gripper,)``.
         gripper_closed: Command of the closed gripper, shape ``(n_gripper,)``.
+        gripper_travel: The open less the closed one, shape ``(n_gripper,)``.
+        gripper_qpos: The gripper's columns of qpos.
     """
 
     qpos: Columns
@@ -90,6 +96,8 @@ class RobotTensors:
     start: torch.Tensor
     gripper_open: torch.Tensor
     gripper_closed: torch.Tensor
+    gripper_travel: torch.Tensor
+    gripper_qpos: Columns
 
 
 class SceneIndex:
@@ -144,6 +152,7 @@ class SceneIndex:
             for name, body in self.bodies.items()
         }
         self._constants: dict[tuple, torch.Tensor] = {}
+        self._columns: dict[str, tuple[Columns, Columns]] = {}
 
         def sensors(bodies: Iterable[tuple[str, str]]) -> list[int]:
             return [int(model.sensor_adr[find(model, "sensor", force_sensor(*p))]) for p in bodies]
@@ -169,7 +178,9 @@ class SceneIndex:
                 torch.as_tensor(np.asarray(values, dtype=float), dtype=dtype, device=device)
                 for values in (self.robot_range, self.ctrl_range, *poses)
             ]
-            self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
+            travel = numbers[-2] - numbers[-1]
+            gripper = Columns(self.robot_qpos[self.n_arm :], device)
+            self._tensors[key] = RobotTensors(*columns, *numbers, travel, gripper)  # type: ignore[arg-type]
         return self._tensors[key]
 
     def constant(self, values: Sequence[float], like: torch.Tensor) -> torch.Tensor:
@@ -180,6 +191,16 @@ class SceneIndex:
         if key not in self._constants:
             self._constants[key] = torch.tensor(values, dtype=like.dtype, device=like.device)
         return self._constants[key]
+
+    def object_columns(self, name: str) -> tuple[Columns, Columns]:
+        """Columns of qpos (7 numbers) and of qvel (6) of an object that moves; any other name is
+        an error that lists those.
+        """
+        if name not in self._columns:
+            pairs = zip(self.object_address(name), (7, 6), strict=True)
+            qpos, qvel = (Columns(range(at, at + width), torch.device("cpu")) for at, width in pairs)
+            self._columns[name] = qpos, qvel
+        return self._columns[name]
 
     def object_address(self, name: str) -> tuple[int, int]:
         """First qpos and qvel address of an object that moves; any other name is an error that

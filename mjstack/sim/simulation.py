@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from enum import IntFlag
+from functools import cached_property
 
 import mujoco
 import torch
@@ -10,6 +11,7 @@ import torch
 from mjstack.config.schema import CameraCfg
 from mjstack.errors import ArgumentError, RebindError
 from mjstack.math import describe_tensor
+from mjstack.scene.index import Columns
 from mjstack.sim.cameras import Cameras
 from mjstack.sim.graph import StepGraph
 from mjstack.sim.model_fields import Fields
@@ -149,6 +151,32 @@ class Simulation(ABC):
         if isinstance(bound, (torch.Tensor, Fields)) and bound is not value:
             raise RebindError(f"sim.{name}" + "[name]" * isinstance(bound, Fields))
         super().__setattr__(name, value)
+
+    def part(self, name: str, columns: Columns | int, *shape: int) -> torch.Tensor:
+        """Columns of a view, for reading. Those that lie side by side are sliced once, because a
+        view keeps its address for life.
+
+        Args:
+            name: Of the view.
+            columns: The columns, or the number of a single one.
+            shape: Of each world's numbers, such as ``(2, 3)`` for six columns.
+        """
+        key = (name, columns, *shape)
+        if key in self._parts:
+            return self._parts[key]
+        at = columns if isinstance(columns, int) else columns.at
+        view = getattr(self, name)
+        if isinstance(at, torch.Tensor):
+            found = view.index_select(1, at)
+            return found.unflatten(1, shape) if shape else found
+        with torch.inference_mode(False):
+            found = view[:, at]
+            self._parts[key] = found.unflatten(1, shape) if shape else found
+        return self._parts[key]
+
+    @cached_property
+    def _parts(self) -> dict[tuple, torch.Tensor]:
+        return {}
 
     @property
     def most_contacts(self) -> torch.Tensor:

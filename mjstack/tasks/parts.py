@@ -46,7 +46,7 @@ def released(*objects: str, open_fraction: float) -> Condition:
     """
 
     def condition(step: Step) -> Tensor:
-        open_wide = (step.opening >= open_fraction).all(1, keepdim=True)
+        open_wide = step.narrowest >= open_fraction
         return step.view.columns(objects).read(step.untouched) & open_wide
 
     return condition
@@ -59,7 +59,7 @@ def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: floa
 
     def condition(step: Step) -> Tensor:
         apart, dz = offset(step, object, onto)
-        return (apart <= xy_err) & (dz >= dz_min) & (dz <= dz_max)
+        return (apart <= xy_err) & (dz.clamp(dz_min, dz_max) == dz)
 
     return condition
 
@@ -99,10 +99,11 @@ def on_table(object: str, *, gap: float) -> Condition:
         view = step.view
         scene = view.env.cfg.scene
         column = view.column(object)
-        off = (step.pos[:, column, :2] - view.constant(*scene.table_center[:2])).abs()
         half = scene.objects[object].half
-        room = view.constant(*(scene.table_half[i] - half[i] for i in (0, 1)))
-        return (step.height[:, column].abs() <= gap) & (off <= room).all(1)
+        room = view.constant(*(scene.table_half[i] - half[i] for i in (0, 1)), gap)
+        center = view.constant(*scene.table_center[:2], 0.0)
+        at = torch.cat((step.pos[:, column, :2], step.height[:, column, None]), dim=1)
+        return ((at - center).abs() <= room).all(1)
 
     return condition
 
@@ -351,7 +352,11 @@ class HeldSuccess:
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
-        self._length.add_(1).mul_(self._condition())
+        holds = self._condition()
+        if not holds.is_cuda and not bool(holds.any()):
+            self._length.zero_()
+            return holds
+        self._length.add_(1).mul_(holds)
         return self._length >= self._steps
 
     def reset(self, mask: Tensor) -> None:

@@ -1,5 +1,7 @@
 """Reward in stages for tasks in which objects are carried to their goals."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -63,23 +65,34 @@ class Progress:
             expected = "a check with goals, which this reward follows"
             raise ConfigError("task.check.func", type(self._check).__name__, expected)
         self._columns = self._view.columns(names)
-        self._scale = scale
         self._within = within
         self._height = height
         self._near = near
-        self._open = max(open_fraction, 1e-6)  # 0: any opening will do
+        # How far each stage has got is computed side by side, those that are measured by a distance
+        # first: reach, carry and place, then lift and release. An open_fraction of 0 takes any
+        # opening.
+        constant = self._view.constant
+        self._ranges = constant(scale, scale, scale, height, max(open_fraction, 1e-6))
+        self._most = constant(*[math.inf] * 3, 1.0, 1.0)
+        self._start = constant(1.0, 1.0, 1.0, 0.0, 0.0)
+        self._sign = constant(-1.0, -1.0, -1.0, 1.0, 1.0)
+        self._number = constant(0.0, 2.0, 3.0, 1.0, 4.0)
+        self._least = constant(*[0.0] * 5)
+        shape = (env.nworld, len(names))
+        self._always = torch.ones(shape, dtype=torch.bool, device=env.device)
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
         step = self._view.step()
         read = self._columns.read
         pos = read(step.pos)
-        goal = torch.stack(list(self._check.goals(step).values()), dim=1)
+        goals = list(self._check.goals(step).values())
+        goal = torch.stack(goals, dim=1) if len(goals) > 1 else goals[0][:, None]
         low = read(step.height)
         in_hand = read(step.in_hand)
         placed = read(self._check.placed(step))
 
-        # Which stage each object is in
+        # Which stages each object has got to
         offset = pos - goal
         above = offset[..., 2]
         away = torch.linalg.vector_norm(pos - grasp_point_pos(env).float()[:, None], dim=-1)
@@ -87,17 +100,17 @@ class Progress:
         held = in_hand & (away <= self._within)
         lifted = held & (low >= self._height)
         over = (across <= self._near) & (above >= -BELOW)
-        stage = held.long()
-        for number, reached in ((2, lifted), (3, over), (4, placed)):
-            stage.masked_fill_(reached, number)
+        reached = torch.stack((self._always, lifted, over, held, placed), dim=-1)
 
-        # How far it has got in it: the column of its stage
-        distances = torch.stack((away, across, above.abs()), dim=-1)
-        reach, carry, place = (1.0 - torch.tanh(distances / self._scale)).unbind(-1)
-        lift = low / self._height
-        release = (step.opening.amin(1, keepdim=True) / self._open).expand_as(low)
-        done = torch.stack((reach, lift, carry, place, release), dim=-1).clamp(0.0, 1.0)
-        value = (stage + done.gather(-1, stage[..., None])[..., 0]) / len(STAGES)
+        # How far it has got in each: the last one that it has got to is worth most
+        opening = step.narrowest.expand_as(low)
+        done = torch.stack((away, across, above.abs(), low, opening), dim=-1).div_(self._ranges)
+        done.clamp_(self._least, self._most)
+        done[..., :3].tanh_()
+        worth = torch.addcmul(self._start, done, self._sign).add_(self._number)
+        value = torch.where(reached, worth, 0.0).amax(-1).div_(len(STAGES))
+        if len(goals) == 1:
+            return value[:, 0]
 
         # One object after the other
         finished = (placed & ~in_hand)[:, :-1]

@@ -23,7 +23,7 @@ from mjstack.tasks.parts import (
     on_top_of,
     released,
 )
-from mjstack.tasks.view import Step
+from mjstack.tasks.view import Step, once_per_step
 
 
 class StackCheck(EpisodeCheck):
@@ -131,9 +131,15 @@ class StackCheck(EpisodeCheck):
             InWindow("RELEASED", f"{t.object} not released", self.released, t.window),
         ]
 
+    @once_per_step
+    def on_goal(self, step: Step) -> Tensor:
+        """Whether the object is on the other one, shape ``(nworld,)``, bool."""
+        return self.stacked(step)
+
+    @once_per_step
     def placed(self, step: Step) -> Tensor:
         """Whether the object is on the other one, and that one on the table."""
-        return torch.stack((self.stacked(step), self.supported(step)), dim=1)
+        return torch.stack((self.on_goal(step), self.supported(step)), dim=1)
 
     def goals(self, step: Step) -> dict[str, Tensor]:
         """See `EpisodeCheck`."""
@@ -184,9 +190,12 @@ class StackSuccess(HeldSuccess):
         """
         self._step = step
         self._slot.add_(1).remainder_(self._steps)
-        stands = self._check.placed(step).all(1) & self._check.released(step)[:, 0]
+        stands = self._check.on_goal(step)
         if not stands.is_cuda and not bool(stands.any()):
             return stands  # no window that holds this step can pass: its slot is never judged
+        stands = self._check.placed(step).all(1) & self._check.released(step)[:, 0]
+        if not stands.is_cuda and not bool(stands.any()):
+            return stands
         self._pose.index_copy_(1, self._slot, step.pose[:, None])
         self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
         for ring in (self._far, self._turned):
@@ -200,7 +209,8 @@ class StackSuccess(HeldSuccess):
             return achieved  # no window that holds this step can pass, in any world
 
         # The newest step against the others
-        pos, quat = self._step.pose[:, None].split((3, 4), dim=-1)
+        pos = self._step.pos[:, None]
+        quat = self._step.quat[:, None]
         torch.sub(self._pose[..., :3], pos, out=self._apart).square_()
         torch.maximum(self._far, self._apart.sum(-1), out=self._far)
         torch.mul(self._pose[..., 3:], quat, out=self._product)

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mjstack.managers.term import current_term
 from mjstack.managers.view import EnvView
 from mjstack.math import lowest_point, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, gripper_opening, pose_w
@@ -19,15 +20,19 @@ PhaseNames = Sequence[Sequence[str]]
 """For each object, names of phases."""
 
 
-def once_per_step(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Make a function whose last argument is a step compute a value once per step, for all
-    conditions that share it. It is not to be written into.
+def once_per_step(compute: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a function of a step compute a value once per step, for all conditions and terms that
+    share it. It is not to be written into.
+
+    The function's last argument is the step. Another one, such as the check of a method, has a
+    ``key``: those of equal keys share the value.
     """
 
     @wraps(compute)
-    def shared(*args: Any) -> Tensor:
-        known = args[-1].known
-        key = (compute, *args[:-1])
+    def shared(*args: Any) -> Any:
+        *others, step = args
+        key = (compute, step.view.key, *(each.key for each in others))
+        known = step.known
         if key not in known:
             known[key] = compute(*args)
         return known[key]
@@ -43,6 +48,7 @@ class TaskView:
         objects: Names of the objects, the order of every dimension over objects.
         phased: Whether the driver has phases.
         count: Steps so far, shape ``(1,)``, int64.
+        key: Equal to that of another view, if both see the same of the same environment.
     """
 
     def __init__(
@@ -67,6 +73,7 @@ class TaskView:
         self.objects = list(objects)
         self.phased = bool(phases)
         self.force = force
+        self.key = f"{id(env)} {force} {' '.join(objects)}"
         self.count = torch.zeros(1, dtype=torch.int64, device=env.device)
         self._phases = [phase.name for phase in phases]
         self._stop = stop
@@ -80,9 +87,15 @@ class TaskView:
         self.top = scene.table_top
         self.half = torch.tensor([each.half for each in self.things], device=env.device)
         self.radius = torch.tensor([each.radius for each in self.things], device=env.device)
-        self.qvel = [
-            None if name in index.fixed else index.object_address(name)[1] for name in objects
-        ]
+        # Columns of the poses and velocities, if all of the objects can move
+        self.movable: tuple[Columns, Columns] | None = None
+        if not set(objects) & set(index.fixed):
+            first = zip(*(index.object_address(name) for name in objects), strict=True)
+            qpos, qvel = (
+                Columns([a + i for a in at for i in range(width)], env.device)
+                for at, width in zip(first, (7, 6), strict=True)
+            )
+            self.movable = qpos, qvel
         self.jaws = self._forces([index.jaw_force[name] for name in objects])
         self.supports = self._forces([index.support_force.get(name, []) for name in objects])
 
@@ -158,41 +171,62 @@ class Step:
     def __init__(self, view: TaskView, phase: Tensor | None) -> None:
         """Take the view, and the phase of every world."""
         self.view = view
-        self.known: dict[tuple, Tensor] = {}  # see `once_per_step`
+        # What is known of this state, see `once_per_step`; within a pass of an environment's terms
+        # all of them share it.
+        self.known: dict[Any, Any] = {} if current_term.values is None else current_term.values
         self._phase = phase
 
-    @cached_property
+    @property
+    @once_per_step
     def pose(self) -> Tensor:
         """Position [m] and quaternion (wxyz), shape ``(nworld, objects, 7)``."""
-        env = self.view.env
-        return torch.stack([pose_w(env, name) for name in self.view.objects], dim=1).float()
+        view = self.view
+        if view.movable is not None:
+            return view.env.sim.part("qpos", view.movable[0], len(view.objects), 7).float()
+        return torch.stack([pose_w(view.env, name) for name in view.objects], dim=1).float()
 
     @property
+    @once_per_step
     def pos(self) -> Tensor:
         """Position [m], shape ``(nworld, objects, 3)``."""
         return self.pose[..., :3]
 
-    @cached_property
+    @property
+    @once_per_step
+    def quat(self) -> Tensor:
+        """Orientation (wxyz), shape ``(nworld, objects, 4)``."""
+        return self.pose[..., 3:]
+
+    @property
+    @once_per_step
     def velocity(self) -> Tensor:
         """Velocity as MuJoCo has it: linear [m/s] in the world, angular [rad/s] in the object's
         frame, shape ``(nworld, objects, 6)``.
         """
-        env = self.view.env
-        still = self.view.constant(*[0.0] * 6).expand(env.nworld, -1)
+        view = self.view
+        env = view.env
+        if view.movable is not None:
+            return env.sim.part("qvel", view.movable[1], len(view.objects), 6).float()
+        still = view.constant(*[0.0] * 6).expand(env.nworld, -1)
         parts = [
-            still if at is None else env.sim.qvel[:, at : at + 6].float() for at in self.view.qvel
+            still
+            if name in env.index.fixed
+            else env.sim.part("qvel", env.index.object_columns(name)[1]).float()
+            for name in view.objects
         ]
         return torch.stack(parts, dim=1)
 
-    @cached_property
+    @property
+    @once_per_step
     def turn(self) -> Tensor:
         """Rotation matrices, shape ``(nworld, objects, 3, 3)``."""
-        return quat_to_matrix(self.pose[..., 3:])
+        return quat_to_matrix(self.quat)
 
-    @cached_property
+    @property
+    @once_per_step
     def height(self) -> Tensor:
         """Height of the lowest point above the table [m], shape ``(nworld, objects)``."""
-        pos, quat = self.pose.split((3, 4), dim=-1)
+        pos, quat = self.pos, self.quat
         first, *others = self.view.things
         if all((each.shape, each.size) == (first.shape, first.size) for each in others):
             return lowest_point(pos, quat, first.shape, first.size) - self.view.top
@@ -202,7 +236,8 @@ class Step:
         ]
         return torch.stack(lowest, dim=1) - self.view.top
 
-    @cached_property
+    @property
+    @once_per_step
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Least and largest coordinates [m] of the corners, or of those of the box around another
         shape, each ``(nworld, objects, 3)``.
@@ -210,36 +245,48 @@ class Step:
         reach = (self.turn.abs() * self.view.half[:, None]).sum(-1)
         return self.pos - reach, self.pos + reach
 
-    @cached_property
+    @property
+    @once_per_step
     def speed(self) -> Tensor:
         """Fastest that any point can be [m/s], shape ``(nworld, objects)``."""
         parts = torch.linalg.vector_norm(self.velocity.unflatten(-1, (2, 3)), dim=-1)
         linear, angular = parts.unbind(-1)
         return linear + self.view.radius * angular
 
-    @cached_property
+    @property
+    @once_per_step
     def pressed(self) -> Tensor:
         """Whether each jaw presses on each object, shape ``(nworld, objects, jaws)``, bool."""
         return self._sensed(self.view.jaws)
 
-    @cached_property
+    @property
+    @once_per_step
     def in_hand(self) -> Tensor:
         """Whether all jaws press on each object, shape ``(nworld, objects)``, bool."""
         return self.pressed.all(-1)
 
-    @cached_property
+    @property
+    @once_per_step
     def untouched(self) -> Tensor:
         """Whether no jaw presses on each object, shape ``(nworld, objects)``, bool."""
         return ~self.pressed.any(-1)
 
-    @cached_property
+    @property
+    @once_per_step
     def opening(self) -> Tensor:
         """How far each gripper joint is open as measured, 0 closed to 1 open, shape ``(nworld,
         n_gripper)``, float32.
         """
         return gripper_opening(self.view.env).float()
 
-    @cached_property
+    @property
+    @once_per_step
+    def narrowest(self) -> Tensor:
+        """The least open one of them, shape ``(nworld, 1)``."""
+        return self.opening if self.opening.shape[1] == 1 else self.opening.amin(1, keepdim=True)
+
+    @property
+    @once_per_step
     def supported(self) -> Tensor:
         """Whether anything but a jaw presses on each object, shape ``(nworld, objects)``, bool;
         needs ``scene.support_sensors``.
@@ -255,6 +302,6 @@ class Step:
         return self.view.judged(self._phase)
 
     def _sensed(self, columns: Columns) -> Tensor:
-        forces = columns.read(self.view.env.sim.sensordata)
-        parts = forces.unflatten(1, (len(self.view.objects), -1, 3))
-        return torch.linalg.vector_norm(parts, dim=-1) > self.view.force
+        shape = (len(self.view.objects), -1, 3)
+        forces = self.view.env.sim.part("sensordata", columns, *shape)
+        return torch.linalg.vector_norm(forces, dim=-1) > self.view.force
