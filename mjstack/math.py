@@ -9,8 +9,8 @@ from functools import cache
 
 import torch
 
-# The third row of a rotation matrix is 2xz - 2wy, 2yz + 2wx, 1 - 2xx - 2yy: columns of w, x, y, z in
-# the products, the left factors first; their signs; and what is added.
+# The third row of a rotation matrix is 2xz - 2wy, 2yz + 2wx, 1 - 2xx - 2yy: columns of w, x, y, z
+# in the products, the left factors first; their signs; and what is added.
 _Z_ROW_FACTORS = torch.tensor([1, 2, 1, 2, 1, 2, 3, 3, 1, 0, 0, 2])
 _Z_ROW_SIGNS = torch.tensor([[2.0, 2.0, -2.0], [-2.0, 2.0, -2.0]])
 _Z_ROW_ADDED = torch.tensor([0.0, 0.0, 1.0])

@@ -35,9 +35,9 @@ PATHS: dict[str, list[str] | None] = {
     ],
     "managers/action.py": [f"ActionManager.{n}" for n in ("process", "apply", "reset")],
     "managers/observation.py": [
-        *(f"_Group.{n}" for n in ("compute", "append", "restart")),
-        "ObservationManager.compute",
-        "ObservationManager.refresh",
+        "_Part.value",
+        *(f"_Group.{n}" for n in ("add_noise", "append", "restart")),
+        *(f"ObservationManager.{n}" for n in ("compute", "refresh", "_step")),
     ],
     "managers/episode.py": [
         "RewardManager.compute",
@@ -46,7 +46,7 @@ PATHS: dict[str, list[str] | None] = {
         "_ValueManager.reset",
         "ResetManager.reset",
     ],
-    "managers/view.py": ["random_uniform"],
+    "managers/view.py": ["random_uniform", "unit_draw", "_draw_on_device", "zero_rows"],
     "managers/term.py": ["shared", "Term.__call__", "Term.reset"],
     "mdp/observation.py": None,
     "mdp/reward.py": None,
@@ -92,12 +92,13 @@ PATHS: dict[str, list[str] | None] = {
         *(
             f"Step.{n}"
             for n in (
-                *("pose", "pos", "velocity", "turn", "height", "bounds", "speed"),
+                *("pose", "pos", "quat", "velocity", "turn", "height", "bounds", "speed"),
                 *(
                     "pressed",
                     "in_hand",
                     "untouched",
                     "opening",
+                    "narrowest",
                     "supported",
                     "judged",
                     "_judged",
@@ -114,7 +115,8 @@ PATHS: dict[str, list[str] | None] = {
         *("HeldSuccess.__call__", "HeldSuccess.reset", "released", "on_top_of"),
     ],
     "tasks/stack.py": [
-        *("StackCheck.placed", "StackCheck.goals", "StackSuccess._stands", "StackSuccess.__call__"),
+        *(f"StackCheck.{n}" for n in ("on_goal", "placed", "goals")),
+        *("StackSuccess._stands", "StackSuccess.__call__"),
     ],
     "tasks/box.py": [
         *(f"BoxCheck.{n}" for n in ("airborne", "resting", "outside", "over", "placed")),
@@ -188,6 +190,7 @@ PATHS: dict[str, list[str] | None] = {
     "sim/substep.py": ["rearranged_step"],
     "sim/graph.py": ["side_by_side"],
     "sim/draws.py": ["draw_uniform"],
+    "sim/simulation.py": ["Simulation.part"],
     "math.py": None,
 }
 

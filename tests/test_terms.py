@@ -727,8 +727,10 @@ def test_reach_success_counts_steps_in_a_row() -> None:
     n = 4
     steps = 80
     near = np.random.default_rng(0).random((steps, n)) < 0.85
-    index = SimpleNamespace(grasp_sites=[0, 2], object_address=lambda name: (3, 0), fixed={})
+    red = slice(3, 10)
+    index = SimpleNamespace(grasp_sites=[0, 2], object_columns=lambda name: (red, red), fixed={})
     env = SimpleNamespace(nworld=n, device=torch.device("cpu"), index=index, sim=SimpleNamespace())
+    env.sim.part = lambda name, columns: getattr(env.sim, name)[:, columns]
     term = ReachSuccess(env, object="red", height=0.06, distance=0.02, steps=5)
     run = np.zeros(n, dtype=int)
     seen = []

@@ -18,7 +18,7 @@ from mjstack.managers.action import ActionManager
 from mjstack.managers.episode import ResetManager, RewardManager, TerminationManager
 from mjstack.managers.observation import ObservationManager
 from mjstack.managers.term import Term, current_term, first_value, step_cache
-from mjstack.math import not_finite
+from mjstack.mdp.geometry import lost_state
 from mjstack.rng import check_seed
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
@@ -143,7 +143,7 @@ class Env:
         self._outputs = Outputs(
             self.reward_manager, self.termination_manager, self.observation_manager, self.success
         )
-        self._faults = FaultLatch(self)
+        self._faults = FaultLatch(self, self._outputs.numbers)
         self.graph = self.captured(self.advance, "env.step")
 
     @property
@@ -366,12 +366,6 @@ class Env:
             The worlds that have ended now, for the next control step; None after the last.
         """
         self.episode_step += 1 if ended is None else ~ended
-        broken = not_finite(self.sim.qpos, self.sim.qvel)
-        if self._success is not None:
-            achieved = self._success(self)
-            if ended is not None:  # theirs stays
-                achieved = torch.where(ended, self.success, achieved)
-            torch.logical_and(achieved, ~broken, out=self.success)
 
         def reward() -> None:
             with step_cache():
@@ -382,23 +376,38 @@ class Env:
             with step_cache():
                 self.observation_manager.compute()
 
-        side_by_side(self.device, reward, observe)
+        with step_cache():  # both branches go on with what success has computed
+            lost = lost_state(self)
+            # None where the host can see that there are none
+            broken = lost if lost.is_cuda or bool(lost.any()) else None
+            if self._success is not None:
+                achieved = self._success(self)
+                if ended is not None:  # theirs stays
+                    achieved = torch.where(ended, self.success, achieved)
+                if broken is not None:
+                    achieved = achieved & ~broken
+                self.success.copy_(achieved)
+            side_by_side(self.device, reward, observe)
         current_term.label = ""
-        if self._check_faults and not broken.is_cuda:
-            self._faults.record(broken)
+        if self._check_faults and not lost.is_cuda and not self._faults.none_now(broken):
+            self._faults.record(lost)
             self._faults.raise_first()
         if last:
             self._reset_ended(broken)
             return None
         return self.termination_manager.terminated | self.termination_manager.truncated
 
-    def _reset_ended(self, broken: Tensor) -> None:
+    def _reset_ended(self, broken: Tensor | None) -> None:
         """The terminal observation, the statistics, the reset of the worlds that ended, and the
         observation to go on with.
+
+        Args:
+            broken: Worlds whose state is not finite, shape ``(nworld,)``, bool; None if there are
+                none.
         """
         ends = self.termination_manager
         rewards = self.reward_manager
-        on_cuda = broken.is_cuda
+        on_cuda = self.success.is_cuda
         done = ends.terminated | ends.truncated
         # On CUDA, where looking would stop the device, worlds are always reset: those of an empty
         # mask, if need be.
@@ -415,7 +424,7 @@ class Env:
                 )
 
         def record() -> None:
-            if on_cuda and self._check_faults:
+            if on_cuda and self._check_faults and broken is not None:
                 self._faults.record(broken)
 
         side_by_side(self.device, keep, count, record)
@@ -426,7 +435,7 @@ class Env:
             self._reset_managers(done)
             with step_cache():
                 self.observation_manager.refresh(done)
-        elif on_cuda or bool(broken.any()):
+        elif broken is not None:
             self._outputs.restore_observations()
 
     def _start_worlds(self, mask: Tensor) -> None:

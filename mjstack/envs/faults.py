@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mjstack.config.functions import offered
 from mjstack.errors import FaultError, name_worlds
-from mjstack.math import not_finite
+from mjstack.math import all_finite, not_finite
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Overflow, Simulation, describe_overflow
 
 if TYPE_CHECKING:
@@ -31,9 +31,16 @@ _FIXES = {
 class FaultLatch:
     """Keeps the faults of every world of an environment until it is cleared."""
 
-    def __init__(self, env: "Env") -> None:
-        """Allocate for the worlds of an environment whose managers are there."""
+    def __init__(self, env: "Env", numbers: Tensor) -> None:
+        """Allocate for the worlds of an environment whose managers are there.
+
+        Args:
+            env: The environment.
+            numbers: The memory of its reward and observations, float32.
+        """
         self._env = env
+        self._numbers = numbers
+        self._any = False  # latched since `clear`, on the CPU
         n = env.nworld
         self._faults = torch.zeros((n, len(_FIXES)), dtype=torch.bool, device=env.device)
         self._overflow = torch.zeros(n, dtype=torch.int32, device=env.device)
@@ -43,6 +50,19 @@ class FaultLatch:
         self._lost = POOL if "overflow" in ends_on else LOST_PHYSICS
         self._state_ends = "non_finite" in ends_on
 
+    def none_now(self, broken: Tensor | None) -> bool:
+        """Whether a short look on the CPU shows that there is nothing to record or to raise.
+
+        Args:
+            broken: Worlds whose state is not finite, or None if there are none.
+        """
+        return (
+            broken is None
+            and not self._any
+            and all_finite(self._numbers)
+            and not bool(self._env.sim.overflow.any())
+        )
+
     def record(self, broken: Tensor) -> None:
         """Add the faults of a step, before a reset can erase them.
 
@@ -50,6 +70,7 @@ class FaultLatch:
             broken: Worlds whose state is not finite, shape ``(nworld,)``, bool.
         """
         env = self._env
+        self._any = True
         self._overflow |= env.sim.overflow & self._lost
         bad_action = env.action_manager.not_finite
         reward = env.reward_manager.reward
@@ -61,6 +82,7 @@ class FaultLatch:
 
     def clear(self) -> None:
         """Clear every fault."""
+        self._any = False
         self._faults.zero_()
         self._overflow.zero_()
 

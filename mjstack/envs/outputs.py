@@ -19,6 +19,11 @@ _ALIGNMENT = 16  # bytes
 class Outputs:
     """Results of `Env.step` in one block of memory. Rewards, ends and observations are computed
     right into it.
+
+    Attributes:
+        tensors: Each of them in that memory, by name.
+        numbers: The memory of the reward and of all observations, shape ``(n,)``, float32: a look
+            at one tensor tells about all of them.
     """
 
     def __init__(
@@ -29,20 +34,26 @@ class Outputs:
         success: Tensor,
     ) -> None:
         """Allocate the block, and move the managers' results into it."""
-        self._groups = list(observations.groups)
+        groups = observations.groups
+        self._groups = list(groups)
+        # The same order for both kinds of observations, so that one copy takes all of them.
         like = {
             "reward": rewards.reward,
+            **{f"obs/{name}": group for name, group in groups.items()},
+            **{f"final/{name}": group for name, group in groups.items()},
             "terminated": ends.terminated,
             "truncated": ends.truncated,
             "success": success,
         }
-        for name, group in observations.groups.items():
-            like[f"obs/{name}"] = like[f"final/{name}"] = group
-        self._layout: dict[str, tuple[int, torch.dtype, torch.Size]] = {}
+        # Of each: its type, shape and strides, and where it begins, in numbers of its type
+        self._layout: dict[str, tuple[torch.dtype, torch.Size, tuple[int, ...], int]] = {}
+        begins: dict[str, int] = {}
         size = 0
         for name, tensor in like.items():
+            begins[name] = size
+            where = size // tensor.element_size()
+            self._layout[name] = (tensor.dtype, tensor.shape, tensor.stride(), where)
             length = tensor.numel() * tensor.element_size()
-            self._layout[name] = (size, tensor.dtype, tensor.shape)
             size = _ALIGNMENT * math.ceil((size + length) / _ALIGNMENT)
         self._memory = torch.zeros(size, dtype=torch.uint8, device=success.device)
         self.tensors = self._views(self._memory)
@@ -52,30 +63,36 @@ class Outputs:
         ends.terminated = self.tensors["terminated"]
         ends.truncated = self.tensors["truncated"]
         for name in self._groups:
-            observations.groups[name] = self.tensors[f"obs/{name}"]
+            groups[name] = self.tensors[f"obs/{name}"]
 
-    def write_final(self, success: Tensor, broken: Tensor) -> None:
+        final = [begins[f"final/{name}"] for name in self._groups]
+        first = final[0] if final else begins["terminated"]
+        self.numbers = self._memory[:first].view(torch.float32)
+        obs = [begins[f"obs/{name}"] for name in self._groups]
+        self._observed = self._memory[obs[0] if obs else first : first]
+        self._final = self._memory[first : begins["terminated"]]
+
+    def write_final(self, success: Tensor, broken: Tensor | None) -> None:
         """Keep success and the observations of this step, before a reset changes them.
 
         Args:
             success: Shape ``(nworld,)``, bool.
-            broken: Worlds whose state is not finite, shape ``(nworld,)``, bool. Their last
-                observation is 0 where it is NaN, which a value times 0 would hand on.
+            broken: Worlds whose state is not finite, shape ``(nworld,)``, bool; None if there are
+                none. Their last observation is 0 where it is NaN, which a value times 0 would hand
+                on.
         """
         self.tensors["success"].copy_(success)
-        whole = not broken.is_cuda and not bool(broken.any())
+        if broken is None:
+            self._final.copy_(self._observed)
+            return
         for name in self._groups:
             group = self.tensors[f"obs/{name}"]
-            if whole:
-                self.tensors[f"final/{name}"].copy_(group)
-                continue
             finite = group.nan_to_num(0.0, 0.0, 0.0)
             torch.where(broken[:, None], finite, group, out=self.tensors[f"final/{name}"])
 
     def restore_observations(self) -> None:
         """Make the final observations the current ones, where no world is reset."""
-        for name in self._groups:
-            self.tensors[f"obs/{name}"].copy_(self.tensors[f"final/{name}"])
+        self._observed.copy_(self._final)
 
     def returned(
         self,
@@ -88,10 +105,11 @@ class Outputs:
         return obs, out["reward"], out["terminated"], out["truncated"], extras
 
     def _views(self, memory: Tensor) -> dict[str, Tensor]:
-        storage = memory.untyped_storage()
+        typed: dict[torch.dtype, Tensor] = {}
         views = {}
-        for name, (start, dtype, shape) in self._layout.items():
-            # Not a view of `memory`: writing into one would then count as writing into the others.
-            tensor = torch.empty(0, dtype=dtype, device=memory.device)
-            views[name] = tensor.set_(storage, start // tensor.element_size(), shape)  # type: ignore[call-overload]
+        for name, (dtype, shape, strides, where) in self._layout.items():
+            if dtype not in typed:
+                typed[dtype] = memory.view(dtype)
+            # `data`: writing into one would else count as writing into the others.
+            views[name] = typed[dtype].as_strided(shape, strides, where).data
         return views

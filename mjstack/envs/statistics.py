@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from mjstack.managers.view import rows_of
+
 
 class EpisodeStatistics:
     """Sums over finished episodes. One tensor holds them all, so that reading is one copy."""
@@ -16,7 +18,6 @@ class EpisodeStatistics:
             *(f"reward/{name}" for name in reward_names),
             *(f"termination/{name}" for name in termination_names),
         ]
-        self._one = torch.ones((1, 1), device=device)
         # float64 counts exactly far beyond the 16.7 million at which float32 stops.
         self._sums = torch.zeros(1 + len(self._names), dtype=torch.float64, device=device)
 
@@ -37,15 +38,16 @@ class EpisodeStatistics:
             rewards: Episode sum of every reward term, shape ``(nworld, nterm)``.
             terminations: What every termination term says, shape ``(nworld, nterm)``, bool.
         """
-        columns = (
-            self._one.expand(len(steps), 1),
-            steps[:, None],
-            success[:, None],
-            rewards.sum(1, keepdim=True),
-        )
+        at = rows_of(done)
+        if isinstance(at, Tensor):
+            done, steps, success = (each.index_select(0, at) for each in (done, steps, success))
+            rewards, terminations = (each.index_select(0, at) for each in (rewards, terminations))
         # A step count is exact in float32 up to 16.7 million; the sums are float64.
-        row = torch.cat([column.float() for column in (*columns, rewards, terminations)], dim=1)
-        self._sums += torch.where(done[:, None], row, 0.0).sum(0, dtype=torch.float64)
+        columns = torch.stack((done.float(), steps.float(), success.float(), rewards.sum(1)), dim=1)
+        row = torch.cat((columns, rewards, terminations.float()), dim=1)
+        if not isinstance(at, Tensor):
+            row = torch.where(done[:, None], row, 0.0)
+        self._sums += row.sum(0, dtype=torch.float64)
 
     def read(self) -> dict[str, float]:
         """Means over the episodes that ended since the last read, which starts anew. Waits for the

@@ -10,8 +10,8 @@ import torch
 from mjstack.config.schema import TermCfg
 from mjstack.errors import ArgumentError, TermError
 from mjstack.managers.term import Term, current_term, render_table
-from mjstack.managers.view import EnvView
-from mjstack.math import describe_tensor
+from mjstack.managers.view import EnvView, zero_rows
+from mjstack.math import all_finite, describe_tensor
 
 
 class ActionTerm(ABC):
@@ -79,6 +79,8 @@ class ActionManager:
         self.action = torch.zeros(shape, dtype=env.sim.qpos.dtype, device=env.device)
         self.previous_action = self.action.clone()
         self._processed = self.action.clone()
+        self._whole = not self.action.is_cuda  # as far as it is known
+        self._parts = self.action.split(self._dims, dim=1) if terms else ()
         self.low = torch.cat([term.low for term in terms]) if terms else self.action[0]
         self.high = torch.cat([term.high for term in terms]) if terms else self.action[0]
         self.not_finite = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
@@ -97,7 +99,9 @@ class ActionManager:
         """
         self.check(action)
         action = action.detach()  # physics has no gradient, and a buffer must not acquire one
-        if not action.is_cuda and not bool(torch.isfinite(action).all()):
+        self._processed.copy_(action)
+        self._whole = all_finite(self._processed)
+        if not action.is_cuda and not self._whole and not bool(torch.isfinite(action).all()):
             world = int((~torch.isfinite(action)).any(1).nonzero()[0, 0])
             raise ArgumentError(
                 "action",
@@ -105,17 +109,18 @@ class ActionManager:
                 "finite numbers",
                 "Check what the policy returns",
             )
-        self._processed.copy_(action)
 
     def apply(self) -> None:
         """Make the processed action the current one and the current one the previous one, and write
         ``sim.ctrl`` in all worlds, term by term.
         """
         self.previous_action.copy_(self.action)
-        torch.nan_to_num(self._processed, 0.0, 0.0, 0.0, out=self.action)
-        self.not_finite |= (self.action != self._processed).any(1)
-        parts = self.action.split(self._dims, dim=1)
-        for (name, term), part in zip(self.terms.items(), parts, strict=True):
+        if self._whole:
+            self.action.copy_(self._processed)
+        else:
+            torch.nan_to_num(self._processed, 0.0, 0.0, 0.0, out=self.action)
+            self.not_finite |= (self.action != self._processed).any(1)
+        for (name, term), part in zip(self.terms.items(), self._parts, strict=True):
             current_term.label = f"action.{name}"
             term.write_commands(part)
 
@@ -133,8 +138,7 @@ class ActionManager:
 
     def reset(self, mask: torch.Tensor) -> None:
         """Zero the actions of the masked worlds."""
-        self.action.masked_fill_(mask[:, None], 0.0)
-        self.previous_action.masked_fill_(mask[:, None], 0.0)
+        zero_rows(mask, self.action, self.previous_action)
 
     def __str__(self) -> str:
         rows = [

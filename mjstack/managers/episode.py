@@ -10,7 +10,7 @@ import torch
 from mjstack.config.functions import offered
 from mjstack.config.schema import RewardTermCfg, TermCfg, TerminationTermCfg
 from mjstack.managers.term import Term, blamed, first_value, render_table
-from mjstack.managers.view import EnvView
+from mjstack.managers.view import EnvView, zero_rows
 
 
 class ResetManager:
@@ -124,7 +124,7 @@ class RewardManager(_ValueManager):
     def reset(self, mask: torch.Tensor) -> None:
         """Start the sums of the masked worlds anew."""
         super().reset(mask)
-        self.episode_sums.masked_fill_(mask[:, None], 0.0)
+        zero_rows(mask, self.episode_sums)
 
     def __str__(self) -> str:
         rows = [(name, term.weight, term.params) for name, term in self._cfg.items()]

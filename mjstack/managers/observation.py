@@ -10,8 +10,8 @@ import torch
 from mjstack.config.schema import ObservationGroupCfg, ObservationTermCfg
 from mjstack.errors import TermError
 from mjstack.managers.term import Term, first_value, render_table
-from mjstack.managers.view import EnvView, random_uniform, rows_of
-from mjstack.scene.index import ALL, Rows
+from mjstack.managers.view import EnvView, rows_of, unit_draw
+from mjstack.scene.index import ALL, Columns, Rows
 
 
 class _Part:
@@ -32,14 +32,21 @@ class _Part:
                 " termination term",
             )
         value = first_value(self.term, env, dims=(1, 2))
-        self.width = 1 if value.dim() == 1 else value.shape[1]
+        self._single = value.dim() == 1
+        self.width = 1 if self._single else value.shape[1]
         self.dim = self.width * cfg.history
+
+    def value(self, env: EnvView) -> torch.Tensor:
+        """The term's value, shape ``(nworld, width)``."""
+        value = self.term(env)
+        return value[:, None] if self._single else value
 
 
 class _Group:
-    """The terms of one group: noise, clipping and scaling are done for all columns at once."""
+    """Where the terms of one group lie in a step of all groups, and what they have had before."""
 
-    def __init__(self, name: str, cfg: ObservationGroupCfg, env: EnvView) -> None:
+    def __init__(self, name: str, cfg: ObservationGroupCfg, env: EnvView, first: int) -> None:
+        """Build the terms; ``first`` is the group's first column in a step."""
         self.name = name
         self.noisy = cfg.noise
         self._env = env
@@ -52,63 +59,52 @@ class _Group:
             )
         parts = self.parts.values()
         self.dim = sum(part.dim for part in parts)
+        widths = [part.width for part in parts]
+        self.width = sum(widths)
+        self._columns = slice(first, first + self.width)
 
         def indices(columns: Sequence[int]) -> torch.Tensor:
             return torch.tensor(columns, dtype=torch.int64, device=env.device)
 
-        widths = indices([part.width for part in parts])
-
-        def row(values: Iterable[float]) -> torch.Tensor:
-            """A number for each column of one step, from one for each part."""
-            numbers = torch.tensor([*values], dtype=torch.float32, device=env.device)
-            return numbers.repeat_interleave(widths)
-
         # Only columns with noise get numbers: where one stands in the draw follows from them alone.
-        noise = row(part.cfg.noise if cfg.noise else 0.0 for part in parts)
-        self._noise_columns = noise.nonzero()[:, 0]
-        self._noise = noise[self._noise_columns]
-        clips = [part.cfg.clip or (-math.inf, math.inf) for part in parts]
-        self._clips = any(part.cfg.clip for part in parts)
-        self._low = row(low for low, _ in clips)
-        self._high = row(high for _, high in clips)
-        self._scales = any(part.cfg.scale != 1.0 for part in parts)
-        self._scale = row(part.cfg.scale for part in parts)
+        noise = spread(widths, [part.cfg.noise if cfg.noise else 0.0 for part in parts])
+        noisy = [column for column, size in enumerate(noise) if size]
+        self._noise_columns = Columns([first + column for column in noisy], env.device)
+        self._noise = torch.tensor(
+            [noise[column] for column in noisy], dtype=torch.float32, device=env.device
+        )
         # Where each column of the group comes from: for `append` in the group before and the new
         # step behind it, where a part's steps move up by one; for `restart` in the new step.
         shift: list[int] = []
         repeat: list[int] = []
-        first = 0  # of the part's columns within one step
+        start = 0  # of the part's columns within one step
         for part in parts:
-            newest = range(first, first + part.width)
-            start = len(shift)
-            shift += range(start + part.width, start + part.dim)
+            newest = range(start, start + part.width)
+            begin = len(shift)
+            shift += range(begin + part.width, begin + part.dim)
             shift += [self.dim + column for column in newest]
             repeat += [*newest] * part.cfg.history
-            first += part.width
-        self._has_history = first < self.dim
+            start += part.width
+        self._has_history = start < self.dim
         self._shift = indices(shift)
         self._repeat = indices(repeat)
         self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
 
-    def compute(self, at: Rows = ALL) -> torch.Tensor:
-        """One step of some worlds, shape ``(n, sum of widths)``."""
+    def add_noise(self, step: torch.Tensor, at: Rows) -> None:
+        """Add the group's noise to a step of some worlds."""
+        if not len(self._noise):
+            return
         env = self._env
-        parts = self.parts.values()
-        values = [part.term(env).reshape(env.nworld, part.width)[at] for part in parts]
-        step = torch.cat(values, dim=1).float()
-        if len(self._noise_columns):
-            size = len(self._noise_columns)
-            draw = random_uniform(
-                env, f"observation.{self.name}", size, step=env.episode_step, at=at
-            ).float()
-            step.index_add_(1, self._noise_columns, self._noise * draw)
-        if self._clips:
-            step.clamp_(self._low, self._high)
-        return step.mul_(self._scale) if self._scales else step
+        draw = unit_draw(env, f"observation.{self.name}", len(self._noise), env.episode_step, at)
+        columns = self._noise_columns.at
+        if isinstance(columns, slice):
+            step[:, columns].add_(self._noise * draw)
+        else:
+            step.index_add_(1, columns, self._noise * draw)
 
-    def append(self, out: torch.Tensor) -> None:
+    def append(self, out: torch.Tensor, step: torch.Tensor) -> None:
         """Take in a new step of every world, and forget the oldest."""
-        step = self.compute()
+        step = step[:, self._columns]
         if not self._has_history:
             out.copy_(step)
             return
@@ -116,10 +112,11 @@ class _Group:
         torch.index_select(both, 1, self._shift, out=self._past)
         out.copy_(self._past)
 
-    def restart(self, out: torch.Tensor, mask: torch.Tensor) -> None:
-        """The whole history of the masked worlds becomes the current step."""
-        at = rows_of(mask)
-        step = self.compute(at)
+    def restart(self, out: torch.Tensor, step: torch.Tensor, mask: torch.Tensor, at: Rows) -> None:
+        """The whole history of the masked worlds becomes the current step, which is that of ``at``
+        alone where it has their numbers.
+        """
+        step = step[:, self._columns]
         kept = self._past if self._has_history else out
         if self._has_history:
             step = step.index_select(1, self._repeat)
@@ -131,8 +128,17 @@ class _Group:
             out.copy_(self._past)
 
 
+def spread(widths: Iterable[int], values: Iterable[float]) -> list[float]:
+    """A number for each column of one step, from one for each part."""
+    pairs = zip(widths, values, strict=True)
+    return [value for width, value in pairs for _ in range(width)]
+
+
 class ObservationManager:
     """Computes every group into one tensor of shape ``(nworld, group_dim)``, float32.
+
+    A step of all groups is one tensor, so that terms are put together, clipped and scaled for all
+    of them at once.
 
     Attributes:
         group_dims: Width of each group.
@@ -147,7 +153,11 @@ class ObservationManager:
         Raises:
             TermError: A term cannot be found, or returns what a group cannot hold.
         """
-        self._groups = {name: _Group(name, group, env) for name, group in cfg.items()}
+        self._env = env
+        self._groups: dict[str, _Group] = {}
+        for name, group in cfg.items():
+            first = sum(each.width for each in self._groups.values())
+            self._groups[name] = _Group(name, group, env, first)
         self.group_dims = {name: group.dim for name, group in self._groups.items()}
         self.term_dims = {
             name: {term: p.dim for term, p in group.parts.items()}
@@ -157,20 +167,50 @@ class ObservationManager:
             name: torch.full((env.nworld, dim), math.nan, dtype=torch.float32, device=env.device)
             for name, dim in self.group_dims.items()
         }
+        self._parts = [p for group in self._groups.values() for p in group.parts.values()]
+        widths = [part.width for part in self._parts]
+
+        def row(values: Iterable[float]) -> torch.Tensor:
+            return torch.tensor(spread(widths, values), dtype=torch.float32, device=env.device)
+
+        clips = [part.cfg.clip or (-math.inf, math.inf) for part in self._parts]
+        self._clips = any(part.cfg.clip for part in self._parts)
+        self._low = row(low for low, _ in clips)
+        self._high = row(high for _, high in clips)
+        self._scales = any(part.cfg.scale != 1.0 for part in self._parts)
+        self._scale = row(part.cfg.scale for part in self._parts)
 
     def compute(self) -> dict[str, torch.Tensor]:
         """Take in a new step of every world, and return `groups`."""
-        for name, group in self._groups.items():
-            group.append(self.groups[name])
+        if self._parts:
+            step = self._step(ALL)
+            for name, group in self._groups.items():
+                group.append(self.groups[name], step)
         return self.groups
 
     def refresh(self, mask: torch.Tensor) -> dict[str, torch.Tensor]:
         """Compute the masked worlds anew after their reset; their whole history becomes the first
         step.
         """
-        for name, group in self._groups.items():
-            group.restart(self.groups[name], mask)
+        if self._parts:
+            at = rows_of(mask)
+            step = self._step(at)
+            for name, group in self._groups.items():
+                group.restart(self.groups[name], step, mask, at)
         return self.groups
+
+    def _step(self, at: Rows) -> torch.Tensor:
+        """One step of all groups in some worlds, shape ``(n, sum of widths)``, float32."""
+        values = [part.value(self._env) for part in self._parts]
+        step = torch.cat(values, dim=1)
+        if isinstance(at, torch.Tensor):
+            step = step.index_select(0, at)
+        step = step.float()
+        for group in self._groups.values():
+            group.add_noise(step, at)
+        if self._clips:
+            step.clamp_(self._low, self._high)
+        return step.mul_(self._scale) if self._scales else step
 
     def not_finite_terms(self, world: int) -> list[str]:
         """Names of the terms whose last value in a world is not finite. Waits for the device."""

@@ -126,9 +126,7 @@ def unit_draw(
         worlds = [numbers[at] for numbers in worlds]
     world, episode, step = worlds
     stream = zlib.crc32(name.encode())
-    return uniform(
-        seed=env.seed, world=world, episode=episode, step=step, stream=stream, size=size
-    )
+    return uniform(seed=env.seed, world=world, episode=episode, step=step, stream=stream, size=size)
 
 
 def _draw_on_device(

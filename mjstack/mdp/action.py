@@ -21,6 +21,7 @@ class _Commands(ActionTerm):
         chosen = list(chosen)
         self._ctrl = env.sim.ctrl
         self._columns = Columns(env.index.ctrl[chosen], env.device)
+        self._part = self._columns.read(self._ctrl)  # its own memory, if they lie side by side
         self._low, self._high = robot(env).ctrl_range[chosen].unbind(1)
         self.actuators = self._columns.indices
         self.dim = dim
@@ -29,7 +30,10 @@ class _Commands(ActionTerm):
 
     def _write_bounded(self, command: Tensor) -> None:
         """Write commands, kept within the actuators' ranges."""
-        self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))
+        if isinstance(self._columns.at, slice):
+            torch.clamp(command, self._low, self._high, out=self._part)
+        else:
+            self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))
 
 
 class JointPosition(_Commands):
@@ -96,13 +100,12 @@ class Gripper(_Commands):
         """Read the profile."""
         self._set_up(env, range(env.index.n_arm, len(env.index.ctrl)), dim=1)
         self._closed = robot(env).gripper_closed
-        self._opening = robot(env).gripper_open - self._closed
+        self._half_travel = 0.5 * robot(env).gripper_travel
 
     def write_commands(self, action: Tensor) -> None:
         """Write the fingers' commands."""
-        self._columns.write(
-            self._ctrl, self._closed + 0.5 * (action.clamp(-1.0, 1.0) + 1.0) * self._opening
-        )
+        opened = (action.clamp(-1.0, 1.0) + 1.0) * self._half_travel
+        self._columns.write(self._ctrl, self._closed + opened)
 
 
 class JointTargets(_Commands):

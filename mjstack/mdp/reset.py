@@ -17,6 +17,7 @@ from mjstack.managers.view import (
     random_uniform,
     rows_of,
     uses_fields,
+    zero_rows,
 )
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import Pose, pose_w, robot, write_object, write_robot
@@ -36,7 +37,7 @@ def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
     """Put the robot at its home, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
     at = rows_of(mask)
     write_robot(env, mask, getattr(robot(env), pose).expand(len(env.world[at]), -1), at)
-    env.sim.qvel.masked_fill_(mask[:, None], 0.0)
+    zero_rows(mask, env.sim.qvel)
 
 
 @offers(joint_noise=True)

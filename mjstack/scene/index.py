@@ -77,6 +77,7 @@ class RobotTensors:
         qpos: Columns of qpos.
         qvel: Columns of qvel.
         ctrl: Columns of ctrl.
+        gripper_qpos: The gripper's columns of qpos.
         range: Joint limits [rad, m], shape ``(n, 2)``.
         ctrl_range: Limits of the joint targets, shape ``(n, 2)``.
         home: Joint values at home, shape ``(n,)``.
@@ -84,12 +85,12 @@ class RobotTensors:
         gripper_open: Command of the open gripper, shape ``(n_gripper,)``.
         gripper_closed: Command of the closed gripper, shape ``(n_gripper,)``.
         gripper_travel: The open less the closed one, shape ``(n_gripper,)``.
-        gripper_qpos: The gripper's columns of qpos.
     """
 
     qpos: Columns
     qvel: Columns
     ctrl: Columns
+    gripper_qpos: Columns
     range: torch.Tensor
     ctrl_range: torch.Tensor
     home: torch.Tensor
@@ -97,7 +98,6 @@ class RobotTensors:
     gripper_open: torch.Tensor
     gripper_closed: torch.Tensor
     gripper_travel: torch.Tensor
-    gripper_qpos: Columns
 
 
 class SceneIndex:
@@ -171,16 +171,17 @@ class SceneIndex:
         """The robot's part on a device. Made once: a captured step may not copy from the host."""
         key = (device, dtype)
         if key not in self._tensors:
-            columns = [Columns(a, device) for a in (self.robot_qpos, self.robot_qvel, self.ctrl)]
+            gripper = self.robot_qpos[self.n_arm :]
+            addresses = (self.robot_qpos, self.robot_qvel, self.ctrl, gripper)
+            columns = [Columns(a, device) for a in addresses]
             r = self._robot
             poses = (r.home, r.start, r.gripper_open, r.gripper_closed)
             numbers = [
                 torch.as_tensor(np.asarray(values, dtype=float), dtype=dtype, device=device)
                 for values in (self.robot_range, self.ctrl_range, *poses)
             ]
-            travel = numbers[-2] - numbers[-1]
-            gripper = Columns(self.robot_qpos[self.n_arm :], device)
-            self._tensors[key] = RobotTensors(*columns, *numbers, travel, gripper)  # type: ignore[arg-type]
+            numbers.append(numbers[-2] - numbers[-1])
+            self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]
 
     def constant(self, values: Sequence[float], like: torch.Tensor) -> torch.Tensor:
@@ -197,9 +198,12 @@ class SceneIndex:
         an error that lists those.
         """
         if name not in self._columns:
-            pairs = zip(self.object_address(name), (7, 6), strict=True)
-            qpos, qvel = (Columns(range(at, at + width), torch.device("cpu")) for at, width in pairs)
-            self._columns[name] = qpos, qvel
+            qpos, qvel = self.object_address(name)
+            here = torch.device("cpu")  # side by side, so that no device has anything of them
+            self._columns[name] = (
+                Columns(range(qpos, qpos + 7), here),
+                Columns(range(qvel, qvel + 6), here),
+            )
         return self._columns[name]
 
     def object_address(self, name: str) -> tuple[int, int]:
