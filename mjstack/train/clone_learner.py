@@ -5,7 +5,7 @@ stopped.
 import copy
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -20,6 +20,7 @@ from mjstack.episodes.context import RunContext
 from mjstack.interrupt import check_interrupt
 from mjstack.policy import Policy, PolicyNetwork, save_policy
 from mjstack.policy.checkpoint import write_state
+from mjstack.sim.graph import StepGraph
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.trainer import (
     BEST,
@@ -101,10 +102,25 @@ class Learner:
         self._network = network.to(device)
         self._average = copy.deepcopy(self._network).requires_grad_(False)
         self._networks = {"network": self._network, "average": self._average}
+        # What a batch depends on lies in tensors, so that a graph can hold the batch.
         self._optimizer = torch.optim.AdamW(
-            self._network.parameters(), lr=job.learning_rate, weight_decay=sizes.weight_decay
+            self._network.parameters(),
+            lr=torch.tensor(job.learning_rate, device=device),
+            weight_decay=sizes.weight_decay,
+            fused=True,
+            capturable=device.type == "cuda",
         )
-        self._generator = torch.Generator(device).manual_seed(cfg.seed + ranks.rank)
+        self._forget = torch.zeros((), device=device)  # share of the average that a batch replaces
+        self._drawn = torch.zeros(self._batch_size, dtype=torch.int64, device=device)
+        self._noise = torch.zeros((self._batch_size, self._seen.shape[1]), device=device)
+        terms = cfg.observation[job.group].terms
+        widest = [
+            sizes.input_noise * terms[name].noise * terms[name].scale
+            for name, width in demonstrations.widths.items()
+            for _ in range(width)
+        ]
+        self._widest = torch.tensor(widest, device=device)  # half-width of each column's noise
+        self._generator = torch.Generator(device)
         self._policy = Policy(
             network=self._average,
             group=job.group,
@@ -122,6 +138,7 @@ class Learner:
         self._sum = torch.zeros((), device=device)  # of losses since the last row
         self._count = 0
         self._events: EventWriter | None = None
+        self._batch: Callable[[], None] = self._fit
 
     def take(self, demonstrations: Demonstrations) -> None:
         """Learn from these demonstrations from now on. The scale stays that of the first ones."""
@@ -147,25 +164,29 @@ class Learner:
         total = self._sizes.batches if total is None else total
         before = self.seconds - time.perf_counter()
         self._events = self._open_events()
+        self._batch = self._fit
+        if self._seen.is_cuda and self._ranks.size == 1:
+            # Demonstrations and weights stay where they are in memory until the last batch.
+            mode = self._context.cfg.graph
+            name = "a batch of the training"
+            self._batch = StepGraph(self._fit, self._seen.device, mode, name=name, scratch=False)
         with _fast_products(self._seen.device):
-            while self.done < total:
-                share = (self.done - first) / (total - first)
-                self._step(0.5 * (1.0 + math.cos(math.pi * share)))
-                self.done += 1
-                self.seconds = before + time.perf_counter()
-                saves = self.done % self._sizes.save_every == 0 or self.done == total
-                if saves:
-                    self._save()
-                if saves or self.done % _SHOWN == 0:
-                    try:
+            try:
+                while self.done < total:
+                    share = (self.done - first) / (total - first)
+                    self._step(0.5 * (1.0 + math.cos(math.pi * share)))
+                    self.done += 1
+                    self.seconds = before + time.perf_counter()
+                    saves = self.done % self._sizes.save_every == 0 or self.done == total
+                    if saves:
+                        self._save()
+                    if saves or self.done % _SHOWN == 0:
                         self._ranks.stop_together()
                         self._context.advance("batches", self.done, total)
                         check_interrupt()
-                    except KeyboardInterrupt:
-                        # The others' generators may be elsewhere: their last saved state counts.
-                        if self._ranks.size == 1:
-                            self._write_state()
-                        raise
+            except KeyboardInterrupt:
+                self._write_state()
+                raise
         if self._events is not None:
             self._events.close()
 
@@ -176,43 +197,49 @@ class Learner:
         return EventWriter(self._folder, self.done, self._context.print_line)
 
     def _step(self, rate: float) -> None:
-        """One batch, at a share of the learning rate."""
-        job = self._job
-        draw = torch.randint(
-            len(self._training),
-            (self._batch_size,),
-            generator=self._generator,
-            device=self._seen.device,
+        """One batch, at a share of the learning rate. What it draws follows from the seed and the
+        batch's number, so training goes on after any of them.
+        """
+        seed = draw_seed(self._policy.config["seed"], self._ranks.rank, self.done)
+        self._generator.manual_seed(seed)
+        torch.randint(
+            len(self._training), self._drawn.shape, generator=self._generator, out=self._drawn
         )
-        loss = self._loss(self._network, self._training[draw], self._sizes.input_noise)
-        for group in self._optimizer.param_groups:
-            group["lr"] = job.learning_rate * rate
-        self._optimizer.zero_grad()
-        loss.backward()
-        self._ranks.average_gradients(self._network.parameters())
-        self._optimizer.step()
+        self._noise.uniform_(-1.0, 1.0, generator=self._generator)
         # The first networks are soon forgotten.
-        keep = min(job.averaging, (1.0 + self.done) / (10.0 + self.done))
-        average = [p.data for p in self._average.parameters()]
-        torch._foreach_lerp_(average, [p.data for p in self._network.parameters()], 1.0 - keep)
-        self._sum += loss.detach()
+        keep = min(self._job.averaging, (1.0 + self.done) / (10.0 + self.done))
+        self._forget.fill_(1.0 - keep)
+        for group in self._optimizer.param_groups:
+            group["lr"].fill_(self._job.learning_rate * rate)
+        self._batch()
         self._count += 1
 
-    def _loss(self, network: PolicyNetwork, steps: Tensor, noise: float = 0.0) -> Tensor:
+    def _fit(self) -> None:
+        """Learn from the drawn steps."""
+        weights = list(self._network.parameters())
+        loss = self._loss(self._network, self._training[self._drawn], self._widest * self._noise)
+        for weight, gradient in zip(weights, torch.autograd.grad(loss, weights), strict=True):
+            weight.grad = gradient
+        self._ranks.average_gradients(weights)
+        self._optimizer.step()
+        average = [p.data for p in self._average.parameters()]
+        change = torch._foreach_sub([p.data for p in weights], average)
+        torch._foreach_mul_(change, self._forget)
+        torch._foreach_add_(average, change)
+        self._sum += loss.detach()
+
+    def _loss(self, network: PolicyNetwork, steps: Tensor, noise: Tensor | float = 0.0) -> Tensor:
         """Mean squared error of the normalised answers at some steps, shape ``(n,)``. At an
         episode's end its last joint targets hold.
 
-        Noise on the observation, in standard deviations, says that the answer is the same a little
-        off the expert's way: so the policy comes back to it.
+        Noise on the observation says that the answer is the same a little off the expert's way. It
+        also hides from the network what only tells the time: while the expert waits, joints settle
+        by micrometers, and a policy that reads these waits for ever where they are others.
         """
         ahead = torch.arange(network.chunk, device=steps.device)
         then = torch.minimum(steps[:, None] + ahead, self._last[steps][:, None])
         wanted = (self._labels[then] - network.action_mean) / network.action_std
-        seen = self._seen[steps]
-        if noise > 0.0:
-            draw = torch.randn(seen.shape, generator=self._generator, device=seen.device)
-            seen = seen + noise * network.observation_std * draw
-        return torch.nn.functional.mse_loss(network.normalized(seen), wanted)
+        return torch.nn.functional.mse_loss(network.normalized(self._seen[steps] + noise), wanted)
 
     @torch.no_grad()
     def _validate(self) -> float:
@@ -257,13 +284,6 @@ class Learner:
                 save_policy(self._folder / BEST, self._policy)
         self._write_state()
 
-    def _parameters(self) -> dict[str, Tensor]:
-        """Everything that training changes, by name."""
-        generators = self._ranks.gather(self._generator.get_state())
-        state = {f"generator.{rank}": each for rank, each in enumerate(generators)}
-        state |= pack_weights(self._networks, self._optimizer)
-        return state | {"sum": self._sum}
-
     def facts(self) -> dict[str, Any]:
         """Everything of the training that is no tensor, in JSON's types."""
         return {
@@ -277,13 +297,12 @@ class Learner:
         }
 
     def _write_state(self) -> None:
-        parameters = self._parameters()
         if self._ranks.writes:
-            write_state(self._folder / STATE, parameters, self.facts())
+            weights = pack_weights(self._networks, self._optimizer)
+            write_state(self._folder / STATE, weights | {"sum": self._sum}, self.facts())
 
     def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
         """Go on from the state and facts of an earlier call."""
-        self._generator.set_state(state[f"generator.{self._ranks.rank}"])
         unpack_weights(state, self._networks, self._optimizer)
         self._sum.copy_(state["sum"])
         self.done = facts["done"]
@@ -292,6 +311,11 @@ class Learner:
         self.curve = facts["curve"]
         self._count = facts["count"]
         self._context.print_line(f"train: goes on after batch {self.done} of {self._sizes.batches}")
+
+
+def draw_seed(seed: int, rank: int, batch: int) -> int:
+    """Seed of what a rank draws for a batch: no other batch or rank of the training has it."""
+    return 1_000_003 * (seed + rank) + batch
 
 
 def _moments(values: Tensor, ranks: Ranks) -> tuple[Tensor, Tensor]:

@@ -110,7 +110,7 @@ class CloneSizes:
     save_every: int = spec(unit="batches", ge=1)
     """Batches between two saved policies."""
     input_noise: float = spec(ge=0.0)
-    """Noise on the observations that training sees, in their standard deviations."""
+    """Noise on the observations that training sees, in multiples of their terms' ``noise``."""
     weight_decay: float = spec(ge=0.0)
     """Of AdamW."""
     leave_out: list[str] = spec(factory=list)
@@ -152,7 +152,7 @@ class CloneJobCfg(TrainJobCfg):
     save_every: int | None = spec(None, unit="batches", ge=1)
     """Batches between two saved policies."""
     input_noise: float | None = spec(None, ge=0.0)
-    """Noise on the observations that training sees, in their standard deviations."""
+    """Noise on the observations that training sees, in multiples of their terms' ``noise``."""
     weight_decay: float | None = spec(None, ge=0.0)
     """Of AdamW."""
     leave_out: list[str] | None = spec(None)
