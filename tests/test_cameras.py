@@ -20,6 +20,7 @@ from gymnasium.utils.env_checker import check_env
 
 from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
 from mjstack.adapters.rsl_rl import RslRlVecEnv
+from mjstack.bench import cameras, cli
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, MjstackError, RunError
@@ -79,7 +80,9 @@ def brightness(env: Env, key: str) -> list[float]:
 @GL
 @pytest.mark.parametrize("mjwarp", ["mjwarp", MJWARP_CUDA])
 def test_images_of_both_backends(make: Make, mjwarp: str) -> None:
-    overrides = ["reset=randomized", *small("front", "wrist", outputs=ALL)]
+    oblong = "scene.cameras.wrist.size=[28,36]"
+    overrides = ["reset=randomized", *small("front", "wrist", outputs=ALL), oblong]
+    sizes = {"front": (32, 32), "wrist": (28, 36)}
     found = {}
     for backend in ("native", mjwarp):
         env = make(backend, *overrides)
@@ -102,9 +105,9 @@ def test_images_of_both_backends(make: Make, mjwarp: str) -> None:
             zip(
                 a,
                 [
-                    ((2, 32, 32, 3), torch.uint8),
-                    ((2, 32, 32, 1), torch.float32),
-                    ((2, 32, 32), torch.int32),
+                    ((2, *sizes[camera], 3), torch.uint8),
+                    ((2, *sizes[camera], 1), torch.float32),
+                    ((2, *sizes[camera]), torch.int32),
                 ],
                 strict=True,
             ),
@@ -142,8 +145,8 @@ def test_without_cameras_nothing_is_drawn_or_kept() -> None:
 @pytest.mark.parametrize("backend", ["native", pytest.param("mjwarp", marks=pytest.mark.full)])
 def test_physics_is_the_same_to_the_bit(make: Make, robot: str, backend: str) -> None:
     ends = []
-    for cameras in ([], small("wrist", size=4)):
-        env = make(backend, f"robot={robot}", "reset=randomized", *cameras)
+    for more in ([], small("wrist", size=4)):
+        env = make(backend, f"robot={robot}", "reset=randomized", *more)
         sim = env.sim
         env.reset_manager.reset(torch.ones(2, dtype=torch.bool))
         generator = torch.Generator().manual_seed(0)
@@ -624,3 +627,16 @@ def test_a_headless_machine_is_one_line_and_nothing_is_written(tmp_path: Any) ->
     assert "offscreen rendering fails (MUJOCO_GL=disable" in done.stderr
     assert "expected OpenGL by EGL or OSMesa" in done.stderr
     assert not folder.exists()
+
+
+@pytest.mark.full
+def test_the_benchmark_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
+    numbers = ["--draws", "1", "--repetitions", "2"]
+    cli.main("cameras", ["sim=mjwarp", "sim.device=cpu", "nworld=2", *small("top"), *numbers])
+    out = capsys.readouterr().out
+    assert "top 32 x 32" in out
+    for name in cameras.ARRANGEMENTS:
+        assert name.split(",")[0] in " ".join(out.split())
+    with pytest.raises(SystemExit):
+        cli.main("cameras", ["sim=mjwarp", *numbers])
+    assert "cameras=null: expected some, such as cameras=front" in capsys.readouterr().err

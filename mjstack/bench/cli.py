@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mjstack.bench import env_step, ik, physics, solver
+from mjstack.bench import cameras, env_step, ik, physics, solver
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import build_env, decided_every_step
@@ -113,6 +113,24 @@ def _physics(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[Ta
     return tables
 
 
+def _cameras(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[Table]:
+    """Images alone, in each arrangement of the renderer."""
+    times = cameras.measure_cameras(
+        RunContext(cfg=cfg), draws=args.draws, repetitions=args.repetitions, advance=advance
+    )
+    images = len(cfg.scene.cameras) * cfg.nworld
+    shown = ", ".join(f"{name} {c.size[0]} x {c.size[1]}" for name, c in cfg.scene.cameras.items())
+    table = Table(
+        title=f"images: {cfg.robot.title}, {cfg.nworld:,} worlds, {shown}",
+        header=["arrangement", "ms per draw", "images/s"],
+        rows=[
+            [name, _spread(ms), _spread([1e3 * images / each for each in ms])]
+            for name, ms in times.items()
+        ],
+    )
+    return [table]
+
+
 def _solver(args: argparse.Namespace, cfg: Config, advance: Advance) -> list[Table]:
     """The fused solver beside ``mujoco_warp.solve``."""
     numbers = solver.compare_solvers(RunContext(cfg=cfg, advance=advance), states=args.states)
@@ -176,6 +194,14 @@ BENCHMARKS: dict[str, tuple[Work, str | None, Numbers]] = {
         _physics,
         physics.measure_arrangements.__doc__,
         {"steps": (20, _STEPS), "repetitions": (5, _REPETITIONS)},
+    ),
+    "cameras": (
+        _cameras,
+        cameras.measure_cameras.__doc__,
+        {
+            "draws": (10, "images of each camera and world per repetition"),
+            "repetitions": (5, _REPETITIONS),
+        },
     ),
     "solver": (_solver, solver.__doc__, {"states": (20_000, "states to record at least")}),
     "ik": (

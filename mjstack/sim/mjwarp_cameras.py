@@ -1,9 +1,11 @@
 """Cameras of MuJoCo Warp: its ray caster, and kernels that bring what it draws into tensors."""
 
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
+import math
 from collections.abc import Collection, Mapping
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,6 +14,11 @@ from mjstack.sim.cameras import PREFIXES, VISIBLE_GROUPS, Cameras, Masks
 from mjstack.sim.warp_setup import mjw, torch_stream_scope, wp
 
 _AWAY = 1e6  # m above everything: where cameras that draw nothing look up from
+TILE = 8
+"""Pixels along the edge of the squares in which rays are cast: neighbours on the device are
+neighbours in the image."""
+BLOCK_DIM = 32
+"""Rays of a CUDA block."""
 
 
 class MjwarpCameras(Cameras):
@@ -42,9 +49,11 @@ class MjwarpCameras(Cameras):
             cameras: The cameras by name.
         """
         self._m = m
+        m.block_dim.render = BLOCK_DIM
         self._d = d
         self._wp_device = device = m.geom_type.device
         super().__init__(model, d.nworld, torch.device(wp.device_to_torch(device)), cameras)
+        dynamic = "cam_fovy" in fields
         wanted = {
             output: [output in camera.outputs for camera in cameras.values()] for output in PREFIXES
         }
@@ -66,13 +75,15 @@ class MjwarpCameras(Cameras):
                 use_textures=model.ntex > 0,
                 enabled_geom_groups=list(VISIBLE_GROUPS),
                 cam_active=list(cameras),
-                use_precomputed_rays="cam_fovy" not in fields,
+                use_precomputed_rays=not dynamic,
                 enable_vertex_normals=model.nmesh > 0,
                 enable_emission=bool(model.mat_emission.any()),
                 enable_per_light_ambient=ambient,
                 enable_specular=specular,
             )
             self._labels = wp.array(self._label_of_geom, dtype=int)
+            # Rays that are computed for each world know their pixel by their number.
+            self._places = wp.array(self._arrange_rays(1 if dynamic else TILE), dtype=int)
         self._numbers = {name: number for number, name in enumerate(cameras)}
         self._due = torch.ones((d.nworld, len(cameras)), dtype=torch.bool, device=self._device)
         self.draw(self.allocate(), dict.fromkeys(cameras))
@@ -102,6 +113,28 @@ class MjwarpCameras(Cameras):
             for name in masks:
                 self._copy(out, name, due)
 
+    def _arrange_rays(self, tile: int) -> np.ndarray:
+        """Order the rays of each camera by squares of pixels.
+
+        Returns:
+            The ray of each pixel among those of its camera, one camera after the other.
+        """
+        rc = self._context
+        places = []
+        order = []
+        first = 0
+        for camera in self.cameras.values():
+            y, x = np.indices(camera.size).reshape(2, -1)
+            pixels = np.lexsort((x, y, x // tile, y // tile))
+            places.append(np.argsort(pixels))
+            order.append(first + pixels)
+            first += len(pixels)
+        rays = np.concatenate(order)
+        for name in ("ray", "ray_offset"):
+            values = getattr(rc, name)
+            values.assign(values.numpy()[rays])
+        return np.concatenate(places)
+
     def close(self) -> None:
         """See `Cameras`; the memory goes with the last reference."""
 
@@ -110,6 +143,8 @@ class MjwarpCameras(Cameras):
         rc = self._context
         camera = self.cameras[name]
         number = self._numbers[name]
+        before = list(self.cameras.values())[:number]
+        first = sum(math.prod(other.size) for other in before)
         copies = {
             "rgb": (copy_rgb, [rc.rgb_data, rc.rgb_adr]),
             "depth": (copy_depth, [rc.depth_data, rc.depth_adr]),
@@ -121,7 +156,7 @@ class MjwarpCameras(Cameras):
             wp.launch(
                 kernel,
                 dim=(self._nworld, *camera.size),
-                inputs=[due, number, *inputs],
+                inputs=[due, number, self._places[first:], *inputs],
                 outputs=[wp.from_torch(image)],
             )
 
@@ -146,6 +181,7 @@ def send_away(
 def copy_rgb(
     due: wp.array2d[bool],
     number: int,
+    places: wp.array[int],
     drawn: wp.array2d[wp.uint32],
     first: wp.array[int],
     out: wp.array4d[wp.uint8],
@@ -153,7 +189,7 @@ def copy_rgb(
     """Red, green and blue of the worlds that are due, from words of alpha, red, green and blue."""
     world, y, x = wp.tid()  # type: ignore[misc]
     if due[world, number]:
-        word = drawn[world, first[number] + y * out.shape[2] + x]
+        word = drawn[world, first[number] + places[y * out.shape[2] + x]]
         out[world, y, x, 0] = wp.uint8(word >> wp.uint32(16))
         out[world, y, x, 1] = wp.uint8(word >> wp.uint32(8))
         out[world, y, x, 2] = wp.uint8(word)
@@ -163,6 +199,7 @@ def copy_rgb(
 def copy_depth(
     due: wp.array2d[bool],
     number: int,
+    places: wp.array[int],
     drawn: wp.array2d[float],
     first: wp.array[int],
     out: wp.array4d[float],
@@ -170,13 +207,14 @@ def copy_depth(
     """Depth of the worlds that are due."""
     world, y, x = wp.tid()  # type: ignore[misc]
     if due[world, number]:
-        out[world, y, x, 0] = drawn[world, first[number] + y * out.shape[2] + x]
+        out[world, y, x, 0] = drawn[world, first[number] + places[y * out.shape[2] + x]]
 
 
 @wp.kernel(enable_backward=False)
 def copy_labels(
     due: wp.array2d[bool],
     number: int,
+    places: wp.array[int],
     drawn: wp.array2d[wp.vec2i],
     first: wp.array[int],
     labels: wp.array[int],
@@ -185,7 +223,7 @@ def copy_labels(
     """Labels of the geoms that the worlds which are due show; -1 where there is none."""
     world, y, x = wp.tid()  # type: ignore[misc]
     if due[world, number]:
-        geom = drawn[world, first[number] + y * out.shape[2] + x][0]
+        geom = drawn[world, first[number] + places[y * out.shape[2] + x]][0]
         if geom >= 0:
             out[world, y, x] = labels[geom]
         else:
