@@ -50,6 +50,7 @@ from mjstack.interrupt import EXIT_CODE, begin_job
 from mjstack.process import is_rank
 from mjstack.report.record import Report, Status
 from mjstack.report.table import Console, Table
+from mjstack.report.write import read_report
 
 if TYPE_CHECKING:
     from mjstack.jobs import CheckedJob
@@ -229,8 +230,14 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
                 " expected a folder for each job. Leave it out, or let it name what differs."
             )
     begin_job()
-    numbered = not _is_set("hydra.sweep.dir", overrides)
-    with claim_folder(folder, numbered=numbered, key="hydra.sweep.dir") as claimed:
+    given = _is_set("hydra.sweep.dir", overrides)
+    if given and "GpuLauncher" in str(OmegaConf.select(master, "hydra.launcher._target_")):
+        from mjstack.jobs.sweep import shared_sweep
+
+        claim = shared_sweep(folder)
+    else:
+        claim = claim_folder(folder, numbered=not given, key="hydra.sweep.dir")
+    with claim as claimed:
         if claimed != folder:
             master.hydra.sweep.dir = str(claimed)
             master.hydra.overrides.hydra.append(f"hydra.sweep.dir='{claimed}'")  # of its jobs
@@ -264,17 +271,27 @@ def run_job(cfg: DictConfig) -> Report:
     own = HydraConfig.get()
     overrides = list(own.overrides.task)
     with search_path(lacking_folders(own.runtime.config_sources)):
-        checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
         folder = Path(own.runtime.output_dir)
+        if own.mode is RunMode.MULTIRUN and cfg.job.name == "gates":
+            # A cluster may have started the job before.
+            earlier = read_report(folder)
+            if earlier is not None and earlier.status is Status.interrupted:
+                cfg.resume = str(folder)
+                _checked.clear()
+                _save_config(cfg, folder)  # Hydra has just put one with interpolations there
+        checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
         with suppress(OSError):  # the job says so
-            # A replay reads values, no interpolations.
-            saved = folder / ".hydra" / "config.yaml"
-            write_atomic(saved, OmegaConf.to_yaml(cfg, resolve=True))
+            _save_config(cfg, folder)
         result = checked.run(folder, overrides)
     _results.append(result)
     if result.status is Status.interrupted:
         raise KeyboardInterrupt
     return result
+
+
+def _save_config(cfg: DictConfig, folder: Path) -> None:
+    """Write the configuration as a replay reads it: values, no interpolations."""
+    write_atomic(folder / ".hydra" / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
 
 
 def _check(cfg: DictConfig, overrides: list[str]) -> "CheckedJob":

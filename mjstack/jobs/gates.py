@@ -167,6 +167,7 @@ def check_gates(cfg: Config) -> CheckedJob:
         work=_run_gates,
         folder=None if cfg.resume is None else Path(cfg.resume),
         own=REPORT,
+        resumable="gates",
         earlier=earlier,
         spreads=True,
     )

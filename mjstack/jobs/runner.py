@@ -92,6 +92,7 @@ class CheckedJob:
         folder: The default folder of a job that resumes; None for a folder of the hour.
         own: A file by which it knows that folder.
         resumes: Its name in report.json, by which it knows any folder that it goes on with.
+        resumable: Its name there if it goes on only where the command line says so.
         earlier: The calls that the run goes on with, in words.
         spreads: Whether ranks share the work: `work` is called in each of them.
     """
@@ -102,6 +103,7 @@ class CheckedJob:
     folder: Path | None = None
     own: str = ""
     resumes: str = ""
+    resumable: str = ""
     earlier: Sequence[str] = ()
     spreads: bool = False
 
@@ -136,7 +138,9 @@ class CheckedJob:
         """
         console = Console(highlight=False, soft_wrap=True)
         errors = Console(stderr=True, soft_wrap=True, markup=False)
-        report = Report(folder=folder, overrides=list(overrides), resumes=self.resumes)
+        report = Report(
+            folder=folder, overrides=list(overrides), resumes=self.resumes or self.resumable
+        )
         cfg = self.context.cfg
         page = Page(title=f"{cfg.robot.title}, {self.title}")
         # The collector need not look at all that was loaded each time it frees a gate's worlds.

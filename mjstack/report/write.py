@@ -3,13 +3,13 @@
 import json
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from mjstack.files import write_atomic
 from mjstack.interrupt import check_interrupt
-from mjstack.report.record import GateResult, Report
+from mjstack.report.record import GateResult, Report, Status
 from mjstack.report.table import Table, format_value, to_document
 
 log = logging.getLogger(__name__)
@@ -52,6 +52,25 @@ def write_report(report: Report) -> None:
     text = json.dumps(finite, indent=2) + "\n"
     write_atomic(report.folder / "report.json", text)
     write_atomic(report.folder / "report.md", to_markdown(report))
+
+
+def read_report(folder: Path, overrides: Sequence[str] = ()) -> Report | None:
+    """The statuses and reasons of a report that a run has left; None if there is none that can be
+    read.
+    """
+    try:
+        data = json.loads((folder / "report.json").read_text())
+        gates = [
+            GateResult(name=gate["name"], status=Status(gate["status"]), reason=gate["reason"])
+            for gate in data["gates"]
+        ]
+        status = Status(data["status"])
+        resumes = str(data["resumes"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return Report(
+        folder=folder, overrides=list(overrides), resumes=resumes, status=status, gates=gates
+    )
 
 
 def safely_write(path: Path, write: Callable[..., object], *args: object) -> str:

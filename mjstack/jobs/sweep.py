@@ -1,0 +1,269 @@
+"""The jobs of a sweep, each in a process with a GPU, or with its cores where there is none."""
+
+import fcntl
+import json
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+import torch
+
+from mjstack.config.session import search_path_args
+from mjstack.errors import ConfigError, FolderError
+from mjstack.files import write_atomic
+from mjstack.interrupt import interrupted
+from mjstack.process import own_command
+from mjstack.report.record import GateResult, Report, Status
+from mjstack.report.table import Console
+from mjstack.report.write import read_report
+
+LOG = "job.log"
+SWEEP = "sweep.json"
+_POLL = 0.1  # s, between two looks at the processes
+_GRACE = 30.0  # s, in which an interrupted job must have ended
+_ENDED = (Status.passed, Status.failed)
+
+
+@dataclass(frozen=True, slots=True)
+class SweepJob:
+    """A job of a sweep: its number, its folder and its overrides."""
+
+    number: int
+    folder: Path
+    overrides: tuple[str, ...]
+
+
+@dataclass(eq=False, slots=True)
+class _Slot:
+    """Where one job at a time runs: its name, its environment, its cores, and the lock of a GPU."""
+
+    name: str
+    env: dict[str, str] = field(default_factory=dict)
+    cores: list[int] = field(default_factory=list)
+    lock: Path | None = None
+
+
+@dataclass(eq=False, slots=True)
+class _Running:
+    job: SweepJob
+    process: subprocess.Popen[bytes]
+    log: IO[bytes]
+    held: IO[bytes] | None
+    began: float
+
+
+@contextmanager
+def shared_sweep(folder: Path) -> Iterator[Path]:
+    """A sweep's folder in which several commands work off its jobs.
+
+    Raises:
+        FolderError: It has something else, or cannot be made.
+    """
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
+    if names and SWEEP not in names:
+        raise FolderError(
+            f"{folder} has {sorted(names)[0]}, expected a new or an empty folder, or one of"
+            " hydra/launcher=gpus. Set hydra.sweep.dir to another"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FolderError(f"{folder} cannot be written ({error.strerror})") from error
+    yield folder
+
+
+def run_jobs(jobs: Sequence[SweepJob], count: int | None = None) -> list[Report]:
+    """Run jobs, as many at once as there are GPUs, and return their reports in order.
+
+    A job that has a result in its folder is not repeated. One that another command is running is
+    waited for. One that was stopped goes on, if it is of a kind that can.
+
+    Args:
+        jobs: The jobs. All folders are in one.
+        count: How many at once; None for one per GPU, or one where there is none.
+
+    Raises:
+        ConfigError: There are not as many GPUs.
+        FolderError: The folder has the jobs of another sweep.
+        KeyboardInterrupt: The command was interrupted; so were its jobs.
+    """
+    slots = _slots(count)
+    _check_sweep(jobs)
+    say = Console(highlight=False, soft_wrap=True, markup=False).print
+    common = set.intersection(*(set(job.overrides) for job in jobs)) if len(jobs) > 1 else set()
+    waiting = list(jobs)
+    running: dict[_Slot, _Running] = {}
+    reports: dict[int, Report] = {}
+    elsewhere: set[int] = set()
+    try:
+        while len(reports) < len(jobs):
+            for slot, one in list(running.items()):
+                if (code := one.process.poll()) is not None:
+                    del running[slot]
+                    report = reports[one.job.number] = _conclude(one, code)
+                    seconds = time.monotonic() - one.began
+                    say(f"job {one.job.number}: {report.status} ({seconds:.0f} s, {slot.name})")
+            if interrupted():
+                raise KeyboardInterrupt
+            for job in list(waiting):
+                if (done := _result(job)) is not None:
+                    say(f"job {job.number}: {done.status}, done before")
+                    reports[job.number] = done
+                    waiting.remove(job)
+                    continue
+                free = [slot for slot in slots if slot not in running]
+                if not free:
+                    break
+                slot = free[0]
+                log = _lock(job.folder / LOG)
+                if log is None:
+                    if job.number not in elsewhere:
+                        say(f"job {job.number}: another command is running it")
+                    elsewhere.add(job.number)
+                    continue
+                if _result(job) is not None:  # it has just ended elsewhere
+                    log.close()
+                    continue
+                held = None if slot.lock is None else _lock(slot.lock)
+                if slot.lock is not None and held is None:  # another sweep's
+                    log.close()
+                    slots.append(slots.pop(slots.index(slot)))
+                    break
+                running[slot] = _start(job, slot, log, held)
+                waiting.remove(job)
+                own = [each for each in job.overrides if each not in common]
+                say(f"job {job.number} on {slot.name}: {' '.join(own)}")
+            time.sleep(_POLL)
+    finally:
+        _stop(running)
+    return [reports[job.number] for job in jobs]
+
+
+def _slots(count: int | None) -> list[_Slot]:
+    """Places for jobs: GPUs, or shares of the cores."""
+    gpus = torch.cuda.device_count()
+    if gpus:
+        if (count or 1) > gpus:
+            raise ConfigError("hydra.launcher.jobs", count, f"at most {gpus}, a GPU for each")
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(gpus)))
+        locks = Path(tempfile.gettempdir()) / f"mjstack-gpus-{os.getuid()}"
+        locks.mkdir(exist_ok=True)
+        return [
+            _Slot(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}, lock=locks / name)
+            for name in visible.split(",")[: count or gpus]
+        ]
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    count = count or 1
+    if cores and count > len(cores):
+        expected = f"at most {len(cores)}, a core for each job"
+        raise ConfigError("hydra.launcher.jobs", count, expected)
+    shares = [cores[n::count] for n in range(count)]
+    return [_Slot(f"cores {','.join(map(str, share))}", cores=share) for share in shares]
+
+
+def _check_sweep(jobs: Sequence[SweepJob]) -> None:
+    """Leave the list of the jobs in the sweep's folder, or compare it with the one there."""
+    path = Path(os.path.commonpath([job.folder.parent for job in jobs])) / SWEEP
+    ours = [[str(job.folder.relative_to(path.parent)), list(job.overrides)] for job in jobs]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    theirs = ours
+    with suppress(OSError, ValueError):
+        theirs = json.loads(path.read_text())
+    if theirs != ours:
+        raise FolderError(
+            f"{path.parent} has another sweep, expected the same jobs, which are in {SWEEP}. Set"
+            " hydra.sweep.dir to another folder"
+        )
+    write_atomic(path, json.dumps(ours, indent=1) + "\n")
+
+
+def _result(job: SweepJob) -> Report | None:
+    report = read_report(job.folder, job.overrides)
+    return report if report is not None and report.status in _ENDED else None
+
+
+def _lock(path: Path) -> IO[bytes] | None:
+    """The file, open and locked until it is closed and the process that writes it has ended; None
+    if another command has it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = path.open("ab")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        return None
+    return file
+
+
+def _start(job: SweepJob, slot: _Slot, log: IO[bytes], held: IO[bytes] | None) -> _Running:
+    """Start the process of a job, which goes on with what an earlier one has left."""
+    earlier = read_report(job.folder, job.overrides)
+    args = list(job.overrides)
+    if earlier is not None and earlier.resumes == "gates":
+        args.append(f"resume={_quoted(job.folder)}")
+    else:
+        args.append(f"hydra.run.dir={_quoted(job.folder)}")
+        if earlier is None or not earlier.resumes:  # nothing that another process can use
+            for path in [path for path in job.folder.iterdir() if path.name != LOG]:
+                (shutil.rmtree if path.is_dir() and not path.is_symlink() else os.remove)(path)
+    process = subprocess.Popen(
+        own_command([*args, *search_path_args()]),
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=subprocess.STDOUT,
+        env=os.environ | slot.env,
+        start_new_session=True,  # Ctrl-C of the terminal comes through this process
+    )
+    if slot.cores:
+        with suppress(OSError):  # it may have ended
+            os.sched_setaffinity(process.pid, slot.cores)
+    return _Running(job, process, log, held, time.monotonic())
+
+
+def _quoted(path: Path) -> str:
+    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{text}'"
+
+
+def _conclude(one: _Running, code: int) -> Report:
+    """The report of a job whose process has ended."""
+    one.log.close()
+    if one.held is not None:
+        one.held.close()
+    report = read_report(one.job.folder, one.job.overrides)
+    if report is not None and report.status in _ENDED:
+        return report
+    lines = (one.job.folder / LOG).read_text(errors="replace").strip().splitlines()
+    how = f"killed by signal {-code}" if code < 0 else f"exit status {code}"
+    why = next((line for line in reversed(lines) if line.startswith("mjstack: ")), "")
+    reason = f"{how}{f': {why}' if why else ''} ({one.job.folder / LOG})"
+    report = Report(folder=one.job.folder, overrides=list(one.job.overrides))
+    report.status = Status.interrupted if code == 130 else Status.failed
+    report.gates = [GateResult(name="job", status=Status.failed, reason=reason)]
+    return report
+
+
+def _stop(running: dict[_Slot, _Running]) -> None:
+    """Interrupt the jobs that run, and wait for them."""
+    for one in running.values():
+        with suppress(OSError):
+            one.process.send_signal(signal.SIGINT)
+    until = time.monotonic() + _GRACE
+    for one in running.values():
+        try:
+            one.process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            one.process.kill()
+            one.process.wait()
+        one.log.close()
+        if one.held is not None:
+            one.held.close()
