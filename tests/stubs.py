@@ -41,25 +41,24 @@ def fake_demonstrations(
             world.
     """
 
-    def play(context: RunContext, sim: Simulation, seed: int) -> Played:
-        worlds = sim.nworld
-        values = torch.zeros((build_phases(context.cfg)[-1].stop, worlds, sum(LAYOUT.values())))
-        for world in range(worlds):
-            values[:, world] = 1e-3 * seed + 1e-6 * world
+    def play(context: RunContext, sim: Simulation, seed: int, worlds: range) -> Played:
+        steps = build_phases(context.cfg)[-1].stop
+        values = torch.zeros((steps, sim.nworld, sum(LAYOUT.values())))
+        for row, world in enumerate(worlds):
+            values[:, row] = 1e-3 * seed + 1e-6 * world
             if noise:
-                values[:, world] = torch.randn(
+                values[:, row] = torch.randn(
                     values[:, 0].shape, generator=torch.Generator().manual_seed(1000 * seed + world)
                 )
-        failed = np.array(
-            [BROKEN if fails(seed, world) else 0 for world in range(worlds)], dtype=np.int32
-        )
+        failed = np.array([BROKEN if fails(seed, world) else 0 for world in worlds], dtype=np.int32)
         if after is not None:
             after(seed, values)
         return Played(
             seed=seed,
             steps=cast(StepRecorder, SimpleNamespace(values=values, schema=LAYOUT)),
             failed=failed,
-            retries=np.array([world % 3 for world in range(worlds)], dtype=np.int32),
+            retries=np.array([world % 3 for world in worlds], dtype=np.int32),
+            worlds=worlds,
         )
 
     return play

@@ -31,6 +31,7 @@ from mjstack.config.check import validate
 from mjstack.config.fingerprint import config_hash, differences
 from mjstack.config.schema import Backend, Config
 from mjstack.datasets import DatasetWriter, Feature
+from mjstack.datasets.part import PartWriter
 from mjstack.envs import build_env, demonstration_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import CommandRecorder
@@ -641,16 +642,16 @@ def test_ctrl_c_keeps_finished_batches(folder: Path, monkeypatch: pytest.MonkeyP
 def test_a_full_disk_is_one_line(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    add = DatasetWriter._write
+    add = PartWriter.write
 
-    def full(self: DatasetWriter, *args: object) -> None:
-        if self._shards == 1 and self.pending == 1:
+    def full(self: PartWriter, *args: object) -> None:
+        if "000001" in self.part.path.name and len(self.part.rows) == 1:
             raise OSError(28, "No space left on device")
         add(self, *args)  # type: ignore[arg-type]
 
     args = ["nworld=2", "job.episodes=5"]
     all_succeed(monkeypatch)
-    monkeypatch.setattr(DatasetWriter, "_write", full)
+    monkeypatch.setattr(PartWriter, "write", full)
     assert collect(*args) == 1
     err = capsys.readouterr().err.strip()
     assert len(err.splitlines()) == 1
@@ -658,7 +659,7 @@ def test_a_full_disk_is_one_line(
     assert "2 committed episodes are kept" in err
     assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
     assert report_of(folder)["status"] == "fail"
-    monkeypatch.setattr(DatasetWriter, "_write", add)
+    monkeypatch.setattr(PartWriter, "write", add)
     assert collect(*args) == 0
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
 
@@ -699,20 +700,20 @@ def test_a_kill_in_the_middle_of_a_batch(folder: Path, monkeypatch: pytest.Monke
 import os, signal
 from functools import partial
 from mjstack.cli import run
-from mjstack.datasets import DatasetWriter
+from mjstack.datasets.part import PartWriter
 from mjstack.jobs import collection
 from stubs import fake_demonstrations
 
 collection.play_demonstrations = fake_demonstrations(lambda seed, world: world == 1, noise=True)
 collection.DatasetWriter = partial(collection.DatasetWriter, file_mb=1)
-add = DatasetWriter._write
+add = PartWriter.write
 
 def killed(self, *args):
     add(self, *args)
-    if self._shards == 1:
+    if "000001" in self.part.path.name:
         os.kill(os.getpid(), signal.SIGKILL)
 
-DatasetWriter._write = killed
+PartWriter.write = killed
 run(ARGS)
 """
     args = ["nworld=7", "job.episodes=8"]
@@ -788,7 +789,7 @@ def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> No
     values = torch.randn(5, 7, 4)
     steps = cast(StepRecorder, SimpleNamespace(values=values, schema={"a": 3, "b": 1}))
     none = np.zeros(7, dtype=np.int32)
-    played = Played(seed=0, steps=steps, failed=none, retries=none)
+    played = Played(seed=0, steps=steps, failed=none, retries=none, worlds=range(len(none)))
     for size in (1, 2 * 5 * 4 * 4, 10**6):  # one world, two and all at once
         monkeypatch.setattr("mjstack.jobs.demonstration._CHUNK_BYTES", size)
         found = dict(played.episodes([6, 0, 3]))

@@ -25,6 +25,7 @@ from mjstack.cli import run
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetWriter, lerobot
+from mjstack.datasets.part import PartWriter
 from mjstack.envs import build_env, demonstration_config
 from mjstack.episodes.context import RunContext, Stage
 from mjstack.errors import UnwrittenError
@@ -172,16 +173,16 @@ def test_figures_of_the_uninterrupted_one(whole: dict[str, Any]) -> None:
 
 def interrupt_at(call: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C comes while an episode is written."""
-    add = DatasetWriter._write
+    add = PartWriter.write
     calls = []
 
-    def interrupted(self: DatasetWriter, *args: Any) -> None:
+    def interrupted(self: PartWriter, *args: Any) -> None:
         calls.append(args)
         if len(calls) == call:
             monkeypatch.setattr(interrupt, "_asked", True)  # as the command's handler does
         add(self, *args)
 
-    monkeypatch.setattr(DatasetWriter, "_write", interrupted)
+    monkeypatch.setattr(PartWriter, "write", interrupted)
 
 
 def play_interrupted(home: Path, call: int, *overrides: str, **kwargs: Any) -> GateResult:
@@ -220,9 +221,9 @@ def test_ctrl_c_after_ctrl_c(tmp_path: Path) -> None:
     played = []
     play = fake_demonstrations(some_fail, noise=True)
 
-    def told(context: Any, sim: Any, seed: int) -> Any:
+    def told(context: Any, sim: Any, seed: int, worlds: range) -> Any:
         played.append((seed, sim.nworld))
-        return play(context, sim, seed)
+        return play(context, sim, seed, worlds)
 
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(collection, "play_demonstrations", told)
@@ -255,7 +256,7 @@ def test_a_kill_between_any_two_files(
     home = tmp_path / "home"
     copies = tmp_path / "copies"
     replace_file = os.replace
-    add = DatasetWriter._write
+    add = PartWriter.write
 
     def copied() -> None:
         shutil.copytree(home, copies / str(len(list(copies.iterdir()))))
@@ -264,14 +265,14 @@ def test_a_kill_between_any_two_files(
         copied()
         replace_file(*args)
 
-    def added(self: DatasetWriter, *args: Any) -> None:
+    def added(self: PartWriter, *args: Any) -> None:
         add(self, *args)
         copied()
 
     copies.mkdir()
     with monkeypatch.context() as context:
         context.setattr(os, "replace", replaced)
-        context.setattr(DatasetWriter, "_write", added)
+        context.setattr(PartWriter, "write", added)
         collect(home, keep_failures=whole["keep_failures"])
     copied()
     found = sorted(copies.iterdir(), key=lambda path: int(path.name))
@@ -292,10 +293,10 @@ def test_a_kill_between_any_two_files(
 def test_a_full_disk_in_a_batch(
     call: int, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    add = DatasetWriter._write
+    add = PartWriter.write
     calls = []
 
-    def full(self: DatasetWriter, *args: Any) -> None:
+    def full(self: PartWriter, *args: Any) -> None:
         calls.append(args)
         if len(calls) == call:
             raise OSError(28, "No space left on device")
@@ -303,7 +304,7 @@ def test_a_full_disk_in_a_batch(
 
     playing = collection_at(tmp_path, keep_failures=whole["keep_failures"])
     with monkeypatch.context() as context:
-        context.setattr(DatasetWriter, "_write", full)
+        context.setattr(PartWriter, "write", full)
         with pytest.raises(UnwrittenError, match="No space left"):
             playing.play()
     kept = pairs(tmp_path / "dataset") if playing.committed else []

@@ -36,6 +36,7 @@ from mjstack.datasets import (
 )
 from mjstack.datasets.lerobot import QUANTILES
 from mjstack.datasets.lerobot import STATISTICS as NAMES
+from mjstack.datasets.part import PartWriter
 from mjstack.datasets.reader import uncommitted
 from mjstack.errors import (
     ArgumentError,
@@ -530,16 +531,16 @@ def test_ctrl_c_in_a_script_keeps_what_is_committed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It comes in the middle of the second of three, of which the first was committed."""
-    add = DatasetWriter._write
+    add = PartWriter.write
     calls = []
 
-    def interrupted(self: DatasetWriter, *args: Any) -> None:
+    def interrupted(self: PartWriter, *args: Any) -> None:
         calls.append(args)
         if len(calls) == 2:
             os.kill(os.getpid(), signal.SIGINT)
         add(self, *args)
 
-    monkeypatch.setattr(DatasetWriter, "_write", interrupted)
+    monkeypatch.setattr(PartWriter, "write", interrupted)
     before = signal.signal(
         signal.SIGINT, signal.default_int_handler
     )  # a shell's background jobs start with it ignored

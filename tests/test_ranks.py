@@ -20,11 +20,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compositions import load_config
+from dataset_checker import check_dataset
 from environments import one_second_episode
 
 import mjstack
 from mjstack.cli import run
 from mjstack.config.schema import Config
+from mjstack.datasets import read_dataset
 from mjstack.distributed import Ranks, current_ranks
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.record import EpisodeRecord
@@ -307,3 +309,23 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
     assert f"MASTER_PORT={port}: is in use" in lines[0]
     assert current_ranks() == Ranks()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.full
+def test_ranks_collect_one_dataset(tmp_path: Path) -> None:
+    """Two ranks begin it, three go on, and it has what one rank collects, in the same order."""
+    args = ["job=collect", "sim=native", "nworld=5", "job.keep_failures=true"]
+    args += one_second_episode()
+    one = [*args, f"job.folder={tmp_path}/one", "job.episodes=12"]
+    assert run(one) == 0
+    several = [*args, f"job.folder={tmp_path}/several"]
+    play(2, [*several, "job.episodes=7"], tmp_path)
+    text = play(3, [*several, "job.episodes=12"], tmp_path)
+    assert text.count("12 of 12 episodes there") == 1
+    found, expected = (read_dataset(tmp_path / name / "dataset") for name in ("several", "one"))
+    for key in ("seed", "world", "length", "success", "retries", "failed_rules"):
+        assert [row[key] for row in found.episodes] == [row[key] for row in expected.episodes]
+    for name in ("observation.state", "action", "episode_index", "index", "timestamp"):
+        np.testing.assert_array_equal(found.frames(name), expected.frames(name))
+    assert found.info["mjstack"]["shards"] > expected.info["mjstack"]["shards"]
+    check_dataset(tmp_path / "several" / "dataset")

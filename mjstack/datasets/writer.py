@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mjstack.datasets import lerobot
+from mjstack.datasets.part import FILE_MB, Part, PartWriter
 from mjstack.datasets.reader import (
     check_same,
     read_info,
@@ -21,7 +22,7 @@ from mjstack.datasets.reader import (
     readable,
     uncommitted,
 )
-from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData, typed_arrays, typed_values
+from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_arrays, typed_values
 from mjstack.errors import DatasetError, UnwrittenError
 from mjstack.files import lock_folder, write_atomic
 
@@ -46,7 +47,7 @@ class DatasetWriter:
         frames: Committed frames.
     """
 
-    def __init__(self, folder: Path | str, spec: DatasetSpec, *, file_mb: int = 100) -> None:
+    def __init__(self, folder: Path | str, spec: DatasetSpec, *, file_mb: int = FILE_MB) -> None:
         """Open the folder, and begin a dataset in it if there is none.
 
         Args:
@@ -70,10 +71,7 @@ class DatasetWriter:
         self._provenance: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}
         self._statistics = np.empty(0)  # of the committed frames
-        # Since the last commit: a row per episode, and the hidden file of the frames.
-        self._rows: list[dict[str, Any]] = []
-        self._file: Any = None
-        self._frames_writer: Any = None
+        self._part: PartWriter | None = None  # since the last commit
         if self.folder.exists() and not self.folder.is_dir():
             raise DatasetError(f"{folder} is a file, expected a folder. Give another")
         try:
@@ -95,7 +93,7 @@ class DatasetWriter:
     @property
     def pending(self) -> int:
         """Episodes that were added and are not committed yet."""
-        return len(self._rows)
+        return len(self._part.part.rows) if self._part is not None else 0
 
     def add(self, episodes: Sequence[EpisodeData]) -> None:
         """Add finished episodes; a batch that does not fit is refused as a whole.
@@ -112,11 +110,14 @@ class DatasetWriter:
         checked = [(typed_values(self.spec, e), typed_arrays(self.spec, e)) for e in episodes]
         for episode, (facts, columns) in zip(episodes, checked, strict=True):
             with self._guarded():
-                if self._file is None:
-                    self._begin_file()
-                self._write(episode.task, facts, columns)
-            # One more like these is too much.
-            if self._file.tell() * (1.0 + 1.0 / self.pending) > self._file_mb * 2**20:
+                if self._part is None:
+                    self._part = PartWriter(self.folder, self.spec, f"{self._shards:06d}")
+                rows = self._part.part.rows
+                number = len(self.committed) + len(rows)
+                start = rows[-1]["dataset_to_index"] if rows else self.frames
+                task = self.number_task(episode.task), episode.task
+                self._part.write(task, facts, columns, number, start)
+            if self._part.is_full(self._file_mb):
                 self.flush()
 
     def flush(self) -> None:
@@ -127,9 +128,26 @@ class DatasetWriter:
                 before is kept.
         """
         self._check_open()
-        if self.pending:
+        if self._part is not None and self.pending:
             with self._guarded():
-                self._commit()
+                self._commit([self._part.complete()])
+                self._part = None
+
+    def number_task(self, task: str) -> int:
+        """The number of a task in the dataset; a new one gets the next."""
+        return self._tasks.setdefault(task, len(self._tasks))
+
+    def commit(self, parts: Sequence[Part]) -> None:
+        """Commit files that other writers have completed, whose episodes follow the committed ones
+        and one another.
+
+        Raises:
+            UnwrittenError: As of `flush`.
+        """
+        self._check_open()
+        self.flush()
+        with self._guarded():
+            self._commit(parts)
 
     def close(self) -> None:
         """Commit what was added, and let another writer in."""
@@ -170,80 +188,24 @@ class DatasetWriter:
             self._provenance.append({"from_episode": len(self.committed), **now})
         self._write_totals()
 
-    def _hidden(self) -> Path:
-        """The data file of the next shard until it is committed."""
-        path = lerobot.shard_path(self.folder, lerobot.DATA, self._shards)
-        return path.with_name(f".{path.name}")
-
-    def _begin_file(self) -> None:
-        """Begin a data file."""
-        self._hidden().parent.mkdir(parents=True, exist_ok=True)
-        self._file = open(self._hidden(), "wb")  # noqa: SIM115
-        # Few floats occur twice: a dictionary of them takes three times the time and half again
-        # the room.
-        self._frames_writer = self._parquet.ParquetWriter(
-            self._file,
-            lerobot.frames_schema(self.spec),
-            compression="snappy",
-            use_dictionary=list(INDICES),
-        )
-
-    def _write(self, task: str, facts: dict[str, Any], columns: dict[str, np.ndarray]) -> None:
-        """Write an episode as a row group, so that it can be read without the others."""
-        number = len(self.committed) + self.pending
-        start = self._rows[-1]["dataset_to_index"] if self._rows else self.frames
-        length = len(next(iter(columns.values())))
-        frame = np.arange(length)
-        indices = {
-            "timestamp": (frame / self.spec.fps).astype(np.float32),
-            "frame_index": frame,
-            "episode_index": np.full(length, number),
-            "index": start + frame,
-            "task_index": np.full(length, self._tasks.setdefault(task, len(self._tasks))),
-        }
-        columns |= {name: values[:, None] for name, values in indices.items()}
-        table = lerobot.frames_table(self._frames_writer.schema, columns)
-        self._frames_writer.write_table(table, row_group_size=length)
-        # float64 holds every type's values exactly, but int64's beyond 2^53.
-        joined = np.concatenate([columns[name] for name in table.column_names], axis=1, dtype=float)
-        named = lerobot.name_statistics(
-            self.spec.features, lerobot.episode_statistics(joined), length
-        )
-        place = lerobot.shard_indices(self._shards)
-        self._rows.append(
-            {
-                "episode_index": number,
-                "tasks": [task],
-                "length": length,
-                **{f"data/{name}": index for name, index in place.items()},
-                "dataset_from_index": start,
-                "dataset_to_index": start + length,
-                **facts,
-                **{f"meta/episodes/{name}": index for name, index in place.items()},
-                **{
-                    f"stats/{name}/{kind}": values
-                    for name, kinds in named.items()
-                    for kind, values in kinds.items()
-                },
-            }
-        )
-
-    def _commit(self) -> None:
-        """Put the frames to their place, then what says what is in them, and info.json last."""
-        self._frames_writer.close()
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
-        os.replace(self._hidden(), lerobot.shard_path(self.folder, lerobot.DATA, self._shards))
+    def _commit(self, parts: Sequence[Part]) -> None:
+        """Put the frames to their places, then what says what is in them, and info.json last."""
+        for shard, part in enumerate(parts, self._shards):
+            path = lerobot.shard_path(self.folder, lerobot.DATA, shard)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(part.path, path)
+            place = lerobot.shard_indices(shard)
+            for row in part.rows:
+                for name, index in place.items():
+                    row[f"data/{name}"] = row[f"meta/episodes/{name}"] = index
         self._write_table(lerobot.tasks_table(list(self._tasks)), self.folder / lerobot.TASKS)
-        rows = self._pa.Table.from_pylist(self._rows)
-        self._write_table(rows, lerobot.shard_path(self.folder, lerobot.EPISODES, self._shards))
-        for row in self._rows:
-            self._count(row)
-        self._shards += 1
+        for shard, part in enumerate(parts, self._shards):
+            rows = self._pa.Table.from_pylist(part.rows)
+            self._write_table(rows, lerobot.shard_path(self.folder, lerobot.EPISODES, shard))
+            for row in part.rows:
+                self._count(row)
+        self._shards += len(parts)
         self._write_totals()
-        self._rows = []
-        self._file = None
 
     def _write_table(self, table: Any, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -294,14 +256,11 @@ class DatasetWriter:
             yield
         except BaseException as error:
             self._open = False
-            self._rows = []
+            if self._part is not None:
+                self._part.abandon()
+                self._part = None
             del self.committed[kept:]
             self.frames = frames
-            if self._frames_writer is not None:
-                self._frames_writer.is_open = False  # its destructor would complete the file
-            if self._file is not None:
-                with contextlib.suppress(OSError):  # closing writes what is buffered
-                    self._file.close()
             info = read_info(self.folder)
             for path in uncommitted(self.folder, info["mjstack"]["shards"] if info else 0):
                 path.unlink()

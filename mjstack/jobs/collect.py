@@ -17,7 +17,7 @@ from mjstack.datasets import DatasetSpec, lerobot, require_pyarrow
 from mjstack.datasets.reader import check_same, read_info
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.context import RunContext, require_episode
-from mjstack.errors import ConfigError, DatasetError
+from mjstack.errors import ConfigError, DatasetError, RankError
 from mjstack.files import check_unused, lock_folder, write_atomic
 from mjstack.jobs.collection import DATASET, FILE, Collection, CollectPlan, read_batches
 from mjstack.jobs.demonstration import ACTION, STATE, episode_config
@@ -55,12 +55,19 @@ def check_collect(cfg: Config) -> CheckedJob:
     context = RunContext(cfg)
     check_task(context)
     plan = plan_collection(context)
-    _check_folder(plan.home / DATASET, plan.spec)
+    if context.ranks.writes:  # it may have begun there when the others come
+        _check_folder(plan.home / DATASET, plan.spec)
     count = cast(CollectJobCfg, cfg.job).episodes
     title = f"task {cfg.task.name}, {count:,} demonstrations"
     work = partial(run_collect, plan)
     return CheckedJob(
-        context=context, title=title, work=work, folder=plan.home, own=DATASET, resumes=NAME
+        context=context,
+        title=title,
+        work=work,
+        folder=plan.home,
+        own=DATASET,
+        resumes=NAME,
+        spreads=True,
     )
 
 
@@ -84,8 +91,13 @@ def plan_collection(context: RunContext) -> CollectPlan:
 def run_collect(plan: CollectPlan, context: RunContext, folder: Path) -> None:
     """Add the missing episodes to the dataset, and leave dataset.md in the folder."""
     context.begin(NAME)
+    if not context.ranks.writes:
+        context.ranks.from_first(lambda: None)  # which opens the dataset
+        Collection(plan, context).play()
+        return
     began = time.perf_counter()
     collection = Collection(plan, context)
+    context.ranks.from_first(lambda: None)
 
     def conclude(status: Status, problem: str = "") -> None:
         result = collection.result(status, problem, time.perf_counter() - began)
@@ -97,8 +109,13 @@ def run_collect(plan: CollectPlan, context: RunContext, folder: Path) -> None:
 
     try:
         problem = collection.play()
-    except KeyboardInterrupt:
-        conclude(Status.interrupted, "interrupted")
+    except (Exception, KeyboardInterrupt) as error:
+        cause = context.ranks.cause(error)
+        if isinstance(cause, KeyboardInterrupt):
+            conclude(Status.interrupted, "interrupted")
+        elif isinstance(cause, RankError):
+            conclude(Status.failed, str(cause))
+            raise cause from error
         raise
     conclude(Status.failed if problem else Status.passed, problem)
 

@@ -5,8 +5,10 @@ until enough are there.
 import json
 import math
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -14,6 +16,8 @@ import numpy as np
 
 from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetSpec, DatasetWriter, EpisodeData, lerobot
+from mjstack.datasets.part import FILE_MB, Part, PartWriter
+from mjstack.datasets.spec import typed_arrays, typed_values
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, DatasetError
@@ -42,12 +46,15 @@ class CollectPlan:
     Attributes:
         home: The job's folder.
         spec: The dataset's columns and provenance.
-        most: Largest number of worlds of a batch: those whose steps fit into the buffer.
+        most: Largest number of worlds of a batch: those whose steps fit into the buffers of all
+            ranks.
+        rank_most: Largest number of worlds whose steps fit into the buffer of a rank.
     """
 
     home: Path
     spec: DatasetSpec
     most: int
+    rank_most: int
 
     @classmethod
     def of(cls, context: RunContext, home: Path, env: Env) -> "CollectPlan":
@@ -68,7 +75,9 @@ class CollectPlan:
         if gib < world:
             expected = f"at least {world:.2g}, which the steps of one world take"
             raise ConfigError("job.buffer_gib", gib, expected)
-        return cls(home=home, spec=spec, most=min(cfg.nworld, int(gib / world)))
+        room = int(gib / world)
+        most = min(cfg.nworld, context.ranks.size * room)
+        return cls(home=home, spec=spec, most=most, rank_most=room)
 
 
 @dataclass(kw_only=True, slots=True)
@@ -116,6 +125,17 @@ def read_batches(path: Path) -> list[CollectedBatch]:
     return batches
 
 
+@dataclass(kw_only=True, slots=True)
+class _Next:
+    """The batch that is played next, as rank 0 tells the others; nothing is left to play if it has
+    no worlds.
+    """
+
+    seed: int = 0
+    worlds: int = 0
+    problem: str = ""
+
+
 class Collection:
     """A dataset, and the worlds that add to it.
 
@@ -126,6 +146,10 @@ class Collection:
     stopped in between, the next one plays the whole batch again and adds the missing episodes.
     Committed ones do not change. On CUDA two plays of a world agree only nearly: the first play
     counts in the success rate, and every episode has the result of the play that recorded it.
+
+    Of several ranks each plays its share of a batch's worlds and writes the episodes of these into
+    files of its own, which rank 0 commits together. The episodes are those that one rank adds, in
+    the same order.
 
     Attributes:
         path: The dataset.
@@ -141,15 +165,24 @@ class Collection:
         self.path = plan.home / DATASET
         self.batches: list[CollectedBatch] = []
         self._sim: Simulation | None = None
+        self._writer: DatasetWriter | None = None
+        if not context.ranks.writes:
+            return
         if not (self.path / lerobot.INFO).exists():
             self._record_path.unlink(missing_ok=True)  # of a dataset that was removed
         self._writer = DatasetWriter(self.path, plan.spec)
         self._before = self.committed
 
     @property
+    def writer(self) -> DatasetWriter:
+        """The dataset's writer, of rank 0."""
+        assert self._writer is not None
+        return self._writer
+
+    @property
     def committed(self) -> int:
         """Number of episodes of the dataset."""
-        return len(self._writer.committed)
+        return len(self.writer.committed)
 
     def play(self) -> str:
         """Play and write until the episodes are there; what was committed is kept.
@@ -162,6 +195,8 @@ class Collection:
             OSError: The record of the batches cannot be written.
         """
         try:
+            if self._writer is None:
+                return self._play()
             with self._writer:
                 self.batches = read_batches(self._record_path)
                 self._count_kept()
@@ -174,73 +209,171 @@ class Collection:
                 self._sim.close()
 
     def _play(self) -> str:
-        committed = self._writer.committed
+        ranks = self._context.ranks
         empty = 0
-        while (wanted := self._job.episodes - len(committed)) > 0:
-            # A batch that was begun, or the next seed
-            begun = next((batch for batch in self.batches if batch.kept < batch.keep), None)
-            if begun is not None:
-                seed = begun.seed
-                worlds = begun.worlds
+        while (then := ranks.from_first(partial(self._next, empty))).worlds:
+            played = self._play_share(then)
+            good = [each for one in played for each in self._usable(one)]
+            bits = np.concatenate([one.failed for one in played]) if played else np.empty(0, int)
+            retries = sum(int(one.retries.sum()) for one in played)
+            every = ranks.gather((bits, retries, good))
+            chosen = ranks.from_first(partial(self._choose, then, every))
+            if ranks.size == 1:
+                for one in played:
+                    self._add(one, [world for world in chosen if world in one.worlds])
             else:
-                seeds = [seed for seed, _ in committed] + [b.seed for b in self.batches]
-                seed = max([self._context.cfg.seed - 1, *seeds]) + 1
-                spare = 1.0 if self._job.keep_failures else _SPARE
-                worlds = min(self._plan.most, math.ceil(spare * wanted))
-            played = play_demonstrations(self._context, self._worlds(worlds), seed)
+                place = ranks.from_first(self._place)
+                parts = ranks.gather(self._write_parts(played, chosen, *place))
+                ranks.from_first(partial(self._commit, parts))
+            for one in played:
+                del one.steps.values  # the device's memory, before the next batch takes as much
+            empty = ranks.from_first(partial(self._tell, then, empty))
+        return then.problem
 
-            # The episodes that are kept
-            batch, usable = self._judge(played, wanted)
-            if begun is None:
-                self.batches.append(batch)
-                self._record()
-            else:
-                batch = begun
-                there = {world for other, world in committed if other == seed}
-                usable = [world for world in usable if world not in there]
-                batch.keep = min(batch.keep, batch.kept + len(usable))
-            self._add(played, usable[: min(batch.keep - batch.kept, wanted)])
-            del played.steps.values  # the device's memory, before the next batch takes as much
-            self._context.print_line(
-                f"collect, seed {seed}: {batch.succeeded} of {worlds} worlds succeeded,"
-                f" {len(committed)} of {self._job.episodes} episodes there"
-            )
-            empty = 0 if batch.kept else empty + 1
-            if empty == _GIVE_UP:
-                why = [f"{text} in {n} of {batch.worlds}" for text, n in batch.broken.items()]
-                reason = f"{_GIVE_UP} seeds in a row brought no episode, the last because of: "
-                return f"{reason}{'; '.join(why)} worlds"
-        return ""
+    def _next(self, empty: int) -> _Next:
+        """A batch that was begun, or the next seed."""
+        committed = self.writer.committed
+        wanted = self._job.episodes - len(committed)
+        if wanted <= 0:
+            return _Next()
+        if empty == _GIVE_UP:
+            last = self.batches[-1]
+            why = [f"{text} in {n} of {last.worlds}" for text, n in last.broken.items()]
+            reason = f"{_GIVE_UP} seeds in a row brought no episode, the last because of: "
+            return _Next(problem=f"{reason}{'; '.join(why)} worlds")
+        begun = self._begun()
+        if begun is not None:
+            return _Next(seed=begun.seed, worlds=begun.worlds)
+        seeds = [seed for seed, _ in committed] + [b.seed for b in self.batches]
+        seed = max([self._context.cfg.seed - 1, *seeds]) + 1
+        spare = 1.0 if self._job.keep_failures else _SPARE
+        return _Next(seed=seed, worlds=min(self._plan.most, math.ceil(spare * wanted)))
 
-    def _judge(self, played: Played, wanted: int) -> tuple[CollectedBatch, list[int]]:
-        """The record of a batch, and the worlds whose episodes can be kept."""
-        rules = self._context.check.rules
+    def _begun(self) -> CollectedBatch | None:
+        return next((batch for batch in self.batches if batch.kept < batch.keep), None)
+
+    def _play_share(self, then: _Next) -> list[Played]:
+        """Play this rank's worlds of a batch: in one go, unless the batch is of more ranks."""
+        share = self._context.ranks.share(then.worlds)
+        size = self._plan.rank_most
+        out = []
+        for first in range(share.start, share.stop, size):
+            part = share[first - share.start : first - share.start + size]
+            sim = self._worlds(len(part))
+            played = play_demonstrations(self._context, sim, then.seed, part)
+            if len(share) > size:  # the device has room for one
+                played.steps.values = played.steps.values.cpu()
+            out.append(played)
+        return out
+
+    def _usable(self, played: Played) -> list[tuple[int, bool]]:
+        """Numbers of the worlds that succeeded, or all if failures are kept, and whether their
+        numbers are finite.
+        """
         good = np.flatnonzero((played.failed == 0) | self._job.keep_failures).tolist()
-        usable = [world for world in good if played.finite(world)]
-        failing = rules.failing(played.failed)
+        return [(played.worlds[world], played.finite(world)) for world in good]
+
+    def _choose(
+        self, then: _Next, every: Sequence[tuple[np.ndarray, int, list[tuple[int, bool]]]]
+    ) -> list[int]:
+        """Record the batch, if it is new, and choose the worlds whose episodes are kept."""
+        committed = self.writer.committed
+        wanted = self._job.episodes - len(committed)
+        failed = np.concatenate([bits for bits, _, _ in every])
+        good = [each for _, _, found in every for each in found]
+        usable = [world for world, finite in good if finite]
+        rules = self._context.check.rules
+        failing = rules.failing(failed)
         broken = {rules.texts[name]: len(worlds) for name, worlds in failing.items()}
         if lost := len(good) - len(usable):
             broken["a number that is not finite"] = lost
-        batch = CollectedBatch(
-            seed=played.seed,
-            worlds=len(played.failed),
-            keep=min(len(usable), wanted),
-            succeeded=int((played.failed == 0).sum()),
-            retries=int(played.retries.sum()),
-            broken=broken,
-        )
-        return batch, usable
+        self._succeeded = int((failed == 0).sum())
+        batch = self._begun()
+        if batch is None:
+            batch = CollectedBatch(
+                seed=then.seed,
+                worlds=len(failed),
+                keep=min(len(usable), wanted),
+                succeeded=self._succeeded,
+                retries=sum(retries for _, retries, _ in every),
+                broken=broken,
+            )
+            self.batches.append(batch)
+            self._record()
+        else:
+            there = {world for other, world in committed if other == then.seed}
+            usable = [world for world in usable if world not in there]
+            batch.keep = min(batch.keep, batch.kept + len(usable))
+        return usable[: min(batch.keep - batch.kept, wanted)]
 
     def _add(self, played: Played, worlds: list[int]) -> None:
         """Commit the episodes of some worlds, and record it."""
-        for count, (world, arrays) in enumerate(played.episodes(worlds), 1):
-            self._writer.add([self._episode(played, world, arrays)])
+        rows = [played.worlds.index(world) for world in worlds]
+        for count, (row, arrays) in enumerate(played.episodes(rows), 1):
+            self.writer.add([self._episode(played, row, arrays)])
             self._context.advance(f"episodes of seed {played.seed}", count, len(worlds))
-        self._writer.flush()
+        self.writer.flush()
         self._record()
 
+    def _place(self) -> tuple[int, int, int]:
+        """Number of the next episode and of the next frame of the dataset, and of the task."""
+        task = self._context.cfg.task
+        return (
+            self.committed,
+            self.writer.frames,
+            self.writer.number_task(task.instruction or task.name),
+        )
+
+    def _write_parts(
+        self, played: Sequence[Played], chosen: list[int], episode: int, frame: int, task: int
+    ) -> list[Part]:
+        """Write this rank's episodes of those that are chosen into files."""
+        parts: list[Part] = []
+        before = {world: count for count, world in enumerate(chosen)}
+        name = f"rank{self._context.ranks.rank:04d}"
+        writer: PartWriter | None = None
+        try:
+            for one in played:
+                mine = [world for world in one.worlds if world in before]
+                rows = [one.worlds.index(world) for world in mine]
+                for world, (row, arrays) in zip(mine, one.episodes(rows), strict=True):
+                    if writer is None:
+                        writer = PartWriter(self.path, self._plan.spec, f"{name}-{len(parts)}")
+                    data = self._episode(one, row, arrays)
+                    writer.write(
+                        (task, data.task),
+                        typed_values(self._plan.spec, data),
+                        typed_arrays(self._plan.spec, data),
+                        episode + before[world],
+                        frame + before[world] * len(arrays[STATE]),
+                    )
+                    if writer.is_full(FILE_MB):
+                        parts.append(writer.complete())
+                        writer = None
+                    self._context.advance(f"episodes of seed {one.seed}", len(parts), len(mine))
+            return [*parts, writer.complete()] if writer is not None else parts
+        except BaseException:
+            if writer is not None:
+                writer.abandon()
+            raise
+
+    def _commit(self, parts: Sequence[Sequence[Part]]) -> None:
+        """Commit the files of all ranks, in their order, and record it."""
+        if files := [part for some in parts for part in some]:
+            self.writer.commit(files)
+        self._record()
+
+    def _tell(self, then: _Next, empty: int) -> int:
+        """Print what a batch has brought; return how many in a row have brought nothing."""
+        batch = next(batch for batch in self.batches if batch.seed == then.seed)
+        self._context.print_line(
+            f"collect, seed {then.seed}: {self._succeeded} of {then.worlds} worlds succeeded,"
+            f" {self.committed} of {self._job.episodes} episodes there"
+        )
+        return 0 if batch.kept else empty + 1
+
     def _count_kept(self) -> None:
-        counts = Counter(seed for seed, _ in self._writer.committed)
+        counts = Counter(seed for seed, _ in self.writer.committed)
         for batch in self.batches:
             batch.kept = counts[batch.seed]
 
@@ -262,7 +395,7 @@ class Collection:
             task=task.instruction or task.name,
             success=not broken,
             seed=played.seed,
-            world=world,
+            world=played.worlds[world],
             values={
                 "retries": int(played.retries[world]),
                 "failed_rules": broken,
@@ -284,7 +417,7 @@ class Collection:
         """
         asked = self._job.episodes
         new = self.committed - self._before
-        steps = self._writer.frames
+        steps = self.writer.frames
         size = sum(path.stat().st_size for path in self.path.rglob("*") if path.is_file()) / 1e6
         notes = {"dataset": str(self.path), "config_sha256": self._plan.spec.config_sha256}
         metrics: dict[str, float] = {

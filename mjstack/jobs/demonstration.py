@@ -101,12 +101,14 @@ class Played:
         steps: All steps, on the device.
         failed: Bits of the task's rules, shape ``(worlds,)``, int32.
         retries: Grasps that were tried again, shape ``(worlds,)``.
+        worlds: Numbers of the worlds, which their starts depend on.
     """
 
     seed: int
     steps: StepRecorder
     failed: np.ndarray
     retries: np.ndarray
+    worlds: range
 
     def finite(self, world: int) -> bool:
         """Whether every number of a world's steps is finite."""
@@ -124,14 +126,18 @@ class Played:
                 yield world, dict(zip(self.steps.schema, np.split(row, ends, axis=1), strict=True))
 
 
-def play_demonstrations(context: RunContext, sim: Simulation, seed: int) -> Played:
+def play_demonstrations(
+    context: RunContext, sim: Simulation, seed: int, worlds: range | None = None
+) -> Played:
     """Play the configured driver once from the starts of a seed, and judge it by the task's check.
+    Worlds are numbered from 0 on if None.
 
     Nothing ends an episode: worlds go on to its end, so all have as many steps.
     """
     cfg = demonstration_config(replace(context.cfg, seed=seed))
     env = Env(sim, context.index, cfg, check_faults=False)  # the check names lost worlds
-    reset_worlds(env, seed)
+    worlds = range(sim.nworld) if worlds is None else worlds
+    reset_worlds(env, seed, worlds)
     recorder = StepRecorder()
     episode = play_episode(
         env,
@@ -145,6 +151,7 @@ def play_demonstrations(context: RunContext, sim: Simulation, seed: int) -> Play
         steps=recorder,
         failed=episode.result.failed.cpu().numpy(),
         retries=episode.retries,
+        worlds=worlds,
     )
 
 
