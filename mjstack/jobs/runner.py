@@ -210,7 +210,7 @@ class CheckedJob:
 def _write(report: Report, page: Page) -> None:
     """Write the report, and its page, whose failure takes no result back."""
     write_report(report)
-    safely_write(report.folder / PAGE, write_page, report, page)
+    safely_write(report.folder / PAGE, write_page, report, page, stops=False)
 
 
 def count_devices(cfg: Config) -> int:

@@ -73,14 +73,18 @@ def read_report(folder: Path, overrides: Sequence[str] = ()) -> Report | None:
     )
 
 
-def safely_write(path: Path, write: Callable[..., object], *args: object) -> str:
+def safely_write(
+    path: Path, write: Callable[..., object], *args: object, stops: bool = True
+) -> str:
     """Write a file by a call with a path beside it and ``args``, complete or not at all; a failure
-    takes no result back.
+    takes no result back. It is not written if the command was asked to stop, unless ``stops`` is
+    false.
 
     Returns:
         Empty, or one line that says why there is no such file. run.log has the traceback.
     """
-    check_interrupt()
+    if stops:
+        check_interrupt()
     begun = path.with_name(f".{path.name}")
     try:
         write(begun, *args)
