@@ -10,9 +10,10 @@ from functools import cache
 import torch
 
 # The third row of a rotation matrix is 2xz - 2wy, 2yz + 2wx, 1 - 2xx - 2yy: columns of w, x, y, z
-# in the products, the left factors first; their signs; and what is added.
-_Z_ROW_FACTORS = torch.tensor([1, 2, 1, 2, 1, 2, 3, 3, 1, 0, 0, 2])
-_Z_ROW_SIGNS = torch.tensor([[2.0, 2.0, -2.0], [-2.0, 2.0, -2.0]])
+# in the products of both terms, their signs times 2, and what is added.
+_Z_ROW_LEFT = torch.tensor([1, 2, 1, 2, 1, 2])
+_Z_ROW_RIGHT = torch.tensor([3, 3, 1, 0, 0, 2])
+_Z_ROW_SIGNS = torch.tensor([2.0, 2.0, -2.0, -2.0, 2.0, -2.0])
 _Z_ROW_ADDED = torch.tensor([0.0, 0.0, 1.0])
 
 
@@ -60,19 +61,17 @@ def quat_z_row(quat: torch.Tensor) -> torch.Tensor:
     """Third row of the rotation matrix: the world-z components of the body's axes, shape ``(...,
     3)``.
     """
-    factors, signs, added = _z_row_constants(quat.device, quat.dtype)
-    first, second = quat.index_select(-1, factors).unflatten(-1, (2, 2, 3)).unbind(-3)
-    return (first * second * signs).sum(-2) + added
+    left, right, signs, added = _z_row_constants(quat.device, quat.dtype)
+    terms = quat.index_select(-1, left) * quat.index_select(-1, right) * signs
+    return terms[..., :3] + terms[..., 3:] + added
 
 
 @cache
-def _z_row_constants(
-    device: torch.device, dtype: torch.dtype
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _z_row_constants(device: torch.device, dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
     """The constants of `quat_z_row`, copied once: a captured step may not copy from the host."""
     with torch.inference_mode(False):
-        signs, added = (each.to(device, dtype, copy=True) for each in (_Z_ROW_SIGNS, _Z_ROW_ADDED))
-        return _Z_ROW_FACTORS.to(device), signs, added
+        columns = (each.to(device) for each in (_Z_ROW_LEFT, _Z_ROW_RIGHT))
+        return (*columns, *(each.to(device, dtype) for each in (_Z_ROW_SIGNS, _Z_ROW_ADDED)))
 
 
 def quat_to_matrix(quat: torch.Tensor) -> torch.Tensor:

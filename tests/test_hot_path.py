@@ -67,7 +67,7 @@ PATHS: dict[str, list[str] | None] = {
         "_Commands._write_bounded",
     ],
     "mdp/reset.py": [
-        *("home", "_write_object"),
+        *("home", "_write_objects"),
         *(
             f"{name}.__call__"
             for name in ("JointNoise", "JitterObjects", "RandomizeObjects", "_Randomized")

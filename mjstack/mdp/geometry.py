@@ -70,7 +70,8 @@ def lost_state(env: EnvView) -> Tensor:
     """Whether a position or velocity is NaN or infinite, shape ``(nworld,)``, bool. Not to be
     written into.
     """
-    return shared((id(env), lost_state), lambda: not_finite(env.sim.qpos, env.sim.qvel))
+    sim = env.sim
+    return shared((id(env), lost_state), lambda: not_finite(sim.qpos, sim.qvel))
 
 
 def nearness(offset: Tensor, scale: float) -> Tensor:

@@ -20,7 +20,7 @@ from mjstack.managers.view import (
     zero_rows,
 )
 from mjstack.math import quat_from_yaw
-from mjstack.mdp.geometry import Pose, pose_w, robot, write_object, write_robot
+from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet
 from mjstack.mdp.starts.randomization import (
     ObjectMasses,
@@ -30,7 +30,7 @@ from mjstack.mdp.starts.randomization import (
     bounds,
 )
 from mjstack.mdp.starts.reach import require_reach
-from mjstack.scene.index import Rows, joint_limits
+from mjstack.scene.index import Columns, Rows, joint_limits
 
 
 def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
@@ -88,15 +88,15 @@ class JitterObjects:
         placement.require_room(xy, candidates=1)
         self._xy = xy
         self._yaw = yaw
+        self._poses = _object_poses(env)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos."""
         count = 3 * len(env.index.objects)
         at = rows_of(mask)
         draws = random_uniform(env, self.label, count, at=at).unflatten(1, (-1, 3))
-        for number, name in enumerate(env.index.objects):
-            xy, yaw = draws[:, number].split((2, 1), dim=1)
-            _write_object(env, mask, name, self._xy * xy, self._yaw * yaw[:, 0], at)
+        xy, yaw = draws.split((2, 1), dim=2)
+        _write_objects(env, mask, self._poses, self._xy * xy, self._yaw * yaw[..., 0], at)
 
 
 @offers(places_objects=True)
@@ -139,6 +139,7 @@ class RandomizeObjects:
         if len(region) != 2:
             raise ParameterError("xy", region, "two numbers [m]")
         self._yaw = yaw
+        self._poses = _object_poses(env)
         self._candidates = candidates
         # The first draws are the same for every scene; the others follow.
         self._more = 3 * candidates if may_meet(env.cfg.scene, region, gap) else 0
@@ -170,9 +171,7 @@ class RandomizeObjects:
         more = draws[:, some:].reshape(len(draws), count, -1)
         candidates = torch.cat((first[..., 1:], more), dim=2)
         offsets, _ = self._placement.choose(candidates.reshape(len(draws), count, -1, 2))
-        yaw = self._yaw * first[..., 0]
-        for number, name in enumerate(env.index.objects):
-            _write_object(env, mask, name, offsets[:, number], yaw[:, number], at)
+        _write_objects(env, mask, self._poses, offsets, self._yaw * first[..., 0], at)
 
 
 class _Randomized:
@@ -222,13 +221,21 @@ class ActuatorGains(_Randomized):
         super().__init__(env, ServoGains(env), bounds("scale", scale))
 
 
-def _write_object(
-    env: EnvView, mask: Tensor, name: str, offset: Tensor, yaw: Tensor, at: Rows
+def _object_poses(env: EnvView) -> Columns:
+    """Columns of the pose of every object that moves, one after the other."""
+    return Columns([qpos + i for qpos in env.index.object_qpos for i in range(7)], env.device)
+
+
+def _write_objects(
+    env: EnvView, mask: Tensor, poses: Columns, offset: Tensor, yaw: Tensor, at: Rows
 ) -> None:
-    """Move the masked worlds' object off the position where the simulation's reset has put it, by
-    x and y [m], and turn it [rad]; the values are those of ``at``.
+    """Move every object of the masked worlds off the position where the simulation's reset has put
+    it, by x and y [m], shape ``(n, objects, 2)``, and turn it [rad], ``(n, objects)``; the values
+    are those of ``at``.
     """
+    now = poses.read(env.sim.qpos)[at].unflatten(1, (-1, 7))
     # Float64, because a float32 cosine need not be that of any angle, and a file of starts has the
     # angle.
     turned = quat_from_yaw(yaw.double()).to(offset.dtype)
-    write_object(env, mask, name, pose_w(env, name)[at, :2] + offset, turned, at)
+    value = torch.cat((now[..., :2] + offset, now[..., 2:3], turned), dim=-1).flatten(1)
+    poses.write_masked(env.sim.qpos, mask, value, at)

@@ -336,7 +336,13 @@ class AtRest(Rule):
 
 
 class HeldSuccess:
-    """Achieved while a condition has held for some steps in a row."""
+    """Achieved while a condition has held for some steps in a row.
+
+    Attributes:
+        nowhere: Whether it was seen, on the CPU, that the condition holds in no world.
+    """
+
+    nowhere = False
 
     def __init__(self, env: EnvView, condition: Callable[[], Tensor], steps: int) -> None:
         """Allocate the streaks.
@@ -353,7 +359,8 @@ class HeldSuccess:
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
         holds = self._condition()
-        if not holds.is_cuda and not bool(holds.any()):
+        self.nowhere = not holds.is_cuda and not bool(holds.any())
+        if self.nowhere:
             self._length.zero_()
             return holds
         self._length.add_(1).mul_(holds)

@@ -108,7 +108,7 @@ class Progress:
         done.clamp_(self._least, self._most)
         done[..., :3].tanh_()
         worth = torch.addcmul(self._start, done, self._sign).add_(self._number)
-        value = torch.where(reached, worth, 0.0).amax(-1).div_(len(STAGES))
+        value = worth.mul_(reached).amax(-1).div_(len(STAGES))
         if len(goals) == 1:
             return value[:, 0]
 

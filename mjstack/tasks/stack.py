@@ -205,7 +205,7 @@ class StackSuccess(HeldSuccess):
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
         achieved = super().__call__(env)
-        if not achieved.is_cuda and not bool(self._length.any()):
+        if self.nowhere:
             return achieved  # no window that holds this step can pass, in any world
 
         # The newest step against the others
