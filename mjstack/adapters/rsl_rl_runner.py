@@ -10,6 +10,7 @@ from mjstack.adapters.rsl_rl import RslRlVecEnv
 from mjstack.config.schema import PpoJobCfg
 from mjstack.distributed import Ranks, current_ranks
 from mjstack.envs import Env
+from mjstack.episodes.live import LiveView
 from mjstack.policy.network import FARTHEST
 
 # isort: split
@@ -26,17 +27,25 @@ class ScaledRewards(RslRlVecEnv):
             ``(3,)``, float64.
     """
 
-    def __init__(self, env: Env, job: PpoJobCfg, ranks: Ranks) -> None:
+    def __init__(
+        self, env: Env, job: PpoJobCfg, ranks: Ranks, live: LiveView | None = None
+    ) -> None:
+        """Take the environment, and the live view of it, if there is one."""
         super().__init__(env, log_interval=sys.maxsize)
         self._gamma = job.gamma
         self._limit = job.reward_limit
         self._ranks = ranks
+        self._live = live
+        if live is not None:
+            live.start(env)
         self._ahead = torch.zeros(env.nworld, device=env.device)
         self.sums = torch.zeros(3, dtype=torch.float64, device=env.device)
 
     def step(self, actions: Tensor) -> tuple[Any, Tensor, Tensor, dict[str, Any]]:
         """See `RslRlVecEnv`."""
         obs, rewards, dones, extras = super().step(actions)
+        if self._live is not None:
+            self._live.after_step(self._steps)
         self._ahead.mul_(self._gamma).add_(rewards)
         values = self._ahead.double()
         new = torch.stack((torch.ones_like(values).sum(), values.sum(), values.square().sum()))

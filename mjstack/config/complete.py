@@ -46,6 +46,7 @@ def complete(cfg: Config) -> None:
         MjstackError: A term has an unknown key, lacks one, or a value has the wrong type; or
             ``robot.file`` is in none of the folders.
     """
+    cfg.view = cfg.view.lower()  # YAML's false and true
     known = {field.name for field in fields(cfg.gate)}
     for name in vars(cfg.gate).keys() - known:
         cfg.gate.added[name] = vars(cfg.gate).pop(name)

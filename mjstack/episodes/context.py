@@ -14,6 +14,7 @@ from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env, driven_config
 from mjstack.envs.buffers import Advance, Workload, measured_sizes, play_workload
+from mjstack.episodes.live import LiveView
 from mjstack.episodes.rollout import (
     CLOSED_LOOP,
     NOMINAL,
@@ -153,6 +154,7 @@ class RunContext:
         record: Gets each result as soon as there is one.
         advance: Told about progress.
         viewers: Look on at the one-world episode that is shown.
+        live: Looks on at everything else too; None without ``view=web``.
         ranks: The processes of the run. Those that write nothing have no folder.
         artifacts: Products of gates.
         page: What the run shows besides its results.
@@ -167,6 +169,7 @@ class RunContext:
     record: Callable[[GateResult], None] = lambda result: None
     advance: Advance = lambda what, done, total: None
     viewers: Sequence[Observer] = ()
+    live: LiveView | None = None
     artifacts: Artifacts = field(default_factory=Artifacts)
     page: Page = field(default_factory=Page)
     ranks: Ranks = field(default_factory=current_ranks)
@@ -180,6 +183,11 @@ class RunContext:
         artifacts are its own: other starts, say, have other peaks.
         """
         return replace(self, cfg=cfg, artifacts=Artifacts())
+
+    @property
+    def spectators(self) -> list[LiveView]:
+        """The live view, for episodes of many worlds."""
+        return [] if self.live is None else [self.live]
 
     @property
     def model(self) -> mujoco.MjModel:

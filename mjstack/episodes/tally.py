@@ -341,7 +341,7 @@ def play_seeds(
                 if record is None:
                     monitors = [FailureMonitor()] if circumstances else []
                     recorders = [MotionRecorder()] if records and seed == cfg.seed else []
-                    looking = [*monitors, *observers(seed), *recorders]
+                    looking = [*monitors, *observers(seed), *recorders, *context.spectators]
                     episode = context.play(
                         sim, cfg.reset, looking, seed=seed, worlds=context.worlds
                     )

@@ -39,8 +39,12 @@ def check_machine(cfg: Config) -> RunContext:
     find_gates(cfg)
     context = RunContext(cfg)
     check_task(context)
-    if (cfg.view or cfg.video) and not {"baseline", "parity"} & set(cfg.gates):
-        key = "view" if cfg.view else "video"
+    shown = {"baseline", "parity"}
+    if cfg.view == "web" and not {*shown, "batch", "success"} & set(cfg.gates):
+        expected = "gates with baseline, parity, batch or success, whose worlds are shown"
+        raise ConfigError("view", "web", expected, "Add one of them to gates")
+    if (cfg.view == "true" or cfg.video) and not shown & set(cfg.gates):
+        key = "view" if cfg.view == "true" else "video"
         expected = "gates with baseline or parity, whose world is shown"
         raise ConfigError(key, "true", expected, "Add one of them to gates")
     check_showing(cfg)
@@ -226,4 +230,4 @@ def _run_gates(context: RunContext, folder: Path) -> None:
     run_gates(replace(context, cfg=cfg))
 
 
-JOB = Job(check_gates, shows=True)
+JOB = Job(check_gates, shows=True, live=True)

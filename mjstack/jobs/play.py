@@ -31,7 +31,7 @@ def check_play(cfg: Config) -> CheckedJob:
     """Raise for what cannot be shown, before anything is written."""
     if cfg.policy is not None:
         cfg = replace(cfg, controller=replace(cfg.controller, name=POLICY))
-    cfg = replace(cfg, video=cfg.video or not cfg.view)
+    cfg = replace(cfg, video=cfg.video or cfg.view == "false")
     if cfg.video and cfg.nworld > _MOST:
         raise ConfigError("nworld", cfg.nworld, f"at most {_MOST} worlds, as a video has room for")
     if not cfg.controller.phases and cfg.controller.name != POLICY:
@@ -105,4 +105,4 @@ def _save(context: RunContext, qpos: np.ndarray, result: GateResult) -> None:
         context.print_line(f"video: {path}")
 
 
-JOB = Job(check_play, shows=True)
+JOB = Job(check_play, shows=True, live=True)

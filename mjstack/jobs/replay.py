@@ -291,4 +291,6 @@ def _compare(
     return bool(reasons), f"{agrees} {ends}{why}"
 
 
-JOB = Job(check_replay, keys=("job", "run", "world", "sim", "view", "video", "web"), shows=True)
+JOB = Job(
+    check_replay, keys=("job", "run", "world", "sim", "view", "video", "web"), shows=True, live=True
+)

@@ -7,7 +7,8 @@ import os
 import re
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,8 @@ from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.context import Artifacts, RunContext
-from mjstack.episodes.rollout import Hook, StepHook
+from mjstack.episodes.live import LiveView
+from mjstack.episodes.rollout import Hook, Observer, StepHook
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import log_error
@@ -42,10 +44,13 @@ from mjstack.report.record import GateResult, Provenance, Report, Status
 from mjstack.report.table import Console, Table, to_document
 from mjstack.report.web import (
     EPISODE,
+    check_address,
     choose_worlds,
     frame_stride,
     lacks_viser,
     save_episode,
+    start_server,
+    stop_server,
 )
 from mjstack.report.write import safely_write, summarize, write_report
 from mjstack.sim import Simulation, resolve_backend
@@ -57,10 +62,12 @@ log = logging.getLogger(__name__)
 
 def check_showing(cfg: Config) -> None:
     """Raise if this machine cannot show an episode as ``view`` or ``video`` ask for."""
-    if cfg.view and not opens_windows():
+    if cfg.view == "web":
+        check_address(cfg.web.host, cfg.web.port)
+    elif cfg.view == "true" and not opens_windows():
         shown = os.environ.get("DISPLAY", "not set")
         expected = f"a display that opens windows (DISPLAY={shown})"
-        raise ConfigError("view", "true", expected, "Use video=true instead")
+        raise ConfigError("view", "true", expected, "Use view=web or video=true instead")
     if cfg.video:
         require_video()
 
@@ -73,12 +80,14 @@ class Job:
         check: Raises a `MjstackError` for what cannot be done here, before anything is written.
             Returns the job ready to run, with the scene and the plan that the check built.
         keys: Top-level keys and groups that its command line may set; None for all.
-        shows: Whether it can show a world (``view``, ``video``).
+        shows: Whether it can show a world (``view=true``, ``video``).
+        live: Whether the live view can show its worlds (``view=web``).
     """
 
     check: Callable[[Config], "CheckedJob"]
     keys: tuple[str, ...] | None = None
     shows: bool = False
+    live: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -164,16 +173,17 @@ class CheckedJob:
                 places = self.context.ranks.gather(self._place())
                 report.provenance["ranks"] = [f"rank {r}: {p}" for r, p in enumerate(places)]
             _write(report, page)
-            with ProgressBar(console) as bar:
+            with ProgressBar(console) as bar, _live_view(self.context, console) as live:
                 context = replace(
                     self.context,
                     folder=folder,
                     overrides=overrides,
                     print_line=bar.print_line,
-                    begin=bar.start,
+                    begin=partial(_begin, bar, live),
                     record=record,
                     advance=bar.advance,
-                    viewers=[Hook(_viewer(self.context))] if cfg.view else [],
+                    viewers=[live] if live else _viewers(self.context),
+                    live=live,
                     artifacts=Artifacts(),
                     page=page,
                 )
@@ -283,10 +293,12 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
         if job.keys is not None and re.split(r"[.@/]", key)[0] not in job.keys:
             expected = f"only {', '.join(job.keys[1:])} beside job={cfg.job.name}"
             raise ConfigError(key, value, expected, "Leave it out")
-    for key in ("view", "video"):
-        if getattr(cfg, key) and not job.shows:
+    for key, asked in (("view", cfg.view != "false"), ("video", cfg.video)):
+        if asked and not (job.live if cfg.view == "web" and key == "view" else job.shows):
             expected = f"false with job={cfg.job.name}, which shows no world"
-            raise ConfigError(key, "true", expected, "Leave it out")
+            if key == "view" and job.live:
+                expected = f"web or false with job={cfg.job.name}"
+            raise ConfigError(key, cfg.view if key == "view" else "true", expected, "Leave it out")
     return job.check(cfg)
 
 
@@ -389,6 +401,34 @@ def _save_episode(context: RunContext) -> str:
     if problem:
         context.print_line(problem)
     return problem
+
+
+def _begin(bar: ProgressBar, live: LiveView | None, name: str) -> None:
+    """Name the part of the run that begins."""
+    bar.start(name)
+    if live is not None:
+        live.begin(name)
+
+
+@contextmanager
+def _live_view(context: RunContext, console: Console) -> Iterator[LiveView | None]:
+    """Serve the live view inside, if it is asked for."""
+    cfg = context.cfg
+    if cfg.view != "web":
+        yield None
+        return
+    server = start_server(cfg.web.host, cfg.web.port)
+    try:
+        console.print(f"live view: http://{cfg.web.host}:{server.get_port()}")
+        alone = context.ranks.size == 1
+        yield LiveView(server, lambda: context.stage.visual_model, pausable=alone)
+    finally:
+        stop_server(server)
+
+
+def _viewers(context: RunContext) -> list[Observer]:
+    """MuJoCo's viewer, if it is asked for."""
+    return [Hook(_viewer(context))] if context.cfg.view == "true" else []
 
 
 def _viewer(context: RunContext) -> StepHook:

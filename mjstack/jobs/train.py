@@ -20,7 +20,7 @@ from mjstack.files import check_unused, reading, to_csv, write_atomic
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import run_success
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.runner import CheckedJob, Job, write_tables
+from mjstack.jobs.runner import CheckedJob, Job, check_showing, write_tables
 from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
@@ -54,6 +54,7 @@ def check_train(cfg: Config) -> CheckedJob:
     context = RunContext(cfg)
     reset = whole_starts(cfg.reset) if trainer.midway else cfg.reset
     check_task(context.with_config(replace(cfg, reset=reset)))
+    check_showing(cfg)
     used = trainer.check(context)
     tested = range(job.test_seed, job.test_seed + cfg.gate.success.seeds)
     if used.start < tested.stop and tested.start < used.stop:
@@ -161,4 +162,4 @@ def _write_curve(context: RunContext, trained: Trained) -> None:
     )
 
 
-JOB = Job(check_train)
+JOB = Job(check_train, live=True)

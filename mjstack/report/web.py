@@ -3,9 +3,11 @@ view shows. The only module that imports viser.
 """
 
 import contextlib
+import errno
 import io
 import logging
 import math
+import socket
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +18,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjstack.errors import MissingExtra
+from mjstack.errors import ConfigError, MissingExtra
 from mjstack.interrupt import check_interrupt
 
 EPISODE = "episode.html"
@@ -278,6 +280,31 @@ def save_episode(
         path.write_text(scene.as_html(), encoding="utf-8")
     finally:
         stop_server(server)
+
+
+def check_address(host: str, port: int) -> None:
+    """Raise where the live view cannot be served.
+
+    Raises:
+        MissingExtra: viser is not installed.
+        ConfigError: The address is not this machine's, or another program has the port.
+    """
+    if find_spec("viser") is None:
+        raise MissingExtra("view=web", "viser", "web")
+    try:
+        family, kind, number, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    except OSError as error:
+        raise ConfigError("web.host", host, f"an address of this machine ({error})") from error
+    with socket.socket(family, kind, number) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(place)
+        except OSError as error:
+            if error.errno == errno.EADDRNOTAVAIL:
+                expected = "an address of this machine, such as 127.0.0.1"
+                raise ConfigError("web.host", host, expected) from error
+            expected = f"a port that is free on {host} ({error.strerror})"
+            raise ConfigError("web.port", port, expected, "Set another web.port") from error
 
 
 def start_server(host: str, port: int) -> Any:

@@ -300,7 +300,8 @@ def _play_round(
             driver = MixedDriver(context.driver(env), own, env, beta, alone)
             recorder = DemonstrationRecorder(job.group, group)
             label = f"steps of round {number} of {job.rounds}, seed {seed}"
-            episode = play_episode(env, driver, [recorder], advance=context.advance, label=label)
+            looking = [recorder, *context.spectators]
+            episode = play_episode(env, driver, looking, advance=context.advance, label=label)
             widths = recorder.widths
             accepted += int((episode.result.failed[:alone] == 0).sum())
             # A world whose state is not finite has nothing to say

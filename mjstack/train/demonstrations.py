@@ -166,7 +166,8 @@ def play_expert(
             driver = NoisyDriver(context.driver(env), env, noise)
             recorder = DemonstrationRecorder(job.group, group)
             label = f"steps of the expert, seed {seed}"
-            episode = play_episode(env, driver, [recorder], advance=context.advance, label=label)
+            looking = [recorder, *context.spectators]
+            episode = play_episode(env, driver, looking, advance=context.advance, label=label)
             if not widths:
                 widths = recorder.widths
                 steps = driver.steps

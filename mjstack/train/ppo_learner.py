@@ -85,7 +85,7 @@ class Learner:
             backend=backend,
             device=device,
         )
-        self._env = ScaledRewards(env, self._job, ranks)
+        self._env = ScaledRewards(env, self._job, ranks, context.live)
         with redirect_stdout(io.StringIO()):  # it prints the networks
             self._runner = Runner(self._env, self._runner_config(), None, device)
         self._log = Log()

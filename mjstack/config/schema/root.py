@@ -63,9 +63,10 @@ class Config:
     graph: str = spec(choices=("auto", "require", "off"))
     """Capture the step as a CUDA graph: auto, require or off. Ignored on native MuJoCo; on Warp's
     CPU device, of physics alone."""
-    view: bool = spec()
-    """Open MuJoCo's viewer on the parity world; gates without parity: the baseline world; job=play:
-    every world."""
+    view: str = spec(choices=("false", "true", "web"))
+    """true: open MuJoCo's viewer on the parity world; gates without parity: the baseline world;
+    job=play: every world. web: serve the same, the worlds of batch and success, and training to a
+    browser."""
     video: bool = spec()
     """Write an mp4 of the same; job=play without view does so."""
     web: WebCfg = field(default_factory=WebCfg)

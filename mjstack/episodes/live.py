@@ -1,0 +1,252 @@
+"""The live view: worlds of a running environment in a browser, with pause, plots and camera
+images.
+"""
+
+import re
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+from mjstack.drivers.driver import Driver
+from mjstack.envs import Env
+from mjstack.episodes.rollout import Observer
+from mjstack.interrupt import check_interrupt
+from mjstack.report.web import MOST, Shapes, Stage
+
+_RATE = 25.0  # pictures per second, at most
+_HISTORY = 500  # points of a plot
+_FIRST = 16  # worlds that are shown at first
+_COLORS = ("#4478b8", "#c93434", "#1a7f4b", "#9a6700", "#7b4ab8", "#1f8a99", "#b8447f", "#656d76")
+_HEIGHT = "height above the table [mm]"
+_REAL = "real time"
+_FAST = "as fast as it runs"
+_EVERY = re.compile(r"\d+(-\d+)?(\s*,\s*\d+(-\d+)?)*")
+
+
+class LiveView(Observer):
+    """Shows worlds after their steps, at most 25 times per second; its time counts as no part of an
+    episode. Between two pictures it costs a look at the clock.
+
+    Attributes:
+        paused: Whether the run waits in its next step.
+    """
+
+    def __init__(
+        self, server: Any, model: Callable[[], mujoco.MjModel], *, pausable: bool = True
+    ) -> None:
+        """Add the controls to a server.
+
+        Args:
+            server: Of `report.web.start_server`.
+            model: Gives the scene with its visuals, when it is first shown.
+            pausable: Whether the run may wait; not where other processes wait for it.
+        """
+        self._server = server
+        self._model = model
+        self._shapes: Shapes | None = None
+        self._stage: Stage | None = None
+        self._shown: list[int] = []
+        self._part = ""
+        self._chosen = ""
+        self._steps = 0  # that a click lets the run make
+        self.paused = False
+
+        # Controls; their callbacks run in other threads and set attributes alone.
+        gui = server.gui
+        self._status = gui.add_markdown("waiting for the first step")
+        self._pause = gui.add_button("Pause", visible=pausable)
+        self._pause.on_click(lambda _: self._toggle())
+        self._step = gui.add_button("Step", visible=pausable)
+        self._step.on_click(lambda _: self._advance())
+        self._pace = gui.add_dropdown("Pace", (_REAL, _FAST), initial_value=_FAST)
+        self._worlds = gui.add_text("Worlds", "", hint=f"such as 0-15, 20; at most {MOST}")
+        self._plotted = gui.add_number("Plotted world", 0, min=0, step=1)
+        self._plots: dict[str, Any] = {}
+        self._images: dict[str, Any] = {}
+        self._history: dict[str, deque[tuple[float, ...]]] = {}
+
+    def begin(self, part: str) -> None:
+        """Name the part of the run that follows."""
+        self._part = part
+
+    def start(self, env: Env, driver: Driver | None = None) -> None:
+        """See `Observer`; in training there may be no driver."""
+        again = getattr(self, "env", None)
+        self.env = env
+        self._driver = driver
+        self.aside = 0.0
+        self._last = -np.inf
+        self._due = time.perf_counter()
+        if again is None or again.nworld != env.nworld:
+            self._chosen = f"0-{min(_FIRST, env.nworld) - 1}" if env.nworld > 1 else "0"
+            self._worlds.value = self._chosen
+            self._pace.value = _REAL if env.nworld == 1 else _FAST
+            self._plotted.max = env.nworld - 1
+            self._stage = None
+        self._history.clear()
+        self._show(0)
+
+    def after_step(self, step: int) -> None:
+        """See `Observer`."""
+        now = time.perf_counter()
+        real = self._pace.value == _REAL
+        if not (self.paused or real) and now - self._last < 1.0 / _RATE:
+            return
+        if not (self.paused or self._server.get_clients()):  # nobody looks
+            self._last = now
+            self._wait(real)
+            return
+        self.env.sim.synchronize()  # what was queued is the episode's time
+        began = time.perf_counter()
+        if self.paused or began - self._last >= 1.0 / _RATE:
+            self._show(step + 1)
+        while self.paused and not self._steps:
+            check_interrupt()
+            time.sleep(0.02)
+            if self._worlds.value != self._chosen:
+                self._show(step + 1)
+        self._steps = max(0, self._steps - 1)
+        self._wait(real and not self.paused)
+        self.aside += time.perf_counter() - began
+
+    def _wait(self, real: bool) -> None:
+        """Keep real time, if that is asked for."""
+        if real:
+            self._due = max(self._due + self.env.cfg.timing.step_dt, time.perf_counter() - 0.2)
+            time.sleep(max(0.0, self._due - time.perf_counter()))
+
+    def _toggle(self) -> None:
+        self.paused = not self.paused
+        self._pause.label = "Go on" if self.paused else "Pause"
+
+    def _advance(self) -> None:
+        if self.paused:
+            self._steps += 1
+        else:
+            self._toggle()
+
+    def _show(self, step: int) -> None:
+        """Draw the chosen worlds, and what is known of the plotted one."""
+        env = self.env
+        self._last = time.perf_counter()
+        problem = self._choose()
+        index = torch.tensor(self._shown, device=env.device)
+        qpos = env.sim.qpos[index].double().cpu().numpy()
+        if self._stage is None:
+            if self._shapes is None:
+                self._shapes = Shapes(self._model())
+            self._server.scene.reset()
+            labels = [str(number) for number in env.world[index].tolist()]
+            self._stage = Stage(self._server, self._shapes, labels, [None] * len(labels))
+        self._stage.update(np.nan_to_num(qpos))
+        world = min(int(self._plotted.value), env.nworld - 1)
+        terms, lines = self._values(world)
+        for title, values in lines.items():
+            self._plot(title, step, values)
+        self._draw_images(world)
+        words = [
+            f"**{self._part}**, step {step:,}, {env.nworld:,} worlds",
+            f"world {world}: {terms}",
+        ]
+        self._status.content = "\n\n".join([*words, *filter(None, [problem])])
+
+    def _choose(self) -> str:
+        """Take over the worlds that were asked for; return what is wrong with them."""
+        text = self._worlds.value.strip()
+        count = self.env.nworld
+        if self._stage is not None and text == self._chosen:
+            return ""
+        found = read_worlds(text, count)
+        if not found:
+            self._shown = self._shown or [0]
+            last = count - 1
+            return (
+                f"Worlds: {text!r} names none, expected numbers from 0 to {last}, such as 0-15, 20"
+            )
+        self._chosen = text
+        self._shown = found
+        self._stage = None
+        return ""
+
+    def _values(self, world: int) -> tuple[str, dict[str, dict[str, float]]]:
+        """A world's state in words, and the lines of the plots by title."""
+        env = self.env
+        rewards = env.reward_manager
+        ends = env.termination_manager
+        words = [f"step {int(env.episode_step[world])} of its episode"]
+        if self._driver is not None and self._driver.phases:
+            phase = int(self._driver.phase[world])
+            words.append(f"phase {self._driver.phases[phase].name}")
+        lines: dict[str, dict[str, float]] = {}
+        if rewards.names:
+            values = rewards.values[world].tolist()
+            lines["reward"] = {"sum": sum(values), **dict(zip(rewards.names, values, strict=True))}
+            words += [
+                f"reward {sum(values):.4g}",
+                f"success {'yes' if env.success[world] else 'no'}",
+            ]
+        if ends.names:
+            held = [n for n, v in zip(ends.names, ends.values[world].tolist(), strict=True) if v]
+            words.append(f"ends: {', '.join(held) or 'no'}")
+        top = env.cfg.scene.table_top
+        heights = {
+            name: 1e3 * (float(env.sim.qpos[world, at + 2]) - top)
+            for name, (at, _) in env.index.objects.items()
+        }
+        if heights:
+            lines[_HEIGHT] = heights
+        return ", ".join(words), lines
+
+    def _plot(self, title: str, step: int, values: Mapping[str, float]) -> None:
+        """Add a point to every line of a plot."""
+        if title not in self._history:
+            self._history[title] = deque(maxlen=_HISTORY)
+            if title in self._plots:
+                self._plots.pop(title).remove()
+        held = self._history[title]
+        held.append((float(step), *np.nan_to_num(list(values.values())).tolist()))
+        data = tuple(np.array(column) for column in zip(*held, strict=True))
+        if title in self._plots:
+            self._plots[title].data = data
+            return
+        series: list[dict[str, Any]] = [{"label": "step"}]
+        for number, name in enumerate(values):
+            color = _COLORS[number % len(_COLORS)]
+            if title == _HEIGHT:  # the object's own
+                rgb = (round(255 * part) for part in self.env.cfg.scene.objects[name].color[:3])
+                color = f"rgb({', '.join(map(str, rgb))})"
+            series.append({"label": name, "stroke": color, "width": 2})
+        scales = {"x": {"time": False}}
+        self._plots[title] = self._server.gui.add_uplot(
+            data, tuple(series), title=title, scales=scales, height=200
+        )
+
+    def _draw_images(self, world: int) -> None:
+        """Show what the cameras have drawn of a world."""
+        for name, images in self.env.images.items():
+            if images.dtype != torch.uint8:
+                continue
+            image = images[world].cpu().numpy()
+            if name in self._images:
+                self._images[name].image = image
+            else:
+                self._images[name] = self._server.gui.add_image(image, label=name)
+
+
+def read_worlds(text: str, count: int) -> list[int]:
+    """Numbers of the worlds that a text such as ``0-15, 20`` names, of those that there are and at
+    most 64; empty for any other text.
+    """
+    if not _EVERY.fullmatch(text):
+        return []
+    found: dict[int, None] = {}
+    for part in text.split(","):
+        first, _, last = part.strip().partition("-")
+        stop = min(int(last or first), count - 1, int(first) + MOST)
+        found |= dict.fromkeys(range(int(first), stop + 1))
+    return list(found)[:MOST]

@@ -1,0 +1,245 @@
+"""The live view: worlds of a running environment in a browser, with pause, step and choice."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import EXECUTABLE, browse
+from compositions import load_config
+from environments import configure
+
+import mjstack.report.web as web
+from mjstack.cli import run
+from mjstack.envs import build_env
+from mjstack.episodes.context import RunContext
+from mjstack.episodes.live import LiveView, read_worlds
+from mjstack.errors import MjstackError
+from mjstack.jobs import check_job
+from mjstack.report.web import Shapes, start_server, stop_server
+
+
+def refusal_of(*overrides: str) -> str:
+    """The line in which a command line is refused, before it writes anything."""
+    with pytest.raises(MjstackError) as caught:
+        check_job(load_config([*overrides]), overrides)
+    assert caught.value.exit_code == 2
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "count", "worlds"),
+    [
+        ("0-3", 10, [0, 1, 2, 3]),
+        ("7, 2-3,7", 10, [7, 2, 3]),
+        ("8-12", 10, [8, 9]),
+        ("0-999999999", 4096, list(range(64))),
+        ("10", 10, []),
+        ("", 10, []),
+        ("-1", 10, []),
+        ("3-", 10, []),
+        ("all", 10, []),
+    ],
+)
+def test_worlds_are_read_from_text(text: str, count: int, worlds: list[int]) -> None:
+    assert read_worlds(text, count) == worlds
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A server at which somebody looks."""
+    opened = start_server("127.0.0.1", 0)
+    monkeypatch.setattr(opened, "get_clients", lambda: {0: None})
+    yield opened
+    stop_server(opened)
+
+
+def test_worlds_pause_step_and_are_chosen(
+    server: Any, stage: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = stage("so101").stage.visual_model
+    env = build_env(configure("task=reach", "reset=randomized"), nworld=5)
+    view = LiveView(server, lambda: model)
+    view.begin("training")
+    env.reset()
+    view.start(env)
+    made: list[int] = []
+    on = threading.Event()
+
+    def play() -> None:
+        for step in range(200):
+            if on.is_set():
+                break
+            env.sim.qpos[:, 0] = 0.001 * step
+            env.advance()
+            view.after_step(step)
+            made.append(step)
+
+    def settle(count: int) -> None:
+        until = time.monotonic() + 20.0
+        while len(made) != count:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        time.sleep(0.1)
+        assert len(made) == count
+
+    view._toggle()
+    worker = threading.Thread(target=play)
+    worker.start()
+    try:
+        settle(0)  # it waits in its first step
+        assert "**training**, step 1, 5 worlds" in view._status.content
+        assert view._stage is not None
+        view._advance()
+        settle(1)
+        view._advance()
+        view._advance()
+        settle(3)
+        assert set(view._plots) == {"reward", "height above the table [mm]"}
+        assert view._plots["reward"].data[0].tolist()[-1] == 4.0
+        # Another choice of worlds, while it waits
+        view._worlds.value = "4, 1"
+        deadline = time.monotonic() + 20.0
+        while view._shown != [4, 1]:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        time.sleep(0.2)
+        places, _ = Shapes(model).poses(env.sim.qpos[[4, 1]].double().numpy())
+        for body, handle in view._stage._handles:
+            held = np.asarray(handle.batched_positions)
+            assert np.allclose(held[:, 2], places[:, body, 2], atol=1e-4)
+        view._worlds.value = "99"
+        while "Worlds: '99' names none, expected numbers from 0 to 4" not in view._status.content:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert view._shown == [4, 1]
+    finally:
+        on.set()
+        view._toggle()
+        worker.join(timeout=30.0)
+        env.close()
+    assert not worker.is_alive()
+    assert view.aside > 0.3
+
+
+def test_without_a_browser_nothing_is_drawn(
+    server: Any, stage: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = build_env(configure("task=reach"), nworld=2)
+    env.reset()
+    monkeypatch.setattr(server, "get_clients", dict)
+    view = LiveView(server, lambda: stage("so101").stage.visual_model)
+    view.start(env)
+    drawn: list[int] = []
+    monkeypatch.setattr(view, "_show", drawn.append)
+    for step in range(3):
+        time.sleep(0.05)
+        view.after_step(step)
+    env.close()
+    assert drawn == []
+    assert view.aside == 0.0
+
+
+@pytest.fixture
+def port() -> int:
+    """A port that no program has."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture
+def taken() -> Iterator[int]:
+    """A port that another program has."""
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        yield other.getsockname()[1]
+
+
+def test_a_port_in_use_is_one_line(taken: int) -> None:
+    line = refusal_of("view=web", f"web.port={taken}")
+    assert f"web.port={taken}: expected a port that is free on 127.0.0.1" in line
+    assert "Set another web.port" in line
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["view=web", "web.host=203.0.113.1"], "web.host=203.0.113.1: expected an address of this"),
+        (["view=web", "web.port=0"], "web.port=0: expected an integer from 1 to 65535"),
+        (
+            ["view=web", "gates=[capacity]"],
+            "expected gates with baseline, parity, batch or success",
+        ),
+        (["view=web", "job=reachability"], "expected false with job=reachability"),
+        (["view=true", "job=train", "trainer=clone"], "expected web or false with job=train"),
+        (["view=perhaps"], "view=perhaps: expected one of false, true, web"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_input_is_one_line(args: list[str], says: str) -> None:
+    assert says in refusal_of(*args)
+
+
+def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web, "find_spec", lambda name: None)
+    line = refusal_of("view=web")
+    assert "view=web needs viser, which is not installed: run pip install 'mjstack[web]'" in line
+
+
+@pytest.mark.full
+def test_worlds_move_as_without_it(tmp_path: Path, port: int) -> None:
+    """The same batch with the view and without ends bit for bit alike."""
+    ends = []
+    for view in ("false", "web"):
+        out = tmp_path / view
+        args = ["gates=[batch]", "nworld=3", "sim=native", f"view={view}", f"web.port={port}"]
+        assert run([*args, f"hydra.run.dir={out}"]) == 0
+        with np.load(out / "worlds_seed0.npz") as held:
+            ends.append(held["qpos"])
+    assert np.array_equal(*ends)
+
+
+@pytest.mark.full
+@pytest.mark.skipif(EXECUTABLE is None, reason="no Chromium is installed here")
+def test_a_browser_looks_at_a_run(tmp_path: Path, port: int) -> None:
+    args = ["gates=[batch]", "nworld=4", "sim=native", "view=web", f"web.port={port}"]
+    command = [sys.executable, "-m", "mjstack", *args, f"hydra.run.dir={tmp_path}/out"]
+    log = tmp_path / "log"
+    with log.open("w") as told:
+        process = subprocess.Popen(command, stdout=told, stderr=subprocess.STDOUT)
+    button = "[...document.querySelectorAll('button')].find(b => b.innerText == '{}')"
+    text = "document.body.innerText"
+    try:
+        until = time.monotonic() + 120.0
+        while "live view: http://127.0.0.1" not in log.read_text():
+            assert process.poll() is None, log.read_text()
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        with browse(1200, 800) as tab:
+            tab.open(f"http://127.0.0.1:{port}")
+            tab.wait(f"!!{button.format('Pause')}")
+            tab.run(f"{button.format('Pause')}.click()")
+            tab.wait(f"{text}.includes('batch, step') || {text}.includes('4 worlds')")
+            time.sleep(1.0)
+            before = tab.run(text)
+            time.sleep(1.0)
+            assert tab.run(text) == before
+            tab.run(f"{button.format('Step')}.click()")
+            tab.wait(f"{text} != {before!r}")
+            assert tab.problems == []
+            assert {address.rstrip("/") for address in tab.requests} == {f"http://127.0.0.1:{port}"}
+            tab.run(f"{button.format('Go on')}.click()")
+        assert process.wait(timeout=200) == 0
+    finally:
+        process.kill()
