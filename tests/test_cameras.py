@@ -21,9 +21,10 @@ from gymnasium.utils.env_checker import check_env
 from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
 from mjstack.adapters.rsl_rl import RslRlVecEnv
 from mjstack.bench import cameras, cli
+from mjstack.config.schema import Backend
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
-from mjstack.errors import ConfigError, MjstackError, RunError
+from mjstack.errors import ArgumentError, ConfigError, MjstackError, RunError
 from mjstack.gates.capacity import run_capacity
 from mjstack.gates.images import agree, compare_images
 from mjstack.gates.parity import run_parity
@@ -32,6 +33,7 @@ from mjstack.jobs import gates
 from mjstack.jobs.runner import check_job
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import build_model
+from mjstack.sim import StateRenderer
 from mjstack.sim import cameras as sim_cameras
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
@@ -394,6 +396,29 @@ def test_looks_that_cannot_be_are_one_line(overrides: list[str], message: str) -
     with pytest.raises(MjstackError) as caught:
         make_env(["sim=native", *overrides], nworld=1)
     assert message in str(caught.value)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("backend", [NATIVE, "mjwarp", MJWARP_CUDA])
+def test_states_are_drawn_later_as_they_were(make: Make, backend: str) -> None:
+    config = ["looks=randomized", "reset=randomized", *small("front", "wrist", outputs=ALL)]
+    env = make(backend, *config, nworld=3)
+    env.reset(seed=2)
+    env.step(still(env))
+    engine = Backend.native if backend == "native" else Backend.mjwarp
+    renderer = StateRenderer(
+        env.sim.model, env.cfg, 5, backend=engine, device=str(env.device), fields=[*env.sim.fields]
+    )
+    for worlds in ([0, 1, 2], [2, 1]):
+        fields = {name: field[worlds] for name, field in env.sim.fields.items()}
+        drawn = renderer.draw(env.sim.qpos[worlds], fields)
+        assert drawn.keys() == env.images.keys()
+        for name, image in drawn.items():
+            assert (image == env.images[name][worlds]).float().mean() > 0.999, name
+    assert renderer.labels == env.cameras.labels
+    with pytest.raises(ArgumentError, match="qpos: found 6 states, expected at most 5"):
+        renderer.draw(env.sim.qpos.repeat(2, 1))
+    renderer.close()
 
 
 # Gates

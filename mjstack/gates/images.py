@@ -16,7 +16,7 @@ from mjstack.report.picture import save_images
 from mjstack.report.record import GateResult
 from mjstack.report.table import Table
 from mjstack.report.write import safely_write
-from mjstack.sim import draw_states
+from mjstack.sim import StateRenderer
 
 FILE = "parity_images.npz"
 PICTURE = "parity_images.png"
@@ -61,11 +61,7 @@ def compare_images(context: RunContext, result: GateResult) -> list[str]:
         path = path[np.isfinite(path).all(axis=1)]
         steps = np.linspace(0, len(path) - 1, limits.image_states).round().astype(int)
         qpos = path[steps]
-        device = context.backend[1]
-        drawn, _ = draw_states(
-            context.model, cfg, torch.from_numpy(qpos), backend=Backend.mjwarp, device=device
-        )
-        mjwarp = {name: image.cpu().numpy() for name, image in drawn.items()}
+        mjwarp, _ = _draw_states(context, cfg, qpos, Backend.mjwarp, context.backend[1])
         if context.folder is not None:
             write_npz(
                 context.folder / FILE, {"qpos": qpos, "about": json.dumps(_about(cfg)), **mjwarp}
@@ -80,10 +76,7 @@ def compare_images(context: RunContext, result: GateResult) -> list[str]:
             " them"
         )
         return []
-    seen, labels = draw_states(
-        context.model, cfg, torch.from_numpy(qpos), backend=Backend.native, device="cpu"
-    )
-    native = {name: image.numpy() for name, image in seen.items()}
+    native, labels = _draw_states(context, cfg, qpos, Backend.native, "cpu")
     found = {
         name: agree(name, native, mjwarp, labels, limits.image_pixels) for name in cfg.scene.cameras
     }
@@ -137,6 +130,17 @@ def agree(
         depth=float(np.median(np.abs(depths[0] - depths[1])[same])) if both else np.inf,
         worst=int(same.mean(axis=(1, 2)).argmin()),
     )
+
+
+def _draw_states(
+    context: RunContext, cfg: Config, qpos: np.ndarray, backend: Backend, device: str
+) -> tuple[Images, list[str]]:
+    """Images of states, shape ``(n, nq)``, and the names of things."""
+    renderer = StateRenderer(context.model, cfg, len(qpos), backend=backend, device=device)
+    drawn = renderer.draw(torch.from_numpy(qpos))
+    images = {name: image.cpu().numpy() for name, image in drawn.items()}
+    renderer.close()
+    return images, renderer.labels
 
 
 def with_all_outputs(cfg: Config) -> Config:

@@ -1,6 +1,6 @@
 """Physics backends behind one protocol."""
 
-from mjstack.sim.build import draw_states, make_simulation, resolve_backend, resolve_device
+from mjstack.sim.build import StateRenderer, make_simulation, resolve_backend, resolve_device
 from mjstack.sim.simulation import (
     LOST_PHYSICS,
     Overflow,
@@ -16,8 +16,8 @@ __all__ = [
     "Overflow",
     "Simulation",
     "SolverLimit",
+    "StateRenderer",
     "describe_overflow",
-    "draw_states",
     "make_simulation",
     "resolve_backend",
     "resolve_device",

@@ -9,7 +9,7 @@ import mujoco
 import torch
 
 from mjstack.config.schema import Backend, Config
-from mjstack.errors import ConfigError, DeviceError
+from mjstack.errors import ArgumentError, ConfigError, DeviceError
 from mjstack.sim.native import NativeSimulation
 from mjstack.sim.simulation import Simulation
 from mjstack.sim.sizes import BatchSizes, resolve_sizes
@@ -98,47 +98,79 @@ def make_simulation(
     )
 
 
-def draw_states(
-    model: mujoco.MjModel,
-    cfg: Config,
-    qpos: torch.Tensor,
-    *,
-    backend: Backend | None = None,
-    device: str | None = None,
-    fields: Mapping[str, torch.Tensor] | None = None,
-) -> tuple[dict[str, torch.Tensor], list[str]]:
-    """Images of states, each in a world for itself: a picture depends on nothing else.
+class StateRenderer:
+    """Draws states, each in a world of its own: an image depends on nothing else. All steps of an
+    episode can be drawn at once, whenever they are needed.
 
-    Args:
-        model: The compiled model.
-        cfg: The configuration, with its cameras.
-        qpos: The states, shape ``(n, nq)``.
-        backend: Overrides the configured backend.
-        device: Overrides the configured device.
-        fields: Model fields of each state by name, each ``(n, ...)``.
-
-    Returns:
-        Images by output and camera as of `Cameras.allocate`, and the names of the things in their
-        segmentation.
-
-    Raises:
-        MjstackError: They do not fit into memory, or this machine cannot draw.
+    Attributes:
+        labels: Names of the things in the segmentation, see `Cameras`.
     """
-    fields = fields or {}
-    sim = make_simulation(
-        model, cfg, len(qpos), backend=backend, device=device, fields=tuple(fields)
-    )
-    sim.qpos.copy_(qpos)
-    for name, values in fields.items():
-        sim.fields[name].copy_(values)
-    sim.kinematics()
-    cameras = sim.make_cameras(cfg.scene.cameras)
-    images = cameras.allocate()
-    cameras.draw(images, dict.fromkeys(cfg.scene.cameras))
-    sim.synchronize()
-    cameras.close()
-    sim.close()
-    return images, cameras.labels
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        cfg: Config,
+        count: int,
+        *,
+        backend: Backend | None = None,
+        device: str | None = None,
+        fields: Sequence[str] = (),
+    ) -> None:
+        """Make the worlds and their cameras.
+
+        Args:
+            model: The compiled model.
+            cfg: The configuration, with its cameras.
+            count: Most states that are drawn at once.
+            backend: Overrides the configured backend.
+            device: Overrides the configured device.
+            fields: Model fields that differ between states, by MuJoCo's names.
+
+        Raises:
+            MjstackError: The images do not fit into memory.
+        """
+        self._sim = make_simulation(
+            model, cfg, count, backend=backend, device=device, fields=fields
+        )
+        self._names = list(cfg.scene.cameras)
+        self._cameras = self._sim.make_cameras(cfg.scene.cameras)
+        self._images = self._cameras.allocate()
+        self._world = torch.arange(count, device=self._sim.device)
+        self.labels = self._cameras.labels
+
+    def draw(
+        self, qpos: torch.Tensor, fields: Mapping[str, torch.Tensor] | None = None
+    ) -> dict[str, torch.Tensor]:
+        """Draw states.
+
+        Args:
+            qpos: The states, shape ``(n, nq)``, n at most ``count``.
+            fields: Model fields of each state by name, each ``(n, ...)``.
+
+        Returns:
+            Images by output and camera as of `Cameras.allocate`, a row for each state. The next
+            call writes into them.
+
+        Raises:
+            ArgumentError: There are more states than worlds.
+            MjstackError: This machine cannot draw.
+        """
+        n = len(qpos)
+        if n > len(self._world):
+            raise ArgumentError("qpos", f"{n} states", f"at most {len(self._world)}")
+        self._sim.qpos[:n] = qpos
+        for name, values in (fields or {}).items():
+            self._sim.fields[name][:n] = values
+        self._sim.kinematics()
+        mask = None if n == len(self._world) else self._world < n
+        self._cameras.draw(self._images, dict.fromkeys(self._names, mask))
+        return {name: image[:n] for name, image in self._images.items()}
+
+    def close(self) -> None:
+        """Give the worlds back."""
+        self._sim.synchronize()
+        self._cameras.close()
+        self._sim.close()
 
 
 def cuda_name(device: str) -> str:
