@@ -15,7 +15,7 @@ from mjstack.errors import ConfigError, UnknownName
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
 _DEVICES = re.compile(r"all|[1-9]\d*")
-_WORLD = re.compile(r"((batch|success):)?(\d+:)?\d+")
+_WORLD = re.compile(r"((batch|success):)?((\d+:)?\d+|failing)")
 
 
 def validate(cfg: Config) -> None:
@@ -79,7 +79,7 @@ def _refuse(wrong: bool, cfg: Config, key: str, expected: str) -> None:
 def _jobs(cfg: Config) -> None:
     """Keys that only one job or one group reads."""
     wrong = cfg.world is not None and not _WORLD.fullmatch(cfg.world)
-    _refuse(wrong, cfg, "world", "a world such as 17, or a seed and a world such as 3:17")
+    _refuse(wrong, cfg, "world", "a world such as 17, a seed and a world such as 3:17, or failing")
     for key in ("run", "world"):
         wrong = getattr(cfg, key) is not None and cfg.job.name != "replay"
         _refuse(wrong, cfg, key, "null, because it is for job=replay alone. Add job=replay")

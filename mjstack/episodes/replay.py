@@ -126,8 +126,13 @@ def start_of_world(
 
 def simulate_one(context: RunContext, backend: Backend, device: str) -> Simulation:
     """Make the simulation of one world of the batch, which plays alone."""
+    return simulate_alone(context, backend, device, 1)
+
+
+def simulate_alone(context: RunContext, backend: Backend, device: str, nworld: int) -> Simulation:
+    """Make the simulation of some worlds of the batch, without the others."""
     sizes = _sizes_alone(resolve_sizes(context.cfg), context.cfg.nworld)
-    return context.simulation(1, backend, device, sizes=sizes)
+    return context.simulation(nworld, backend, device, sizes=sizes)
 
 
 def _sizes_alone(sizes: BatchSizes, nworld: int) -> BatchSizes:

@@ -24,6 +24,7 @@ from mjstack.files import write_atomic, write_npz
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
 from mjstack.jobs.gates import check_task
+from mjstack.jobs.replay_failing import Failing, replay_failing
 from mjstack.jobs.runner import CheckedJob, Job, check_showing, run_provenance
 from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.report.record import GateResult, Status
@@ -64,12 +65,23 @@ class ReplayPlan:
 
 def check_replay(cfg: Config) -> CheckedJob:
     """Raise for what cannot be replayed, before anything is written."""
-    plan = _plan(cfg)
+    failing = _failing(cfg)
+    plan = _plan(cfg if failing is None else replace(cfg, world=failing.first))
     context = plan.context
     require_episode(context.cfg)
     check_task(context)
     check_showing(context.cfg)
     _check_start(plan)
+    if failing is not None:
+        if cfg.view or cfg.video:
+            expected = "one world, such as 17, which view and video show"
+            raise ConfigError("world", cfg.world, expected)
+        return CheckedJob(
+            context=context,
+            title=f"replay of {len(failing)} failing worlds of {plan.run.folder}",
+            work=partial(replay_failing, failing, plan.where),
+            spreads=True,
+        )
     nworld = context.cfg.nworld
     title = f"replay of world {plan.world} of {nworld}, seed {plan.seed}, of {plan.run.folder}"
     return CheckedJob(context=context, title=title, work=partial(_replay_all, plan))
@@ -84,6 +96,19 @@ def _replay_all(plan: ReplayPlan, context: RunContext, folder: Path) -> None:
         context.print_line(line)
     for number, (backend, _) in enumerate(plan.where):
         run_guarded(context, f"replay_{backend}", partial(_replay, plan, number, changes))
+
+
+def _failing(cfg: Config) -> Failing | None:
+    """The failing worlds, where all of them are asked for."""
+    gate, _, which = (cfg.world or "").rpartition(":")
+    if which != "failing" or cfg.run is None:
+        return None
+    run = EarlierRun.read(cfg.run)
+    had = [name for name in ("batch", "success") if name in run.cfg.gates]
+    if (gate or had[:1]) and (not gate or gate in had):
+        return Failing.of(run, gate or had[0])
+    expected = f"failing worlds of a gate that run had, {' or '.join(had) or 'but it had none'}"
+    raise ConfigError("world", cfg.world, expected)
 
 
 def _plan(cfg: Config) -> ReplayPlan:
@@ -292,5 +317,8 @@ def _compare(
 
 
 JOB = Job(
-    check_replay, keys=("job", "run", "world", "sim", "view", "video", "web"), shows=True, live=True
+    check_replay,
+    keys=("job", "run", "world", "sim", "view", "video", "web", "devices"),
+    shows=True,
+    live=True,
 )

@@ -85,4 +85,4 @@ class Config:
     has it, or one."""
     world: str | None = spec(None)
     """job=replay: a world of it, such as 17, or 3:17 for world 17 of seed 3; success:3:17 where
-    batch ran too."""
+    batch ran too; failing for all that failed."""
