@@ -456,5 +456,6 @@ def _viewer(context: RunContext) -> StepHook:
 def _print_summary(console: Console, report: Report) -> None:
     console.print(summarize(report.gates).to_console(STATUS_COLOR))
     if (report.folder / "report.md").exists():  # the disk may be full
-        console.print(f"report: {escape(str(report.folder))}/report.md and report.html")
+        names = ["report.md", *filter(lambda n: (report.folder / n).exists(), (PAGE, EPISODE))]
+        console.print(f"report: {escape(str(report.folder))}/{', '.join(names)}")
     console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status}[/]")

@@ -312,11 +312,14 @@ def start_server(host: str, port: int) -> Any:
 
     Raises:
         MissingExtra: viser is not installed.
+        OSError: Nothing can be served there.
     """
     try:
         import viser
     except ImportError as error:
         raise MissingExtra("view=web", "viser", "web") from error
+    with socket.create_server((host, port)):  # viser would try other ports, and then hang
+        pass
     logging.getLogger("websockets").setLevel(logging.WARNING)
     with contextlib.redirect_stdout(io.StringIO()):  # its banner
         return viser.ViserServer(host=host, port=port, verbose=False)
