@@ -73,7 +73,7 @@ def check_replay(cfg: Config) -> CheckedJob:
     check_showing(context.cfg)
     _check_start(plan)
     if failing is not None:
-        if cfg.view or cfg.video:
+        if cfg.view != "false" or cfg.video:
             expected = "one world, such as 17, which view and video show"
             raise ConfigError("world", cfg.world, expected)
         return CheckedJob(
