@@ -22,7 +22,7 @@ from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
 from mjstack.adapters.rsl_rl import RslRlVecEnv
 from mjstack.bench import cameras, cli
 from mjstack.config.schema import Backend
-from mjstack.envs import Env
+from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError, ConfigError, MjstackError, RunError
 from mjstack.gates.capacity import run_capacity
@@ -162,6 +162,16 @@ def test_physics_is_the_same_to_the_bit(make: Make, robot: str, backend: str) ->
     assert ends[0][2].any()
 
 
+def test_a_driven_episode_has_the_same_scene_and_draws_nothing() -> None:
+    cfg = load_config(["sim=native", "cameras=front", "looks=randomized"])
+    env = build_env(driven_config(cfg), nworld=1)
+    obs, _ = env.reset()
+    assert (obs, env.images, env.cameras) == ({}, {}, None)
+    assert env.sim.model.camera("front").id >= 0
+    assert env.sim.model.ngeom == build_model(cfg).ngeom
+    env.close()
+
+
 # When they are drawn
 
 
@@ -264,6 +274,33 @@ def test_replayed_steps_draw_what_eager_steps_draw(make: Make) -> None:
         assert env.graph.captured == (graph == "require")
     for name, image in ends[0].items():
         assert (image == ends[1][name]).float().mean() > 0.99, name
+
+
+@pytest.mark.gpu
+@CUDA
+def test_a_step_with_images_reads_nothing_from_the_device(make: Make) -> None:
+    """Torch raises at every host read, also in steps that reset worlds."""
+    env = make(
+        "mjwarp-cuda",
+        "looks=randomized",
+        "reset=randomized",
+        "termination.time_out.params.steps=5",
+        "scene.cameras.front.terminal=true",
+        "scene.cameras.wrist.rate=10.0",
+        *small("front", "wrist", outputs=ALL),
+        nworld=16,
+    )
+    env.reset(seed=0)
+    env.step(still(env))
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(11):
+            env.step(still(env))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert (env.episode >= 2).all()
+    env.raise_faults()
 
 
 # Looks

@@ -61,7 +61,7 @@ class GymnasiumVectorEnv(VectorEnv):
         if group is not None and group not in boxes:
             raise UnknownName("observation group", group, boxes)
         boxes |= {name: _image_box(image) for name, image in env.images.items()}
-        cameras = env.cfg.scene.cameras
+        cameras = env.cameras.cameras if env.cameras is not None else {}
         lacking = [name for name, camera in cameras.items() if not camera.terminal]
         if group is None and lacking:
             expected = "true, because final_obs has the images of all cameras"

@@ -7,7 +7,7 @@ from typing import Any
 
 from mjstack.bench.timing import WARM_UP, timed
 from mjstack.config.schema import Backend
-from mjstack.envs import build_env, without_cameras
+from mjstack.envs import build_env, without_images
 from mjstack.envs.buffers import Advance
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError
@@ -50,7 +50,7 @@ def measure_cameras(
     backend, device = resolve_backend(cfg)
     if backend is not Backend.mjwarp:
         raise ConfigError("sim.backend", backend, "mjwarp", "Add sim=mjwarp")
-    env = build_env(without_cameras(cfg), model=context.model, backend=backend, device=device)
+    env = build_env(without_images(cfg), model=context.model, backend=backend, device=device)
     env.reset(seed=cfg.seed)
     sim = env.sim
     graphs = {}

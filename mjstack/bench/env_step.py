@@ -108,8 +108,8 @@ def measure_env_step(
     }
     out.facts["episodes_ended"] = int(ended)
     out.problem = describe_lost(parts.lost) or parts.problem or out.problem
-    cameras = env.cfg.scene.cameras
-    if cameras:
+    if env.cameras is not None:
+        cameras = env.cameras.cameras
         images = len(cameras) * env.nworld * steps
         out.samples |= {
             "images_ms_per_step": [ms * i for _, _, _, i in times],

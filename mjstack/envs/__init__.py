@@ -7,7 +7,7 @@ from mjstack.envs.build import (
     driven_config,
     make_env,
 )
-from mjstack.envs.camera_schedule import without_cameras
+from mjstack.envs.camera_schedule import without_images
 from mjstack.envs.env import Env
 
 __all__ = [
@@ -17,5 +17,5 @@ __all__ = [
     "demonstration_config",
     "driven_config",
     "make_env",
-    "without_cameras",
+    "without_images",
 ]

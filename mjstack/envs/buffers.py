@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Backend, Config
-from mjstack.envs.camera_schedule import without_cameras
+from mjstack.envs.camera_schedule import without_images
 from mjstack.envs.env import Env
 from mjstack.envs.faults import NO_KEY, POOL, describe_loss
 from mjstack.errors import FaultError
@@ -250,7 +250,7 @@ def random_actions(
     def play(sim: Simulation) -> np.ndarray:
         # A lack of room is what this looks for.
         index = SceneIndex(sim.model, cfg.robot, cfg.scene)
-        env = Env(sim, index, without_cameras(cfg), check_faults=False)
+        env = Env(sim, index, without_images(cfg), check_faults=False)
         env.reset(seed=cfg.seed)
         play_random_actions(env, steps, advance)
         return np.zeros(sim.nworld, dtype=np.int64)

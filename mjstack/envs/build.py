@@ -11,7 +11,7 @@ import torch
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.envs.buffers import probe_env_sizes
-from mjstack.envs.camera_schedule import without_cameras
+from mjstack.envs.camera_schedule import without_images
 from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError
 from mjstack.managers.episode import required_fields
@@ -112,7 +112,7 @@ def driven_config(cfg: Config, reset: dict[str, TermCfg] | None = None) -> Confi
     rewards it: the check judges the whole. Nothing is drawn.
     """
     return replace(
-        without_cameras(decided_every_step(cfg)),
+        without_images(decided_every_step(cfg)),
         action=cfg.controller.action,
         observation={},
         termination={},

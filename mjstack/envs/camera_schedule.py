@@ -25,6 +25,7 @@ class CameraSchedule:
         Raises:
             ConfigError: They do not fit into the device's memory.
         """
+        cameras = {name: camera for name, camera in cameras.items() if camera.outputs}
         self._env = env
         timing = env.cfg.timing
         self._held = timing.policy_decimation
@@ -71,6 +72,7 @@ class CameraSchedule:
             self.cameras.draw(out, masks)
 
 
-def without_cameras(cfg: Config) -> Config:
-    """The configuration of an environment that draws nothing, in the scene of one that does."""
-    return replace(cfg, scene=replace(cfg.scene, cameras={}))
+def without_images(cfg: Config) -> Config:
+    """The configuration of an environment that draws nothing, with the same scene."""
+    cameras = {name: replace(camera, outputs=[]) for name, camera in cfg.scene.cameras.items()}
+    return replace(cfg, scene=replace(cfg.scene, cameras=cameras))

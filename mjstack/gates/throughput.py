@@ -13,7 +13,7 @@ from mjstack.bench.episode import measure_episode
 from mjstack.bench.physics import measure_physics
 from mjstack.bench.timing import EnergyMeter, Measurement
 from mjstack.config.schema import Backend
-from mjstack.envs import build_env, decided_every_step, without_cameras
+from mjstack.envs import build_env, decided_every_step, without_images
 from mjstack.episodes.context import RunContext, each_rank, lacks_episode
 from mjstack.errors import MjstackError
 from mjstack.gates.runner import log_error
@@ -169,7 +169,7 @@ def _on_environment(
     began = time.perf_counter()
     cfg = decided_every_step(context.cfg)
     env = build_env(
-        cfg if cameras else without_cameras(cfg),
+        cfg if cameras else without_images(cfg),
         model=context.model,
         backend=backend,
         device=device,
