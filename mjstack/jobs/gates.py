@@ -208,7 +208,7 @@ def _check_resumed(context: RunContext, name: str) -> list[str]:
 def _played_config(cfg: Config) -> dict[str, Any]:
     """Everything that the episodes of batch and success depend on; more seeds may be asked for."""
     config = config_content(cfg)
-    for key in ("gates", "view", "video", "web", "graph"):
+    for key in ("gates", "view", "video", "graph"):
         del config[key]
     backend, _ = resolve_backend(cfg)
     config["sim"] = {"backend": backend, "step": cfg.sim.step}
