@@ -15,7 +15,7 @@ import torch
 from box_checker import BLUE, RED, BoxOutcome, BoxRecording, check_box_world
 from check_cases import STOPPED_EARLY, limits
 from compositions import load_config
-from environments import at_double_speed
+from environments import StubViews, at_double_speed
 
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
@@ -236,7 +236,7 @@ def feed(
         name: torch.tensor(np.stack([getattr(w, name) for w in worlds]), dtype=dtype)
         for name in ("xpos", "xquat")
     }
-    sim = SimpleNamespace(
+    sim = StubViews(
         model=context.model,
         device=torch.device("cpu"),
         step_count=torch.tensor([w.step_count for w in worlds]),

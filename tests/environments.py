@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -205,3 +206,11 @@ def assert_traces(a: Trace, b: Trace, rows: Any, other: Any, backend: str) -> No
     assert len(a) == len(b) > 0
     for t, (x, y) in enumerate(zip(a, b, strict=True)):
         assert_rows(x, y, rows, other, backend, f"step {t}:")
+
+
+class StubViews(SimpleNamespace):
+    """Views that a test sets anew at every step, in place of a `Simulation`."""
+
+    def part(self, name: str, columns: Any, *shape: int) -> torch.Tensor:
+        found = getattr(self, name)[:, getattr(columns, "at", columns)]
+        return found.unflatten(1, shape) if shape else found

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from check_cases import STOPPED_EARLY, Altered, Cases, limits, rules_of
+from environments import StubViews
 from stack_checker import BLUE, RED, Outcome, check_world
 
 from mjstack.scene.index import Columns
@@ -76,6 +77,7 @@ def feed(
     """Plays recordings through the check, as of a driver with phases or without; the state also has
     one coordinate of an arm, and the gripper's.
     """
+    closed = torch.tensor(rec.cfg.robot.gripper_closed, dtype=dtype)
     index = SimpleNamespace(
         object_address={"red": (1, 1), "blue": (8, 7)}.__getitem__,
         jaw_force=rec.jaw_force,
@@ -84,9 +86,9 @@ def feed(
         fixed={},
         n_arm=1,
         on=lambda device, dtype: SimpleNamespace(
-            qpos=Columns([0, *range(15, 15 + worlds[0].gripper.shape[1])], device),
-            gripper_closed=torch.tensor(rec.cfg.robot.gripper_closed, dtype=dtype),
-            gripper_open=torch.tensor(rec.cfg.robot.gripper_open, dtype=dtype),
+            gripper_qpos=Columns(range(15, 15 + worlds[0].gripper.shape[1]), device),
+            gripper_closed=closed,
+            gripper_travel=torch.tensor(rec.cfg.robot.gripper_open, dtype=dtype) - closed,
         ),
     )
     n = len(worlds)
@@ -96,7 +98,7 @@ def feed(
     velocity = np.stack([w.velocity.reshape(len(w.velocity), 12) for w in worlds])
     force = np.stack([w.force for w in worlds])
     gripper = np.stack([w.gripper for w in worlds])
-    sim = SimpleNamespace(
+    sim = StubViews(
         step_count=torch.tensor([w.step_count for w in worlds]),
         overflow=torch.tensor([w.overflow for w in worlds], dtype=torch.int32),
     )

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from check_cases import limits
-from environments import actions, configure, on_shared_sim, returned
+from environments import StubViews, actions, configure, on_shared_sim, returned
 from stack_checker import BLUE, RED, lowest_corner
 
 from mjstack.config.schema import Config
@@ -633,7 +633,7 @@ def assert_success(
         device=torch.device("cpu"),
         cfg=rec.cfg,
         index=rec.index,
-        sim=SimpleNamespace(),
+        sim=StubViews(),
     )
     env.sim.qpos, env.sim.qvel, env.sim.sensordata = (view[0] for view in state)
     term = StackSuccess(env)
@@ -729,8 +729,7 @@ def test_reach_success_counts_steps_in_a_row() -> None:
     near = np.random.default_rng(0).random((steps, n)) < 0.85
     red = slice(3, 10)
     index = SimpleNamespace(grasp_sites=[0, 2], object_columns=lambda name: (red, red), fixed={})
-    env = SimpleNamespace(nworld=n, device=torch.device("cpu"), index=index, sim=SimpleNamespace())
-    env.sim.part = lambda name, columns: getattr(env.sim, name)[:, columns]
+    env = SimpleNamespace(nworld=n, device=torch.device("cpu"), index=index, sim=StubViews())
     term = ReachSuccess(env, object="red", height=0.06, distance=0.02, steps=5)
     run = np.zeros(n, dtype=int)
     seen = []
