@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 import subprocess
 import sys
@@ -104,8 +105,11 @@ def test_worlds_pause_step_and_are_chosen(
         view._advance()
         view._advance()
         settle(3)
-        assert set(view._plots) == {"reward", "height above the table [mm]"}
-        assert view._plots["reward"].data[0].tolist()[-1] == 4.0
+        plots = {title: (names, plot) for (title, *names), plot in view._plots.items()}
+        assert set(plots) == {"reward", "height above the table [mm]"}
+        names, plot = plots["reward"]
+        assert names == ["sum", *env.reward_manager.names]
+        assert plot.data[0].tolist()[-1] == 4.0
         # Another choice of worlds, while it waits
         view._worlds.value = "4, 1"
         deadline = time.monotonic() + 20.0
@@ -213,7 +217,9 @@ def test_worlds_move_as_without_it(tmp_path: Path, port: int) -> None:
 @pytest.mark.full
 @pytest.mark.skipif(EXECUTABLE is None, reason="no Chromium is installed here")
 def test_a_browser_looks_at_a_run(tmp_path: Path, port: int) -> None:
-    args = ["gates=[batch]", "nworld=4", "sim=native", "view=web", f"web.port={port}"]
+    """It pauses a run and makes single steps; Ctrl-C ends the run while it waits."""
+    args = ["gates=[batch]", "nworld=4", "gate.batch.seeds=1000", "sim=native"]
+    args += ["view=web", f"web.port={port}"]
     command = [sys.executable, "-m", "mjstack", *args, f"hydra.run.dir={tmp_path}/out"]
     log = tmp_path / "log"
     with log.open("w") as told:
@@ -230,7 +236,7 @@ def test_a_browser_looks_at_a_run(tmp_path: Path, port: int) -> None:
             tab.open(f"http://127.0.0.1:{port}")
             tab.wait(f"!!{button.format('Pause')}")
             tab.run(f"{button.format('Pause')}.click()")
-            tab.wait(f"{text}.includes('batch, step') || {text}.includes('4 worlds')")
+            tab.wait(f"{text}.includes('4 worlds') && {text}.includes('Go on')")
             time.sleep(1.0)
             before = tab.run(text)
             time.sleep(1.0)
@@ -239,7 +245,7 @@ def test_a_browser_looks_at_a_run(tmp_path: Path, port: int) -> None:
             tab.wait(f"{text} != {before!r}")
             assert tab.problems == []
             assert {address.rstrip("/") for address in tab.requests} == {f"http://127.0.0.1:{port}"}
-            tab.run(f"{button.format('Go on')}.click()")
-        assert process.wait(timeout=200) == 0
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 130
     finally:
         process.kill()

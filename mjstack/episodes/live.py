@@ -66,9 +66,9 @@ class LiveView(Observer):
         self._pace = gui.add_dropdown("Pace", (_REAL, _FAST), initial_value=_FAST)
         self._worlds = gui.add_text("Worlds", "", hint=f"such as 0-15, 20; at most {MOST}")
         self._plotted = gui.add_number("Plotted world", 0, min=0, step=1)
-        self._plots: dict[str, Any] = {}
+        self._plots: dict[tuple[str, ...], Any] = {}
         self._images: dict[str, Any] = {}
-        self._history: dict[str, deque[tuple[float, ...]]] = {}
+        self._history: dict[tuple[str, ...], deque[tuple[float, ...]]] = {}
 
     def begin(self, part: str) -> None:
         """Name the part of the run that follows."""
@@ -148,6 +148,10 @@ class LiveView(Observer):
         terms, lines = self._values(world)
         for title, values in lines.items():
             self._plot(title, step, values)
+        # Another part of the run has other lines. Removed plots could still get an update.
+        for (title, *names), plot in self._plots.items():
+            if plot.visible != (names == list(lines.get(title, ()))):
+                plot.visible = not plot.visible
         self._draw_images(world)
         words = [
             f"**{self._part}**, step {step:,}, {env.nworld:,} worlds",
@@ -204,15 +208,12 @@ class LiveView(Observer):
 
     def _plot(self, title: str, step: int, values: Mapping[str, float]) -> None:
         """Add a point to every line of a plot."""
-        if title not in self._history:
-            self._history[title] = deque(maxlen=_HISTORY)
-            if title in self._plots:
-                self._plots.pop(title).remove()
-        held = self._history[title]
+        key = (title, *values)
+        held = self._history.setdefault(key, deque(maxlen=_HISTORY))
         held.append((float(step), *np.nan_to_num(list(values.values())).tolist()))
         data = tuple(np.array(column) for column in zip(*held, strict=True))
-        if title in self._plots:
-            self._plots[title].data = data
+        if key in self._plots:
+            self._plots[key].data = data
             return
         series: list[dict[str, Any]] = [{"label": "step"}]
         for number, name in enumerate(values):
@@ -222,7 +223,7 @@ class LiveView(Observer):
                 color = f"rgb({', '.join(map(str, rgb))})"
             series.append({"label": name, "stroke": color, "width": 2})
         scales = {"x": {"time": False}}
-        self._plots[title] = self._server.gui.add_uplot(
+        self._plots[key] = self._server.gui.add_uplot(
             data, tuple(series), title=title, scales=scales, height=200
         )
 
