@@ -39,6 +39,15 @@ for _name, _node in (JOB_SCHEMAS | TRAINER_SCHEMAS).items():
     ConfigStore.instance().store(name=f"{_name}_schema", node=_node, provider="mjstack")
 
 
+def _control_steps(seconds: float, *, _root_: DictConfig) -> int:
+    """Control steps of a time [s], which ``${steps:SECONDS}`` stands for."""
+    step_dt = _root_.timing.physics_dt * _root_.timing.decimation
+    return round(seconds / step_dt) if step_dt > 0.0 else 1  # what is wrong is told later
+
+
+OmegaConf.register_new_resolver("steps", _control_steps)
+
+
 def load_config(
     overrides: Sequence[str] = (), *, config_dir: str | os.PathLike | None = None
 ) -> Config:

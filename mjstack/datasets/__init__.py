@@ -1,8 +1,8 @@
-"""Demonstrations on disk in the layout of LeRobotDataset v3, with pyarrow alone."""
+"""Demonstrations on disk in the layout of LeRobotDataset v3, with pyarrow and ffmpeg."""
 
 from mjstack.datasets.lerobot import require_pyarrow
 from mjstack.datasets.reader import StoredDataset, read_dataset
-from mjstack.datasets.spec import DatasetSpec, EpisodeData, Feature
+from mjstack.datasets.spec import DatasetSpec, EpisodeData, Feature, Video
 from mjstack.datasets.writer import DatasetWriter
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "EpisodeData",
     "Feature",
     "StoredDataset",
+    "Video",
     "read_dataset",
     "require_pyarrow",
 ]

@@ -6,26 +6,30 @@
     meta/tasks.parquet                      task texts and their indices
     meta/episodes/chunk-000/file-000.parquet  a row per episode: task, length, place, statistics
     data/chunk-000/file-000.parquet         the frames, a row group per episode
+    videos/<name>/chunk-000/file-000.mp4    the images of the same frames, if there are any
 
-A shard is a data file and the episodes file of the same number. Shards are never changed once they
-count.
+A shard is a data file, the episodes file and the videos of the same number. Shards are never
+changed once they count.
 """
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mjstack.datasets.spec import INDICES, DatasetSpec, Feature
+from mjstack.datasets.spec import INDICES, DatasetSpec, Video
 from mjstack.errors import MissingExtra
 
 VERSION = "v3.0"
 CHUNK = 1000  # files in a folder
-FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-DATA = f"data/{FILE}"
-EPISODES = f"meta/episodes/{FILE}"
+FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA = f"data/{FILE}.parquet"
+EPISODES = f"meta/episodes/{FILE}.parquet"
+VIDEO = f"videos/{{video_key}}/{FILE}.mp4"
+VIDEO_MB = 200  # size at which a video file is full
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
@@ -52,17 +56,37 @@ def shard_indices(shard: int) -> dict[str, int]:
     return {"chunk_index": shard // CHUNK, "file_index": shard % CHUNK}
 
 
-def shard_path(folder: Path, files: str, shard: int) -> Path:
-    """Where a shard's frames (`DATA`) or episodes (`EPISODES`) are."""
-    return folder / files.format(**shard_indices(shard))
+def shard_path(folder: Path, files: str, shard: int, video: str = "") -> Path:
+    """Where a shard's frames (`DATA`), episodes (`EPISODES`) or images (`VIDEO`) are."""
+    return folder / files.format(**shard_indices(shard), video_key=video)
 
 
-def all_features(features: Mapping[str, Feature]) -> dict[str, tuple[str, int]]:
+def columns_of(spec: DatasetSpec) -> dict[str, tuple[str, int]]:
     """Type and dimension of every column of the frames, in the order of info.json and of
     the files.
     """
-    own = {name: (feature.dtype, feature.dim) for name, feature in features.items()}
+    own = {name: (feature.dtype, feature.dim) for name, feature in spec.features.items()}
     return own | {name: (dtype, 1) for name, dtype in INDICES.items()}
+
+
+def statistics_of(spec: DatasetSpec) -> dict[str, list[int]]:
+    """Shape of the statistics of every column and, after those, of every video's channels."""
+    shapes = {name: [dim] for name, (_, dim) in columns_of(spec).items()}
+    return shapes | {name: [3, 1, 1] for name in spec.videos}
+
+
+def video_info(video: Video, fps: int) -> dict[str, Any]:
+    """The block ``info`` of a video's feature."""
+    return {
+        "video.height": video.height,
+        "video.width": video.width,
+        "video.codec": video.codec,
+        "video.pix_fmt": "yuv420p",
+        "video.fps": fps,
+        "video.channels": 3,
+        "has_audio": False,
+        "is_depth_map": False,
+    }
 
 
 def make_info(
@@ -87,6 +111,15 @@ def make_info(
     features |= {
         name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in INDICES.items()
     }
+    features |= {
+        name: {
+            "dtype": "video",
+            "shape": [video.height, video.width, 3],
+            "names": ["height", "width", "channels"],
+            "info": video_info(video, spec.fps),
+        }
+        for name, video in spec.videos.items()
+    }
     return {
         "codebase_version": VERSION,
         "robot_type": spec.robot_type,
@@ -96,9 +129,9 @@ def make_info(
         "total_tasks": tasks,
         "chunks_size": CHUNK,
         "data_files_size_in_mb": file_mb,
-        "video_files_size_in_mb": 200,  # LeRobot's default: it wants a number without videos too
+        "video_files_size_in_mb": VIDEO_MB,  # LeRobot wants a number without videos too
         "data_path": DATA,
-        "video_path": None,
+        "video_path": VIDEO if spec.videos else None,
         "splits": {"train": f"0:{episodes}"},
         "features": features,
         "mjstack": {
@@ -121,7 +154,7 @@ def frames_schema(spec: DatasetSpec) -> Any:
     pa, _ = require_pyarrow()
     columns = []
     types = {}
-    for name, (dtype, dim) in all_features(spec.features).items():
+    for name, (dtype, dim) in columns_of(spec).items():
         scalar = pa.bool_() if dtype == "bool" else getattr(pa, dtype)()
         value = {"dtype": dtype, "_type": "Value"}
         columns.append(pa.field(name, scalar if dim == 1 else pa.list_(scalar, dim)))
@@ -180,7 +213,40 @@ def episode_statistics(frames: np.ndarray) -> np.ndarray:
     return np.stack([ranked[0], ranked[-1], frames.mean(0), frames.std(0), *quantiles])
 
 
-def merge_statistics(parts: Sequence[np.ndarray], counts: Sequence[int]) -> np.ndarray:
+def sampled_frames(frames: int) -> np.ndarray:
+    """The frames of an episode whose images statistics are of, as LeRobot chooses them."""
+    count = max(min(100, frames), min(int(frames**0.75), 10_000))
+    return np.round(np.linspace(0, frames - 1, count)).astype(int)
+
+
+def image_statistics(images: np.ndarray) -> np.ndarray:
+    """Statistics of red, green and blue in 0 to 1, over all pixels of some images.
+
+    Args:
+        images: Shape ``(n, height, width, 3)``, uint8.
+
+    Returns:
+        Shape ``(statistics, 3)``, in the order of `STATISTICS`.
+    """
+    side = max(images.shape[1:3])
+    if side >= 300:  # LeRobot leaves pixels of large images out
+        images = images[:, :: side // 150, :: side // 150]
+    values = np.arange(256.0)
+    found = []
+    for channel in range(3):
+        counts = np.bincount(images[..., channel].ravel(), minlength=256)
+        seen = np.flatnonzero(counts)
+        mean = np.average(values, weights=counts)
+        std = math.sqrt(np.average((values - mean) ** 2, weights=counts))
+        ranks = np.cumsum(counts) / counts.sum()
+        quantiles = np.searchsorted(ranks, list(QUANTILES.values()))
+        found.append([seen[0], seen[-1], mean, std, *quantiles])
+    return np.array(found).T / 255.0
+
+
+def merge_statistics(
+    parts: Sequence[np.ndarray], counts: Sequence[int] | Sequence[np.ndarray]
+) -> np.ndarray:
     """Statistics of all frames, exact but for the quantiles.
 
     Those are the parts' quantiles weighted by frames, as LeRobot has them: those of all frames
@@ -188,47 +254,54 @@ def merge_statistics(parts: Sequence[np.ndarray], counts: Sequence[int]) -> np.n
 
     Args:
         parts: Statistics of each part, as `episode_statistics` returns them.
-        counts: Frames of each.
+        counts: Frames of each, or frames of each number, each shape ``(dim,)``.
     """
     stacked = np.stack(parts)
-    weights = np.array(counts) / sum(counts)
-    merged = np.tensordot(weights, stacked, 1)
+    frames = np.stack([np.broadcast_to(count, stacked.shape[2]) for count in counts])
+    weights = frames / frames.sum(0)
+    merged = (weights[:, None] * stacked).sum(0)
     lows, highs, means, stds = stacked[:, :4].swapaxes(0, 1)
     merged[0] = lows.min(0)
     merged[1] = highs.max(0)
-    merged[3] = np.sqrt(weights @ (stds**2 + (means - merged[2]) ** 2))
+    merged[3] = np.sqrt((weights * (stds**2 + (means - merged[2]) ** 2)).sum(0))
     return merged
 
 
 def name_statistics(
-    features: Mapping[str, Feature], statistics: np.ndarray, count: int
+    spec: DatasetSpec, statistics: np.ndarray, counts: np.ndarray
 ) -> dict[str, dict[str, list]]:
     """Statistics ``(statistics, dim)`` by feature and name, and the number of frames that they are
-    of: the content of stats.json.
+    of, shape ``(dim,)``: the content of stats.json.
     """
     named = {}
     start = 0
-    for name, (_, dim) in all_features(features).items():
-        values = statistics[:, start : start + dim].tolist()
-        named[name] = dict(zip(STATISTICS, values, strict=True)) | {"count": [count]}
+    for name, shape in statistics_of(spec).items():
+        dim = shape[0]
+        values = statistics[:, start : start + dim].reshape(-1, *shape).tolist()
+        count = {"count": [int(counts[start])]}
+        named[name] = dict(zip(STATISTICS, values, strict=True)) | count
         start += dim
     return named
 
 
-def row_statistics(features: Mapping[str, Feature], row: Mapping[str, Any]) -> np.ndarray:
-    """Statistics of an episode from its row, as `episode_statistics` returns them.
+def row_statistics(spec: DatasetSpec, row: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Statistics of an episode from its row, as `episode_statistics` returns them, and the number
+    of frames that each number's are of, shape ``(dim,)``.
 
     Raises:
         Exception: The row has others.
     """
+    shapes = statistics_of(spec)
     found = np.array(
         [
-            np.concatenate([row[f"stats/{name}/{kind}"] for name in all_features(features)])
+            np.concatenate([np.ravel(row[f"stats/{name}/{kind}"]) for name in shapes])
             for kind in STATISTICS
         ],
         dtype=float,
     )
-    dims = sum(dim for _, dim in all_features(features).values())
-    if found.shape != (len(STATISTICS), dims) or not np.isfinite(found).all():
+    counts = np.concatenate([row[f"stats/{name}/count"] * shapes[name][0] for name in shapes])
+    dims = sum(shape[0] for shape in shapes.values())
+    whole = found.shape == (len(STATISTICS), dims) and counts.shape == (dims,)
+    if not whole or not np.isfinite(found).all() or counts.min() < 1:
         raise ValueError(f"statistics of episode {row['episode_index']}")
-    return found
+    return found, counts

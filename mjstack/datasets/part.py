@@ -1,4 +1,4 @@
-"""A data file of a dataset before it is committed: several processes may write one each."""
+"""Files of a dataset before they are committed: several processes may write some each."""
 
 import contextlib
 import os
@@ -9,28 +9,48 @@ from typing import Any
 import numpy as np
 
 from mjstack.datasets import lerobot
-from mjstack.datasets.spec import INDICES, DatasetSpec
+from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData
+from mjstack.datasets.video import VideoEncoder
 
 FILE_MB = 100  # size of a data file at which the next one begins
+IMAGES_GIB = 1.0  # images that may wait for being encoded
 
 
 @dataclass(kw_only=True, slots=True)
 class Part:
-    """A complete hidden file, and a row for each of its episodes."""
+    """Complete hidden files, and a row for each of their episodes.
+
+    Attributes:
+        path: The data file.
+        videos: The file of each video.
+        rows: Rows of the episodes.
+        waited: Time for which the writer has waited for encoders [s].
+    """
 
     path: Path
+    videos: dict[str, Path] = field(default_factory=dict)
     rows: list[dict[str, Any]] = field(default_factory=list)
+    waited: float = 0.0
 
 
 class PartWriter:
-    """Writes episodes into a hidden file, one after the other, and keeps none of their frames.
+    """Writes episodes into hidden files, one after the other. It keeps none of their frames, but
+    images until they are encoded.
 
     Attributes:
         part: What is written so far.
     """
 
-    def __init__(self, folder: Path, spec: DatasetSpec, name: str) -> None:
-        """Begin a file, whose name tells the processes apart.
+    def __init__(
+        self, folder: Path, spec: DatasetSpec, name: str, *, images_gib: float = IMAGES_GIB
+    ) -> None:
+        """Begin files, whose name tells the processes apart.
+
+        Args:
+            folder: The dataset.
+            spec: Its columns and videos.
+            name: Part of the names.
+            images_gib: Images that may wait for being encoded [GiB].
 
         Raises:
             OSError: It cannot be written.
@@ -48,14 +68,27 @@ class PartWriter:
             compression="snappy",
             use_dictionary=list(INDICES),
         )
+        self._videos: VideoEncoder | None = None
+        if spec.videos:
+            for video in spec.videos:
+                path = lerobot.shard_path(folder, lerobot.VIDEO, 0, video)
+                self.part.videos[video] = path.with_name(f".file-{name}.mp4")
+            most = int(images_gib * 2**30)
+            self._videos = VideoEncoder(spec.videos, spec.fps, self.part.videos, most)
 
     def is_full(self, file_mb: int) -> bool:
-        """Whether one more episode like these would make the file larger than that [MiB]."""
-        return self._file.tell() * (1.0 + 1.0 / len(self.part.rows)) > file_mb * 2**20
+        """Whether one more episode like these would make the data file larger than that [MiB], or a
+        video larger than `lerobot.VIDEO_MB`.
+        """
+        share = self._file.tell() / (file_mb * 2**20)
+        if self._videos is not None:
+            share = max(share, self._videos.megabytes() / lerobot.VIDEO_MB)
+        return share * (1.0 + 1.0 / len(self.part.rows)) > 1.0
 
     def write(
         self,
-        task: tuple[int, str],
+        episode: EpisodeData,
+        task: int,
         facts: dict[str, Any],
         columns: dict[str, np.ndarray],
         number: int,
@@ -64,7 +97,8 @@ class PartWriter:
         """Write an episode as a row group, so that it can be read without the others.
 
         Args:
-            task: Number of the task in the dataset, and its words.
+            episode: The episode.
+            task: Number of its task in the dataset.
             facts: Values of its row.
             columns: Its frames, as the spec has them.
             number: Its number in the dataset.
@@ -77,7 +111,7 @@ class PartWriter:
             "frame_index": frame,
             "episode_index": np.full(length, number),
             "index": start + frame,
-            "task_index": np.full(length, task[0]),
+            "task_index": np.full(length, task),
         }
         columns = dict(columns)
         for name, values in indices.items():
@@ -86,18 +120,36 @@ class PartWriter:
         self._writer.write_table(table, row_group_size=length)
         # float64 holds every type's values exactly, but int64's beyond 2^53.
         joined = np.concatenate([columns[name] for name in table.column_names], axis=1, dtype=float)
+        statistics = [lerobot.episode_statistics(joined)]
+        counts = [length] * joined.shape[1]
+        if self._videos is not None:
+            self._videos.add(episode.images)
+        sampled = lerobot.sampled_frames(length)
+        for name in self._spec.videos:
+            statistics.append(lerobot.image_statistics(episode.images[name][sampled]))
+            counts += [len(sampled)] * 3
         named = lerobot.name_statistics(
-            self._spec.features, lerobot.episode_statistics(joined), length
+            self._spec, np.concatenate(statistics, axis=1), np.array(counts)
         )
+        shown = sum(row["length"] for row in self.part.rows)  # frames before it in the videos
+        times = {
+            "from_timestamp": shown / self._spec.fps,
+            "to_timestamp": (shown + length) / self._spec.fps,
+        }
         place = lerobot.shard_indices(0)  # the commit knows it
         self.part.rows.append(
             {
                 "episode_index": number,
-                "tasks": [task[1]],
+                "tasks": [episode.task],
                 "length": length,
                 **{f"data/{name}": index for name, index in place.items()},
                 "dataset_from_index": start,
                 "dataset_to_index": start + length,
+                **{
+                    f"videos/{name}/{key}": value
+                    for name in self._spec.videos
+                    for key, value in (place | times).items()
+                },
                 **facts,
                 **{f"meta/episodes/{name}": index for name, index in place.items()},
                 **{
@@ -109,15 +161,20 @@ class PartWriter:
         )
 
     def complete(self) -> Part:
-        """Close the file; it is on the disk then."""
+        """Close the files; they are on the disk then."""
         self._writer.close()
         self._file.flush()
         os.fsync(self._file.fileno())
         self._file.close()
+        if self._videos is not None:
+            self._videos.complete()
+            self.part.waited = self._videos.waited
         return self.part
 
     def abandon(self) -> None:
-        """Close the file as it is."""
+        """Close the files as they are."""
+        if self._videos is not None:
+            self._videos.abandon()
         self._writer.is_open = False  # its destructor would complete the file
         with contextlib.suppress(OSError):  # closing writes what is buffered
             self._file.close()

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from mjstack.datasets import lerobot
-from mjstack.datasets.spec import DatasetSpec
+from mjstack.datasets.spec import DatasetSpec, Video
+from mjstack.datasets.video import decode
 from mjstack.errors import DatasetError, UnknownName
 from mjstack.files import reading
 
@@ -31,6 +32,33 @@ class StoredDataset:
     tasks: list[str]
     episodes: list[dict[str, Any]]
 
+    def images(self, name: str, episode: int) -> np.ndarray:
+        """Decode an episode's images.
+
+        Args:
+            name: Such as ``observation.images.front``.
+            episode: Its number.
+
+        Returns:
+            Shape ``(frames, height, width, 3)``, uint8.
+
+        Raises:
+            UnknownName: There are no such images.
+            DatasetError: There is no such episode, or a file is missing or damaged.
+        """
+        videos = _videos(self.info)
+        if name not in videos:
+            raise UnknownName("video", name, videos)
+        if not 0 <= episode < len(self.episodes):
+            found = f"{self.folder} has {len(self.episodes)} episodes"
+            raise DatasetError(f"{found}, expected one with number {episode}. Give a smaller one")
+        row = self.episodes[episode]
+        place = {key: row[f"videos/{name}/{key}"] for key in ("chunk_index", "file_index")}
+        path = self.folder / lerobot.VIDEO.format(video_key=name, **place)
+        start = row[f"videos/{name}/from_timestamp"]
+        with readable(path):
+            return decode(path, videos[name], start, row["length"], self.info["fps"])
+
     def frames(self, name: str) -> np.ndarray:
         """Every frame of a column. Those of an episode are the slice from its
         ``dataset_from_index`` to its ``dataset_to_index``.
@@ -45,7 +73,8 @@ class StoredDataset:
             UnknownName: There is no such column.
             DatasetError: A file is missing or damaged.
         """
-        features = self.info["features"]
+        videos = _videos(self.info)
+        features = {k: each for k, each in self.info["features"].items() if k not in videos}
         if name not in features:
             raise UnknownName("feature", name, features)
         dtype = features[name]["dtype"]
@@ -111,13 +140,25 @@ def _check_types(info: Any) -> None:
     empty = lerobot.make_info(DatasetSpec(robot_type="", fps=1, features={}, config_sha256=""))
     for found, wanted in ((info, empty), (info["mjstack"], empty["mjstack"])):
         for name, value in wanted.items():
-            if type(found[name]) is not type(value):
+            kinds = type(value) if name != "video_path" else str | None
+            if not isinstance(found[name], kinds) or isinstance(found[name], bool):
                 raise ValueError(f"{name} is {found[name]!r:.60}")
+    _videos(info)
     for feature in info["features"].values():
-        np.empty(feature["shape"], feature["dtype"])
+        dtype = "uint8" if feature["dtype"] == "video" else feature["dtype"]
+        np.empty(feature["shape"], dtype)
     for entry in info["mjstack"]["provenance"]:
         if not 0 <= entry["from_episode"] <= info["total_episodes"]:
             raise ValueError(f"from_episode is {entry['from_episode']}")
+
+
+def _videos(info: dict[str, Any]) -> dict[str, Video]:
+    """The videos of info.json."""
+    return {
+        name: Video(height=int(feature["shape"][0]), width=int(feature["shape"][1]))
+        for name, feature in info["features"].items()
+        if feature["dtype"] == "video"
+    }
 
 
 def check_same(folder: Path, info: dict[str, Any], spec: DatasetSpec) -> None:
@@ -187,6 +228,10 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
                     raise ValueError(f"row {len(rows)} has a negative seed or world")
                 rows.append(row)
         path = lerobot.shard_path(folder, lerobot.DATA, shard)
+        for video in _videos(info):
+            images = lerobot.shard_path(folder, lerobot.VIDEO, shard, video)
+            with readable(images):
+                images.stat()
         with readable(path):
             frames += lerobot.require_pyarrow()[1].read_metadata(path).num_rows
     found = (len(rows), frames)
@@ -206,11 +251,17 @@ def uncommitted(folder: Path, shards: int) -> list[Path]:
         for files in (lerobot.DATA, lerobot.EPISODES)
         for shard in range(shards)
     }
+    counted |= {
+        lerobot.shard_path(folder, lerobot.VIDEO, shard, video.name)
+        for video in folder.glob("videos/*")
+        for shard in range(shards)
+    }
     places = [
         f"{place}/chunk-*/{name}"
         for place in ("data", "meta/episodes")
         for name in ("file-*.parquet", ".file-*.parquet*")
     ]
+    places += [f"videos/*/chunk-*/{name}" for name in ("file-*.mp4", ".file-*.mp4*")]
     places += [
         f"meta/.{Path(name).name}.*" for name in (lerobot.INFO, lerobot.STATS, lerobot.TASKS)
     ]

@@ -11,6 +11,7 @@ import numpy as np
 
 from mjstack.errors import ArgumentError, DatasetError
 
+CODECS = ("h264", "av1")
 DTYPES = ("float32", "float64", "int32", "int64", "bool")
 # Accepted types of an episode's values, and the type that is kept.
 VALUE_DTYPES: dict[str, tuple[Any, type]] = {
@@ -51,6 +52,21 @@ class Feature:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Video:
+    """A camera's images, which each frame has one of. They are kept as videos.
+
+    Attributes:
+        height: Pixels, an even number.
+        width: Pixels, an even number.
+        codec: One of `CODECS`.
+    """
+
+    height: int
+    width: int
+    codec: str = "h264"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class DatasetSpec:
     """Everything that all episodes of a dataset share.
 
@@ -62,6 +78,7 @@ class DatasetSpec:
             ``next.success`` by these names; others are kept as they are.
         config_sha256: Hash of what the episodes depend on. A dataset is gone on with under the same
             hash only.
+        videos: Images by name, such as ``observation.images.front``.
         values: Values that each episode has beside success, seed and world, by name, as one of
             `VALUE_DTYPES`.
         provenance: Other facts about this call's episodes, such as seed and versions, in
@@ -72,6 +89,7 @@ class DatasetSpec:
     fps: int
     features: Mapping[str, Feature]
     config_sha256: str
+    videos: Mapping[str, Video] = field(default_factory=dict)
     values: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
@@ -90,6 +108,16 @@ class DatasetSpec:
                 raise ArgumentError(
                     f"{label}.names", list(feature.names), "names, each once, and a unit for each"
                 )
+        for name, video in self.videos.items():
+            label = f"videos['{name}']"
+            if "/" in name or name in self.features or name in INDICES:
+                raise ArgumentError(label, name, "a name without / that no feature has")
+            if video.codec not in CODECS:
+                raise ArgumentError(f"{label}.codec", video.codec, f"one of {', '.join(CODECS)}")
+            if min(video.height, video.width) < 2 or video.height % 2 or video.width % 2:
+                found = f"{video.height}x{video.width}"
+                expected = "even numbers of pixels, because a video halves the resolution of colour"
+                raise ArgumentError(label, found, expected)
         for name, dtype in self.values.items():
             if dtype not in VALUE_DTYPES:
                 raise ArgumentError(f"values['{name}']", dtype, f"one of {', '.join(VALUE_DTYPES)}")
@@ -97,11 +125,13 @@ class DatasetSpec:
 
 @dataclass(eq=False, kw_only=True, slots=True)
 class EpisodeData:
-    """One finished episode. The writer has copied all of it when `add` returns, so the arrays may
-    be used again.
+    """One finished episode. The writer has copied its numbers when `add` returns, so those arrays
+    may be used again.
 
     Attributes:
         arrays: The frames by feature, each ``(frames, dim)``, or ``(frames,)`` where dim is 1.
+        images: The images by video, each ``(frames, height, width, 3)``, uint8. The writer may
+            still read them when `add` returns: do not write into them.
         task: The task in words.
         success: Whether it was.
         seed: The seed it was played with.
@@ -115,6 +145,7 @@ class EpisodeData:
     seed: int
     world: int
     values: Mapping[str, float | int | bool | str] = field(default_factory=dict)
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def term_columns(term: str, dim: int, history: int) -> list[str]:
@@ -167,6 +198,24 @@ def typed_arrays(spec: DatasetSpec, episode: EpisodeData) -> dict[str, np.ndarra
                 f" expected finite {feature.dtype}. Leave the episode out"
             )
     return typed
+
+
+def check_images(spec: DatasetSpec, episode: EpisodeData, frames: int) -> None:
+    """Check that an episode has the images of all its frames.
+
+    Raises:
+        DatasetError: An array is missing, unknown or of another shape or type.
+    """
+    where = _where(episode)
+    _check_names(where, "video", episode.images, spec.videos)
+    for name, video in spec.videos.items():
+        images = episode.images[name]
+        shape = (frames, video.height, video.width, 3)
+        if images.shape != shape or images.dtype != np.uint8:
+            raise DatasetError(
+                f"{where}: {name} is {images.dtype} of shape {images.shape}, expected uint8 of"
+                f" {shape}. Give an image for every frame"
+            )
 
 
 def typed_values(spec: DatasetSpec, episode: EpisodeData) -> dict[str, Any]:

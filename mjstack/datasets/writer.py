@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mjstack.datasets import lerobot
-from mjstack.datasets.part import FILE_MB, Part, PartWriter
+from mjstack.datasets.part import FILE_MB, IMAGES_GIB, Part, PartWriter
 from mjstack.datasets.reader import (
     check_same,
     read_info,
@@ -22,7 +22,13 @@ from mjstack.datasets.reader import (
     readable,
     uncommitted,
 )
-from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_arrays, typed_values
+from mjstack.datasets.spec import (
+    DatasetSpec,
+    EpisodeData,
+    check_images,
+    typed_arrays,
+    typed_values,
+)
 from mjstack.errors import DatasetError, UnwrittenError
 from mjstack.files import lock_folder, write_atomic
 
@@ -35,6 +41,8 @@ class DatasetWriter:
     many files count: a kill or a Ctrl-C before it costs the episodes since the last commit, and the
     next writer clears away what they left. One writer has a dataset at a time.
 
+    Images are encoded beside what goes on after `add`; `flush` waits for them.
+
         with DatasetWriter(folder, spec) as writer:
             for seed in seeds:
                 writer.add(play(seed))
@@ -45,15 +53,24 @@ class DatasetWriter:
         spec: Its columns and provenance.
         committed: Seed and world of every committed episode, in order.
         frames: Committed frames.
+        waited: Time for which commits have waited for images to be encoded [s].
     """
 
-    def __init__(self, folder: Path | str, spec: DatasetSpec, *, file_mb: int = FILE_MB) -> None:
+    def __init__(
+        self,
+        folder: Path | str,
+        spec: DatasetSpec,
+        *,
+        file_mb: int = FILE_MB,
+        images_gib: float = IMAGES_GIB,
+    ) -> None:
         """Open the folder, and begin a dataset in it if there is none.
 
         Args:
             folder: The dataset's own folder.
             spec: Its columns and provenance.
             file_mb: Size of a data file at which it is committed and the next one begins [MiB].
+            images_gib: Images that may wait for being encoded [GiB].
 
         Raises:
             DatasetError: Something else is there, or a dataset of another configuration.
@@ -65,12 +82,15 @@ class DatasetWriter:
         self.spec = spec
         self.committed: list[tuple[int, int]] = []
         self.frames = 0
+        self.waited = 0.0
         self._file_mb = file_mb
+        self._images_gib = images_gib
         self._open = True
         self._shards = 0
         self._provenance: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}
         self._statistics = np.empty(0)  # of the committed frames
+        self._counts = np.zeros(0, dtype=int)  # frames that each of them is of
         self._part: PartWriter | None = None  # since the last commit
         if self.folder.exists() and not self.folder.is_dir():
             raise DatasetError(f"{folder} is a file, expected a folder. Give another")
@@ -95,6 +115,12 @@ class DatasetWriter:
         """Episodes that were added and are not committed yet."""
         return len(self._part.part.rows) if self._part is not None else 0
 
+    @property
+    def added(self) -> list[tuple[int, int]]:
+        """Seed and world of every episode that was added, committed or not."""
+        rows = self._part.part.rows if self._part is not None else []
+        return self.committed + [(row["seed"], row["world"]) for row in rows]
+
     def add(self, episodes: Sequence[EpisodeData]) -> None:
         """Add finished episodes; a batch that does not fit is refused as a whole.
 
@@ -108,15 +134,20 @@ class DatasetWriter:
         """
         self._check_open()
         checked = [(typed_values(self.spec, e), typed_arrays(self.spec, e)) for e in episodes]
+        for episode, (_, columns) in zip(episodes, checked, strict=True):
+            check_images(self.spec, episode, len(next(iter(columns.values()))))
         for episode, (facts, columns) in zip(episodes, checked, strict=True):
             with self._guarded():
                 if self._part is None:
-                    self._part = PartWriter(self.folder, self.spec, f"{self._shards:06d}")
+                    name = f"{self._shards:06d}"
+                    self._part = PartWriter(
+                        self.folder, self.spec, name, images_gib=self._images_gib
+                    )
                 rows = self._part.part.rows
                 number = len(self.committed) + len(rows)
                 start = rows[-1]["dataset_to_index"] if rows else self.frames
-                task = self.number_task(episode.task), episode.task
-                self._part.write(task, facts, columns, number, start)
+                task = self.number_task(episode.task)
+                self._part.write(episode, task, facts, columns, number, start)
             if self._part.is_full(self._file_mb):
                 self.flush()
 
@@ -160,7 +191,8 @@ class DatasetWriter:
 
     def _resume(self) -> None:
         """Count what is committed, and clear away what is not."""
-        for pattern in ("data", "data/*", "meta", "meta/*", "meta/episodes/*"):
+        own = ("data", "data/*", "meta", "meta/*", "meta/episodes/*")
+        for pattern in (*own, "videos", "videos/*", "videos/*/*"):
             for path in self.folder.glob(pattern):
                 if path.is_symlink():
                     raise DatasetError(
@@ -191,13 +223,17 @@ class DatasetWriter:
     def _commit(self, parts: Sequence[Part]) -> None:
         """Put the frames to their places, then what says what is in them, and info.json last."""
         for shard, part in enumerate(parts, self._shards):
-            path = lerobot.shard_path(self.folder, lerobot.DATA, shard)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(part.path, path)
-            place = lerobot.shard_indices(shard)
+            moves = {lerobot.shard_path(self.folder, lerobot.DATA, shard): part.path}
+            for name, hidden in part.videos.items():
+                moves[lerobot.shard_path(self.folder, lerobot.VIDEO, shard, name)] = hidden
+            for path, hidden in moves.items():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(hidden, path)
+            files = ["data", "meta/episodes", *(f"videos/{name}" for name in part.videos)]
             for row in part.rows:
-                for name, index in place.items():
-                    row[f"data/{name}"] = row[f"meta/episodes/{name}"] = index
+                for name, index in lerobot.shard_indices(shard).items():
+                    row |= {f"{file}/{name}": index for file in files}
+            self.waited += part.waited
         self._write_table(lerobot.tasks_table(list(self._tasks)), self.folder / lerobot.TASKS)
         for shard, part in enumerate(parts, self._shards):
             rows = self._pa.Table.from_pylist(part.rows)
@@ -215,11 +251,13 @@ class DatasetWriter:
 
     def _count(self, row: dict[str, Any]) -> None:
         """Count an episode by its row."""
-        statistics = lerobot.row_statistics(self.spec.features, row)
+        statistics, counts = lerobot.row_statistics(self.spec, row)
         if self.frames:
             parts = (self._statistics, statistics)
-            statistics = lerobot.merge_statistics(parts, (self.frames, row["length"]))
+            statistics = lerobot.merge_statistics(parts, (self._counts, counts))
+            counts = self._counts + counts
         self._statistics = statistics
+        self._counts = counts
         self.frames += row["length"]
         self.committed.append((row["seed"], row["world"]))
 
@@ -227,7 +265,7 @@ class DatasetWriter:
         """Write statistics, and last the file that says what counts."""
         (self.folder / "meta").mkdir(exist_ok=True)
         if self.committed:
-            stats = lerobot.name_statistics(self.spec.features, self._statistics, self.frames)
+            stats = lerobot.name_statistics(self.spec, self._statistics, self._counts)
             write_atomic(self.folder / lerobot.STATS, lerobot.to_json(stats))
         info = lerobot.make_info(
             self.spec,

@@ -2,10 +2,11 @@
 until enough are there.
 """
 
+import itertools
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -24,6 +25,7 @@ from mjstack.errors import ConfigError, DatasetError
 from mjstack.files import reading, write_atomic
 from mjstack.jobs.demonstration import (
     STATE,
+    EpisodeRenderer,
     Played,
     make_spec,
     play_demonstrations,
@@ -36,6 +38,7 @@ from mjstack.sim import Simulation
 DATASET = "dataset"  # within the job's folder
 FILE = "batches.json"
 _SPARE = 1.05  # worlds played over episodes that are missing: some fail
+MOST_DRAWN = 4096  # states at once
 _GIVE_UP = 3  # batches in a row without an episode
 
 
@@ -71,6 +74,8 @@ class CollectPlan:
         del provenance["date"], provenance["config_sha256"]
         spec = make_spec(env, cfg, provenance)
         step = 4 * sum(column.dim for column in spec.features.values() if column.dtype == "float32")
+        if spec.videos:
+            step += 4 * context.model.nq
         world = context.episode_steps * step / 2**30
         if gib < world:
             expected = f"at least {world:.2g}, which the steps of one world take"
@@ -151,6 +156,9 @@ class Collection:
     files of its own, which rank 0 commits together. The episodes are those that one rank adds, in
     the same order.
 
+    Images are drawn when a batch has been judged, and encoded while the next one is played. So its
+    episodes are committed after that.
+
     Attributes:
         path: The dataset.
         batches: All that were played, in earlier calls too; read by `play`.
@@ -165,12 +173,13 @@ class Collection:
         self.path = plan.home / DATASET
         self.batches: list[CollectedBatch] = []
         self._sim: Simulation | None = None
+        self._renderer: EpisodeRenderer | None = None
         self._writer: DatasetWriter | None = None
         if not context.ranks.writes:
             return
         if not (self.path / lerobot.INFO).exists():
             self._record_path.unlink(missing_ok=True)  # of a dataset that was removed
-        self._writer = DatasetWriter(self.path, plan.spec)
+        self._writer = DatasetWriter(self.path, plan.spec, images_gib=self._job.buffer_gib)
         self._before = self.committed
 
     @property
@@ -207,6 +216,8 @@ class Collection:
                     self._record()
             if self._sim is not None:
                 self._sim.close()
+            if self._renderer is not None:
+                self._renderer.close()
 
     def _play(self) -> str:
         ranks = self._context.ranks
@@ -226,14 +237,14 @@ class Collection:
                 parts = ranks.gather(self._write_parts(played, chosen, *place))
                 ranks.from_first(partial(self._commit, parts))
             for one in played:
-                del one.steps.values  # the device's memory, before the next batch takes as much
+                one.drop()  # before the next batch takes as much memory
             empty = ranks.from_first(partial(self._tell, then, empty))
         return then.problem
 
     def _next(self, empty: int) -> _Next:
         """A batch that was begun, or the next seed."""
-        committed = self.writer.committed
-        wanted = self._job.episodes - len(committed)
+        added = self.writer.added
+        wanted = self._job.episodes - len(added)
         if wanted <= 0:
             return _Next()
         if empty == _GIVE_UP:
@@ -244,7 +255,7 @@ class Collection:
         begun = self._begun()
         if begun is not None:
             return _Next(seed=begun.seed, worlds=begun.worlds)
-        seeds = [seed for seed, _ in committed] + [b.seed for b in self.batches]
+        seeds = [seed for seed, _ in added] + [b.seed for b in self.batches]
         seed = max([self._context.cfg.seed - 1, *seeds]) + 1
         spare = 1.0 if self._job.keep_failures else _SPARE
         return _Next(seed=seed, worlds=min(self._plan.most, math.ceil(spare * wanted)))
@@ -262,7 +273,7 @@ class Collection:
             sim = self._worlds(len(part))
             played = play_demonstrations(self._context, sim, then.seed, part)
             if len(share) > size:  # the device has room for one
-                played.steps.values = played.steps.values.cpu()
+                played.to_host()
             out.append(played)
         return out
 
@@ -277,8 +288,8 @@ class Collection:
         self, then: _Next, every: Sequence[tuple[np.ndarray, int, list[tuple[int, bool]]]]
     ) -> list[int]:
         """Record the batch, if it is new, and choose the worlds whose episodes are kept."""
-        committed = self.writer.committed
-        wanted = self._job.episodes - len(committed)
+        added = self.writer.added
+        wanted = self._job.episodes - len(added)
         failed = np.concatenate([bits for bits, _, _ in every])
         good = [each for _, _, found in every for each in found]
         usable = [world for world, finite in good if finite]
@@ -301,18 +312,22 @@ class Collection:
             self.batches.append(batch)
             self._record()
         else:
-            there = {world for other, world in committed if other == then.seed}
+            there = {world for other, world in added if other == then.seed}
             usable = [world for world in usable if world not in there]
             batch.keep = min(batch.keep, batch.kept + len(usable))
         return usable[: min(batch.keep - batch.kept, wanted)]
 
     def _add(self, played: Played, worlds: list[int]) -> None:
-        """Commit the episodes of some worlds, and record it."""
-        rows = [played.worlds.index(world) for world in worlds]
-        for count, (row, arrays) in enumerate(played.episodes(rows), 1):
-            self.writer.add([self._episode(played, row, arrays)])
+        """Add the episodes of some worlds, and record it. They are committed, but for images that
+        are still encoded.
+        """
+        if self._plan.spec.videos:
+            self.writer.flush()  # the batch before
+        for count, data in enumerate(self._episodes(played, worlds), 1):
+            self.writer.add([data])
             self._context.advance(f"episodes of seed {played.seed}", count, len(worlds))
-        self.writer.flush()
+        if not self._plan.spec.videos:
+            self.writer.flush()
         self._record()
 
     def _place(self) -> tuple[int, int, int]:
@@ -335,17 +350,18 @@ class Collection:
         try:
             for one in played:
                 mine = [world for world in one.worlds if world in before]
-                rows = [one.worlds.index(world) for world in mine]
-                for world, (row, arrays) in zip(mine, one.episodes(rows), strict=True):
+                for world, data in zip(mine, self._episodes(one, mine), strict=True):
                     if writer is None:
-                        writer = PartWriter(self.path, self._plan.spec, f"{name}-{len(parts)}")
-                    data = self._episode(one, row, arrays)
+                        number = f"{name}-{len(parts)}"
+                        room = self._job.buffer_gib
+                        writer = PartWriter(self.path, self._plan.spec, number, images_gib=room)
                     writer.write(
-                        (task, data.task),
+                        data,
+                        task,
                         typed_values(self._plan.spec, data),
                         typed_arrays(self._plan.spec, data),
                         episode + before[world],
-                        frame + before[world] * len(arrays[STATE]),
+                        frame + before[world] * len(data.arrays[STATE]),
                     )
                     if writer.is_full(FILE_MB):
                         parts.append(writer.complete())
@@ -368,12 +384,12 @@ class Collection:
         batch = next(batch for batch in self.batches if batch.seed == then.seed)
         self._context.print_line(
             f"collect, seed {then.seed}: {self._succeeded} of {then.worlds} worlds succeeded,"
-            f" {self.committed} of {self._job.episodes} episodes there"
+            f" {len(self.writer.added)} of {self._job.episodes} episodes there"
         )
         return 0 if batch.kept else empty + 1
 
     def _count_kept(self) -> None:
-        counts = Counter(seed for seed, _ in self.writer.committed)
+        counts = Counter(seed for seed, _ in self.writer.added)
         for batch in self.batches:
             batch.kept = counts[batch.seed]
 
@@ -383,7 +399,25 @@ class Collection:
         records = [asdict(batch) for batch in self.batches]
         write_atomic(self._record_path, json.dumps(records, indent=1) + "\n")
 
-    def _episode(self, played: Played, world: int, arrays: dict[str, np.ndarray]) -> EpisodeData:
+    def _episodes(self, played: Played, worlds: Sequence[int]) -> Iterator[EpisodeData]:
+        """Some worlds' episodes, with their images if there are cameras."""
+        rows = [played.worlds.index(world) for world in worlds]
+        images: Iterator[dict[str, np.ndarray]] = itertools.repeat({})
+        if played.states is not None and rows:
+            if self._renderer is None:
+                count = min(self._plan.rank_most, len(played.worlds), MOST_DRAWN)
+                self._renderer = EpisodeRenderer(self._context, count)
+            images = self._renderer.episodes(played, rows)
+        for (row, arrays), shown in zip(played.episodes(rows), images, strict=False):
+            yield self._episode(played, row, arrays, shown)
+
+    def _episode(
+        self,
+        played: Played,
+        world: int,
+        arrays: dict[str, np.ndarray],
+        images: dict[str, np.ndarray],
+    ) -> EpisodeData:
         """A world's steps and its result. `next.success` is true in the last step of a successful
         episode alone.
         """
@@ -392,6 +426,7 @@ class Collection:
         last = np.arange(len(arrays[STATE])) == len(arrays[STATE]) - 1
         return EpisodeData(
             arrays={**arrays, "next.done": last, "next.success": last & (not broken)},
+            images=images,
             task=task.instruction or task.name,
             success=not broken,
             seed=played.seed,
@@ -463,6 +498,9 @@ class Collection:
         # This call
         if new:
             metrics["episodes_per_s"] = new / seconds
+            if self._renderer is not None:
+                metrics["drawing_s"] = self._renderer.seconds
+                metrics["encoding_wait_s"] = self.writer.waited
             reasons.append(f"{new / seconds:.3g} episodes/s in all")
         elif self.committed >= asked:
             reasons.append("they were there already")

@@ -2,8 +2,10 @@
 step, and what a dataset of them holds.
 """
 
+import math
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import mujoco
@@ -14,19 +16,21 @@ from mjstack.config.check import places_objects
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import offered
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
-from mjstack.datasets import DatasetSpec, Feature
+from mjstack.datasets import DatasetSpec, Feature, Video
 from mjstack.datasets.spec import term_columns
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import Observer, play_episode, reset_worlds
 from mjstack.errors import ConfigError
+from mjstack.managers.episode import required_fields
 from mjstack.mdp.starts.placement import GAP, SCHEMA, may_meet
-from mjstack.sim import Simulation, resolve_backend
+from mjstack.sim import Simulation, StateRenderer, resolve_backend
 
 STATE = "observation.state"
 ACTION = "action"
 REWARD = "next.reward"
+IMAGES = "observation.images"
 _CHUNK_BYTES = 128 * 2**20  # copied to the host at once
 # Changing one of these changes no episode. The action terms are the controller's, and nothing ends
 # an episode early.
@@ -55,10 +59,17 @@ class StepRecorder(Observer):
     Attributes:
         values: The steps, shape ``(steps, nworld, dim)``, float32.
         schema: How many numbers of each kind there are, in order.
+        states: Positions before each step, from which images are drawn, shape ``(steps, nworld,
+            nq)``, float32; None if they are not kept.
     """
 
     values: torch.Tensor
     schema: dict[str, int]
+    states: torch.Tensor | None = None
+
+    def __init__(self, *, keep_states: bool = False) -> None:
+        """``keep_states``: keep the positions."""
+        self._keep_states = keep_states
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
@@ -69,6 +80,9 @@ class StepRecorder(Observer):
         self.schema = {STATE: joints, **groups, ACTION: joints, REWARD: 1}
         shape = (driver.steps, env.nworld, sum(self.schema.values()))
         self.values = torch.zeros(shape, device=env.device)
+        if self._keep_states:
+            self.states = torch.zeros((*shape[:2], env.sim.qpos.shape[1]), device=env.device)
+            self._qpos = torch.zeros_like(self.states[0])
         self._robot = env.index.on(env.device, env.sim.qpos.dtype)
         seen = joints + sum(dims.values())
         self._seen = torch.zeros((env.nworld, seen), device=env.device)
@@ -81,6 +95,8 @@ class StepRecorder(Observer):
         command = self._robot.ctrl.read(env.sim.ctrl).float()
         step = torch.cat((self._seen, command, env.reward_manager.reward[:, None]), dim=1)
         self.values.index_copy_(0, self._next, step[None])
+        if self.states is not None:
+            self.states.index_copy_(0, self._next, self._qpos[None])
         self._next.add_(1)
         self._observe()
 
@@ -90,6 +106,8 @@ class StepRecorder(Observer):
         torch.cat(
             [self._robot.qpos.read(self.env.sim.qpos).float(), *groups], dim=1, out=self._seen
         )
+        if self.states is not None:
+            self._qpos.copy_(self.env.sim.qpos)
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -102,6 +120,8 @@ class Played:
         failed: Bits of the task's rules, shape ``(worlds,)``, int32.
         retries: Grasps that were tried again, shape ``(worlds,)``.
         worlds: Numbers of the worlds, which their starts depend on.
+        states: Positions before each step, shape ``(steps, worlds, nq)``; None without cameras.
+        fields: Model fields of the worlds by name, each ``(worlds, ...)``.
     """
 
     seed: int
@@ -109,10 +129,24 @@ class Played:
     failed: np.ndarray
     retries: np.ndarray
     worlds: range
+    states: torch.Tensor | None = None
+    fields: Mapping[str, torch.Tensor] = field(default_factory=dict)
 
     def finite(self, world: int) -> bool:
         """Whether every number of a world's steps is finite."""
-        return bool(self.steps.values[:, world].isfinite().all())
+        parts = [self.steps.values] + ([] if self.states is None else [self.states])
+        return all(bool(part[:, world].isfinite().all()) for part in parts)
+
+    def to_host(self) -> None:
+        """Give the device's memory back."""
+        self.steps.values = self.steps.values.cpu()
+        if self.states is not None:
+            self.states = self.steps.states = self.states.cpu()
+
+    def drop(self) -> None:
+        """Give all memory back."""
+        del self.steps.values
+        self.states = self.steps.states = None
 
     def episodes(self, worlds: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
         """Some worlds' steps on the host, by kind, each ``(steps, dim)``; copied in chunks."""
@@ -138,7 +172,8 @@ def play_demonstrations(
     env = Env(sim, context.index, cfg, check_faults=False)  # the check names lost worlds
     worlds = range(sim.nworld) if worlds is None else worlds
     reset_worlds(env, seed, worlds)
-    recorder = StepRecorder()
+    drawn = bool(context.cfg.scene.cameras)
+    recorder = StepRecorder(keep_states=drawn)
     episode = play_episode(
         env,
         context.driver(env),
@@ -152,7 +187,91 @@ def play_demonstrations(
         failed=episode.result.failed.cpu().numpy(),
         retries=episode.retries,
         worlds=worlds,
+        states=recorder.states,
+        fields={name: sim.fields[name].clone() for name in sim.fields} if drawn else {},
     )
+
+
+class EpisodeRenderer:
+    """Draws the images of episodes after they have been judged, as many steps at once as there are
+    worlds.
+
+    Attributes:
+        seconds: Time that it took [s].
+    """
+
+    def __init__(self, context: RunContext, count: int) -> None:
+        """Make worlds in which ``count`` states are drawn at once.
+
+        Raises:
+            MjstackError: They do not fit into memory.
+        """
+        cfg = drawn_config(context.cfg)
+        backend, device = context.backend
+        fields = required_fields(cfg.reset)
+        self.seconds = 0.0
+        self._count = count
+        self._renderer = StateRenderer(
+            context.model, cfg, count, backend=backend, device=device, fields=fields
+        )
+        # Steps from one image to the next, as the environment draws them
+        hz = cfg.task.control_hz
+        cameras = cfg.scene.cameras
+        self._every = {name: round(hz / (each.rate or hz)) for name, each in cameras.items()}
+
+    def episodes(self, played: Played, rows: Sequence[int]) -> Iterator[dict[str, np.ndarray]]:
+        """Images of some worlds' episodes on the host, by column, each ``(steps, height, width,
+        3)``, uint8.
+        """
+        assert played.states is not None
+        steps = len(played.states)
+        step = math.gcd(*self._every.values())
+        states = played.states[::step]
+        at_once = max(1, self._count // len(states))
+        for first in range(0, len(rows), at_once):
+            began = time.perf_counter()
+            some = torch.tensor(rows[first : first + at_once])
+            shown = states.index_select(1, some.to(states.device)).transpose(0, 1).flatten(0, 1)
+            fields = {
+                name: values[some.to(values.device)].repeat_interleave(len(states), 0)
+                for name, values in played.fields.items()
+            }
+            drawn = self._draw(shown, fields)
+            self.seconds += time.perf_counter() - began
+            for row in range(len(some)):
+                rows_of = slice(row * len(states), (row + 1) * len(states))
+                yield {
+                    f"{IMAGES}.{name}": np.repeat(drawn[name][rows_of][:: every // step], every, 0)[
+                        :steps
+                    ]
+                    for name, every in self._every.items()
+                }
+
+    def close(self) -> None:
+        """Give the worlds back."""
+        self._renderer.close()
+
+    def _draw(
+        self, qpos: torch.Tensor, fields: Mapping[str, torch.Tensor]
+    ) -> dict[str, np.ndarray]:
+        """Images of any number of states by camera, on the host."""
+        parts: dict[str, list[np.ndarray]] = {name: [] for name in self._every}
+        for first in range(0, len(qpos), self._count):
+            rows = slice(first, first + self._count)
+            looks = {name: values[rows] for name, values in fields.items()}
+            images = self._renderer.draw(qpos[rows], looks)
+            for name, some in parts.items():
+                some.append(images[f"images.{name}"].cpu().numpy().copy())
+        return {name: np.concatenate(some) for name, some in parts.items()}
+
+
+def drawn_config(cfg: Config) -> Config:
+    """The configuration whose cameras have the outputs that a dataset keeps."""
+    cameras = {
+        name: replace(camera, outputs=["rgb"], terminal=False)
+        for name, camera in cfg.scene.cameras.items()
+    }
+    return replace(cfg, scene=replace(cfg.scene, cameras=cameras))
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:
@@ -167,7 +286,10 @@ def episode_config(cfg: Config) -> dict[str, Any]:
         del config[key]
     backend, _ = resolve_backend(cfg)
     config["sim"] = {"backend": backend}
-    config["job"] = {"keep_failures": cast(CollectJobCfg, cfg.job).keep_failures}
+    job = cast(CollectJobCfg, cfg.job)
+    config["job"] = {"keep_failures": job.keep_failures}
+    if cfg.scene.cameras:
+        config["job"]["codec"] = job.codec
     placed = [term.params for term in cfg.reset.values() if places_objects(term)]
     if any(may_meet(cfg.scene, params["xy"], params.get("gap", GAP)) for params in placed):
         config["starts_schema"] = SCHEMA  # the others are drawn as ever
@@ -201,10 +323,16 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
         "next.done": Feature(dtype="bool", names=("done",), units=("1",)),
         "next.success": Feature(dtype="bool", names=("success",), units=("1",)),
     }
+    codec = cast(CollectJobCfg, cfg.job).codec
+    videos = {
+        f"{IMAGES}.{name}": Video(height=camera.size[0], width=camera.size[1], codec=codec)
+        for name, camera in cfg.scene.cameras.items()
+    }
     return DatasetSpec(
         robot_type=cfg.robot.name,
         fps=round(cfg.task.control_hz),
         features=features,
+        videos=videos,
         config_sha256=config_hash(config),
         values={"retries": "int64", "failed_rules": "string", "config_sha256": "string"},
         provenance={**provenance, "config": config},

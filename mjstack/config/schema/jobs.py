@@ -78,7 +78,10 @@ class CollectJobCfg(JobCfg):
     folder: str | None = spec(None)
     """Folder of the dataset; null: ``outputs/collect/<hash>`` of everything episodes depend on."""
     buffer_gib: float = spec(unit="GiB", gt=0.0)
-    """Device memory for the steps of one batch of worlds; more worlds are played in turns."""
+    """Device memory for the steps of one batch of worlds; more worlds are played in turns. With
+    cameras also memory for images that wait for being encoded."""
+    codec: str = spec("h264", choices=("h264", "av1"))
+    """Codec of the videos."""
 
 
 @dataclass(slots=True)

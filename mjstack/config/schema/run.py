@@ -27,6 +27,8 @@ class TimingCfg:
     """Control steps in which an action of a policy is repeated, in training. A driver decides in
     every control step; a policy that was trained so repeats its answers by itself.
     """
+    control_hz: float = spec(50.0, unit="Hz", gt=0.0, le=1e6)
+    """Control rate that these make: ``task.control_hz`` of the built-in tasks."""
     command_delay: int = spec(0, unit="control steps", ge=0, le=1000)
     """Control steps between a command and its effect; until then the start's command holds."""
 

@@ -1,0 +1,308 @@
+"""Datasets with images: what is decoded is what was drawn, and nothing is half-written."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from compositions import load_config
+from environments import has_gl
+
+from mjstack.cli import run
+from mjstack.datasets import DatasetSpec, DatasetWriter, EpisodeData, Feature, Video, read_dataset
+from mjstack.datasets import video as video_module
+from mjstack.datasets.lerobot import QUANTILES
+from mjstack.datasets.reader import uncommitted
+from mjstack.drivers.closed_loop import make_expert
+from mjstack.envs import build_env
+from mjstack.episodes.rollout import reset_worlds
+from mjstack.errors import ArgumentError, DatasetError, UnwrittenError
+
+GL = pytest.mark.skipif(not has_gl(), reason="MuJoCo does not draw offscreen here")
+SIZES = {"observation.images.front": (32, 48), "observation.images.wrist": (16, 16)}
+SPEC = DatasetSpec(
+    robot_type="so101",
+    fps=50,
+    features={"action": Feature(dtype="float32", names=("jaw",), units=("rad",))},
+    videos={name: Video(height=h, width=w) for name, (h, w) in SIZES.items()},
+    config_sha256="c" * 64,
+)
+
+
+def episode(world: int) -> EpisodeData:
+    """Smooth images that change from frame to frame; 7 to 131 frames."""
+    frames = 131 if world == 2 else 7 + world
+    images = {}
+    for name, (height, width) in SIZES.items():
+        y, x = np.indices((height, width))
+        t = np.arange(frames)[:, None, None]
+        red = 60 + 20 * world + 2 * x + 0 * t
+        green = 200 - 3 * y - 0 * t
+        blue = 90 + (t % 60) + 0 * x
+        images[name] = np.stack(np.broadcast_arrays(red, green, blue), axis=-1).astype(np.uint8)
+    actions = np.arange(frames, dtype=np.float32)
+    return EpisodeData(
+        arrays={"action": actions}, images=images, task="t", success=True, seed=7, world=world
+    )
+
+
+def write(folder: Path, worlds: range, *, spec: DatasetSpec = SPEC, batch: int = 3) -> None:
+    with DatasetWriter(folder, spec) as writer:
+        for world in worlds:
+            writer.add([episode(world)])
+            if world % batch == batch - 1:
+                writer.flush()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def image_names(folder: Path) -> list[str]:
+    return [name for name in contents(folder) if name.startswith("videos/")]
+
+
+@pytest.mark.parametrize("codec", ["h264", pytest.param("av1", marks=pytest.mark.full)])
+def test_decoded_images_are_those_that_were_added(tmp_path: Path, codec: str) -> None:
+    videos = {name: replace(video, codec=codec) for name, video in SPEC.videos.items()}
+    write(tmp_path, range(5), spec=replace(SPEC, videos=videos))
+    stored = read_dataset(tmp_path)
+    info = stored.info["features"]["observation.images.front"]
+    assert (info["dtype"], info["shape"]) == ("video", [32, 48, 3])
+    assert info["info"]["video.codec"] == codec
+    assert image_names(tmp_path) == [
+        f"videos/{name}/chunk-000/file-00{shard}.mp4" for name in SIZES for shard in (0, 1)
+    ]
+    for number in reversed(range(5)):
+        for name in SIZES:
+            expected = episode(number).images[name].astype(int)
+            found = stored.images(name, number)
+            assert found.shape == expected.shape
+            assert np.abs(found - expected).mean(axis=(1, 2, 3)).max() < 3.0
+    assert len(stored.frames("action")) == stored.info["total_frames"] == 167
+    with pytest.raises(DatasetError, match="has 5 episodes"):
+        stored.images("observation.images.front", 5)
+
+
+def test_statistics_are_per_channel_and_in_0_to_1(tmp_path: Path) -> None:
+    write(tmp_path, range(3))
+    rows = pq.read_table(tmp_path / "meta/episodes").to_pylist()
+    total = json.loads((tmp_path / "meta/stats.json").read_text())
+    for name in SIZES:
+        key = f"stats/{name}"
+        for world, row in enumerate(rows):
+            images = episode(world).images[name]
+            chosen = np.round(np.linspace(0, len(images) - 1, min(len(images), 100))).astype(int)
+            values = images[chosen].reshape(-1, 3) / 255.0
+            assert row[f"{key}/count"] == [len(chosen)]
+            exact = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
+            exact |= {"std": values.std(0)}
+            exact |= {k: np.quantile(values, q, axis=0) for k, q in QUANTILES.items()}
+            for kind, expected in exact.items():
+                found = np.array(row[f"{key}/{kind}"])
+                assert found.shape == (3, 1, 1)
+                assert np.allclose(found.ravel(), expected, atol=2.0 / 255.0 + 1e-9), kind
+                if not kind.startswith("q"):
+                    assert np.allclose(found.ravel(), expected, atol=1e-9), kind
+        counts = np.array([row[f"{key}/count"][0] for row in rows])
+        means = np.array([row[f"{key}/mean"] for row in rows])[..., 0, 0]
+        assert total[name]["count"] == [int(counts.sum())]
+        assert np.allclose(np.ravel(total[name]["mean"]), counts @ means / counts.sum())
+    assert total["action"]["count"] == [146]
+
+
+def test_a_resumed_dataset_is_the_uninterrupted_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*paths: Path) -> None:
+        raise OSError("no more")
+
+    write(tmp_path / "whole", range(6))
+    write(tmp_path / "parts", range(3))
+    with pytest.raises(UnwrittenError), DatasetWriter(tmp_path / "parts", SPEC) as writer:
+        writer.add([episode(4)])
+        monkeypatch.setattr(os, "replace", fail)
+    monkeypatch.undo()
+    write(tmp_path / "parts", range(3, 6))
+    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+
+
+def test_a_full_disk_keeps_what_was_committed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path, range(3))
+    before = contents(tmp_path)
+    script = tmp_path.parent / "ffmpeg"
+    script.write_text("#!/bin/sh\necho 'av_interleaved: No space left on device' >&2\nexit 228\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(script))
+    writer = DatasetWriter(tmp_path, SPEC)
+    with pytest.raises(UnwrittenError, match=r"No space left on device.*3 committed"):  # noqa: PT012
+        writer.add([episode(3)])
+        writer.flush()
+    writer.close()
+    assert contents(tmp_path) == before
+    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE")
+    write(tmp_path, range(3, 6))
+    assert len(read_dataset(tmp_path).episodes) == 6
+
+
+@pytest.mark.full
+def test_a_kill_leaves_what_was_committed(tmp_path: Path) -> None:
+    code = (
+        "from test_videos import *\n"
+        f"writer = DatasetWriter({str(tmp_path)!r}, SPEC)\n"
+        "for world in range(3): writer.add([episode(world)])\n"
+        "writer.flush()\n"
+        "for world in range(3, 6): writer.add([episode(world)])\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": paths})
+    assert done.returncode == -signal.SIGKILL
+    assert uncommitted(tmp_path, 1)
+    assert len(read_dataset(tmp_path).episodes) == 3
+    with DatasetWriter(tmp_path, SPEC):
+        pass
+    assert uncommitted(tmp_path, 1) == []
+    assert len(image_names(tmp_path)) == 2
+
+
+def test_few_images_wait_for_the_encoders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    encode = video_module.encode
+    go = threading.Event()
+    begun: list[int] = []
+
+    def slow(images: np.ndarray, *args: object) -> None:
+        begun.append(len(images))
+        go.wait(60.0)
+        encode(images, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(video_module, "encode", slow)
+    with DatasetWriter(tmp_path, SPEC, images_gib=2.0 * 7 * 32 * 48 * 3 / 2**30) as writer:
+        writer.add([episode(0)])  # does not wait
+        assert writer.committed == []
+        assert writer.added == [(7, 0)]
+        threading.Timer(0.2, go.set).start()
+        writer.add([episode(1)])  # there is no room for both
+        assert go.is_set()
+    assert writer.waited > 0.0
+    assert writer.committed == [(7, 0), (7, 1)]
+
+
+def test_images_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    good = episode(0)
+    with DatasetWriter(tmp_path, SPEC) as writer:
+        short = {name: images[:-1] for name, images in good.images.items()}
+        with pytest.raises(DatasetError, match=r"front is uint8 of shape \(6, .*expected uint8"):
+            writer.add([replace(good, images=short)])
+        with pytest.raises(DatasetError, match="video names are missing"):
+            writer.add([replace(good, images={})])
+    assert read_dataset(tmp_path).episodes == []
+    with pytest.raises(ArgumentError, match="found 33x32, expected even numbers"):
+        replace(SPEC, videos={"a": Video(height=33, width=32)})
+    with pytest.raises(ArgumentError, match="expected one of h264, av1"):
+        replace(SPEC, videos={"a": Video(height=32, width=32, codec="vp9")})
+
+
+def test_a_missing_video_is_one_line(tmp_path: Path) -> None:
+    write(tmp_path, range(2))
+    (tmp_path / image_names(tmp_path)[0]).unlink()
+    with pytest.raises(DatasetError, match=r"file-000.mp4: cannot be read"):
+        read_dataset(tmp_path)
+
+
+# job=collect
+
+SMALL = [
+    "cameras=[front,wrist]",
+    "scene.cameras.front.size=[32,32]",
+    "scene.cameras.wrist.size=[32,32]",
+    "scene.cameras.wrist.rate=10",
+]
+COMMAND = ["job=collect", "task=reach", "sim=native", "job.folder=demos", *SMALL]
+
+
+@GL
+def test_without_an_encoder_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for program, says in (("/bin/false", "cannot be encoded"), ("/no/ffmpeg", "cannot be encoded")):
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", program)
+        assert run(COMMAND) == 2
+        err = capsys.readouterr().err.strip()
+        assert says in err
+        assert len(err.splitlines()) == 1
+    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE")
+    assert run([*COMMAND, "scene.cameras.wrist.outputs=[depth]"]) == 2
+    assert "expected rgb among them" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert run(COMMAND) == 2
+    assert "pip install 'mjstack[video]'" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def halved(images: np.ndarray) -> np.ndarray:
+    """Means of 2 x 2 pixels: a video has one colour for each."""
+    n, height, width, _ = images.shape
+    return images.reshape(n, height // 2, 2, width // 2, 2, 3).mean(axis=(2, 4))
+
+
+@GL
+@pytest.mark.full
+@pytest.mark.parametrize("backend", ["native", "mjwarp"])
+def test_a_dataset_has_the_images_of_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, backend: str
+) -> None:
+    """Five episodes in batches of three; images as an environment draws them in its steps."""
+    monkeypatch.chdir(tmp_path)
+    add = DatasetWriter.add
+    added: dict[tuple[int, int], dict[str, np.ndarray]] = {}
+
+    def keep(self: DatasetWriter, episodes: list[EpisodeData]) -> None:
+        added.update({(each.seed, each.world): dict(each.images) for each in episodes})
+        add(self, episodes)
+
+    monkeypatch.setattr(DatasetWriter, "add", keep)
+    args = [*COMMAND, f"sim={backend}", "sim.device=cpu", "looks=randomized", "timing=hz30"]
+    assert run([*args, "nworld=3", "job.episodes=5"]) == 0
+    stored = read_dataset(tmp_path / "demos/dataset")
+    assert stored.info["fps"] == 30
+    assert [row["length"] for row in stored.episodes] == [90] * 5
+    cfg = load_config([*args, "job.episodes=5"])
+    drawn = replace(cfg, action=cfg.controller.action, termination={})
+    env = build_env(drawn, nworld=3)
+    for row in stored.episodes:
+        if row["world"] == 0:
+            reset_worlds(env, row["seed"])
+            expert = make_expert(env)
+            shown: dict[str, list[torch.Tensor]] = {"front": [], "wrist": []}
+            obs = env.images
+            for _ in range(row["length"]):
+                for name, images in shown.items():
+                    images.append(obs[f"images.{name}"].clone())
+                obs, *_ = env.step(expert.command())
+        for name, images in shown.items():
+            expected = torch.stack(images)[:, row["world"]].numpy()
+            key = f"observation.images.{name}"
+            drawn = added[row["seed"], row["world"]][key]
+            # Poses are kept in float32
+            assert (np.abs(drawn.astype(int) - expected) > 8).mean() < 1e-3
+            found = stored.images(key, row["episode_index"])
+            assert np.abs(halved(found) - halved(drawn)).mean(axis=(1, 2, 3)).max() < 6.0, name
+    env.close()
+    assert run([*args, "nworld=3", "job.episodes=5"]) == 0  # does nothing
+    assert run([*args, "nworld=3", "job.episodes=6"]) == 0
+    assert len(read_dataset(tmp_path / "demos/dataset").episodes) == 6
