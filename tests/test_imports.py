@@ -42,7 +42,7 @@ HOMES = {
     "omegaconf": ("config/", "cli.py", "jobs/"),
     "matplotlib": ("report/",),
     "glfw": ("report/picture.py",),
-    "imageio_ffmpeg": ("report/picture.py",),
+    "imageio_ffmpeg": ("report/picture.py", "datasets/video.py"),
     "pynvml": ("bench/timing.py",),
     "gymnasium": ("adapters/",),
     "rsl_rl": ("adapters/",),

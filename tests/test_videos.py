@@ -130,7 +130,7 @@ def test_a_resumed_dataset_is_the_uninterrupted_one(
 
     write(tmp_path / "whole", range(6))
     write(tmp_path / "parts", range(3))
-    with pytest.raises(UnwrittenError), DatasetWriter(tmp_path / "parts", SPEC) as writer:
+    with pytest.raises(UnwrittenError), DatasetWriter(tmp_path / "parts", SPEC) as writer:  # noqa: PT012
         writer.add([episode(4)])
         monkeypatch.setattr(os, "replace", fail)
     monkeypatch.undo()

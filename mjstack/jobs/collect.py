@@ -23,18 +23,15 @@ from mjstack.files import check_unused, lock_folder, write_atomic
 from mjstack.jobs.collection import (
     DATASET,
     FILE,
-    MOST_DRAWN,
     Collection,
     CollectPlan,
     read_batches,
 )
-from mjstack.jobs.demonstration import ACTION, STATE, drawn_config, episode_config
+from mjstack.jobs.demonstration import ACTION, STATE, episode_config
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table, format_value, to_document
-from mjstack.sim import StateRenderer
-from mjstack.sim.cameras import check_image_memory
 
 NAME = "collect"
 LOADING = """\
@@ -95,34 +92,23 @@ def plan_collection(context: RunContext) -> CollectPlan:
             _check_starts(env)
         plan = CollectPlan.of(context, collect_folder(cfg), env)
         if cfg.scene.cameras:
-            _check_images(context, plan)
+            _check_images(cfg, plan)
         return plan
     finally:
         env.close()
 
 
-def _check_images(context: RunContext, plan: CollectPlan) -> None:
-    """Refuse images that cannot be drawn, held or encoded.
+def _check_images(cfg: Config, plan: CollectPlan) -> None:
+    """Refuse images that cannot be kept or encoded.
 
     Raises:
         MjstackError: One cannot.
     """
-    cfg = context.cfg
     for name, camera in cfg.scene.cameras.items():
         if "rgb" not in camera.outputs:
             expected = "rgb among them, which a dataset keeps"
             raise ConfigError(f"scene.cameras.{name}.outputs", list(camera.outputs), expected)
     check_encoder(plan.spec.videos, plan.spec.fps)
-    cfg = drawn_config(cfg)
-    backend, device = context.backend
-    native = backend is Backend.native
-    worlds = min(plan.most, plan.rank_most, MOST_DRAWN)
-    where = torch.device(device)
-    check_image_memory(context.model, cfg.scene.cameras, worlds, where, mjwarp=not native)
-    if native:  # where there is no OpenGL, say so now
-        renderer = StateRenderer(context.model, cfg, 1, backend=backend, device=device)
-        renderer.draw(torch.from_numpy(context.model.qpos0)[None])
-        renderer.close()
 
 
 def run_collect(plan: CollectPlan, context: RunContext, folder: Path) -> None:

@@ -38,7 +38,7 @@ from mjstack.sim import Simulation
 DATASET = "dataset"  # within the job's folder
 FILE = "batches.json"
 _SPARE = 1.05  # worlds played over episodes that are missing: some fail
-MOST_DRAWN = 4096  # states at once
+_MOST_DRAWN = 4096  # states at once
 _GIVE_UP = 3  # batches in a row without an episode
 
 
@@ -405,7 +405,7 @@ class Collection:
         images: Iterator[dict[str, np.ndarray]] = itertools.repeat({})
         if played.states is not None and rows:
             if self._renderer is None:
-                count = min(self._plan.rank_most, len(played.worlds), MOST_DRAWN)
+                count = min(self._plan.rank_most, len(played.worlds), _MOST_DRAWN)
                 self._renderer = EpisodeRenderer(self._context, count)
             images = self._renderer.episodes(played, rows)
         for (row, arrays), shown in zip(played.episodes(rows), images, strict=False):
