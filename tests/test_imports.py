@@ -41,6 +41,7 @@ HOMES = {
     "hydra": ("config/", "cli.py"),
     "omegaconf": ("config/", "cli.py", "jobs/"),
     "matplotlib": ("report/",),
+    "PIL": ("report/",),
     "glfw": ("report/picture.py",),
     "imageio_ffmpeg": ("report/picture.py", "datasets/video.py"),
     "pynvml": ("bench/timing.py",),

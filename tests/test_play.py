@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import mujoco
@@ -11,8 +12,10 @@ import numpy as np
 import pytest
 from compositions import load_config
 from environments import configure, has_gl
+from PIL import Image, ImageSequence, features
 from policies import write_policy
 
+import mjstack
 import mjstack.jobs.play as play
 import mjstack.jobs.runner as runner
 from mjstack.cli import run
@@ -35,7 +38,9 @@ def saved(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """States of videos, none of which is drawn."""
     videos: list[np.ndarray] = []
 
-    def save(path: Path, model: mujoco.MjModel, qpos: np.ndarray, *options: object) -> None:
+    def save(
+        path: Path, model: mujoco.MjModel, qpos: np.ndarray, *options: object, **named: object
+    ) -> None:
         path.touch()
         videos.append(qpos)
 
@@ -120,7 +125,80 @@ def test_a_video_has_worlds_side_by_side(tmp_path: Path) -> None:
     assert picture[370:, 490:].max() < 40  # the fourth is empty
 
 
+@pytest.mark.skipif(not has_gl(), reason="MuJoCo cannot draw offscreen here")
+def test_a_camera_of_the_scene_draws_the_video(tmp_path: Path) -> None:
+    """Ten pictures per second of 60 steps, each world in its own looks."""
+    policy = write_policy(tmp_path / "policy", configure("task=reach"))
+    out = tmp_path / "out"
+    seen = ["cameras=front", "looks=randomized", "scene.cameras.front.size=[48,64]", "seed=3"]
+    clip = ["job.camera=front", "job.format=gif", "job.fps=10", "job.width=128", "nworld=2"]
+    args = [*REACH, *seen, *clip, f"policy={policy}", "web.episode=false"]
+    assert run([*args, f"hydra.run.dir={out}"]) == 0
+    with Image.open(out / "episode.gif") as video:
+        assert video.info["loop"] == 0
+        frames = [frame.convert("RGB") for frame in ImageSequence.Iterator(video)]
+        assert 6 < len(frames) <= 12  # equal ones in a row are one
+        times = [frame.info["duration"] for frame in ImageSequence.Iterator(video)]
+    assert sum(times) == 1200
+    first = np.asarray(frames[0], int).reshape(48, 2, 64, 3)
+
+    env = mjstack.make_env(["task=reach", "reset=randomized", "sim=native", *seen], nworld=2)
+    starts = env.reset(seed=3)[0]["images.front"].numpy().astype(int)
+    env.close()
+    for world in range(2):
+        apart = [abs(first[:, world] - start).mean() for start in starts]
+        assert apart[world] < 4.0
+        assert apart[1 - world] > 2.0 * apart[world]
+
+
+@pytest.mark.parametrize("ending", ["gif", "webp"])
+def test_a_loop_lasts_as_long_as_the_episode(ending: str, tmp_path: Path) -> None:
+    """Thirty pictures per second, which are no whole hundredths apart, scaled to the width."""
+    path = tmp_path / f"x.{ending}"
+
+    def draw(states: np.ndarray) -> Iterator[np.ndarray]:
+        for (state,) in states:
+            image = np.zeros((20, 40, 3), np.uint8)
+            image[:, int(10 * state) :][:, :10] = (200, 40, 0)
+            yield image
+
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    qpos = np.tile(np.arange(4.0)[None, :, None], (4, 1, 1))
+    save_video(path, model, qpos, 1.0 / 30.0, fps=30.0, width=160, draw=draw)
+    with Image.open(path) as video:
+        assert video.size == (160, 80)
+        assert video.n_frames == 4
+        for number in range(4):
+            video.seek(number)
+            shown = np.asarray(video.convert("RGB"), float)
+            assert video.info["duration"] == (30, 40, 30, 30)[number]
+            for column in (0, 80):  # two worlds in a row
+                near = shown[:, column + 20 * number :][:, 4:16].mean((0, 1))
+                assert near == pytest.approx((200, 40, 0), abs=16)
+            assert shown.mean((0, 1)) == pytest.approx((50, 10, 0), abs=5)
+
+
+def test_without_a_writer_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setattr(features, "check", lambda feature: False)
+    out = tmp_path / "out"
+    for form, says in (
+        ("mp4", "needs imageio-ffmpeg, which is not installed: run pip install 'mjstack[video]'"),
+        ("webp", "Pillow here writes no WebP. Use job.format=gif or job.format=mp4."),
+    ):
+        assert run(["job=play", "task=reach", f"job.format={form}", f"hydra.run.dir={out}"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert says in line
+        assert not out.exists()
+
+
 BAD = [
+    (["job.format=avi"], "job.format=avi: expected one of mp4, gif, webp"),
+    (["job.camera=side", "cameras=front"], "job.camera=side: expected null, or one of scene.c"),
+    (["job.camera=front"], "scene.cameras: there is none. Add a camera: cameras=front"),
+    (["job.width=10"], "job.width=10: expected an integer from 64 to 1280 [pixels] or null"),
     (["nworld=65"], "nworld=65: expected at most 64 worlds"),
     (["policy=nowhere"], "policy=nowhere: has no policy.json"),
     (["policy=null", "task=lonely"], "lonely"),
@@ -178,7 +256,7 @@ def test_without_a_display_nothing_is_written(
 def test_a_video_that_cannot_be_written_fails_the_job(
     saved: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*args: object) -> None:
+    def full(*args: object, **named: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(play, "save_video", full)

@@ -2,13 +2,18 @@
 side in a video.
 """
 
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import cast
 
+import mujoco
 import numpy as np
+import torch
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, PlayJobCfg
 from mjstack.episodes.context import RunContext, judge_one
 from mjstack.episodes.motion import show_world
 from mjstack.episodes.replay import simulate_one
@@ -21,9 +26,9 @@ from mjstack.report.gl import require_offscreen
 from mjstack.report.picture import save_video
 from mjstack.report.record import GateResult, Status
 from mjstack.report.write import safely_write
+from mjstack.sim import StateRenderer
 
 NAME = "play"
-VIDEO = "episode.mp4"
 _MOST = 64  # worlds of a video
 
 
@@ -37,10 +42,15 @@ def check_play(cfg: Config) -> CheckedJob:
     if not cfg.controller.phases and cfg.controller.name != POLICY:
         expected = "a task with phases, which the expert follows"
         raise ConfigError("task", cfg.task.name, expected, "Name a policy: policy=FOLDER")
+    job = cast(PlayJobCfg, cfg.job)
+    if job.camera is not None and job.camera not in cfg.scene.cameras:
+        there = ", ".join(cfg.scene.cameras) or "there is none"
+        expected = f"null, or one of scene.cameras: {there}"
+        raise ConfigError("job.camera", job.camera, expected, "Add a camera: cameras=front")
     context = RunContext(cfg)
     check_task(context)
-    check_showing(cfg)
-    if cfg.video:
+    check_showing(cfg, f".{job.format}")
+    if cfg.video and job.camera is None:  # cameras have been checked with the task
         require_offscreen(context.model)
     driver = "a policy" if cfg.controller.name == POLICY else "the expert"
     title = f"task {cfg.task.name}, {cfg.nworld} worlds with {driver}"
@@ -57,6 +67,7 @@ def play_worlds(context: RunContext) -> list[GateResult]:
     """
     cfg = context.cfg
     recorders = []
+    fields = []
     details = []
     good = 0
     with closing(simulate_one(context, *context.backend)) as sim:
@@ -77,6 +88,7 @@ def play_worlds(context: RunContext) -> list[GateResult]:
                 good += not failed
                 told = told or f"succeeded, {context.check.headline(metrics)}"
             recorders.append(recorder)
+            fields.append({name: value.clone() for name, value in sim.fields.items()})
             show_world(context, f"{NAME}_{world}", str(world), recorder, failed=failed)
             details.append(f"world {world}: {told}")
             context.print_line(details[-1])
@@ -89,20 +101,54 @@ def play_worlds(context: RunContext) -> list[GateResult]:
         details=details,
     )
     if cfg.video:
-        _save(context, np.stack([recorder.qpos for recorder in recorders]), result)
+        _save(context, np.stack([recorder.qpos for recorder in recorders]), fields, result)
     return [result]
 
 
-def _save(context: RunContext, qpos: np.ndarray, result: GateResult) -> None:
+def _save(
+    context: RunContext,
+    qpos: np.ndarray,
+    fields: Sequence[Mapping[str, torch.Tensor]],
+    result: GateResult,
+) -> None:
     """Write the video; without one there is nothing to look at, and the job fails."""
     assert context.folder is not None
-    path = context.folder / VIDEO
+    job = cast(PlayJobCfg, context.cfg.job)
+    path = context.folder / f"episode.{job.format}"
+    write = partial(save_video, fps=job.fps, width=job.width)
+    if job.camera is not None:
+        write = partial(_save_by_camera, write, context, fields)
     shown = (context.stage.visual_model, qpos, context.cfg.timing.step_dt, context.advance)
-    if problem := safely_write(path, save_video, *shown):
+    if problem := safely_write(path, write, *shown):
         result.status = Status.failed
         result.reason += f"; {problem}"
     else:
         context.print_line(f"video: {path}")
+
+
+def _save_by_camera(
+    save: Callable[..., None],
+    context: RunContext,
+    fields: Sequence[Mapping[str, torch.Tensor]],
+    path: Path,
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    *args: object,
+) -> None:
+    """Call `save_video` so that a camera of the scene draws, each world in its own looks."""
+    cfg = context.cfg
+    name = cast(str, cast(PlayJobCfg, cfg.job).camera)
+    camera = replace(cfg.scene.cameras[name], outputs=["rgb"])
+    one = replace(cfg, scene=replace(cfg.scene, cameras={name: camera}))
+    looks = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
+    renderer = StateRenderer(context.model, one, len(qpos), fields=list(looks))
+
+    def draw(states: np.ndarray) -> np.ndarray:
+        images = renderer.draw(torch.from_numpy(states), looks)
+        return images[f"images.{name}"].cpu().numpy()
+
+    with closing(renderer):
+        save(path, model, qpos, *args, draw=draw)
 
 
 JOB = Job(check_play, shows=True, live=True)

@@ -60,8 +60,10 @@ from mjstack.sim.native import available_cores
 log = logging.getLogger(__name__)
 
 
-def check_showing(cfg: Config) -> None:
-    """Raise if this machine cannot show an episode as ``view`` or ``video`` ask for."""
+def check_showing(cfg: Config, ending: str = ".mp4") -> None:
+    """Raise if this machine cannot show an episode as ``view`` or ``video`` ask for, the video with
+    a name of this ending.
+    """
     if cfg.view == "web":
         check_address(cfg.web.host, cfg.web.port)
     elif cfg.view == "true" and not opens_windows():
@@ -69,7 +71,7 @@ def check_showing(cfg: Config) -> None:
         expected = f"a display that opens windows (DISPLAY={shown})"
         raise ConfigError("view", "true", expected, "Use view=web or video=true instead")
     if cfg.video:
-        require_video()
+        require_video(ending)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,10 @@ video.
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,9 @@ import matplotlib
 import mujoco
 import numpy as np
 from matplotlib.patches import Rectangle
+from PIL import Image, features
 
-from mjstack.errors import MissingExtra
+from mjstack.errors import MissingExtra, MjstackError
 from mjstack.interrupt import check_interrupt
 from mjstack.report.gl import open_renderer
 
@@ -22,6 +25,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 Drawn = tuple[Sequence[float], Sequence[float]]
+Draw = Callable[[np.ndarray], Iterable[np.ndarray]]
+Frames = Callable[[Sequence[int]], Iterator[np.ndarray]]
 
 
 @contextmanager
@@ -89,8 +94,13 @@ def save_video(
     qpos: np.ndarray,
     step_dt: float,
     advance: Callable[[str, int, int], None] = lambda what, done, total: None,
+    *,
+    fps: float = 25.0,
+    width: int | None = None,
+    draw: Draw | None = None,
 ) -> None:
-    """Write an mp4 of episodes in real time, side by side.
+    """Write a video of episodes in real time, side by side: an mp4, or a GIF or WebP that loops, by
+    the file's ending.
 
     Args:
         path: The file.
@@ -98,44 +108,114 @@ def save_video(
         qpos: States at the ends of steps, shape ``(worlds, steps, nq)``.
         step_dt: Time between two of them [s].
         advance: Told about progress.
+        fps: Frames per second [Hz], as near as whole steps allow.
+        width: Of the video [pixels]; 640 by default with one world, 960 with several.
+        draw: Draws a state of every world, shape ``(worlds, nq)``, as images ``(height, width,
+            3)``, uint8. By default the scene is seen from the side.
 
     Raises:
-        MjstackError: This machine cannot draw offscreen, or lacks the extra ``video``.
+        MjstackError: This machine cannot draw offscreen, or lacks what writes the format.
     """
-    writer_of = require_video()
-    skip = max(1, round(1.0 / (25.0 * step_dt)))
+    write = require_video(path.suffix)
+    skip = max(1, round(1.0 / (fps * step_dt)))
     states = qpos[:, ::skip].swapaxes(0, 1)
     count, worlds, nq = states.shape
-
-    # Rows and columns of pictures
     columns = math.ceil(math.sqrt(worlds))
-    rows = math.ceil(worlds / columns)
-    width = (640 if worlds == 1 else 960) // columns
-    height = 3 * width // 4
-    size = (columns * width, rows * height)
-    writer = writer_of(str(path), size, fps=1.0 / (step_dt * skip), macro_block_size=16)
-    writer.send(None)
-    images = _render(model, states.reshape(-1, nq), width, height)
-    for number in range(count):
-        frame = np.zeros((rows, height, columns, width, 3), np.uint8)
-        for world in range(worlds):
-            frame[world // columns, :, world % columns] = next(images)
-        writer.send(frame.reshape(rows * height, columns * width, 3))
-        advance("pictures of the video", number + 1, count)
-    writer.close()
+    wide = (width or (640 if worlds == 1 else 960)) // columns
+
+    def frames(numbers: Sequence[int]) -> Iterator[np.ndarray]:
+        """Draw some frames."""
+        chosen = states[list(numbers)]
+        if draw is None:
+            images = _render(model, chosen.reshape(-1, nq), wide, 3 * wide // 4)
+        else:
+            images = (image for frame in chosen for image in draw(frame))
+        for done in range(1, len(chosen) + 1):
+            check_interrupt()
+            yield _side_by_side([_fit(image, wide) for image in islice(images, worlds)], columns)
+            if len(chosen) == count:  # not of a sample
+                advance("pictures of the video", done, count)
+
+    write(path, frames, count, step_dt * skip)
 
 
-def require_video() -> Callable[..., Any]:
-    """The mp4 writer.
+def _fit(image: np.ndarray, wide: int) -> np.ndarray:
+    """Scale an image to a width; a smaller one is the mean of what its pixels cover."""
+    height, width, _ = image.shape
+    if width == wide:
+        return image
+    size = (wide, max(1, round(height * wide / width)))
+    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
+
+
+def _side_by_side(images: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    """Images of one size in rows; the places that are left are black."""
+    rows = math.ceil(len(images) / columns)
+    height, width, _ = images[0].shape
+    frame = np.zeros((rows, height, columns, width, 3), np.uint8)
+    for number, image in enumerate(images):
+        frame[number // columns, :, number % columns] = image
+    return frame.reshape(rows * height, columns * width, 3)
+
+
+def require_video(ending: str = ".mp4") -> Callable[[Path, Frames, int, float], None]:
+    """What writes a video by the ending of its name: called with the file, what draws its frames,
+    their number, and the time between two of them [s].
 
     Raises:
-        MissingExtra: It is not installed.
+        MissingExtra: The mp4 writer is not installed.
+        MjstackError: Pillow was built without WebP.
     """
+    if ending in _LOOPS:
+        if ending == ".webp" and not features.check("webp"):
+            raise MjstackError("Pillow here writes no WebP", "Use job.format=gif or job.format=mp4")
+        return partial(_write_loop, options=_LOOPS[ending])
     try:
         import imageio_ffmpeg
     except ImportError as error:
         raise MissingExtra("video=true", "imageio-ffmpeg", "video") from error
-    return imageio_ffmpeg.write_frames
+    return partial(_write_mp4, imageio_ffmpeg.write_frames)
+
+
+def _write_mp4(
+    writer_of: Callable[..., Any], path: Path, frames: Frames, count: int, dt: float
+) -> None:
+    drawn = frames(range(count))
+    first = next(drawn)
+    writer = writer_of(str(path), first.shape[1::-1], fps=1.0 / dt, macro_block_size=16)
+    writer.send(None)
+    writer.send(first)
+    for frame in drawn:
+        writer.send(frame)
+    writer.close()
+
+
+# Pillow's options by ending. `optimize` makes what has not moved transparent.
+_LOOPS: dict[str, dict[str, Any]] = {".gif": {"optimize": True}, ".webp": {"quality": 60}}
+_COLORS = 96  # of a GIF; with 255 it is 40 % larger, and looks the same
+
+
+def _write_loop(
+    path: Path, frames: Frames, count: int, dt: float, options: Mapping[str, Any]
+) -> None:
+    """Write a GIF or a WebP. All frames of a GIF have the same colours, without dithering, so that
+    what does not move keeps its colour.
+    """
+    images: Iterator[Image.Image] = map(Image.fromarray, frames(range(count)))
+    if path.suffix == ".gif":
+        sample = np.concatenate(list(frames([0, count // 2, count - 1])))
+        palette = Image.fromarray(sample).quantize(_COLORS)
+        images = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    first = next(images)
+    ends = 10 * np.round(100.0 * dt * np.arange(count + 1)).astype(int)  # a GIF counts in 10 ms
+    first.save(
+        path,
+        save_all=True,
+        append_images=images,
+        duration=np.diff(ends).tolist(),
+        loop=0,
+        **options,
+    )
 
 
 def opens_windows() -> bool:

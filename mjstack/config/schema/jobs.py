@@ -85,6 +85,20 @@ class CollectJobCfg(JobCfg):
 
 
 @dataclass(slots=True)
+class PlayJobCfg(JobCfg):
+    """Worlds with a policy or the expert, in a viewer or as a video."""
+
+    format: str = spec(choices=("mp4", "gif", "webp"))
+    """Format of the video ``episode.<format>``; a GIF or WebP loops."""
+    camera: str | None = spec(None)
+    """One of ``scene.cameras``, which draws the video; null: a view from the side."""
+    fps: float = spec(unit="Hz", gt=0.0)
+    """Pictures per second of the video, as near as whole control steps allow."""
+    width: int | None = spec(None, unit="pixels", ge=64, le=1280)
+    """Width of the video; null: 640 with one world, 960 with several."""
+
+
+@dataclass(slots=True)
 class TrainJobCfg(JobCfg):
     """A policy is trained, and judged from starts that training has not used."""
 
@@ -268,5 +282,6 @@ JOB_SCHEMAS = {
     "scaling": ScalingJobCfg,
     "reachability": ReachabilityJobCfg,
     "collect": CollectJobCfg,
+    "play": PlayJobCfg,
     "train": CloneJobCfg,
 }
