@@ -39,11 +39,14 @@ def choices() -> list[str]:
 
 
 def rounds() -> list[list[str]]:
-    """Every choice once: the first of every group together, then the second ones."""
+    """Every choice once: the first of every group together, then the second ones. Experiments are
+    alone: they choose jobs too.
+    """
     groups: dict[str, list[str]] = {}
     for choice in choices():
         groups.setdefault(choice.partition("=")[0], []).append(choice)
-    return [list(filter(None, found)) for found in zip_longest(*groups.values())]
+    alone = [[choice] for choice in groups.pop("experiment")]
+    return [*(list(filter(None, found)) for found in zip_longest(*groups.values())), *alone]
 
 
 def test_every_file_composes() -> None:
@@ -117,6 +120,7 @@ def test_overrides_arrive() -> None:
 def test_experiment_is_what_it_changes() -> None:
     assert load_config(["experiment=fine"]).timing.decimation == 20
     assert load_config(["experiment=asset_solver"]).solver.iterations is None
+    assert load_config(["experiment=clip"]).job.name == "play"
 
 
 FIGURES = {

@@ -68,7 +68,7 @@ class Config:
     job=play: every world. web: serve the same, the worlds of batch and success, and training to a
     browser."""
     video: bool = spec()
-    """Write an mp4 of the same; job=play without view does so."""
+    """Write a video of the same; job=play without view does so."""
     web: WebCfg = field(default_factory=WebCfg)
     """Worlds in a browser."""
     starts: str | None = spec(None)
