@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
 from mjstack.adapters.rsl_rl import RslRlVecEnv
 from mjstack.bench import cameras, cli
 from mjstack.config.schema import Backend
+from mjstack.distributed import Ranks
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError, ConfigError, MjstackError, RunError
@@ -665,6 +667,24 @@ def test_images_that_do_not_fit_into_memory_are_one_line(
         f" worlds need {'1.14' if backend == 'native' else '3.95'} GiB and 0.931 GiB are free."
         " Lower nworld, or the cameras' size."
     )
+
+
+@pytest.mark.parametrize(
+    ("device", "devices", "size", "nworld"),
+    [("cuda:0", "4", 1, 5), ("cuda:2", "4", 4, 5), ("cuda:1", "null", 2, 9), ("cpu", "2", 1, 17)],
+)
+def test_a_gpu_needs_room_for_the_images_of_its_rank(
+    device: str, devices: str, size: int, nworld: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[int] = []
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 4)
+    monkeypatch.setattr("mjstack.jobs.runner.resolve_backend", lambda cfg: ("mjwarp", device))
+    monkeypatch.setattr(gates, "check_image_memory", lambda *args, mjwarp: found.append(args[2]))
+    cfg = load_config(["cameras=front", "nworld=17", f"devices={devices}"])
+    backend = (Backend.mjwarp, device)
+    context: Any = SimpleNamespace(cfg=cfg, backend=backend, ranks=Ranks(0, size), model=None)
+    gates.check_cameras(context)
+    assert found == [nworld]
 
 
 def run(*overrides: str, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -143,7 +143,7 @@ TOLD = [
     ("hydra.mode=MULTIRUN", "hydra.mode=MULTIRUN: expected RUN without -m. Replace it by -m."),
     ("-m hydra.sweeper.params={seed:1}", "hydra.sweeper.params: expected none. Give the values"),
     ("-m seed=1 +hydra.sweeper.params.nworld=2", "hydra.sweeper.params: expected none."),
-    ("hydra/launcher=nope", "Available: basic. Others are plugins of Hydra, which pip installs"),
+    ("hydra/launcher=nope", ". Others are plugins of Hydra, which pip installs, such as hydra-"),
     ("-sc", "-sc: expected install=SHELL or uninstall=SHELL alone."),
 ]
 

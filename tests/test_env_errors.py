@@ -90,6 +90,15 @@ def test_action_that_is_not_finite_names_its_world(env: Env, bad: float) -> None
     fails(ArgumentError, lambda: env.step(action), "action: found", "in world 1", "finite")
 
 
+@pytest.mark.full
+def test_action_that_the_simulation_cannot_hold_names_its_world(cfg: Config) -> None:
+    env = on_shared_sim("mjwarp", 3, cfg)  # float32
+    env.reset(seed=0)
+    action = zeros(env).double()
+    action[1, 4] = 1e300
+    fails(ArgumentError, lambda: env.step(action), "1e+300", "in world 1", "finite")
+
+
 @pytest.mark.parametrize("huge", [1e20, 1e38])
 def test_a_reward_that_a_huge_action_breaks_names_the_action(env: Env, huge: float) -> None:
     env.step(zeros(env))

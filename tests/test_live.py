@@ -49,6 +49,7 @@ def refusal_of(*overrides: str) -> str:
         ("-1", 10, []),
         ("3-", 10, []),
         ("all", 10, []),
+        ("9" * 5000, 10, []),
     ],
 )
 def test_worlds_are_read_from_text(text: str, count: int, worlds: list[int]) -> None:
@@ -148,9 +149,18 @@ def test_without_a_browser_nothing_is_drawn(
     for step in range(3):
         time.sleep(0.05)
         view.after_step(step)
-    env.close()
     assert drawn == []
     assert view.aside == 0.0
+    # Real time is kept all the same, and is none of the episode's.
+    view._pace.value = "real time"
+    began = time.perf_counter()
+    for step in range(20):
+        view.after_step(step)
+    waited = time.perf_counter() - began
+    env.close()
+    assert drawn == []
+    assert waited > 0.1  # of 0.4 s, as it makes up for 0.2 s
+    assert view.aside > 0.9 * waited
 
 
 @pytest.fixture
@@ -180,6 +190,7 @@ def test_a_port_in_use_is_one_line(taken: int) -> None:
     ("args", "says"),
     [
         (["view=web", "web.host=203.0.113.1"], "web.host=203.0.113.1: expected an address of this"),
+        (["view=web", "web.host=::1"], "web.host=::1: expected an address of this machine"),
         (["view=web", "web.port=0"], "web.port=0: expected an integer from 1 to 65535"),
         (
             ["view=web", "gates=[capacity]"],

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,11 +31,38 @@ from mjstack.datasets import read_dataset
 from mjstack.distributed import Ranks, current_ranks
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.record import EpisodeRecord
+from mjstack.episodes.tally import _record as record_of
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.jobs import check_ranks, count_devices
 
 SHORT = ["sim=native", "gates=[batch]", *one_second_episode()]
 OF_CALL = {"seconds", "rank_first_world", "rank_place"}  # of a record
+
+MEETING = """\
+import torch
+
+from mjstack.distributed import current_ranks, joined
+from mjstack.errors import RankError
+
+def refuse():
+    raise ValueError("no")
+
+with joined() as ranks:
+    assert current_ranks() is ranks
+    assert ranks.gather(10 * ranks.rank) == [0, 10]
+    assert ranks.from_first(lambda: ranks.rank) == 0
+    assert ranks.in_all(lambda: ranks.rank) == [0, 1]
+    assert ranks.any(ranks.rank == 1) and not ranks.any(False)
+    total = torch.tensor([1.0, ranks.rank])
+    ranks.sum_(total)
+    assert total.tolist() == [2.0, 1.0]
+    try:
+        ranks.in_all(lambda: ranks.rank and refuse())
+    except RankError as error:
+        assert "rank 1 of 2: ValueError: no" in str(error), error
+        print("rank", ranks.rank, "told" if error.told else "tells")
+    ranks.end()
+"""
 
 TRAP = """\
 import os, signal
@@ -87,6 +115,7 @@ def assert_same_episodes(one: Path, other: Path) -> None:
         assert path.read_bytes() == (other / path.name).read_bytes()
 
 
+@pytest.mark.full
 def test_two_ranks_play_what_one_plays(tmp_path: Path) -> None:
     """Five worlds: the shares differ. Batch and success, whose starts are drawn; every gate has one
     result, and says where its worlds were.
@@ -110,6 +139,54 @@ def test_two_ranks_play_what_one_plays(tmp_path: Path) -> None:
         assert [row[1].split(":")[0] for row in table["rows"]] == ["rank 0", "rank 1"]
     assert two["gates"][0]["notes"]["ranks"] == "rank 0 alone"
     assert len(two["provenance"]["ranks"]) == 2
+
+
+def test_shares_played_apart_join_to_the_whole(finished: Path) -> None:
+    """Three worlds as two ranks share them, in one process: bit for bit what one rank played."""
+    cfg = load_config([*SHORT, "nworld=3"])
+    context = RunContext(cfg)
+    parts = []
+    for rank in (0, 1):
+        own = replace(context, ranks=Ranks(rank, 2))
+        with closing(own.batch_simulation(len(own.worlds))) as sim:
+            episode = own.play(sim, cfg.reset, seed=1, worlds=own.worlds)
+            parts.append(record_of(own, sim, 1, episode, []))
+    joined = EpisodeRecord.join(parts)
+    whole = EpisodeRecord.read(finished, 1, whole=True)
+    assert whole is not None
+    assert list(joined.ranks) == [0, 1]
+    assert len(np.unique(joined.start, axis=0)) == 3
+    for name in ("failed", "qpos", "start"):
+        np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name), err_msg=name)
+    for name in ("values", "measured"):
+        ours, theirs = (getattr(each, name) for each in (joined, whole))
+        assert ours.keys() == theirs.keys()
+        for key in ours:
+            np.testing.assert_array_equal(ours[key], theirs[key], err_msg=key)
+
+
+def test_two_ranks_meet(tmp_path: Path) -> None:
+    """What they gather, sum and do in turns; an error of one is an error of both."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    (tmp_path / "meeting.py").write_text(MEETING)
+    root = str(Path(mjstack.__file__).parents[1])
+    own = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "PYTHONPATH": root}
+    processes = [
+        subprocess.Popen(
+            [sys.executable, str(tmp_path / "meeting.py")],
+            env=os.environ | own | {"RANK": str(rank), "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for rank in (0, 1)
+    ]
+    texts = [process.communicate(timeout=200)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], texts
+    assert "rank 0 tells" in texts[0]
+    assert "rank 1 told" in texts[1]
 
 
 @pytest.mark.full

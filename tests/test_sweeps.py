@@ -5,18 +5,18 @@ from __future__ import annotations
 import importlib.util
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from environments import one_second_episode
 from one_node_slurm import interrupt_a_sweep, why_not
 from test_ranks import SHORT, report_of, start
 
-from mjstack.cli import run
 from mjstack.errors import ConfigError, FolderError
 from mjstack.jobs import sweep as module
-from mjstack.jobs.sweep import LOG, SweepJob, run_jobs, shared_sweep
-from mjstack.report.record import Status
-from mjstack.report.write import read_report
+from mjstack.jobs.sweep import LOG, SWEEP, SweepJob, run_jobs, shared_sweep
+from mjstack.report.record import GateResult, Report, Status
+from mjstack.report.write import read_report, write_report
 
 STUB = """\
 import json, os, sys
@@ -53,19 +53,37 @@ def jobs(folder: Path, *seeds: int) -> list[SweepJob]:
 def test_a_queue(stub: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Reports in the order of the jobs; a killed one says so, and it alone runs again."""
     some = jobs(stub, 1, 2, 9, 4)
-    reports = run_jobs(some)
+    reports = run_jobs(stub, some)
     assert [report.status for report in reports] == ["pass", "fail", "fail", "pass"]
     assert max(report.exit_code for report in reports) == 1
     (gate,) = reports[2].gates
     assert "killed by signal 9: mjstack: what it says" in gate.reason
     assert (stub / "0" / LOG).read_text().startswith("mjstack: what it says None")
     capsys.readouterr()
-    assert [report.status for report in run_jobs(some)] == ["pass", "fail", "fail", "pass"]
+    assert [report.status for report in run_jobs(stub, some)] == ["pass", "fail", "fail", "pass"]
     out = capsys.readouterr().out
     assert out.count("done before") == 3
     assert "job 2 on cores" in out
-    with pytest.raises(FolderError, match="has another sweep"):
-        run_jobs(some[:2])
+    with pytest.raises(FolderError, match="has another sweep, whose job 1 is seed=2"):
+        run_jobs(stub, jobs(stub, 1, 3))
+
+
+def test_a_sweeper_brings_jobs_in_batches(stub: Path) -> None:
+    """All of them are in one list, also where their folders are below others."""
+    some = [
+        SweepJob(n, stub / "so101" / str(n), (f"seed={seed}",)) for n, seed in enumerate((1, 4))
+    ]
+    for job in some:
+        assert [report.status for report in run_jobs(stub, [job])] == ["pass"]
+    with shared_sweep(stub):
+        assert json.loads((stub / SWEEP).read_text())["1"] == ["so101/1", ["seed=4"]]
+
+
+@pytest.mark.parametrize("count", [0, -1, "x", 1.5])
+def test_a_number_of_jobs_that_cannot_be_is_refused(count: Any, stub: Path) -> None:
+    with pytest.raises(ConfigError, match=f"hydra.launcher.jobs={count}: expected null, or an"):
+        run_jobs(stub, jobs(stub, 1), count)
+    assert not stub.exists()
 
 
 def test_a_job_that_was_stopped_goes_on(stub: Path) -> None:
@@ -75,7 +93,7 @@ def test_a_job_that_was_stopped_goes_on(stub: Path) -> None:
         (stub / name / "kept").touch()
         report = {"status": "interrupted", "resumes": resumes, "gates": []}
         (stub / name / "report.json").write_text(json.dumps(report))
-    run_jobs(jobs(stub, 1, 3))
+    run_jobs(stub, jobs(stub, 1, 3))
     assert (stub / "0" / "kept").exists()
     assert str(stub / "0") in (stub / "0" / LOG).read_text()
     assert not (stub / "1" / "kept").exists()
@@ -87,13 +105,13 @@ def test_a_gpu_for_each_job(stub: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
     monkeypatch.setattr("tempfile.tempdir", str(stub.parent))
     with pytest.raises(ConfigError, match=r"hydra.launcher.jobs=3: expected at most 2"):
-        run_jobs(jobs(stub, 1), 3)
+        run_jobs(stub, jobs(stub, 1), 3)
     for slot in module._slots(None):
         assert slot.lock is not None
         if slot.name == "GPU 5":
             held = module._lock(slot.lock)
     assert held is not None
-    run_jobs(jobs(stub, 1, 3))
+    run_jobs(stub, jobs(stub, 1, 3))
     assert all((stub / name / LOG).read_text().endswith(" 7\n") for name in "01")
     held.close()
 
@@ -140,7 +158,7 @@ def test_a_report_is_read_back(tmp_path: Path) -> None:
     assert read_report(tmp_path) is None
     (tmp_path / "report.json").write_text("{}")
     assert read_report(tmp_path) is None
-    assert run([*SHORT, "nworld=2", f"hydra.run.dir={tmp_path}/run"]) == 1
-    report = read_report(tmp_path / "run")
-    assert report is not None
-    assert (report.status, report.resumes) == (Status.failed, "gates")
+    gate = GateResult(name="batch", status=Status.failed, reason="so")
+    written = Report(folder=tmp_path, resumes="gates", status=Status.failed, gates=[gate])
+    write_report(written)
+    assert read_report(tmp_path) == written

@@ -39,7 +39,7 @@ class GpuLauncher(Launcher):
             HydraConfig.instance().set_config(cfg)  # for what is interpolated
             folder = Path(str(cfg.hydra.sweep.dir)) / str(cfg.hydra.sweep.subdir)
             jobs.append(SweepJob(number, folder, tuple(overrides)))
-        reports = run_jobs(jobs, self._jobs)
+        reports = run_jobs(Path(str(self._config.hydra.sweep.dir)), jobs, self._jobs)
         return [
             JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED, _return_value=report)
             for job, report in zip(jobs, reports, strict=True)

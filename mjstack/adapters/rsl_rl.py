@@ -77,7 +77,6 @@ class RslRlVecEnv(VecEnv):
         """
         return self._tensordict(
             {name: group.clone() for name, group in self.env.observation_manager.groups.items()}
-            | self.env.images
         )
 
     def step(

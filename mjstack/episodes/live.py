@@ -25,7 +25,8 @@ _COLORS = ("#4478b8", "#c93434", "#1a7f4b", "#9a6700", "#7b4ab8", "#1f8a99", "#b
 _HEIGHT = "height above the table [mm]"
 _REAL = "real time"
 _FAST = "as fast as it runs"
-_EVERY = re.compile(r"\d+(-\d+)?(\s*,\s*\d+(-\d+)?)*")
+_ONE = r"\d{1,9}(-\d{1,9})?"
+_EVERY = re.compile(rf"{_ONE}(\s*,\s*{_ONE})*")
 
 
 class LiveView(Observer):
@@ -97,13 +98,13 @@ class LiveView(Observer):
         real = self._pace.value == _REAL
         if not (self.paused or real) and now - self._last < 1.0 / _RATE:
             return
-        if not (self.paused or self._server.get_clients()):  # nobody looks
+        watched = self.paused or bool(self._server.get_clients())
+        if not (watched or real):
             self._last = now
-            self._wait(real)
             return
         self.env.sim.synchronize()  # what was queued is the episode's time
         began = time.perf_counter()
-        if self.paused or began - self._last >= 1.0 / _RATE:
+        if self.paused or (watched and began - self._last >= 1.0 / _RATE):
             self._show(step + 1)
         while self.paused and not self._steps:
             check_interrupt()
@@ -144,7 +145,7 @@ class LiveView(Observer):
             labels = [str(number) for number in env.world[index].tolist()]
             self._stage = Stage(self._server, self._shapes, labels, [None] * len(labels))
         self._stage.update(np.nan_to_num(qpos))
-        world = min(int(self._plotted.value), env.nworld - 1)
+        world = min(max(0, int(self._plotted.value)), env.nworld - 1)
         terms, lines = self._values(world)
         for title, values in lines.items():
             self._plot(title, step, values)

@@ -19,7 +19,7 @@ from mjstack.errors import ConfigError, KeyedError, RunError, Unreachable
 from mjstack.gates.images import load_images
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
-from mjstack.jobs.runner import CheckedJob, Job, check_showing, run_provenance
+from mjstack.jobs.runner import CheckedJob, Job, check_showing, count_devices, run_provenance
 from mjstack.managers.episode import required_fields
 from mjstack.report.gl import require_offscreen
 from mjstack.sim import resolve_backend
@@ -126,8 +126,14 @@ def check_cameras(context: RunContext) -> None:
         return
     backend, device = context.backend
     native = backend is Backend.native
+    # Ranks on CUDA have a device each, others share the memory.
+    ranks = max(context.ranks.size, count_devices(cfg)) if device.startswith("cuda") else 1
     check_image_memory(
-        context.model, cfg.scene.cameras, cfg.nworld, torch.device(device), mjwarp=not native
+        context.model,
+        cfg.scene.cameras,
+        -(-cfg.nworld // ranks),
+        torch.device(device),
+        mjwarp=not native,
     )
     if native:
         require_offscreen(context.model)

@@ -246,6 +246,13 @@ def count_devices(cfg: Config) -> int:
     return int(cfg.devices)
 
 
+def check_share(cfg: Config, size: int) -> None:
+    """Raise a `ConfigError` if there are fewer worlds than ranks."""
+    if cfg.nworld < size:
+        expected = f"at least {size}, a world for each rank"
+        raise ConfigError("nworld", cfg.nworld, expected)
+
+
 def check_ranks(context: RunContext) -> None:
     """Raise if the ranks of a job do not fit together. Called in each of them.
 
@@ -278,9 +285,7 @@ def check_ranks(context: RunContext) -> None:
                     f"ranks {other} and {rank} ({there}) have one GPU, {which}, expected one each",
                     "Start as many ranks as there are GPUs, with sim.device=auto",
                 )
-    if cfg.nworld < ranks.size:
-        expected = f"at least {ranks.size}, a world for each rank"
-        raise ConfigError("nworld", cfg.nworld, expected)
+    check_share(cfg, ranks.size)
 
 
 def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
@@ -419,6 +424,7 @@ def _live_view(context: RunContext, console: Console) -> Iterator[LiveView | Non
     if cfg.view != "web":
         yield None
         return
+    check_address(cfg.web.host, cfg.web.port)  # another program may have come first
     server = start_server(cfg.web.host, cfg.web.port)
     try:
         console.print(f"live view: http://{cfg.web.host}:{server.get_port()}")

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import torch
 
@@ -80,23 +80,24 @@ def shared_sweep(folder: Path) -> Iterator[Path]:
     yield folder
 
 
-def run_jobs(jobs: Sequence[SweepJob], count: int | None = None) -> list[Report]:
+def run_jobs(folder: Path, jobs: Sequence[SweepJob], count: int | None = None) -> list[Report]:
     """Run jobs, as many at once as there are GPUs, and return their reports in order.
 
     A job that has a result in its folder is not repeated. One that another command is running is
     waited for. One that was stopped goes on, if it is of a kind that can.
 
     Args:
-        jobs: The jobs. All folders are in one.
+        folder: The sweep's folder.
+        jobs: The jobs, all or some of the sweep's.
         count: How many at once; None for one per GPU, or one where there is none.
 
     Raises:
-        ConfigError: There are not as many GPUs.
+        ConfigError: The number is none, or there are not as many GPUs.
         FolderError: The folder has the jobs of another sweep.
         KeyboardInterrupt: The command was interrupted; so were its jobs.
     """
     slots = _slots(count)
-    _check_sweep(jobs)
+    _check_sweep(folder, jobs)
     say = Console(highlight=False, soft_wrap=True, markup=False).print
     common = set.intersection(*(set(job.overrides) for job in jobs)) if len(jobs) > 1 else set()
     waiting = list(jobs)
@@ -149,6 +150,8 @@ def run_jobs(jobs: Sequence[SweepJob], count: int | None = None) -> list[Report]
 
 def _slots(count: int | None) -> list[_Slot]:
     """Places for jobs: GPUs, or shares of the cores."""
+    if count is not None and (type(count) is not int or count < 1):
+        raise ConfigError("hydra.launcher.jobs", count, "null, or an integer of at least 1")
     gpus = torch.cuda.device_count()
     if gpus:
         if (count or 1) > gpus:
@@ -169,20 +172,26 @@ def _slots(count: int | None) -> list[_Slot]:
     return [_Slot(f"cores {','.join(map(str, share))}", cores=share) for share in shares]
 
 
-def _check_sweep(jobs: Sequence[SweepJob]) -> None:
-    """Leave the list of the jobs in the sweep's folder, or compare it with the one there."""
-    path = Path(os.path.commonpath([job.folder.parent for job in jobs])) / SWEEP
-    ours = [[str(job.folder.relative_to(path.parent)), list(job.overrides)] for job in jobs]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    theirs = ours
+def _check_sweep(folder: Path, jobs: Sequence[SweepJob]) -> None:
+    """Add the jobs to the list in the sweep's folder, by their numbers, or compare them with those
+    there. A sweeper may bring them in several batches.
+    """
+    path = folder / SWEEP
+    folder.mkdir(parents=True, exist_ok=True)
+    theirs: dict[str, Any] = {}
     with suppress(OSError, ValueError):
-        theirs = json.loads(path.read_text())
-    if theirs != ours:
-        raise FolderError(
-            f"{path.parent} has another sweep, expected the same jobs, which are in {SWEEP}. Set"
-            " hydra.sweep.dir to another folder"
-        )
-    write_atomic(path, json.dumps(ours, indent=1) + "\n")
+        theirs = dict(json.loads(path.read_text()))
+    ours = {
+        str(job.number): [os.path.relpath(job.folder, folder), list(job.overrides)] for job in jobs
+    }
+    for number, job in ours.items():
+        if theirs.get(number, job) != job:
+            raise FolderError(
+                f"{folder} has another sweep, whose job {number} is"
+                f" {' '.join(theirs[number][1])}, expected the same jobs, which are in {SWEEP}. Set"
+                " hydra.sweep.dir to another folder"
+            )
+    write_atomic(path, json.dumps(theirs | ours, indent=1) + "\n")
 
 
 def _result(job: SweepJob) -> Report | None:

@@ -101,8 +101,9 @@ class ActionManager:
         action = action.detach()  # physics has no gradient, and a buffer must not acquire one
         self._processed.copy_(action)
         self._whole = all_finite(self._processed)
-        if not action.is_cuda and not self._whole and not bool(torch.isfinite(action).all()):
-            world = int((~torch.isfinite(action)).any(1).nonzero()[0, 0])
+        kept = self._processed  # a float64 may be more than it holds
+        if not action.is_cuda and not self._whole and not bool(torch.isfinite(kept).all()):
+            world = int((~torch.isfinite(kept)).any(1).nonzero()[0, 0])
             raise ArgumentError(
                 "action",
                 f"{action[world].tolist()} in world {world}",

@@ -292,10 +292,10 @@ def check_address(host: str, port: int) -> None:
     if find_spec("viser") is None:
         raise MissingExtra("view=web", "viser", "web")
     try:
-        family, kind, number, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        place = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_STREAM)[0][-1]
     except OSError as error:
         raise ConfigError("web.host", host, f"an address of this machine ({error})") from error
-    with socket.socket(family, kind, number) as probe:
+    with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(place)
@@ -308,18 +308,16 @@ def check_address(host: str, port: int) -> None:
 
 
 def start_server(host: str, port: int) -> Any:
-    """A viser server; port 0 is any that is free.
+    """A viser server; port 0 is any that is free. Ask `check_address` of others: where one is in
+    use, viser tries the next ones and then hangs.
 
     Raises:
         MissingExtra: viser is not installed.
-        OSError: Nothing can be served there.
     """
     try:
         import viser
     except ImportError as error:
         raise MissingExtra("view=web", "viser", "web") from error
-    with socket.create_server((host, port)):  # viser would try other ports, and then hang
-        pass
     logging.getLogger("websockets").setLevel(logging.WARNING)
     with contextlib.redirect_stdout(io.StringIO()):  # its banner
         return viser.ViserServer(host=host, port=port, verbose=False)

@@ -161,10 +161,11 @@ class Simulation(ABC):
             columns: The columns, or the number of a single one.
             shape: Of each world's numbers, such as ``(2, 3)`` for six columns.
         """
-        key = (name, columns, *shape)
+        at = columns if isinstance(columns, int) else columns.at
+        which = columns if isinstance(columns, int) else columns.indices
+        key = (name, which, *shape)
         if key in self._parts:
             return self._parts[key]
-        at = columns if isinstance(columns, int) else columns.at
         view = getattr(self, name)
         if isinstance(at, torch.Tensor):
             found = view.index_select(1, at)

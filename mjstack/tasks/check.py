@@ -187,7 +187,8 @@ class EpisodeCheck(ABC):
     Attributes:
         cfg: The configuration.
         t: The thresholds.
-        key: Equal to that of another check with the same thresholds; see `once_per_step`.
+        key: Equal to that of another check of its class with the same thresholds; see
+            `once_per_step`.
         rules: Names, bits and words of the rules.
         objects: The objects that the task is about, which the rules read.
         summaries: Metrics of a batch: by name, a measured value and which of its worlds' counts,
@@ -213,7 +214,7 @@ class EpisodeCheck(ABC):
             )
         self.cfg = cfg
         self.t: Any = typed("task.check", node, self.Thresholds)
-        self.key = f"{type(self).__module__}.{self.t}"
+        self.key = f"{type(self).__module__}.{type(self).__qualname__} {self.t}"
         phases = cfg.controller.phases
         steps = sum(round(phase.seconds / cfg.timing.step_dt) for phase in phases.values())
         steps = steps or cfg.task.episode_steps
