@@ -232,12 +232,12 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
             )
     begin_job()
     given = _is_set("hydra.sweep.dir", overrides)
-    if given and "GpuLauncher" in str(OmegaConf.select(master, "hydra.launcher._target_")):
-        from mjstack.jobs.sweep import shared_sweep
+    claim = claim_folder(folder, numbered=not given, key="hydra.sweep.dir")
+    if "GpuLauncher" in str(OmegaConf.select(master, "hydra.launcher._target_")):
+        from mjstack.jobs.sweep import find_slots, shared_sweep
 
-        claim = shared_sweep(folder)
-    else:
-        claim = claim_folder(folder, numbered=not given, key="hydra.sweep.dir")
+        find_slots(OmegaConf.select(master, "hydra.launcher.jobs"))
+        claim = shared_sweep(folder) if given else claim
     with claim as claimed:
         if claimed != folder:
             master.hydra.sweep.dir = str(claimed)

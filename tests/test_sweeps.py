@@ -106,7 +106,7 @@ def test_a_gpu_for_each_job(stub: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr("tempfile.tempdir", str(stub.parent))
     with pytest.raises(ConfigError, match=r"hydra.launcher.jobs=3: expected at most 2"):
         run_jobs(stub, jobs(stub, 1), 3)
-    for slot in module._slots(None):
+    for slot in module.find_slots(None):
         assert slot.lock is not None
         if slot.name == "GPU 5":
             held = module._lock(slot.lock)

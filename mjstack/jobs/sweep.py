@@ -42,7 +42,7 @@ class SweepJob:
 
 
 @dataclass(eq=False, slots=True)
-class _Slot:
+class Slot:
     """Where one job at a time runs: its name, its environment, its cores, and the lock of a GPU."""
 
     name: str
@@ -96,12 +96,12 @@ def run_jobs(folder: Path, jobs: Sequence[SweepJob], count: int | None = None) -
         FolderError: The folder has the jobs of another sweep.
         KeyboardInterrupt: The command was interrupted; so were its jobs.
     """
-    slots = _slots(count)
+    slots = find_slots(count)
     _check_sweep(folder, jobs)
     say = Console(highlight=False, soft_wrap=True, markup=False).print
     common = set.intersection(*(set(job.overrides) for job in jobs)) if len(jobs) > 1 else set()
     waiting = list(jobs)
-    running: dict[_Slot, _Running] = {}
+    running: dict[Slot, _Running] = {}
     reports: dict[int, Report] = {}
     elsewhere: set[int] = set()
     try:
@@ -148,8 +148,12 @@ def run_jobs(folder: Path, jobs: Sequence[SweepJob], count: int | None = None) -
     return [reports[job.number] for job in jobs]
 
 
-def _slots(count: int | None) -> list[_Slot]:
-    """Places for jobs: GPUs, or shares of the cores."""
+def find_slots(count: int | None) -> list[Slot]:
+    """Places for jobs: GPUs, or shares of the cores.
+
+    Raises:
+        ConfigError: The number is none, or there are not as many.
+    """
     if count is not None and (type(count) is not int or count < 1):
         raise ConfigError("hydra.launcher.jobs", count, "null, or an integer of at least 1")
     gpus = torch.cuda.device_count()
@@ -160,7 +164,7 @@ def _slots(count: int | None) -> list[_Slot]:
         locks = Path(tempfile.gettempdir()) / f"mjstack-gpus-{os.getuid()}"
         locks.mkdir(exist_ok=True)
         return [
-            _Slot(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}, lock=locks / name)
+            Slot(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}, lock=locks / name)
             for name in visible.split(",")[: count or gpus]
         ]
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
@@ -169,7 +173,7 @@ def _slots(count: int | None) -> list[_Slot]:
         expected = f"at most {len(cores)}, a core for each job"
         raise ConfigError("hydra.launcher.jobs", count, expected)
     shares = [cores[n::count] for n in range(count)]
-    return [_Slot(f"cores {','.join(map(str, share))}", cores=share) for share in shares]
+    return [Slot(f"cores {','.join(map(str, share))}", cores=share) for share in shares]
 
 
 def _check_sweep(folder: Path, jobs: Sequence[SweepJob]) -> None:
@@ -213,7 +217,7 @@ def _lock(path: Path) -> IO[bytes] | None:
     return file
 
 
-def _start(job: SweepJob, slot: _Slot, log: IO[bytes], held: IO[bytes] | None) -> _Running:
+def _start(job: SweepJob, slot: Slot, log: IO[bytes], held: IO[bytes] | None) -> _Running:
     """Start the process of a job, which goes on with what an earlier one has left."""
     earlier = read_report(job.folder, job.overrides)
     args = list(job.overrides)
@@ -261,7 +265,7 @@ def _conclude(one: _Running, code: int) -> Report:
     return report
 
 
-def _stop(running: dict[_Slot, _Running]) -> None:
+def _stop(running: dict[Slot, _Running]) -> None:
     """Interrupt the jobs that run, and wait for them."""
     for one in running.values():
         with suppress(OSError):
