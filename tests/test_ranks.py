@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from compositions import load_config
 from dataset_checker import check_dataset
 from environments import one_second_episode
@@ -32,7 +33,7 @@ from mjstack.distributed import Ranks, current_ranks
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.tally import _record as record_of
-from mjstack.errors import ConfigError, MjstackError
+from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.jobs import check_ranks, count_devices
 
 SHORT = ["sim=native", "gates=[batch]", *one_second_episode()]
@@ -292,6 +293,8 @@ def test_finished_seeds_are_read_back(finished: Path) -> None:
     assert (finished / "worlds_seed1.npz").stat().st_mtime_ns == written
     assert run([*args, "gate.batch.seeds=3"]) == 1
     assert report_of(finished)["gates"][0]["metrics"]["episodes"] == 9
+    page = (finished / "report.html").read_text()
+    assert ("Play it in 3-D" in page) == (finished / "episode.html").exists()
 
 
 @pytest.mark.parametrize(
@@ -320,6 +323,22 @@ def test_a_record_of_an_older_version_is_refused(finished: Path, tmp_path: Path)
     assert EpisodeRecord.read(tmp_path, 0) is not None
     with pytest.raises(MjstackError, match="cannot be read"):
         EpisodeRecord.read(tmp_path, 0, whole=True)
+
+
+def test_an_environment_of_later_worlds_starts_and_ends_like_them() -> None:
+    overrides = ["sim=native", "reset=randomized", "termination.time_out.params.steps=2"]
+    found = []
+    for own in ({"nworld": 4}, {"nworld": 2, "first_world": 2}):
+        env = mjstack.make_env(overrides, seed=3, **own)
+        zeros = torch.zeros((env.nworld, env.action_manager.action_dim))
+        steps = [env.reset(seed=3)[0], *(env.step(zeros)[0] for _ in range(3))]
+        env.close()
+        found.append([{name: group[-2:] for name, group in obs.items()} for obs in steps])
+    for ours, theirs in zip(*found, strict=True):
+        for name in ours:
+            assert torch.equal(ours[name], theirs[name]), name
+    with pytest.raises(ArgumentError, match="first_world: found -1, expected an integer of at"):
+        mjstack.make_env(overrides, nworld=2, first_world=-1)
 
 
 # Ranks that do not fit together

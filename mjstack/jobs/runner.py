@@ -404,7 +404,8 @@ def _save_episode(context: RunContext) -> str:
         frame_dt = frame_stride(cfg.timing.step_dt) * cfg.timing.step_dt
         shown = (context.stage.visual_model, worlds, frame_dt)
         problem = safely_write(folder / EPISODE, save_episode, *shown)
-        page.episode = "" if problem else EPISODE
+    if (folder / EPISODE).exists():  # perhaps an earlier call's, of seeds that were read back
+        page.episode = EPISODE
     if problem:
         context.print_line(problem)
     return problem
