@@ -3,11 +3,14 @@ each answer before it asks again.
 """
 
 import copy
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from mjstack.config.schema import CameraCfg
 from mjstack.drivers.driver import PhaselessDriver, require_joint_targets
 from mjstack.envs.env import Env
 from mjstack.errors import PolicyError, TermError
@@ -15,6 +18,7 @@ from mjstack.managers.action import ActionManager
 from mjstack.managers.observation import ObservationManager
 from mjstack.mdp.geometry import robot
 from mjstack.policy import Policy
+from mjstack.sim.cameras import Cameras
 
 _GRID = 2.0**20  # per rad or m
 
@@ -30,17 +34,22 @@ class PolicyDriver(PhaselessDriver):
     another order. On CUDA every step computes the network in float32, because a captured step
     cannot skip it, and worlds that do not ask keep their targets.
 
+    A policy that sees images has its cameras drawn in the worlds that ask, when they ask.
+
     A policy with other actions than absolute joint targets brings its action terms. They turn each
     action, which is repeated until the next answer, into joint targets in every control step.
     """
 
-    def __init__(self, env: Env, policy: Policy) -> None:
+    def __init__(
+        self, env: Env, policy: Policy, cameras: Mapping[str, CameraCfg] | None = None
+    ) -> None:
         """Build the policy's observation and allocate for the environment's worlds.
 
         Args:
             env: The environment, its worlds started; its action terms must take absolute joint
                 targets.
             policy: The policy.
+            cameras: The scene's cameras, if the environment's configuration does not have them.
 
         Raises:
             MjstackError: The policy was trained for something else, or the environment takes other
@@ -48,6 +57,8 @@ class PolicyDriver(PhaselessDriver):
         """
         cfg = env.cfg
         require_joint_targets(cfg, "absolute joint targets, which a policy gives")
+        if cameras is not None:
+            cfg = replace(cfg, scene=replace(cfg.scene, cameras=dict(cameras)))
         policy.check_fit(cfg)
         group = policy.group
         try:
@@ -73,6 +84,15 @@ class PolicyDriver(PhaselessDriver):
         network = copy.deepcopy(policy.network).to(env.device, dtype)
         self._network = network.requires_grad_(False)
         self._dtype = dtype
+        self._cameras: Cameras | None = None
+        self._images: dict[str, Tensor] = {}
+        names = list(policy.network.vision.sizes)
+        if names:
+            # They are drawn when the policy asks, whatever their rate is.
+            seen = {name: replace(cfg.scene.cameras[name], outputs=["rgb"]) for name in names}
+            seen = {name: replace(camera, terminal=False) for name, camera in seen.items()}
+            self._cameras = env.sim.make_cameras(seen)
+            self._images = self._cameras.allocate()
         self._execute = policy.execute
         shape = (env.nworld, min(policy.execute, network.chunk), network.joints)
         self._chunk = torch.zeros(shape, device=env.device)
@@ -113,7 +133,11 @@ class PolicyDriver(PhaselessDriver):
 
     def _ask(self, asks: Tensor) -> None:
         """Take the policy's answer in the worlds that ask, shape ``(nworld,)``, bool."""
-        answer = self._network(self._observed.to(self._dtype))[:, : self._chunk.shape[1]]
+        if self._cameras is not None:
+            mask = asks if asks.is_cuda or not bool(asks.all()) else None
+            self._cameras.draw(self._images, dict.fromkeys(self._cameras.cameras, mask))
+        images = [image.to(self._dtype) for image in self._images.values()]
+        answer = self._network(self._observed.to(self._dtype), images)[:, : self._chunk.shape[1]]
         answer = (torch.round(answer * _GRID) / _GRID).float()
         torch.where(asks[:, None, None], answer, self._chunk, out=self._chunk)
 

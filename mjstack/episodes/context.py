@@ -277,7 +277,7 @@ class RunContext:
         """The configured driver, for worlds that have started."""
         sim = env.sim
         if env.cfg.controller.name == POLICY:
-            return PolicyDriver(env, self.stage.policy)
+            return PolicyDriver(env, self.stage.policy, self.cfg.scene.cameras)
         if env.cfg.controller.name == CLOSED_LOOP:
             # Loads Warp, which a native open-loop run does not need.
             from mjstack.drivers.closed_loop import ClosedLoopDriver

@@ -14,7 +14,7 @@ from mjstack.config.schema import Backend, Config
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import POLICY as DRIVER
-from mjstack.errors import FolderError
+from mjstack.errors import FolderError, PolicyError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import run_guarded
 from mjstack.jobs.demonstration import group_feature, joint_units
@@ -35,6 +35,12 @@ def check_export(cfg: Config) -> CheckedJob:
     require_onnx()
     context = RunContext(replace(cfg, controller=replace(cfg.controller, name=DRIVER)))
     check_task(context)
+    if context.stage.policy.network.vision.sizes:
+        raise PolicyError(
+            f"policy={cfg.policy}: sees images, expected one that sees numbers alone, which ONNX"
+            " files are written for",
+            "Play it with controller=policy",
+        )
     title = f"task {cfg.task.name}, policy {context.stage.policy.folder}"
     return CheckedJob(context=context, title=title, work=_export)
 

@@ -1,6 +1,6 @@
 """Trained policies: their network, and the folder in which one is kept."""
 
 from mjstack.policy.checkpoint import Policy, load_policy, save_policy
-from mjstack.policy.network import PolicyNetwork
+from mjstack.policy.network import PolicyNetwork, Vision
 
-__all__ = ["Policy", "PolicyNetwork", "load_policy", "save_policy"]
+__all__ = ["Policy", "PolicyNetwork", "Vision", "load_policy", "save_policy"]

@@ -6,7 +6,7 @@ policy that was there before.
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
@@ -26,15 +26,18 @@ from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCf
 from mjstack.config.session import is_trusted_function
 from mjstack.errors import PolicyError
 from mjstack.files import reading, write_atomic
-from mjstack.policy.network import PolicyNetwork
+from mjstack.policy.network import PolicyNetwork, Vision
 
-FORMAT = 1  # grows when an older mjstack could not read what is written
+# Grows when an older mjstack could not read what is written
+FORMAT = 1
+_WITH_IMAGES = 2
 _NAME_ANOTHER = "Name a folder that job=train has written"
 # A stranger's files may ask for more than this.
 _MOST_TEXT = 2**24  # bytes
 _MOST_WEIGHTS = 2**32  # bytes
 _MOST_COUNT = 1_000_000
 _MOST_LAYERS = 100
+_MOST_PIXELS = 4096  # along a side
 _MOST_HELD = 1000  # control steps between two answers
 
 
@@ -76,13 +79,15 @@ class Policy:
         return [*self.config["robot"]["arm_joints"], *self.config["robot"]["gripper_joints"]]
 
     def check_fit(self, cfg: Config) -> None:
-        """Check that the policy was trained for the robot, task, objects and step of a
+        """Check that the policy was trained for the robot, task, objects, step and cameras of a
         configuration.
 
         Raises:
             PolicyError: It was trained for something else; names the first difference.
         """
-        self._compare(_requirements(self.config), _requirements(config_content(cfg)))
+        cameras = list(self.network.vision.sizes)
+        trained = _requirements(self.config, cameras)
+        self._compare(trained, _requirements(config_content(cfg), cameras))
 
     def check_widths(self, widths: Mapping[str, int]) -> None:
         """Check how many numbers each term of its group has in the worlds that it is to drive.
@@ -117,7 +122,7 @@ class Policy:
                 )
 
 
-def _requirements(config: Mapping[str, Any]) -> dict[str, Any]:
+def _requirements(config: Mapping[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
     """The values that a policy depends on, by dotted key. Physics, solver and starts may differ."""
     keys = [
         ("robot", "name"),
@@ -134,6 +139,11 @@ def _requirements(config: Mapping[str, Any]) -> dict[str, Any]:
     found = {f"{group}.{key}": config[group][key] for group, key in keys}
     for name, thing in config["scene"]["objects"].items():
         found[f"scene.objects.{name}"] = f"{thing['shape']} {thing['size']}"
+    for name in cameras:
+        camera = config["scene"]["cameras"].get(name)
+        if camera is not None:
+            for key in ("size", "fovy", "pose"):
+                found[f"scene.cameras.{name}.{key}"] = camera[key]
     return found
 
 
@@ -168,12 +178,16 @@ def save_policy(folder: Path, policy: Policy) -> None:
 
 def policy_facts(policy: Policy) -> dict[str, Any]:
     """Observation, action, network and training of a policy, in JSON's types."""
+    vision = policy.network.vision
+    images = {"images": {name: list(size) for name, size in vision.sizes.items()}}
+    layers = {"channels": list(vision.channels), "features": vision.features}
     return {
-        "format": FORMAT,
+        "format": _WITH_IMAGES if vision.sizes else FORMAT,
         "observation": {
             "group": policy.group,
             "widths": policy.widths,
             **asdict(policy.observation),
+            **(images if vision.sizes else {}),
         },
         "action": {
             "joints": policy.joints,
@@ -184,7 +198,11 @@ def policy_facts(policy: Policy) -> dict[str, Any]:
             "execute": policy.execute,
             "step_dt": 1.0 / policy.config["task"]["control_hz"],
         },
-        "network": {"hidden": policy.hidden, "activation": "elu"},
+        "network": {
+            "hidden": policy.hidden,
+            "activation": "elu",
+            **(layers if vision.sizes else {}),
+        },
         "training": policy.training,
     }
 
@@ -202,10 +220,10 @@ def load_policy(folder: Path) -> Policy:
         raise PolicyError(f"policy={folder}: has no {POLICY_FILE}, {expected}", _NAME_ANOTHER)
     with reading(path, PolicyError, _NAME_ANOTHER):
         facts = json.loads(_read(path, _MOST_TEXT))
-        if facts["format"] != FORMAT:
+        if facts["format"] not in (FORMAT, _WITH_IMAGES):
             raise PolicyError(
-                f"policy={folder}: has format {facts['format']}, expected {FORMAT}, which this"
-                " mjstack reads",
+                f"policy={folder}: has format {facts['format']}, expected {FORMAT} or"
+                f" {_WITH_IMAGES}, which this mjstack reads",
                 "Use the mjstack that wrote it, or train it again",
             )
         policy = _from_facts(facts, path)
@@ -245,12 +263,14 @@ def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
         raise ValueError(f"network.hidden has {len(hidden)} layers, more than {_MOST_LAYERS}")
     # A term may have no numbers here, such as headings where nothing is a box.
     widths = {name: _whole(name, width, least=0) for name, width in seen["widths"].items()}
+    vision = _read_vision(facts)
     with torch.device("meta"):
         network = PolicyNetwork(
             sum(widths.values()),
             _whole("action.width", action["width"]),
             _whole("action.chunk", action["chunk"]),
             hidden,
+            vision,
         )
     policy = Policy(
         network=network,
@@ -267,8 +287,28 @@ def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
     )
     if policy.joints != action["joints"] or list(policy.observation.terms) != list(widths):
         raise ValueError("observation, action and config do not fit together")
-    _requirements(policy.config)  # they are all there
+    required = _requirements(policy.config, list(vision.sizes))  # they are all there
+    for name, size in vision.sizes.items():
+        if required.get(f"scene.cameras.{name}.size") != list(size):
+            raise ValueError(f"images of {name} are not those of config")
     return policy
+
+
+def _read_vision(facts: Mapping[str, Any]) -> Vision:
+    """The images that the policy of a file sees."""
+    images = facts["observation"].get("images", {})
+    if not images:
+        return Vision()
+    network = facts["network"]
+    channels = [_whole("network.channels", width) for width in network["channels"]]
+    if not 1 <= len(channels) <= _MOST_LAYERS:
+        raise ValueError(f"network.channels has {len(channels)} layers")
+    sizes = {}
+    for name, (height, width) in images.items():
+        sides = [_whole("observation.images", side, most=_MOST_PIXELS) for side in (height, width)]
+        sizes[str(name)] = (sides[0], sides[1])
+    features = _whole("network.features", network["features"])
+    return Vision(sizes=sizes, channels=channels, features=features)
 
 
 def _whole(name: str, value: object, least: int = 1, most: int = _MOST_COUNT) -> int:

@@ -1,8 +1,9 @@
 """The network of a policy: a multilayer perceptron between normalised observations and joint
-targets.
+targets, and convolutions between images and it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import torch
@@ -12,10 +13,52 @@ _CONSTANT = 1e-6  # a column that varies less has no scale
 FARTHEST = 5.0  # standard deviations: an observation beyond is taken for one there
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Vision:
+    """Images that a policy sees, and the layers that read them.
+
+    Attributes:
+        sizes: Height and width of each camera's images, by its name.
+        channels: Channels of each convolution. Each halves height and width.
+        features: Numbers that the perceptron gets from each image.
+    """
+
+    sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    channels: Sequence[int] = ()
+    features: int = 0
+
+
+class ImageEncoder(nn.Module):
+    """Convolutions that turn images into some numbers each."""
+
+    def __init__(self, size: tuple[int, int], channels: Sequence[int], features: int) -> None:
+        """Make the layers for images of a size, height and width."""
+        super().__init__()
+        layers: list[nn.Module] = []
+        height, width = size
+        for before, after in pairwise([3, *channels]):
+            kernel = 5 if not layers else 3
+            layers += [nn.Conv2d(before, after, kernel, stride=2, padding=kernel // 2), nn.ELU()]
+            height = -(-height // 2)
+            width = -(-width // 2)
+        flat = channels[-1] * height * width
+        self.layers = nn.Sequential(*layers, nn.Flatten(), nn.Linear(flat, features), nn.ELU())
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Shape ``(n, features)`` from images of shape ``(n, height, width, 3)``, 0 to 255."""
+        centred = images.permute(0, 3, 1, 2) / 127.5 - 1.0
+        return self.layers(centred)
+
+
 class PolicyNetwork(nn.Module):
     """Answers an observation with the joint targets of the next control steps, a chunk.
 
     Both are normalised inside, by mean and standard deviation, which are saved with the weights.
+
+    Attributes:
+        chunk: Steps of one answer.
+        joints: Joint targets of one step.
+        vision: Images that it sees; without cameras if there are none.
     """
 
     observation_mean: Tensor
@@ -23,7 +66,14 @@ class PolicyNetwork(nn.Module):
     action_mean: Tensor
     action_std: Tensor
 
-    def __init__(self, inputs: int, joints: int, chunk: int, hidden: Sequence[int]) -> None:
+    def __init__(
+        self,
+        inputs: int,
+        joints: int,
+        chunk: int,
+        hidden: Sequence[int],
+        vision: Vision | None = None,
+    ) -> None:
         """Make the layers, with random weights of torch's generator.
 
         Args:
@@ -31,11 +81,16 @@ class PolicyNetwork(nn.Module):
             joints: Joint targets of one step.
             chunk: Steps of one answer.
             hidden: Widths of the hidden layers.
+            vision: Images that it sees besides.
         """
         super().__init__()
         self.chunk = chunk
         self.joints = joints
-        widths = [inputs, *hidden]
+        self.vision = vision = vision or Vision()
+        self.encoders = nn.ModuleList(
+            ImageEncoder(size, vision.channels, vision.features) for size in vision.sizes.values()
+        )
+        widths = [inputs + vision.features * len(vision.sizes), *hidden]
         layers: list[nn.Module] = []
         for before, after in pairwise(widths):
             layers += [nn.Linear(before, after), nn.ELU()]
@@ -52,19 +107,23 @@ class PolicyNetwork(nn.Module):
         self.get_buffer(f"{name}_mean").copy_(mean)
         self.get_buffer(f"{name}_std").copy_(torch.where(std > _CONSTANT, std, constant))
 
-    def normalized(self, observation: Tensor) -> Tensor:
+    def normalized(self, observation: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """Answer in normalised joint targets, shape ``(n, chunk, joints)``."""
         scaled = (observation - self.observation_mean) / self.observation_std
         scaled = scaled.clamp(-FARTHEST, FARTHEST)
+        seen = [enc(image) for enc, image in zip(self.encoders, images, strict=True)]
+        scaled = torch.cat([scaled, *(each.to(scaled.dtype) for each in seen)], dim=1)
         return self.layers(scaled).unflatten(1, (self.chunk, self.joints))
 
-    def forward(self, observation: Tensor) -> Tensor:
+    def forward(self, observation: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """Joint targets [rad, m].
 
         Args:
             observation: Shape ``(n, inputs)``.
+            images: Those of each camera of ``vision``, shape ``(n, height, width, 3)``, 0 to 255,
+                in the network's type.
 
         Returns:
             Shape ``(n, chunk, joints)``.
         """
-        return self.action_mean + self.action_std * self.normalized(observation)
+        return self.action_mean + self.action_std * self.normalized(observation, images)

@@ -1,5 +1,6 @@
 """Trainer *clone*: a policy learns by regression to answer as the expert does."""
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,9 +13,10 @@ import torch
 from mjstack.config.schema import Backend, CloneJobCfg, CloneSizes
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.context import RunContext
-from mjstack.errors import FolderError, MjstackError
+from mjstack.errors import ConfigError, FolderError, MjstackError, UnknownName
 from mjstack.managers.observation import ObservationManager
 from mjstack.policy.checkpoint import read_state
+from mjstack.sim.memory import free_memory
 from mjstack.train.clone_learner import Learner
 from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import batches_of, play_expert
@@ -27,11 +29,45 @@ def check_clone(context: RunContext) -> range:
     job = cast(CloneJobCfg, cfg.job)
     sizes = resolve_sizes(job, context.backend[1])
     group = observed_group(job, sizes.leave_out)
+    check_vision(context, job)
     with _one_world(context) as env:
         widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
         if job.dataset is not None:
             return check_dataset(Path(job.dataset), env, group, widths)
     return range(cfg.seed, cfg.seed + len(batches_of(job, sizes, cfg.nworld)))
+
+
+def check_vision(context: RunContext, job: CloneJobCfg) -> None:
+    """Refuse images that a policy cannot see, or that do not fit into memory.
+
+    Raises:
+        MjstackError: Some do not.
+    """
+    cameras = context.cfg.scene.cameras
+    for name in job.vision.cameras:
+        if name not in cameras:
+            raise UnknownName("job.vision.cameras: camera", name, cameras)
+        if "rgb" not in cameras[name].outputs:
+            expected = "rgb among them, which a policy sees"
+            raise ConfigError(f"scene.cameras.{name}.outputs", cameras[name].outputs, expected)
+    if not job.vision.cameras:
+        return
+    if len(set(job.vision.cameras)) < len(job.vision.cameras):
+        raise ConfigError("job.vision.cameras", job.vision.cameras, "names, each once")
+    if not job.vision.channels:
+        raise ConfigError("job.vision.channels", [], "at least one number")
+    if job.dataset is not None:
+        expected = "null, because images are drawn from the positions of episodes that are played"
+        raise ConfigError("job.dataset", job.dataset, expected, "Or set job.vision.cameras=[]")
+    images = 3 * sum(math.prod(cameras[name].size) for name in job.vision.cameras)
+    needed = job.vision.pool * images
+    free = free_memory(torch.device(context.backend[1]))
+    if needed > free:
+        expected = (
+            f"at most {free // images}, as the device has {free / 2**30:.3g} GiB free and so many"
+            f" steps need {needed / 2**30:.3g} GiB"
+        )
+        raise ConfigError("job.vision.pool", job.vision.pool, expected, "Or make images smaller")
 
 
 @contextmanager

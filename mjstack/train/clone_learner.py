@@ -5,7 +5,7 @@ stopped.
 import copy
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -18,10 +18,11 @@ from mjstack.config.schema import CloneJobCfg, CloneSizes, Config
 from mjstack.distributed import Ranks
 from mjstack.episodes.context import RunContext
 from mjstack.interrupt import check_interrupt
-from mjstack.policy import Policy, PolicyNetwork, save_policy
+from mjstack.policy import Policy, PolicyNetwork, Vision, save_policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.sim.graph import StepGraph
 from mjstack.train.demonstrations import Demonstrations
+from mjstack.train.images import Augmentation, ImagePool
 from mjstack.train.trainer import (
     BEST,
     LAST,
@@ -34,6 +35,7 @@ from mjstack.train.trainer import (
 _HELD_OUT = 20  # of so many episodes one is for validation
 _LEAST = 0.1  # scale of a column, of the largest one of its term
 _VALIDATED = 65536  # steps at once
+_VALIDATED_IMAGES = 4096  # steps, at most
 _SHOWN = 10  # batches between two looks at the progress
 
 
@@ -51,6 +53,7 @@ class Learner:
     """
 
     trainer = "clone"
+    _validation: Tensor
 
     def __init__(
         self,
@@ -86,10 +89,11 @@ class Learner:
         self._batch_size = max(1, sizes.batch_size // ranks.size)
 
         # The network, its average and its optimizer
+        vision = vision_of(cfg, job)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(cfg.seed)
             network = PolicyNetwork(
-                self._seen.shape[1], self._labels.shape[1], job.chunk, sizes.hidden
+                self._seen.shape[1], self._labels.shape[1], job.chunk, sizes.hidden, vision
             )
         mean, std = _moments(self._labels, ranks)
         network.set_scale("action", mean.cpu(), std.cpu())
@@ -121,6 +125,18 @@ class Learner:
         ]
         self._widest = torch.tensor(widest, device=device)  # half-width of each column's noise
         self._generator = torch.Generator(device)
+        # Images
+        self._pool: ImagePool | None = None
+        self._shown: ImagePool | None = None
+        if vision.sizes:
+            seed = draw_seed(cfg.seed, ranks.rank, 0)
+            shared = (context, job.vision, vision, demonstrations)
+            self._pool = ImagePool(*shared, self._training, self._batch_size, seed)
+            every = -(-len(self._validation) // _VALIDATED_IMAGES)
+            self._validation = self._validation[::every]
+            self._shown = ImagePool(*shared, self._validation, self._batch_size, seed)
+            cameras = len(vision.sizes)
+            self._augment = Augmentation(job.vision, cameras, self._batch_size, device)
         self._policy = Policy(
             network=self._average,
             group=job.group,
@@ -163,6 +179,9 @@ class Learner:
         """
         total = self._sizes.batches if total is None else total
         before = self.seconds - time.perf_counter()
+        for pool in (self._pool, self._shown):
+            if pool is not None:
+                pool.fill(self.done - 1)
         self._events = self._open_events()
         self._batch = self._fit
         if self._seen.is_cuda and self._ranks.size == 1:
@@ -187,6 +206,10 @@ class Learner:
             except KeyboardInterrupt:
                 self._write_state()
                 raise
+            finally:
+                for pool in (self._pool, self._shown):
+                    if pool is not None:
+                        pool.close()
         if self._events is not None:
             self._events.close()
 
@@ -202,10 +225,12 @@ class Learner:
         """
         seed = draw_seed(self._policy.config["seed"], self._ranks.rank, self.done)
         self._generator.manual_seed(seed)
-        torch.randint(
-            len(self._training), self._drawn.shape, generator=self._generator, out=self._drawn
-        )
+        among = len(self._training if self._pool is None else self._pool.steps)
+        torch.randint(among, self._drawn.shape, generator=self._generator, out=self._drawn)
         self._noise.uniform_(-1.0, 1.0, generator=self._generator)
+        if self._pool is not None:
+            self._augment.draw(self._generator)
+            self._pool.advance(self.done)
         # The first networks are soon forgotten.
         keep = min(self._job.averaging, (1.0 + self.done) / (10.0 + self.done))
         self._forget.fill_(1.0 - keep)
@@ -217,7 +242,13 @@ class Learner:
     def _fit(self) -> None:
         """Learn from the drawn steps."""
         weights = list(self._network.parameters())
-        loss = self._loss(self._network, self._training[self._drawn], self._widest * self._noise)
+        images: Sequence[Tensor] = ()
+        if self._pool is None:
+            steps = self._training[self._drawn]
+        else:
+            steps = self._pool.steps[self._drawn]
+            images = self._augment(self._pool.images, self._drawn)
+        loss = self._loss(self._network, steps, images, self._widest * self._noise)
         for weight, gradient in zip(weights, torch.autograd.grad(loss, weights), strict=True):
             weight.grad = gradient
         self._ranks.average_gradients(weights)
@@ -228,7 +259,13 @@ class Learner:
         torch._foreach_add_(average, change)
         self._sum += loss.detach()
 
-    def _loss(self, network: PolicyNetwork, steps: Tensor, noise: Tensor | float = 0.0) -> Tensor:
+    def _loss(
+        self,
+        network: PolicyNetwork,
+        steps: Tensor,
+        images: Sequence[Tensor],
+        noise: Tensor | float = 0.0,
+    ) -> Tensor:
         """Mean squared error of the normalised answers at some steps, shape ``(n,)``. At an
         episode's end its last joint targets hold.
 
@@ -239,13 +276,29 @@ class Learner:
         ahead = torch.arange(network.chunk, device=steps.device)
         then = torch.minimum(steps[:, None] + ahead, self._last[steps][:, None])
         wanted = (self._labels[then] - network.action_mean) / network.action_std
-        return torch.nn.functional.mse_loss(network.normalized(self._seen[steps] + noise), wanted)
+        # Convolutions on CUDA in bfloat16. A graph cannot hold the cache of converted weights.
+        fast = torch.autocast(
+            steps.device.type,
+            torch.bfloat16,
+            enabled=steps.is_cuda and len(images) > 0,
+            cache_enabled=False,
+        )
+        with fast:
+            answer = network.normalized(self._seen[steps] + noise, images)
+        return torch.nn.functional.mse_loss(answer.float(), wanted)
 
     @torch.no_grad()
     def _validate(self) -> float:
         """The average network's loss in the episodes that are held out."""
-        parts = self._validation.split(_VALIDATED)
-        total = torch.stack([self._loss(self._average, part) * len(part) for part in parts]).sum()
+        losses = []
+        size = _VALIDATED if self._shown is None else self._batch_size
+        for first in range(0, len(self._validation), size):
+            rows = slice(first, first + size)
+            images = [] if self._shown is None else [each[rows] for each in self._shown.images]
+            part = self._validation[rows]
+            shown = [each.float() for each in images]
+            losses.append(self._loss(self._average, part, shown) * len(part))
+        total = torch.stack(losses).sum()
         count = torch.full_like(total, len(self._validation))
         self._ranks.sum_(total, count)
         return float(total / count)
@@ -327,6 +380,19 @@ def _moments(values: Tensor, ranks: Ranks) -> tuple[Tensor, Tensor]:
     ranks.sum_(count, first, second)
     mean = (first / count).float()
     return mean, (second / count - (first / count) ** 2).clamp(min=0.0).sqrt().float()
+
+
+def vision_of(cfg: Config, job: CloneJobCfg) -> Vision:
+    """The images that a policy of the job sees."""
+    settings = job.vision
+    if not settings.cameras:
+        return Vision()
+    cameras = cfg.scene.cameras
+    return Vision(
+        sizes={name: (cameras[name].size[0], cameras[name].size[1]) for name in settings.cameras},
+        channels=settings.channels,
+        features=settings.features,
+    )
 
 
 @contextmanager

@@ -136,6 +136,9 @@ def check_dagger(context: RunContext) -> range:
     if cfg.controller.name != STATE_BASED:
         expected = "state_based, because trainer=dagger asks the expert in the policy's states"
         raise ConfigError("controller", cfg.controller.name, expected)
+    if job.vision.cameras:
+        expected = "[], because trainer=dagger learns from numbers"
+        raise ConfigError("job.vision.cameras", job.vision.cameras, expected, "Set trainer=pixels")
     if job.dataset is not None:
         expected = "null, because trainer=dagger asks the expert itself"
         raise ConfigError("job.dataset", job.dataset, expected, "Set trainer=clone")

@@ -3,8 +3,9 @@ targets that the expert has given.
 """
 
 import math
+from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import cast
 
 import torch
@@ -66,16 +67,20 @@ class DemonstrationRecorder(Observer):
         seen: Observations before each step, shape ``(steps, nworld, inputs)``.
         labels: The expert's joint targets of each step, shape ``(steps, nworld, nu)``.
         widths: Numbers of each term of the observation.
+        qpos: Positions before each step, shape ``(steps, nworld, nq)``, float32; None if they are
+            not kept.
     """
 
     seen: Tensor
     labels: Tensor
     widths: dict[str, int]
+    qpos: Tensor | None = None
 
-    def __init__(self, name: str, group: ObservationGroupCfg) -> None:
-        """Take the observation group's name and configuration."""
+    def __init__(self, name: str, group: ObservationGroupCfg, *, keep_states: bool = False) -> None:
+        """Take the observation group's name and configuration, and whether positions are kept."""
         self._name = name
         self._group = group
+        self._keep_states = keep_states
 
     def start(self, env: Env, driver: Driver) -> None:
         """See `Observer`."""
@@ -86,6 +91,9 @@ class DemonstrationRecorder(Observer):
         shape = (driver.steps, env.nworld)
         self.seen = torch.zeros((*shape, self._now.shape[1]), device=env.device)
         self.labels = torch.zeros((*shape, len(env.index.ctrl)), device=env.device)
+        if self._keep_states:
+            self.qpos = torch.zeros((*shape, env.sim.qpos.shape[1]), device=env.device)
+            self._last = env.sim.qpos.float().clone()
         self._next = torch.zeros(1, dtype=torch.int64, device=env.device)
         self._observations.refresh(torch.ones(env.nworld, dtype=torch.bool, device=env.device))
 
@@ -94,6 +102,9 @@ class DemonstrationRecorder(Observer):
         driver = cast(NoisyDriver, self.driver)
         self.seen.index_copy_(0, self._next, self._now[None])
         self.labels.index_copy_(0, self._next, driver.label[None])
+        if self.qpos is not None:
+            self.qpos.index_copy_(0, self._next, self._last[None])
+            self._last.copy_(self.env.sim.qpos)
         self._next.add_(1)
         self._observations.compute()
 
@@ -109,6 +120,9 @@ class Demonstrations:
         widths: Numbers of each term of the observation, in order.
         played: Episodes that were played.
         source: Where they come from, in words.
+        qpos: Positions before each step, from which images are drawn, shape ``(steps of all
+            episodes, nq)``, float32; None where there are none.
+        fields: Model fields of the episodes' worlds by name, each ``(episodes, ...)``.
     """
 
     seen: Tensor
@@ -117,6 +131,14 @@ class Demonstrations:
     widths: dict[str, int]
     played: int
     source: str
+    qpos: Tensor | None = None
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def episode(self) -> Tensor:
+        """The episode that each step belongs to, shape ``(steps,)``, int64."""
+        return torch.arange(len(self.ends), device=self.ends.device).repeat_interleave(
+            self.lengths()
+        )
 
     def lengths(self) -> Tensor:
         """Steps of each episode, shape ``(episodes,)``, int64."""
@@ -157,14 +179,16 @@ def play_expert(
     batches = list(enumerate(batches_of(job, sizes, nworld), start=cfg.seed))
     worlds = context.ranks.share(nworld)
     most = sum(len(range(worlds.start, min(worlds.stop, count))) for _, (count, _) in batches)
-    seen = labels = torch.zeros(0)
+    drawn = bool(job.vision.cameras)
+    seen = labels = qpos = torch.zeros(0)
+    fields: dict[str, list[Tensor]] = {}
     widths: dict[str, int] = {}
     kept = steps = 0
     with closing(context.batch_simulation(len(worlds))) as sim:
         for seed, (count, noise) in batches:
             env = context.start(sim, cfg.reset, seed=seed, worlds=worlds)
             driver = NoisyDriver(context.driver(env), env, noise)
-            recorder = DemonstrationRecorder(job.group, group)
+            recorder = DemonstrationRecorder(job.group, group, keep_states=drawn)
             label = f"steps of the expert, seed {seed}"
             looking = [recorder, *context.spectators]
             episode = play_episode(env, driver, looking, advance=context.advance, label=label)
@@ -173,11 +197,17 @@ def play_expert(
                 steps = driver.steps
                 seen = recorder.seen.new_zeros((most, steps, recorder.seen.shape[2]))
                 labels = recorder.labels.new_zeros((most, steps, recorder.labels.shape[2]))
+                if recorder.qpos is not None:
+                    qpos = recorder.qpos.new_zeros((most, steps, recorder.qpos.shape[2]))
             good = (episode.result.failed == 0).nonzero()[:, 0]
             good = good[good < count - worlds.start]
             into = slice(kept, kept + len(good))
             seen[into] = recorder.seen[:, good].transpose(0, 1)
             labels[into] = recorder.labels[:, good].transpose(0, 1)
+            if recorder.qpos is not None:
+                qpos[into] = recorder.qpos[:, good].transpose(0, 1)
+                for name in sim.fields:
+                    fields.setdefault(name, []).append(sim.fields[name][good].clone())
             kept += len(good)
             what = f"noise of {noise:g} rad" if noise else "no noise"
             succeeded = sum(context.ranks.gather(len(good)))
@@ -192,4 +222,6 @@ def play_expert(
         widths=widths,
         played=most,
         source=f"the expert, seeds {batches[0][0]} to {batches[-1][0]}",
+        qpos=qpos[:kept].flatten(0, 1) if drawn else None,
+        fields={name: torch.cat(parts) for name, parts in fields.items()},
     )

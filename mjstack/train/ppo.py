@@ -41,6 +41,9 @@ def make_plan(cfg: Config) -> Plan:
     else:
         start = load_policy(Path(job.start_from))
         start.check_fit(cfg)
+        if start.network.vision.sizes:
+            expected = "a policy that sees no images"
+            raise ConfigError("job.start_from", job.start_from, expected)
         name = start.group
         seen = start.observation
         cfg = _acting_as(cfg, start)

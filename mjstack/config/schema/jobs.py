@@ -1,6 +1,6 @@
 """Jobs: what each of them needs to know."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
@@ -135,6 +135,27 @@ class CloneSizes:
 
 
 @dataclass(slots=True)
+class VisionCfg:
+    """Images that a policy sees, and how it learns from them."""
+
+    cameras: list[str] = spec(factory=list)
+    """Cameras of the scene that it sees; empty: none."""
+    channels: list[int] = spec(factory=lambda: [32, 64, 128, 128], ge=1, le=4096)
+    """Channels of the convolutions for each camera; each halves height and width."""
+    features: int = spec(256, ge=1, le=65536)
+    """Numbers that the other layers get from each image."""
+    shift: int = spec(2, unit="pixels", ge=0, le=1000)
+    """Largest shift of an image in training, up, down and to the sides."""
+    color: float = spec(0.2, ge=0.0, le=1.0)
+    """Largest change of brightness and of each colour in training, as a share."""
+    pool: int = spec(131072, unit="steps", ge=1)
+    """Steps whose images are kept on the device. Batches are drawn from these."""
+    uses: int = spec(4, unit="batches", ge=1)
+    """How often an image is in a batch, on average, before another one is drawn in its place. If
+    all steps fit into the pool, each is drawn once."""
+
+
+@dataclass(slots=True)
 class CloneJobCfg(TrainJobCfg):
     """A network learns to answer as the expert does. What is null is as ``sizes`` has it."""
 
@@ -174,6 +195,8 @@ class CloneJobCfg(TrainJobCfg):
     """Of AdamW."""
     leave_out: list[str] | None = spec(None)
     """Terms of the group that the policy does not see."""
+    vision: VisionCfg = field(default_factory=VisionCfg)
+    """Images that it sees."""
     sizes: dict[str, CloneSizes] = spec(factory=dict)
     """Values of the keys that are null above, for ``cuda`` and for ``cpu``."""
 

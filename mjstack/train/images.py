@@ -1,0 +1,169 @@
+"""Images that a policy learns from: drawn from the positions of demonstrations as they are needed,
+on the device.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mjstack.config.schema import Config, VisionCfg
+from mjstack.episodes.context import RunContext
+from mjstack.managers.episode import required_fields
+from mjstack.policy import Vision
+from mjstack.sim import StateRenderer
+from mjstack.train.demonstrations import Demonstrations
+
+_OWN = 2**40  # seeds that nothing else has
+_AT_ONCE = 2048  # states that are drawn at most, where more are needed
+
+
+class ImagePool:
+    """Images of some steps of demonstrations, of which the oldest give way to new ones.
+
+    The content follows from the seed and the number of the batch alone, so training goes on after
+    any batch. If all steps fit, each is drawn once and stays.
+
+    Attributes:
+        steps: The step that each row shows, shape ``(rows,)``, int64.
+        images: Images of those steps, one for each camera, each ``(rows, height, width, 3)``,
+            uint8.
+    """
+
+    def __init__(
+        self,
+        context: RunContext,
+        settings: VisionCfg,
+        vision: Vision,
+        demonstrations: Demonstrations,
+        steps: Tensor,
+        batch_size: int,
+        seed: int,
+    ) -> None:
+        """Allocate.
+
+        Args:
+            context: The run, for its scene and its device.
+            settings: How many images are kept, and how often each is used.
+            vision: The images that the policy sees.
+            demonstrations: The episodes.
+            steps: Those of their steps that are drawn, shape ``(n,)``, int64.
+            batch_size: Steps of a batch.
+            seed: Of the choice of steps.
+
+        Raises:
+            MjstackError: The images do not fit into memory.
+        """
+        assert demonstrations.qpos is not None
+        self._qpos = demonstrations.qpos
+        self._fields = demonstrations.fields
+        self._episode = demonstrations.episode()
+        self._from = steps
+        self._names = list(vision.sizes)
+        device = steps.device
+        self._whole = len(steps) <= settings.pool
+        self._fresh = max(1, batch_size // settings.uses)
+        if self._whole:
+            self._fresh = min(_AT_ONCE, len(steps))
+        rows = len(steps) if self._whole else -(-settings.pool // self._fresh) * self._fresh
+        self._count = -(-rows // self._fresh)
+        cfg = policy_cameras(context, self._names)
+        backend, where = context.backend
+        fields = required_fields(cfg.reset)
+        self._renderer = StateRenderer(
+            context.model, cfg, self._fresh, backend=backend, device=where, fields=fields
+        )
+        self._generator = torch.Generator(device)
+        self._seed = _OWN + seed
+        self.steps = torch.zeros(rows, dtype=torch.int64, device=device)
+        self.images = [
+            torch.zeros((rows, *vision.sizes[name], 3), dtype=torch.uint8, device=device)
+            for name in self._names
+        ]
+
+    def fill(self, batch: int) -> None:
+        """Draw what the pool has after a batch of this number."""
+        if self._whole:
+            self.steps.copy_(self._from)
+            for first in range(0, len(self.steps), self._fresh):
+                self._draw(slice(first, first + self._fresh))
+            return
+        for number in range(batch - self._count + 1, batch + 1):
+            self._draw_part(number)
+
+    def advance(self, batch: int) -> None:
+        """Draw new images for a batch in the place of the oldest."""
+        if not self._whole:
+            self._draw_part(batch)
+
+    def _draw_part(self, number: int) -> None:
+        """Draw the part of the pool that has this number."""
+        first = number % self._count * self._fresh
+        rows = slice(first, first + self._fresh)
+        self._generator.manual_seed(self._seed + number + self._count)
+        chosen = torch.randint(
+            len(self._from), (self._fresh,), generator=self._generator, device=self.steps.device
+        )
+        self.steps[rows] = self._from[chosen]
+        self._draw(rows)
+
+    def _draw(self, rows: slice) -> None:
+        """Draw the steps of some rows."""
+        steps = self.steps[rows]
+        episodes = self._episode[steps]
+        fields = {name: values[episodes] for name, values in self._fields.items()}
+        drawn = self._renderer.draw(self._qpos[steps], fields)
+        for name, images in zip(self._names, self.images, strict=True):
+            images[rows] = drawn[f"images.{name}"]
+
+    def close(self) -> None:
+        """Give the worlds for drawing back."""
+        self._renderer.close()
+
+
+def policy_cameras(context: RunContext, names: Sequence[str]) -> Config:
+    """The configuration whose cameras are those that a policy sees, and draw colours alone."""
+    cfg = context.cfg
+    cameras = {
+        name: replace(cfg.scene.cameras[name], outputs=["rgb"], terminal=False) for name in names
+    }
+    return replace(cfg, scene=replace(cfg.scene, cameras=cameras))
+
+
+class Augmentation:
+    """Random shifts and colours of a batch of images. What it draws lies in tensors, so a graph can
+    hold the rest.
+    """
+
+    def __init__(self, settings: VisionCfg, cameras: int, count: int, device: torch.device) -> None:
+        """Allocate for batches of ``count`` steps."""
+        self._shift = settings.shift
+        self._color = settings.color
+        self._moves = torch.zeros((cameras, count, 2), dtype=torch.int64, device=device)
+        self._tints = torch.zeros((cameras, count, 2, 4), device=device)
+
+    def draw(self, generator: torch.Generator) -> None:
+        """Draw the numbers of a batch."""
+        self._moves.random_(0, 2 * self._shift + 1, generator=generator)
+        self._tints.uniform_(-1.0, 1.0, generator=generator)
+
+    def __call__(self, pool: Sequence[Tensor], rows: Tensor) -> list[Tensor]:
+        """Augmented images of some rows of a pool, each ``(n, height, width, 3)``, float32, 0 to
+        255. What a shift leaves open repeats the border.
+        """
+        out = []
+        for images, moves, tints in zip(pool, self._moves, self._tints, strict=True):
+            height, width = images.shape[1:3]
+            moves = moves - self._shift
+            y = torch.arange(height, device=rows.device) + moves[:, :1]
+            x = torch.arange(width, device=rows.device) + moves[:, 1:]
+            y = y.clamp(0, height - 1)[:, :, None]
+            x = x.clamp(0, width - 1)[:, None, :]
+            picked = images[rows[:, None, None], y, x].float()
+            # Of all colours, and of each
+            change = 0.5 * self._color * (tints[..., :1] + tints[..., 1:])
+            gain = 1.0 + change[:, None, None, 0]
+            offset = 127.5 * change[:, None, None, 1]
+            out.append((picked * gain + offset).clamp(0.0, 255.0))
+        return out
