@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -130,11 +131,13 @@ class Learner:
         self._shown: ImagePool | None = None
         if vision.sizes:
             seed = draw_seed(cfg.seed, ranks.rank, 0)
-            shared = (context, job.vision, vision, demonstrations)
-            self._pool = ImagePool(*shared, self._training, self._batch_size, seed)
+            own = (vision, demonstrations)
+            size = self._batch_size
+            self._pool = ImagePool(context, job.vision, *own, self._training, size, seed)
             every = -(-len(self._validation) // _VALIDATED_IMAGES)
             self._validation = self._validation[::every]
-            self._shown = ImagePool(*shared, self._validation, self._batch_size, seed)
+            all_of_them = replace(job.vision, pool=len(self._validation))
+            self._shown = ImagePool(context, all_of_them, *own, self._validation, size, seed)
             cameras = len(vision.sizes)
             self._augment = Augmentation(job.vision, cameras, self._batch_size, device)
         self._policy = Policy(

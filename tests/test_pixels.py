@@ -1,0 +1,343 @@
+"""Policies that see images: what they learn from, what they see, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import pytest
+import torch
+from compositions import load_config, make_env
+
+import mjstack.train.clone_learner as clone_learner
+from mjstack.cli import run
+from mjstack.config.schema import CloneJobCfg, VisionCfg
+from mjstack.drivers.policy import PolicyDriver
+from mjstack.episodes.context import RunContext
+from mjstack.errors import PolicyError
+from mjstack.interrupt import handle_interrupts
+from mjstack.policy import Policy, load_policy
+from mjstack.sim import StateRenderer
+from mjstack.train.clone_learner import Learner, vision_of
+from mjstack.train.demonstrations import Demonstrations
+from mjstack.train.images import Augmentation, ImagePool
+
+CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+CAMERAS = [
+    "cameras=[front,wrist]",
+    "scene.cameras.front.size=[16,24]",
+    "scene.cameras.wrist.size=[16,16]",
+]
+SHORT = ["controller.phases.hold.seconds=0.4", "task.episode_steps=70", "task.check.window=10"]
+SMALL = ["task=reach", "sim=mjwarp", "sim.device=cpu", "nworld=4", *CAMERAS, *SHORT]
+TINY = [
+    "job=train",
+    "trainer=pixels",
+    *SMALL,
+    "web.episode=false",
+    "job.vision.channels=[4,8]",
+    "job.vision.features=8",
+    "job.vision.pool=40",
+    "job.vision.uses=2",
+    "job.vision.shift=1",
+    "job.episodes=4",
+    "job.noisy_episodes=0",
+    "job.hidden=[16]",
+    "job.batches=12",
+    "job.batch_size=16",
+    "job.save_every=6",
+    "gate.success.rate=0.0",
+]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny training."""
+    folder = tmp_path_factory.mktemp("pixels") / "training"
+    assert run([*TINY, f"job.folder={folder}"]) == 0
+    return folder
+
+
+def same(a: Policy, b: Policy) -> bool:
+    ours = a.network.state_dict()
+    theirs = b.network.state_dict()
+    return all(torch.equal(value, theirs[name]) for name, value in ours.items())
+
+
+def test_a_policy_sees_images_and_joints(trained: Path) -> None:
+    policy = load_policy(trained / "last")
+    assert list(policy.widths) == ["joint_pos"]
+    vision = policy.network.vision
+    assert vision.sizes == {"front": (16, 24), "wrist": (16, 16)}
+    facts = json.loads((trained / "last/policy.json").read_text())
+    assert facts["format"] == 2
+    assert facts["observation"]["images"] == {"front": [16, 24], "wrist": [16, 16]}
+    assert facts["network"]["channels"] == [4, 8]
+    gates = json.loads((trained / "report.json").read_text())["gates"]
+    assert [gate["status"] for gate in gates] == ["pass", "pass"]
+    # Either image changes the answer
+    seen = torch.zeros(1, 6)
+    black = [torch.zeros(1, *size, 3) for size in vision.sizes.values()]
+    answer = policy.network(seen, black)
+    for number in range(2):
+        lit = [image + 200.0 * (number == k) for k, image in enumerate(black)]
+        assert not torch.allclose(policy.network(seen, lit), answer)
+
+
+def test_the_driver_sees_what_the_environment_draws(trained: Path) -> None:
+    """Each world's images when it asks, also after a reset of its own."""
+    policy = load_policy(trained / "last")
+    env = make_env([*SMALL, "action=joint_absolute", "observation=pixels", "~termination.success"])
+    env.reset(seed=5)
+    driver = PolicyDriver(env, policy)
+    network = policy.network.double()
+    expected = torch.zeros(4, 5, 6)
+    images = env.images
+    seen = env.observation_manager.groups["policy"]
+    for step in range(13):
+        if step == 7:
+            env.reset(mask=torch.tensor([False, True, False, False]))
+        slot = env.episode_step % 5
+        shown = [images[f"images.{name}"].double() for name in ("front", "wrist")]
+        observed = env.observation_manager.compute()["policy"] if seen is None else seen
+        exact = env.index.on(env.device, env.sim.qpos.dtype).qpos.read(env.sim.qpos)
+        home = torch.tensor(env.cfg.robot.home)
+        answer = network((exact - home).double(), shown)[:, :5].float()
+        expected = torch.where((slot == 0)[:, None, None], answer, expected)
+        command = driver.command()
+        wanted = expected[torch.arange(4), slot]
+        assert torch.allclose(command, wanted, atol=1e-5), step
+        assert observed.shape == (4, 6)
+        env.step(command)
+    env.close()
+
+
+def test_other_cameras_are_refused(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    base = [*SMALL[:4], *SHORT, "controller=policy", f"policy={trained}/last", "gates=[batch]"]
+    for cameras, says in (
+        ([], "was trained with scene.cameras.front.size=[16, 24], and here it is missing"),
+        ([*CAMERAS, "scene.cameras.wrist.size=[32,32]"], "wrist.size=[16, 16], and here it is"),
+        ([*CAMERAS, "scene.cameras.front.fovy=50"], "front.fovy=45.0, and here it is 50.0"),
+    ):
+        assert run([*base, *cameras]) == 2
+        err = capsys.readouterr().err.strip()
+        assert says in err
+        assert len(err.splitlines()) == 1
+    # More than it sees
+    env = make_env([*SMALL, "action=joint_absolute", "cameras=[front,wrist,top]"])
+    env.reset(seed=0)
+    PolicyDriver(env, load_policy(trained / "last"))
+    without = replace(env.cfg, scene=replace(env.cfg.scene, cameras={}))
+    with pytest.raises(PolicyError, match="here it is missing"):
+        load_policy(trained / "last").check_fit(without)
+    env.close()
+
+
+def test_a_policy_that_sees_images_is_not_exported(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["job=export", *SMALL, f"policy={trained}/last"]) == 2
+    assert "sees images, expected one that sees numbers alone" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"observation": {"images": {"front": [16, 16]}}}, "images of front are not those of conf"),
+        ({"observation": {"images": {"front": [10**9, 16]}}}, "observation.images is 1000000000"),
+        ({"network": {"channels": []}}, "network.channels has 0 layers"),
+        ({"network": {"features": 9}}, "loading state_dict"),
+    ],
+    ids=["size", "too large", "no layers", "another network"],
+)
+def test_a_strangers_policy_is_refused(
+    trained: Path, tmp_path: Path, change: dict[str, dict], says: str
+) -> None:
+    for path in (trained / "last").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    facts = json.loads((tmp_path / "policy.json").read_text())
+    for block, values in change.items():
+        facts[block] |= values
+    (tmp_path / "policy.json").write_text(json.dumps(facts))
+    with pytest.raises(PolicyError, match="cannot be read") as caught:
+        load_policy(tmp_path)
+    assert says in str(caught.value)
+
+
+BAD: list[tuple[list[str], str]] = [
+    (["job.vision.cameras=[front,side]"], "job.vision.cameras: camera 'side' does not exist"),
+    (["job.vision.cameras=[front,front]"], "job.vision.cameras=['front', 'front']: expected"),
+    (["job.vision.channels=[]"], "job.vision.channels=[]: expected at least one number"),
+    (["scene.cameras.front.outputs=[depth]"], "expected rgb among them, which a policy sees"),
+    (["job.vision.pool=1000000000000"], "job.vision.pool=1000000000000: expected at most"),
+    (["job.dataset=outputs/demos"], "expected null, because images are drawn"),
+    (["trainer=dagger", "job.vision.cameras=[front]"], "trainer=dagger learns from numbers"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
+def test_bad_input_is_one_line(
+    overrides: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    base = ["job=train", "trainer=pixels", *SMALL]
+    if overrides[0].startswith("trainer"):
+        base = ["job=train", *SMALL]
+    assert run([*base, *overrides]) == 2
+    err = capsys.readouterr().err.strip()
+    assert says in err
+    assert len(err.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+# Training data
+
+
+def demonstrations(context: RunContext, count: int) -> Demonstrations:
+    """Two episodes of positions that differ in every step."""
+    qpos = torch.from_numpy(context.model.qpos0).float().repeat(count, 1)
+    qpos[:, 0] = torch.linspace(-1.0, 1.0, count)
+    none = torch.zeros(count, 1)
+    ends = torch.tensor([count // 3, count])
+    return Demonstrations(
+        seen=none, labels=none, ends=ends, widths={}, played=2, source="", qpos=qpos
+    )
+
+
+def test_the_pool_has_the_images_of_its_steps() -> None:
+    cfg = load_config([*TINY, "reset=nominal"])
+    context = RunContext(cfg)
+    vision = vision_of(cfg, cast(CloneJobCfg, cfg.job))
+    found = demonstrations(context, 60)
+    steps = torch.arange(10, 60)
+    settings = VisionCfg(cameras=["front", "wrist"], pool=20, uses=4)
+    every = StateRenderer(context.model, cfg, 60)
+    assert found.qpos is not None
+    expected = {name: image.clone() for name, image in every.draw(found.qpos).items()}
+
+    def check(pool: ImagePool) -> None:
+        assert set(pool.steps.tolist()) <= set(steps.tolist())
+        for name, images in zip(vision.sizes, pool.images, strict=True):
+            assert torch.equal(images, expected[f"images.{name}"][pool.steps])
+
+    pool = ImagePool(context, settings, vision, found, steps, 32, 7)
+    pool.fill(-1)
+    assert len(pool.steps) == 24  # three parts of 8
+    check(pool)
+    kept = [pool.steps.clone()]
+    for batch in range(4):
+        pool.advance(batch)
+        check(pool)
+        kept.append(pool.steps.clone())
+        assert ((kept[-1] != kept[-2]).reshape(3, 8).any(1).sum()) == 1
+    assert (kept[-1] != kept[0]).float().mean() > 0.5
+    again = ImagePool(context, settings, vision, found, steps, 32, 7)
+    again.fill(2)
+    again.advance(3)
+    assert torch.equal(again.steps, kept[-1])
+
+    # All of them fit
+    whole = ImagePool(context, replace(settings, pool=50), vision, found, steps, 32, 7)
+    whole.fill(-1)
+    assert torch.equal(whole.steps, steps)
+    check(whole)
+    whole.advance(0)
+    assert torch.equal(whole.steps, steps)
+
+
+def test_augmentation_shifts_and_tints() -> None:
+    pool = [torch.randint(0, 256, (5, 9, 12, 3), dtype=torch.uint8) for _ in range(2)]
+    rows = torch.tensor([4, 0, 0, 2])
+    generator = torch.Generator().manual_seed(0)
+    still = Augmentation(VisionCfg(shift=0, color=0.0), 2, 4, torch.device("cpu"))
+    still.draw(generator)
+    for image, images in zip(still(pool, rows), pool, strict=True):
+        assert torch.equal(image, images[rows].float())
+
+    moving = Augmentation(VisionCfg(shift=2, color=0.0), 2, 4, torch.device("cpu"))
+    found: set[tuple[int, int]] = set()
+    for _ in range(30):
+        moving.draw(generator)
+        for image, images, moves in zip(moving(pool, rows), pool, moving._moves, strict=True):
+            for one, row, (y, x) in zip(image, rows.tolist(), (moves - 2).tolist(), strict=True):
+                found.add((y, x))
+                padded = torch.nn.functional.pad(
+                    images[row].permute(2, 0, 1)[None].float(), (2, 2, 2, 2), mode="replicate"
+                )[0].permute(1, 2, 0)
+                assert torch.equal(one, padded[2 + y : 11 + y, 2 + x : 14 + x])
+    assert found == {(y, x) for y in range(-2, 3) for x in range(-2, 3)}
+
+    grey = [torch.full((5, 9, 12, 3), 100, dtype=torch.uint8)] * 2
+    tinted = Augmentation(VisionCfg(shift=0, color=0.2), 2, 4, torch.device("cpu"))
+    tinted.draw(generator)
+    image = torch.cat(tinted(grey, rows))
+    assert torch.equal(image, image[:, :1, :1].expand_as(image))  # alike in all of an image
+    colors = image[:, 0, 0]
+    assert ((colors - 100.0).abs() <= 0.2 * 100.0 + 0.2 * 127.5 + 1e-3).all()
+    assert colors.std() > 3.0
+    assert (colors.std(dim=1) > 0.5).all()
+
+
+@pytest.mark.full
+def test_a_training_goes_on_where_it_was_interrupted(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import mjstack.interrupt as interrupt
+
+    step = Learner._step
+
+    def stop(self: Learner, rate: float) -> None:
+        step(self, rate)
+        if self.done + 1 == 8:
+            monkeypatch.setattr(interrupt, "_asked", True)
+
+    monkeypatch.setattr(Learner, "_step", stop)
+    monkeypatch.setattr(clone_learner, "_SHOWN", 1)
+    command = [*TINY, f"job.folder={tmp_path}"]
+    with handle_interrupts():
+        assert run(command) == 130
+    monkeypatch.undo()
+    assert run(command) == 0
+    assert same(load_policy(tmp_path / "last"), load_policy(trained / "last"))
+
+
+def success_rate(overrides: Sequence[str], folder: Path) -> float:
+    assert run([*overrides, f"job.folder={folder}"]) == 0
+    gates = json.loads((folder / "report.json").read_text())["gates"]
+    return gates[-1]["metrics"]["success_rate"]
+
+
+@pytest.mark.full
+def test_two_cores_train_reach_from_pixels(tmp_path: Path) -> None:
+    """One camera of 32 x 32 pixels: some two minutes, most of them for two cores' learning."""
+    overrides = [
+        "job=train",
+        "trainer=pixels",
+        "task=reach",
+        "sim=mjwarp",
+        "sim.device=cpu",
+        "nworld=64",
+        "cameras=front",
+        "scene.cameras.front.size=[32,32]",
+        "job.vision.cameras=[front]",
+        "job.vision.channels=[16,32,32]",
+        "job.vision.features=64",
+        "job.vision.shift=0",
+        "gate.success.rate=0.7",
+    ]
+    assert success_rate(overrides, tmp_path) >= 0.7
+
+
+@pytest.mark.full
+@pytest.mark.gpu
+@CUDA
+def test_cuda_learns_and_plays_in_graphs(tmp_path: Path) -> None:
+    on_cuda = [each.replace("sim.device=cpu", "sim.device=cuda:0") for each in TINY]
+    assert success_rate([*on_cuda, "graph=require"], tmp_path) >= 0.0
