@@ -217,6 +217,7 @@ class EpisodeRenderer:
         # Steps from one image to the next, as the environment draws them
         hz = cfg.task.control_hz
         cameras = cfg.scene.cameras
+        self._sizes = {name: each.size for name, each in cameras.items()}
         self._every = {name: round(hz / (each.rate or hz)) for name, each in cameras.items()}
 
     def episodes(self, played: Played, rows: Sequence[int]) -> Iterator[dict[str, np.ndarray]]:
@@ -240,12 +241,13 @@ class EpisodeRenderer:
             self.seconds += time.perf_counter() - began
             for row in range(len(some)):
                 rows_of = slice(row * len(states), (row + 1) * len(states))
-                yield {
-                    f"{IMAGES}.{name}": np.repeat(drawn[name][rows_of][:: every // step], every, 0)[
-                        :steps
-                    ]
-                    for name, every in self._every.items()
-                }
+                episode = {}
+                for name, every in self._every.items():
+                    images = drawn[name][rows_of][:: every // step]
+                    if every > 1:
+                        images = np.repeat(images, every, axis=0)[:steps]
+                    episode[f"{IMAGES}.{name}"] = images
+                yield episode
 
     def close(self) -> None:
         """Give the worlds back."""
@@ -255,14 +257,15 @@ class EpisodeRenderer:
         self, qpos: torch.Tensor, fields: Mapping[str, torch.Tensor]
     ) -> dict[str, np.ndarray]:
         """Images of any number of states by camera, on the host."""
-        parts: dict[str, list[np.ndarray]] = {name: [] for name in self._every}
+        shapes = {name: (len(qpos), *size, 3) for name, size in self._sizes.items()}
+        out = {name: np.empty(shape, np.uint8) for name, shape in shapes.items()}
         for first in range(0, len(qpos), self._count):
             rows = slice(first, first + self._count)
             looks = {name: values[rows] for name, values in fields.items()}
             images = self._renderer.draw(qpos[rows], looks)
-            for name, some in parts.items():
-                some.append(images[f"images.{name}"].cpu().numpy().copy())
-        return {name: np.concatenate(some) for name, some in parts.items()}
+            for name, whole in out.items():
+                torch.from_numpy(whole[rows]).copy_(images[f"images.{name}"])
+        return out
 
 
 def drawn_config(cfg: Config) -> Config:
