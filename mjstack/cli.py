@@ -234,10 +234,11 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     given = _is_set("hydra.sweep.dir", overrides)
     claim = claim_folder(folder, numbered=not given, key="hydra.sweep.dir")
     if "GpuLauncher" in str(OmegaConf.select(master, "hydra.launcher._target_")):
-        from mjstack.jobs.sweep import find_slots, shared_sweep
+        from mjstack.jobs.sweep import SweepJob, find_slots, shared_sweep
 
         find_slots(OmegaConf.select(master, "hydra.launcher.jobs"))
-        claim = shared_sweep(folder) if given else claim
+        known = [SweepJob(number, one, tuple(jobs[number])) for one, number in taken.items()]
+        claim = shared_sweep(folder, known) if given else claim
     with claim as claimed:
         if claimed != folder:
             master.hydra.sweep.dir = str(claimed)

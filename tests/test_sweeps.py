@@ -64,8 +64,12 @@ def test_a_queue(stub: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert out.count("done before") == 3
     assert "job 2 on cores" in out
-    with pytest.raises(FolderError, match="has another sweep, whose job 1 is seed=2"):
-        run_jobs(stub, jobs(stub, 1, 3))
+    other = jobs(stub, 1, 3)
+    refusal = "has another sweep, whose job 1 is seed=2"
+    with pytest.raises(FolderError, match=refusal):
+        run_jobs(stub, other)
+    with pytest.raises(FolderError, match=refusal), shared_sweep(stub, other):
+        pass
 
 
 def test_a_sweeper_brings_jobs_in_batches(stub: Path) -> None:

@@ -61,8 +61,12 @@ class _Running:
 
 
 @contextmanager
-def shared_sweep(folder: Path) -> Iterator[Path]:
+def shared_sweep(folder: Path, jobs: Sequence[SweepJob] = ()) -> Iterator[Path]:
     """A sweep's folder in which several commands work off its jobs.
+
+    Args:
+        folder: The folder.
+        jobs: The jobs, as far as they are known.
 
     Raises:
         FolderError: It has something else, or cannot be made.
@@ -73,6 +77,7 @@ def shared_sweep(folder: Path) -> Iterator[Path]:
             f"{folder} has {sorted(names)[0]}, expected a new or an empty folder, or one of"
             " hydra/launcher=gpus. Set hydra.sweep.dir to another"
         )
+    _with_those_there(folder, jobs)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -97,7 +102,9 @@ def run_jobs(folder: Path, jobs: Sequence[SweepJob], count: int | None = None) -
         KeyboardInterrupt: The command was interrupted; so were its jobs.
     """
     slots = find_slots(count)
-    _check_sweep(folder, jobs)
+    every = _with_those_there(folder, jobs)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomic(folder / SWEEP, json.dumps(every, indent=1) + "\n")
     say = Console(highlight=False, soft_wrap=True, markup=False).print
     common = set.intersection(*(set(job.overrides) for job in jobs)) if len(jobs) > 1 else set()
     waiting = list(jobs)
@@ -176,15 +183,16 @@ def find_slots(count: int | None) -> list[Slot]:
     return [Slot(f"cores {','.join(map(str, share))}", cores=share) for share in shares]
 
 
-def _check_sweep(folder: Path, jobs: Sequence[SweepJob]) -> None:
-    """Add the jobs to the list in the sweep's folder, by their numbers, or compare them with those
-    there. A sweeper may bring them in several batches.
+def _with_those_there(folder: Path, jobs: Sequence[SweepJob]) -> dict[str, Any]:
+    """Folders and overrides of the jobs and of those in the sweep's list, by their numbers. A
+    sweeper may bring them in several batches.
+
+    Raises:
+        FolderError: The list has another job of one of these numbers.
     """
-    path = folder / SWEEP
-    folder.mkdir(parents=True, exist_ok=True)
     theirs: dict[str, Any] = {}
     with suppress(OSError, ValueError):
-        theirs = dict(json.loads(path.read_text()))
+        theirs = dict(json.loads((folder / SWEEP).read_text()))
     ours = {
         str(job.number): [os.path.relpath(job.folder, folder), list(job.overrides)] for job in jobs
     }
@@ -195,7 +203,7 @@ def _check_sweep(folder: Path, jobs: Sequence[SweepJob]) -> None:
                 f" {' '.join(theirs[number][1])}, expected the same jobs, which are in {SWEEP}. Set"
                 " hydra.sweep.dir to another folder"
             )
-    write_atomic(path, json.dumps(theirs | ours, indent=1) + "\n")
+    return theirs | ours
 
 
 def _result(job: SweepJob) -> Report | None:
