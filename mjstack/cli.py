@@ -129,17 +129,19 @@ def _show(hydra: Hydra, flags: Namespace, overrides: list[str]) -> None:
 
 def _run_one(hydra: Hydra, overrides: list[str]) -> int:
     """Compose, check and run one job, perhaps as one of several ranks."""
-    # They load torch.
-    from mjstack.distributed import joined, launch
-    from mjstack.jobs import check_ranks, check_share, count_devices
-
     if not is_rank():
         cfg, checked = _compose_one(hydra, overrides)
+        from mjstack.distributed import launch  # they load torch
+        from mjstack.jobs import check_share, count_devices
+
         if (count := count_devices(checked.context.cfg)) > 1:
             _check_spreads(checked)
             check_share(checked.context.cfg, count)
             return launch([*overrides, *search_path_args()], count)
         return _run_checked(hydra, cfg, checked, overrides)
+    from mjstack.distributed import joined
+    from mjstack.jobs import check_ranks
+
     with joined() as ranks:
         problem = ""
         try:

@@ -291,7 +291,7 @@ def test_a_job_goes_on_in_its_folder(
     given = [] if changes.get("folder") == Path("given") else ["hydra.run.dir=given"]
     assert begin(f"job={job.split()[0]}", *given, **changes) == 0
     report = json.loads(Path("given", "report.json").read_text())
-    assert (report["resumes"], report["status"]) == (changes.get("resumes", ""), "pass")
+    assert (report["resumes"], report["status"]) == (changes.get("resumes", "gates"), "pass")
     assert "job:\n" in Path("given", ".hydra", "config.yaml").read_text()
 
 

@@ -21,6 +21,7 @@ from compositions import load_config, put
 from environments import one_second_episode
 from matplotlib.axes import Axes
 
+from mjstack import process
 from mjstack.cli import run
 from mjstack.config.check import validate
 from mjstack.config.schema import Backend
@@ -415,7 +416,7 @@ def test_ctrl_c_leaves_the_finished_runs_and_no_process(folder: Path) -> None:
 def test_a_run_ends_with_its_job() -> None:
     """Also where a second Ctrl-C ends that at once. The run holds stderr as long as it lives."""
     start = (
-        scaling_run._START.rpartition(" from ")[0]
+        process._START.rpartition(" from ")[0]
         + " import time; print(1, flush=True); time.sleep(90)"
     )
     program = f"""

@@ -20,14 +20,8 @@ from mjstack.errors import UnknownName
 _GROUP = re.compile(r"  - (?P<name>\w+): (?P<default>\[.*\]|\S+) # (?P<words>.+)")
 _EXAMPLES = (
     ("robot=rebot nworld=64", "all gates this machine can run"),
-    ("'gates=[baseline,parity]' timing=fine", "two gates, 1 ms physics"),
     ("-m robot=so101,rebot timing=default,fine", "a sweep with a summary table"),
-    ("'gates=[batch]' gate.batch.seeds=10", "ten seeds: how rare are failures?"),
     ("'gates=[success]' nworld=64", "how often does it work from random starts?"),
-    (
-        "reset=starts_file starts=worlds.csv nworld=64",
-        "worlds that start as the rows of a file say",
-    ),
     (
         "job=replay run=outputs/DATE/TIME world=17",
         "one world of an earlier run again: why did it fail?",
@@ -44,12 +38,6 @@ _EXAMPLES = (
     (
         "job=play policy=outputs/mine/last",
         "four worlds of the policy as a video; view=true: in MuJoCo's viewer",
-    ),
-    ("job=scaling robot=so101", "throughput from 1 to 32,768 worlds; resumes"),
-    ("job=study nworld=8", "what the solver's limits cost, and which worlds still succeed"),
-    (
-        "job=reachability robot=rebot",
-        "what the arm reaches, and how far objects may stand from their places",
     ),
 )
 _FLAGS = (

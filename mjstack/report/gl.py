@@ -6,8 +6,6 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from mjstack.errors import MjstackError
-
 if TYPE_CHECKING:
     import mujoco
 
@@ -52,6 +50,8 @@ def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Rend
         MjstackError: This machine cannot draw offscreen.
     """
     import mujoco
+
+    from mjstack.errors import MjstackError  # not with mjstack: Ctrl-C is not handled there yet
 
     try:
         return mujoco.Renderer(model, height, width)
