@@ -18,7 +18,7 @@ from mjstack.managers.action import ActionManager
 from mjstack.managers.observation import ObservationManager
 from mjstack.mdp.geometry import robot
 from mjstack.policy import Policy
-from mjstack.sim.cameras import Cameras
+from mjstack.sim.cameras import Cameras, color_cameras
 
 _GRID = 2.0**20  # per rad or m
 
@@ -89,9 +89,7 @@ class PolicyDriver(PhaselessDriver):
         names = list(policy.network.vision.sizes)
         if names:
             # They are drawn when the policy asks, whatever their rate is.
-            seen = {name: replace(cfg.scene.cameras[name], outputs=["rgb"]) for name in names}
-            seen = {name: replace(camera, terminal=False) for name, camera in seen.items()}
-            self._cameras = env.sim.make_cameras(seen)
+            self._cameras = env.sim.make_cameras(color_cameras(cfg.scene.cameras, names))
             self._images = self._cameras.allocate()
         self._execute = policy.execute
         shape = (env.nworld, min(policy.execute, network.chunk), network.joints)

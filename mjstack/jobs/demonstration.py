@@ -26,6 +26,7 @@ from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
 from mjstack.mdp.starts.placement import GAP, SCHEMA, may_meet
 from mjstack.sim import Simulation, StateRenderer, resolve_backend
+from mjstack.sim.cameras import color_cameras
 
 STATE = "observation.state"
 ACTION = "action"
@@ -206,7 +207,9 @@ class EpisodeRenderer:
         Raises:
             MjstackError: They do not fit into memory.
         """
-        cfg = drawn_config(context.cfg)
+        cfg = context.cfg
+        cameras = color_cameras(cfg.scene.cameras)
+        cfg = replace(cfg, scene=replace(cfg.scene, cameras=cameras))
         backend, device = context.backend
         fields = required_fields(cfg.reset)
         self.seconds = 0.0
@@ -216,7 +219,6 @@ class EpisodeRenderer:
         )
         # Steps from one image to the next, as the environment draws them
         hz = cfg.task.control_hz
-        cameras = cfg.scene.cameras
         self._sizes = {name: each.size for name, each in cameras.items()}
         self._every = {name: round(hz / (each.rate or hz)) for name, each in cameras.items()}
 
@@ -266,15 +268,6 @@ class EpisodeRenderer:
             for name, whole in out.items():
                 torch.from_numpy(whole[rows]).copy_(images[f"images.{name}"])
         return out
-
-
-def drawn_config(cfg: Config) -> Config:
-    """The configuration whose cameras have the outputs that a dataset keeps."""
-    cameras = {
-        name: replace(camera, outputs=["rgb"], terminal=False)
-        for name, camera in cfg.scene.cameras.items()
-    }
-    return replace(cfg, scene=replace(cfg.scene, cameras=cameras))
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:

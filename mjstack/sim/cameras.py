@@ -2,7 +2,8 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import mujoco
 import torch
@@ -97,6 +98,14 @@ class Cameras(ABC):
     @abstractmethod
     def close(self) -> None:
         """Give what drawing needs back."""
+
+
+def color_cameras(
+    cameras: Mapping[str, CameraCfg], names: Sequence[str] | None = None
+) -> dict[str, CameraCfg]:
+    """Some cameras, or all, with colours as their only output."""
+    chosen = cameras if names is None else names
+    return {name: replace(cameras[name], outputs=["rgb"], terminal=False) for name in chosen}
 
 
 def image_bytes(

@@ -8,11 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import Config, VisionCfg
+from mjstack.config.schema import VisionCfg
 from mjstack.episodes.context import RunContext
 from mjstack.managers.episode import required_fields
 from mjstack.policy import Vision
 from mjstack.sim import StateRenderer
+from mjstack.sim.cameras import color_cameras
 from mjstack.train.demonstrations import Demonstrations
 
 _OWN = 2**40  # seeds that nothing else has
@@ -68,7 +69,9 @@ class ImagePool:
             self._fresh = min(_AT_ONCE, len(steps))
         rows = len(steps) if self._whole else -(-settings.pool // self._fresh) * self._fresh
         self._count = -(-rows // self._fresh)
-        cfg = policy_cameras(context, self._names)
+        cfg = context.cfg
+        cameras = color_cameras(cfg.scene.cameras, self._names)
+        cfg = replace(cfg, scene=replace(cfg.scene, cameras=cameras))
         backend, where = context.backend
         fields = required_fields(cfg.reset)
         self._renderer = StateRenderer(
@@ -120,15 +123,6 @@ class ImagePool:
     def close(self) -> None:
         """Give the worlds for drawing back."""
         self._renderer.close()
-
-
-def policy_cameras(context: RunContext, names: Sequence[str]) -> Config:
-    """The configuration whose cameras are those that a policy sees, and draw colours alone."""
-    cfg = context.cfg
-    cameras = {
-        name: replace(cfg.scene.cameras[name], outputs=["rgb"], terminal=False) for name in names
-    }
-    return replace(cfg, scene=replace(cfg.scene, cameras=cameras))
 
 
 class Augmentation:
