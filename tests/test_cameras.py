@@ -574,7 +574,6 @@ def test_throughput_and_capacity_count_images() -> None:
     images_s = m["cameras.images_per_s.median"]
     images_ms = m["cameras.images_ms_per_step.median"]
     assert images_s == pytest.approx(4 * 2 * 1e3 / images_ms, rel=0.5)
-    assert m["cameras.ms_per_env_step.median"] > 0.0
     assert "env_step.images_per_s.median" not in m
     size = 4 * 2 * 16 * 16 * 3 / 1e6
     assert m["cameras.images_mb"] == pytest.approx(size)

@@ -408,7 +408,7 @@ def _worlds(tally: EpisodeTally, context: RunContext) -> Worlds:
 
 
 def _read(context: RunContext, gate: str, seed: int) -> EpisodeRecord | None:
-    """What an earlier call of a run that is gone on with has left of a seed."""
+    """The results of a seed that an earlier call of the run has left."""
     if context.cfg.resume is None or context.folder is None:
         return None
     record = EpisodeRecord.read(context.folder, seed, gate, whole=True)

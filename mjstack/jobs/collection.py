@@ -152,8 +152,8 @@ class Collection:
     Committed ones do not change. On CUDA two plays of a world agree only nearly: the first play
     counts in the success rate, and every episode has the result of the play that recorded it.
 
-    Of several ranks each plays its share of a batch's worlds and writes the episodes of these into
-    files of its own, which rank 0 commits together. The episodes are those that one rank adds, in
+    Several ranks share a batch's worlds. Each writes the episodes of its worlds into separate
+    files, which rank 0 commits together. The episodes are those that one rank adds, in
     the same order.
 
     Images are drawn when a batch has been judged, and encoded while the next one is played. So its
