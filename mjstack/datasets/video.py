@@ -105,7 +105,7 @@ def check_encoder(videos: Mapping[str, Video], fps: int) -> None:
 
 
 def _ffmpeg(arguments: Sequence[str], content: memoryview | None = None) -> bytes:
-    """The output of ffmpeg. Ctrl-C does not reach ffmpeg, so a video that was begun is completed."""
+    """The output of ffmpeg. Ctrl-C does not reach ffmpeg, so a video once begun is completed."""
     try:
         import imageio_ffmpeg
 
