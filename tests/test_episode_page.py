@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import zstandard
 from browser import EXECUTABLE, Tab, browse
+from environments import one_second_episode
 
 import mjstack.report.web as web
 from mjstack.cli import run
@@ -204,6 +205,27 @@ def test_without_viser_a_run_says_how_to_have_the_page(
     assert "mjstack[web]" in (out / "report.html").read_text()
 
 
+def labels_of(path: Path) -> list[str]:
+    """Texts of the worlds of a page."""
+    return [m["props"]["text"] for _, m in messages(path) if m["type"] == "LabelMessage"]
+
+
+def test_a_resumed_run_shows_the_worlds_that_it_reads_back(tmp_path: Path) -> None:
+    """Baseline plays anew, and the page still has the batch, poses and all."""
+    args = ["sim=native", "gates=[baseline,batch]", "nworld=3", *one_second_episode()]
+    page = tmp_path / "run" / "episode.html"
+    assert run([*args, f"hydra.run.dir={page.parent}"]) == 1
+    played = messages(page)
+    page.unlink()
+    assert run([*args, "gate.batch.seeds=2", f"resume={page.parent}"]) == 1
+    assert len(labels_of(page)) == 4
+    for (_, ours), (_, theirs) in zip(played, messages(page), strict=True):
+        assert ours.keys() == theirs.keys()
+        for name in ("batched_positions", "batched_wxyzs", "text"):
+            held = [one.get("props", one.get("updates", {})).get(name) for one in (ours, theirs)]
+            assert np.array_equal(*held), name
+
+
 @pytest.fixture(scope="module")
 def failing(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run on MJWarp with worlds that fail."""
@@ -219,8 +241,7 @@ def test_failing_worlds_stand_beside_their_native_copies(failing: Path) -> None:
     (gate,) = json.loads((failing / "report.json").read_text())["gates"][1:]
     lost = int(gate["metrics"]["episodes"] - gate["metrics"]["succeeded"])
     assert 0 < lost < 6
-    sent = messages(failing / "episode.html")
-    labels = [m["props"]["text"] for _, m in sent if m["type"] == "LabelMessage"]
+    labels = labels_of(failing / "episode.html")
     assert len(labels) == 6 + lost + 1
     numbers = [int(label.split(":")[0].split(",")[0]) for label in labels[:-1]]
     for one in range(lost):

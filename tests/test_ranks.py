@@ -104,9 +104,9 @@ def report_of(folder: Path) -> dict:
 
 def assert_same_episodes(one: Path, other: Path) -> None:
     """Records and tables of two runs agree bit for bit."""
-    names = sorted(path.name for path in one.glob("*.npz"))
+    names = sorted(path.name for path in one.glob("*_seed*.npz"))
     assert names
-    assert names == sorted(path.name for path in other.glob("*.npz"))
+    assert names == sorted(path.name for path in other.glob("*_seed*.npz"))
     for name in names:
         with np.load(one / name) as ours, np.load(other / name) as theirs:
             assert ours.files == theirs.files

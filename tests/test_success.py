@@ -114,6 +114,7 @@ def test_small_region_passes(passed: Path) -> None:
         [
             ".hydra",
             "episode.html",
+            "motion_success.npz",
             "starts_seed0.csv",
             "report.html",
             "report.json",

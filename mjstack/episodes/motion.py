@@ -5,6 +5,8 @@ first, each beside its copy on native MuJoCo.
 import logging
 from collections.abc import Sequence
 from contextlib import closing
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,12 +16,16 @@ from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import Observer, WorldRecorder
+from mjstack.errors import RunError
+from mjstack.files import reading, write_npz
 from mjstack.interrupt import check_interrupt
 from mjstack.report.web import MOST, World, frame_stride, lacks_viser
+from mjstack.report.write import safely_write
 
 log = logging.getLogger(__name__)
 
 _BYTES = 64 * 2**20  # of one recording
+_MARKS = ("label", "failed", "twin")  # of a world, in the file beside its positions
 _TWINS = 8  # failing worlds that native MuJoCo plays too
 
 
@@ -74,7 +80,7 @@ def show_batch(
     context: RunContext, gate: str, recorder: MotionRecorder, failed: np.ndarray
 ) -> None:
     """Add a gate's worlds to the page: failing ones, each beside its copy on native MuJoCo where
-    that was not the backend, and then others.
+    that was not the backend, and then others. A file keeps them for a resumed run.
 
     Args:
         context: The gate's run.
@@ -87,14 +93,42 @@ def show_batch(
     twins = _play_twins(context, failing[:_TWINS])
     others = [world for world in range(recorder.recorded) if not failed[world]]
     chosen = [*failing, *others][: MOST - len(twins)]
-    shown = context.page.worlds3d.setdefault(gate, [])
-    for world, qpos in zip(chosen, recorder.positions(chosen), strict=True):
+    shown: list[World] = []
+    motions = recorder.positions(chosen).astype(np.float32)
+    for world, qpos in zip(chosen, motions, strict=True):
         bits = int(failed[world])
         shown.append(
             World(label=_label(str(world), rules.broken(bits)), qpos=qpos, failed=bits > 0)
         )
         if world in twins:
             shown.append(twins[world])
+    context.page.worlds3d[gate] = shown
+    arrays: dict[str, Any] = {name: [getattr(world, name) for world in shown] for name in _MARKS}
+    arrays["qpos"] = [world.qpos for world in shown]
+    if problem := safely_write(_path(context, gate), write_npz, arrays, stops=False):
+        context.print_line(problem)
+
+
+def restore_batch(context: RunContext, gate: str) -> None:
+    """Add the worlds to the page that an earlier call of the run has shown, if it has.
+
+    Raises:
+        RunError: Their file cannot be read.
+    """
+    path = _path(context, gate)
+    if path.exists():
+        with reading(path, RunError, "Remove it"), np.load(path) as held:
+            labels, failed, twin = (held[name].tolist() for name in _MARKS)
+            rows = zip(labels, held["qpos"], failed, twin, strict=True)
+            context.page.worlds3d[gate] = [
+                World(label=label, qpos=qpos, failed=lost, twin=copy)
+                for label, qpos, lost, copy in rows
+            ]
+
+
+def _path(context: RunContext, gate: str) -> Path:
+    assert context.folder is not None
+    return context.folder / f"motion_{gate}.npz"
 
 
 def _play_twins(context: RunContext, worlds: Sequence[int]) -> dict[int, World]:
@@ -105,7 +139,7 @@ def _play_twins(context: RunContext, worlds: Sequence[int]) -> dict[int, World]:
     try:
         with closing(context.simulation(len(worlds), Backend.native, "cpu")) as sim:
             episode = context.play(sim, context.cfg.reset, [recorder], worlds=worlds)
-        positions = recorder.positions(range(len(worlds)))
+        positions = recorder.positions(range(len(worlds))).astype(np.float32)
     except Exception:
         check_interrupt()
         log.exception("no copies of failing worlds on native MuJoCo")

@@ -15,7 +15,7 @@ import numpy as np
 from mjstack.config.session import search_path_args
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor, describe_sign
-from mjstack.episodes.motion import MotionRecorder, records_motion, show_batch
+from mjstack.episodes.motion import MotionRecorder, records_motion, restore_batch, show_batch
 from mjstack.episodes.record import FAILING, SUCCESS_FAILING, Circumstances, EpisodeRecord
 from mjstack.episodes.rollout import Episode, Observer
 from mjstack.errors import RunError, first_line, name_worlds
@@ -350,6 +350,8 @@ def play_seeds(
                     tally.first = episode if tally.first is None else tally.first
                 else:
                     tally.again.append(seed)
+                    if records and seed == cfg.seed:
+                        restore_batch(context, gate)
                 tally.add(record)
             except Exception as error:
                 check_interrupt()
