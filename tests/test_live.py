@@ -9,6 +9,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +19,21 @@ import numpy as np
 import pytest
 from browser import EXECUTABLE, browse
 from compositions import load_config
-from environments import configure
+from environments import configure, has_gl
 
 import mjstack.report.web as web
 from mjstack.cli import run
 from mjstack.envs import build_env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.live import LiveView, read_worlds
+from mjstack.episodes.rollout import rollout
 from mjstack.errors import MjstackError
 from mjstack.jobs import check_job
+from mjstack.jobs.runner import _camera_renderer
 from mjstack.report.web import Shapes, start_server, stop_server
+from mjstack.sim.cameras import color_cameras
+
+GL = pytest.mark.skipif(not has_gl(), reason="MuJoCo does not draw offscreen here")
 
 
 def refusal_of(*overrides: str) -> str:
@@ -134,6 +142,38 @@ def test_worlds_pause_step_and_are_chosen(
         env.close()
     assert not worker.is_alive()
     assert view.aside > 0.3
+
+
+@pytest.mark.parametrize("backend", [pytest.param("native", marks=GL), "mjwarp"])
+def test_a_driven_episode_shows_cameras_and_rewards(server: Any, backend: str) -> None:
+    """Its environment draws nothing; the images are those that one with cameras would have, in
+    the looks of the world. Without the view the episode has no rewards."""
+    sizes = [f"scene.cameras.{name}.size=[32,32]" for name in ("front", "wrist")]
+    args = ["view=web", f"sim={backend}", "cameras=[front,wrist]", "looks=randomized", *sizes]
+    cfg = load_config((*args, "reset=randomized", "sim.device=cpu"))
+    context = RunContext(cfg)
+    sim = context.batch_simulation(3)
+    env = context.start(sim, cfg.reset)
+    assert env.images == {}
+    renderer = partial(_camera_renderer, context)
+    with closing(LiveView(server, lambda: context.stage.visual_model, renderer=renderer)) as view:
+        view._plotted.value = 2
+        rollout(env, context.driver(env), [view], steps=3)
+        view._show(3)
+        drawn = sim.make_cameras(color_cameras(cfg.scene.cameras))
+        images = drawn.allocate()
+        drawn.draw(images, dict.fromkeys(cfg.scene.cameras))
+        drawn.close()
+        assert set(view._images) == set(images) == {"images.front", "images.wrist"}
+        for name, handle in view._images.items():
+            assert np.array_equal(handle.image, images[name][2].numpy())
+            assert not np.array_equal(handle.image, images[name][1].numpy())
+        names = {title: names for title, *names in view._plots}
+        assert names["reward"] == ["sum", *cfg.reward]
+        assert "success no" in view._status.content
+    unseen = context.with_config(replace(cfg, view="false")).start(sim, cfg.reset)
+    assert unseen.reward_manager.names == []
+    sim.close()
 
 
 def test_without_a_browser_nothing_is_drawn(

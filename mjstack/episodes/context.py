@@ -251,6 +251,13 @@ class RunContext:
             return {name: self.phase(phase).stop - 1 for name, phase in states.items()}
         return {f"third_{k}": k * self.episode_steps // 3 - 1 for k in (1, 2, 3)}
 
+    def driven(self, reset: Reset) -> Config:
+        """The configuration of a driven episode. The live view also shows rewards and success."""
+        cfg = driven_config(self.cfg, reset)
+        if self.cfg.view == "web":
+            cfg = replace(cfg, reward=self.cfg.reward, task=self.cfg.task)
+        return cfg
+
     def start(
         self,
         sim: Simulation,
@@ -269,7 +276,7 @@ class RunContext:
             worlds: Their numbers, which random numbers depend on: ``[17]`` starts one world as
                 world 17 of any batch starts. By default they are numbered from 0 on.
         """
-        cfg = driven_config(self.cfg, reset)
+        cfg = self.driven(reset)
         env = Env(sim, self.index, cfg, check_faults=False)
         return reset_worlds(env, cfg.seed if seed is None else seed, worlds)
 

@@ -5,7 +5,7 @@ images.
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -17,6 +17,7 @@ from mjstack.envs import Env
 from mjstack.episodes.rollout import Observer
 from mjstack.interrupt import check_interrupt
 from mjstack.report.web import MOST, Shapes, Stage
+from mjstack.sim import StateRenderer
 
 _RATE = 25.0  # pictures per second, at most
 _HISTORY = 500  # points of a plot
@@ -38,17 +39,27 @@ class LiveView(Observer):
     """
 
     def __init__(
-        self, server: Any, model: Callable[[], mujoco.MjModel], *, pausable: bool = True
+        self,
+        server: Any,
+        model: Callable[[], mujoco.MjModel],
+        *,
+        renderer: Callable[[Sequence[str]], StateRenderer] | None = None,
+        pausable: bool = True,
     ) -> None:
         """Add the controls to a server.
 
         Args:
             server: Of `report.web.start_server`.
             model: Gives the scene with its visuals, when it is first shown.
+            renderer: Makes what draws the cameras where the environment draws nothing, for a state
+                with these model fields of its own; None without cameras.
             pausable: Whether the run may wait; not where other processes wait for it.
         """
         self._server = server
         self._model = model
+        self._make_renderer = renderer
+        self._renderer: StateRenderer | None = None
+        self._fields: list[str] = []  # of the renderer's state
         self._shapes: Shapes | None = None
         self._stage: Stage | None = None
         self._shown: list[int] = []
@@ -91,6 +102,12 @@ class LiveView(Observer):
             self._stage = None
         self._history.clear()
         self._show(0)
+
+    def close(self) -> None:
+        """Give back what draws the cameras."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
     def after_step(self, step: int) -> None:
         """See `Observer`."""
@@ -229,15 +246,29 @@ class LiveView(Observer):
         )
 
     def _draw_images(self, world: int) -> None:
-        """Show what the cameras have drawn of a world."""
-        for name, images in self.env.images.items():
-            if images.dtype != torch.uint8:
+        """Show what the cameras see of a world."""
+        for name, seen in self._see(world).items():
+            if seen.dtype != torch.uint8:
                 continue
-            image = images[world].cpu().numpy()
+            image = seen.cpu().numpy()
             if name in self._images:
                 self._images[name].image = image
             else:
                 self._images[name] = self._server.gui.add_image(image, label=name)
+
+    def _see(self, world: int) -> dict[str, torch.Tensor]:
+        """Images of a world: the environment's own, or drawn here in an episode that has none."""
+        env = self.env
+        if env.images or self._make_renderer is None:
+            return {name: images[world] for name, images in env.images.items()}
+        one = slice(world, world + 1)
+        looks = {name: values[one] for name, values in env.sim.fields.items()}
+        if self._renderer is None or self._fields != list(looks):
+            self.close()
+            self._fields = list(looks)
+            self._renderer = self._make_renderer(self._fields)
+        drawn = self._renderer.draw(env.sim.qpos[one].nan_to_num(), looks)
+        return {name: images[0] for name, images in drawn.items()}
 
 
 def read_worlds(text: str, count: int) -> list[int]:

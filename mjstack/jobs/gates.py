@@ -105,7 +105,7 @@ def check_task(context: RunContext) -> None:
     if phases[-1].stop > cfg.task.episode_steps:
         expected = f"at least the steps of the phases, {phases[-1].stop}"
         raise ConfigError("task.episode_steps", cfg.task.episode_steps, expected)
-    check_env(context, driven_config(cfg, reset={}), action="controller.action")
+    check_env(context, context.driven({}), action="controller.action")
     if cfg.controller.approach_gain > 0.0:
         turn_sign(context.model, cfg)
     if cfg.controller.name == STATE_BASED and cfg.task.check is not None:
@@ -143,7 +143,7 @@ def check_driver(context: RunContext) -> None:
     """Raise if the configured driver does not fit the configured worlds, such as a policy of other
     ones.
     """
-    cfg = driven_config(context.cfg, reset={})
+    cfg = context.driven({})
     env = build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu")
     try:
         env.reset()

@@ -8,7 +8,7 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -53,8 +53,9 @@ from mjstack.report.web import (
     stop_server,
 )
 from mjstack.report.write import safely_write, summarize, write_report
-from mjstack.sim import Simulation, resolve_backend
+from mjstack.sim import Simulation, StateRenderer, resolve_backend
 from mjstack.sim.build import cuda_driver, cuda_name, cuda_uuid
+from mjstack.sim.cameras import color_cameras
 from mjstack.sim.native import available_cores
 
 log = logging.getLogger(__name__)
@@ -429,10 +430,25 @@ def _live_view(context: RunContext, console: Console) -> Iterator[LiveView | Non
     server = start_server(cfg.web.host, cfg.web.port)
     try:
         console.print(f"live view: http://{cfg.web.host}:{server.get_port()}")
-        alone = context.ranks.size == 1
-        yield LiveView(server, lambda: context.stage.visual_model, pausable=alone)
+        with closing(
+            LiveView(
+                server,
+                lambda: context.stage.visual_model,
+                renderer=partial(_camera_renderer, context) if cfg.scene.cameras else None,
+                pausable=context.ranks.size == 1,
+            )
+        ) as live:
+            yield live
     finally:
         stop_server(server)
+
+
+def _camera_renderer(context: RunContext, fields: Sequence[str]) -> StateRenderer:
+    """What draws the cameras of one world for the live view, on the backend of the batch."""
+    cfg = context.cfg
+    colors = replace(cfg, scene=replace(cfg.scene, cameras=color_cameras(cfg.scene.cameras)))
+    backend, device = context.backend
+    return StateRenderer(context.model, colors, 1, backend=backend, device=device, fields=fields)
 
 
 def _viewers(context: RunContext) -> list[Observer]:
