@@ -16,15 +16,16 @@ import pytest
 import torch
 from check_cases import rules_of
 from compositions import load_config
-from environments import at_double_speed
+from environments import at_double_speed, one_second_episode
 
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import context as gate_module
+from mjstack.episodes import tally as tally_module
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.record import FAILING, EpisodeRecord
 from mjstack.episodes.rollout import Episode, play_episode
 from mjstack.errors import RunError
-from mjstack.files import write_atomic
+from mjstack.files import to_csv, write_atomic
 from mjstack.gates.batch import run_batch
 from mjstack.gates.runner import run_gates
 from mjstack.math import wilson_interval
@@ -124,6 +125,23 @@ def test_failing_worlds_are_a_table(two_seeds: tuple[Path, GateResult, list[str]
         assert float(row["xy_err_m"]) > 0.00134
         for name, values in record.values.items():
             assert float(row[name]) == pytest.approx(values[int(row["world"])], rel=1e-5)
+
+
+def test_the_table_is_written_once(
+    new_context: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Once after each seed would take quadratic time."""
+    written: list[int] = []
+
+    def counted(rows: list) -> str:
+        written.append(len(rows))
+        return to_csv(rows)
+
+    monkeypatch.setattr(tally_module, "to_csv", counted)
+    own = ["sim=native", "nworld=2", "gate.batch.seeds=3", *one_second_episode()]
+    result = play(new_context(*own), tmp_path)
+    assert written == [6]
+    assert f"{FAILING} has every failing episode with what was measured" in result.details
 
 
 @pytest.mark.full
@@ -265,10 +283,13 @@ def test_a_few_failures_may_be_allowed(new_context: Callable[..., RunContext]) -
 
 @pytest.mark.full
 def test_no_trajectory_is_kept(new_context: Callable[..., RunContext], tmp_path: Path) -> None:
-    """A trajectory of qpos alone would take 48 kB a world on the host."""
+    """A trajectory of qpos alone would take 48 kB a world on the host. The 3-D page has its own
+    bound, of 64 worlds.
+    """
 
     def peak(nworld: int) -> int:
-        context = new_context("sim=native", f"nworld={nworld}", *at_double_speed())
+        own = ["sim=native", f"nworld={nworld}", "web.episode=false"]
+        context = new_context(*own, *at_double_speed())
         assert context.model.nq * 8 * 300 == 48_000
         tracemalloc.start()
         play(context, tmp_path)

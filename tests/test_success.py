@@ -393,6 +393,7 @@ def test_what_stops_the_second_seed_keeps_the_first(
     assert "0 of 2 episodes succeeded" in result.reason
     assert "seeds 1 to 2 not played: the second seed" in result.reason
     left = {REGIONS, PICTURE, FAILING, "success_seed0.npz", "starts_seed0.csv", "starts_seed1.csv"}
+    left |= {"motion_success.npz"}
     assert {path.name for path in tmp_path.iterdir()} <= left
     assert {FAILING, "success_seed0.npz", "starts_seed0.csv"} <= {
         path.name for path in tmp_path.iterdir()

@@ -19,14 +19,14 @@ from mjstack.episodes.motion import MotionRecorder, records_motion, restore_batc
 from mjstack.episodes.record import FAILING, SUCCESS_FAILING, Circumstances, EpisodeRecord
 from mjstack.episodes.rollout import Episode, Observer
 from mjstack.errors import RunError, first_line, name_worlds
-from mjstack.files import to_csv, write_atomic
+from mjstack.files import to_csv
 from mjstack.interrupt import check_interrupt
 from mjstack.math import wilson_interval
 from mjstack.report.html import Worlds
 from mjstack.report.record import GateResult, Status
 from mjstack.report.svg import Map
 from mjstack.report.table import Table
-from mjstack.report.write import format_percent
+from mjstack.report.write import format_percent, safely_write
 from mjstack.sim import Simulation
 from mjstack.tasks.check import EpisodeCheck
 
@@ -145,13 +145,14 @@ class EpisodeTally:
         self.ends.append(np.array([hash(row.tobytes()) for row in rounded]))
 
     def write_failing(self) -> None:
-        """Write the table of failing episodes, if there are any.
-
-        Raises:
-            OSError: It cannot be written.
+        """Write the table of failing episodes, if there are any. A full disk takes no result
+        back.
         """
         if self.rows and self.path is not None:
-            write_atomic(self.path, to_csv(self.rows))
+            text = to_csv(self.rows)
+            problem = safely_write(self.path, Path.write_text, text, stops=False)
+            has = f"{self.path.name} has every failing episode with what was measured"
+            self.details.append(problem or has)
 
     def names(self, seed: int, worlds: Sequence[int]) -> list[str]:
         """Names of a seed's episodes, as ``world=`` of job=replay takes them."""
@@ -203,13 +204,10 @@ class EpisodeTally:
         """Lines of the report: the failing episodes by rule, and remarks."""
         named = [("target out of reach", self.unreachable)] if self.unreachable else []
         named += [(self.check.rules.texts[rule], names) for rule, names in self.broken.items()]
-        lines = [
+        return [
             f"{text}: {name_worlds(names, self.episodes, _NAMED, self.noun)}"
             for text, names in named
         ] + self.details
-        if self.failed and self.path is not None:
-            lines.append(f"{self.path.name} has every failing episode with what was measured")
-        return lines
 
     @property
     def way_to_look(self) -> str:
@@ -373,10 +371,10 @@ def play_seeds(
                 )
     finally:
         sim.close()
+        tally.write_failing()  # once: its rows grow with the seeds
     if tally.again:
         seeds = ", ".join(_runs(tally.again))
         tally.details.append(f"an earlier call has played seeds {seeds}")
-        tally.write_failing()
     if cfg.nworld > 1:
         context.page.worlds[gate] = _worlds(tally, context)
     return tally
@@ -466,7 +464,6 @@ def _write(record: EpisodeRecord, tally: EpisodeTally) -> None:
         return
     try:
         record.write(tally.path.parent, tally.gate)
-        tally.write_failing()
     except OSError as error:
         log.exception("the record of seed %d was not written", record.seed)
         tally.details.append(
