@@ -157,10 +157,20 @@ def test_histograms_count_every_world(tmp_path: Path) -> None:
     assert "threshold 0.015 m" in text
 
 
-def test_maps_show_every_failed_world_of_a_large_batch(tmp_path: Path) -> None:
-    text = page(tmp_path, 20_000)
-    assert text.count("<path class=x") == 4000
-    assert "4,000 of 20,000 are drawn" in text
+@pytest.mark.parametrize(
+    ("count", "failed", "note"),
+    [
+        (10_000, 2000, "3,000 of 10,000 are drawn, all failed ones among them."),
+        (20_000, 3000, "3,000 of 20,000 are drawn, 3,000 of 4,000 failed ones among them."),
+    ],
+)
+def test_maps_of_a_large_batch_show_failed_worlds_first(
+    tmp_path: Path, count: int, failed: int, note: str
+) -> None:
+    text = page(tmp_path, count)
+    assert text.count("<path class=x") == failed
+    assert text.count("<circle class=o") == 3000 - failed
+    assert note in text
     assert len(text) < 1e6
 
 

@@ -351,10 +351,12 @@ def _plots(worlds: Worlds, thresholds: Mapping[str, float]) -> list[str]:
     if worlds.maps:
         note = ""
         shown = np.arange(count)
-        if count > _POINTS:  # every failed one, and some of the others
+        if count > _POINTS:  # failed ones first
             order = np.argsort(~bad, kind="stable")
-            shown = np.sort(order[: max(_POINTS, int(bad.sum()))])
-            note = f" {len(shown):,} of {count:,} are drawn, all failed ones among them."
+            shown = np.sort(order[:_POINTS])
+            lost = int(bad.sum())
+            failed = f"{_POINTS:,} of {lost:,}" if lost > _POINTS else "all"
+            note = f" {_POINTS:,} of {count:,} are drawn, {failed} failed ones among them."
         drawn = "".join(
             table_map(one, worlds.names, worlds.broken, shown.tolist()) for one in worlds.maps
         )
