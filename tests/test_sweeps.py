@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from pathlib import Path
 
 args = dict(arg.split("=", 1) for arg in sys.argv[1:])
 folder = Path((args.get("hydra.run.dir") or args["resume"]).strip("'"))
+if os.environ.get("SILENT"):
+    sys.exit(3)
 print("mjstack: what it says", args.get("resume"), os.environ.get("CUDA_VISIBLE_DEVICES"))
 if args["seed"] == "9":
     os.kill(os.getpid(), 9)
@@ -72,6 +75,14 @@ def test_a_queue(stub: Path, capsys: pytest.CaptureFixture[str]) -> None:
         pass
 
 
+def test_the_reason_is_not_an_earlier_processs(stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    some = jobs(stub, 9)
+    run_jobs(stub, some)
+    monkeypatch.setenv("SILENT", "1")
+    ((gate,),) = [report.gates for report in run_jobs(stub, some)]
+    assert gate.reason == f"exit status 3 ({stub / '0' / LOG})"
+
+
 def test_a_sweeper_brings_jobs_in_batches(stub: Path) -> None:
     """All of them are in one list, also where their folders are below others."""
     some = [
@@ -118,6 +129,29 @@ def test_a_gpu_for_each_job(stub: Path, monkeypatch: pytest.MonkeyPatch) -> None
     run_jobs(stub, jobs(stub, 1, 3))
     assert all((stub / name / LOG).read_text().endswith(" 7\n") for name in "01")
     held.close()
+
+
+def test_the_locks_of_gpus_are_the_users_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    locks = tmp_path / f"mjstack-gpus-{os.getuid()}"
+    locks.mkdir(mode=0o777)
+    (slot,) = module.find_slots(None)
+    assert slot.lock is not None
+    assert slot.lock.parent == locks
+    assert locks.stat().st_mode & 0o777 == 0o700
+    locks.rmdir()
+    (tmp_path / "elsewhere").mkdir()
+    locks.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(FolderError, match=r"is another user's or no folder.*Set TMPDIR"):
+        module.find_slots(None)
+    own = os.getuid()
+    monkeypatch.setattr("os.getuid", lambda: own + 1)
+    (tmp_path / f"mjstack-gpus-{own + 1}").mkdir()
+    with pytest.raises(FolderError, match="is another user's"):
+        module.find_slots(None)
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import signal
+import stat
 import subprocess
 import tempfile
 import time
@@ -56,6 +57,7 @@ class _Running:
     job: SweepJob
     process: subprocess.Popen[bytes]
     log: IO[bytes]
+    logged: int  # bytes of earlier processes
     held: IO[bytes] | None
     began: float
 
@@ -160,6 +162,7 @@ def find_slots(count: int | None) -> list[Slot]:
 
     Raises:
         ConfigError: The number is none, or there are not as many.
+        FolderError: Another user has the folder of the GPUs' locks.
     """
     if count is not None and (type(count) is not int or count < 1):
         raise ConfigError("hydra.launcher.jobs", count, "null, or an integer of at least 1")
@@ -168,8 +171,7 @@ def find_slots(count: int | None) -> list[Slot]:
         if (count or 1) > gpus:
             raise ConfigError("hydra.launcher.jobs", count, f"at most {gpus}, a GPU for each")
         visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(gpus)))
-        locks = Path(tempfile.gettempdir()) / f"mjstack-gpus-{os.getuid()}"
-        locks.mkdir(exist_ok=True)
+        locks = _lock_folder()
         return [
             Slot(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}, lock=locks / name)
             for name in visible.split(",")[: count or gpus]
@@ -181,6 +183,26 @@ def find_slots(count: int | None) -> list[Slot]:
         raise ConfigError("hydra.launcher.jobs", count, expected)
     shares = [cores[n::count] for n in range(count)]
     return [Slot(f"cores {','.join(map(str, share))}", cores=share) for share in shares]
+
+
+def _lock_folder() -> Path:
+    """This user's folder with a lock for each GPU, on this machine. Others may not write there:
+    they could hold a lock for ever, or put a link in its place.
+
+    Raises:
+        FolderError: Another user has made it.
+    """
+    folder = Path(tempfile.gettempdir()) / f"mjstack-gpus-{os.getuid()}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+        raise FolderError(
+            f"{folder} is another user's or no folder, expected one of yours, for locks of GPUs",
+            "Set TMPDIR to a folder of yours",
+        )
+    folder.chmod(0o700)
+    return folder
 
 
 def _with_those_there(folder: Path, jobs: Sequence[SweepJob]) -> dict[str, Any]:
@@ -236,6 +258,7 @@ def _start(job: SweepJob, slot: Slot, log: IO[bytes], held: IO[bytes] | None) ->
         if earlier is None or not earlier.resumes:  # nothing that another process can use
             for path in [path for path in job.folder.iterdir() if path.name != LOG]:
                 (shutil.rmtree if path.is_dir() and not path.is_symlink() else os.remove)(path)
+    logged = log.tell()
     process = subprocess.Popen(
         own_command([*args, *search_path_args()]),
         stdin=subprocess.DEVNULL,
@@ -247,7 +270,7 @@ def _start(job: SweepJob, slot: Slot, log: IO[bytes], held: IO[bytes] | None) ->
     if slot.cores:
         with suppress(OSError):  # it may have ended
             os.sched_setaffinity(process.pid, slot.cores)
-    return _Running(job, process, log, held, time.monotonic())
+    return _Running(job, process, log, logged, held, time.monotonic())
 
 
 def _quoted(path: Path) -> str:
@@ -263,7 +286,9 @@ def _conclude(one: _Running, code: int) -> Report:
     report = read_report(one.job.folder, one.job.overrides)
     if report is not None and report.status in _ENDED:
         return report
-    lines = (one.job.folder / LOG).read_text(errors="replace").strip().splitlines()
+    with (one.job.folder / LOG).open("rb") as log:
+        log.seek(one.logged)
+        lines = log.read().decode(errors="replace").splitlines()
     how = f"killed by signal {-code}" if code < 0 else f"exit status {code}"
     why = next((line for line in reversed(lines) if line.startswith("mjstack: ")), "")
     reason = f"{how}{f': {why}' if why else ''} ({one.job.folder / LOG})"
