@@ -39,6 +39,7 @@ from mjstack.config.session import (
 )
 from mjstack.errors import (
     CompositionError,
+    ConfigError,
     MjstackError,
     RankError,
     UnknownName,
@@ -195,10 +196,7 @@ def _run_checked(hydra: Hydra, cfg: DictConfig, checked: "CheckedJob", overrides
 
 
 def _sweep(hydra: Hydra, overrides: list[str]) -> int:
-    """Compose and check every job of a sweep, then run them.
-
-    Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
-    """
+    """Compose and check every job of a sweep, then run them."""
     if is_rank():
         raise CompositionError("torchrun: expected one job, and -m makes several. Leave one out.")
     jobs = _expand(overrides)
@@ -213,25 +211,7 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     if jobs and OmegaConf.select(master, "hydra.sweeper.params"):
         raise refused
     folder = _hydra_path(master, "sweep.dir")
-    taken: dict[Path, int] = {}
-    for number, job in enumerate(jobs):
-        cfg = compose(hydra, job, sweep=master)
-        checked = _check(cfg, job)
-        if checked.context.cfg.devices is not None:
-            raise CompositionError(
-                "devices: expected null with -m. To give each job a GPU, add hydra/launcher=gpus."
-            )
-        with open_dict(cfg):
-            cfg.hydra.job.num = number
-            cfg.hydra.job.id = str(number)
-        one = Path(os.path.normpath(folder / _hydra_path(cfg, "sweep.subdir")))
-        if not one.is_relative_to(folder):
-            check_unused(one, key="hydra.sweep.subdir")
-        if taken.setdefault(one, number) != number:
-            raise CompositionError(
-                f"hydra.sweep.subdir: jobs {taken[one]} and {number} would both write into {one},"
-                " expected a folder for each job. Leave it out, or let it name what differs."
-            )
+    numbers = _check_jobs(hydra, master, folder, jobs)
     begin_job()
     given = _is_set("hydra.sweep.dir", overrides)
     claim = claim_folder(folder, numbered=not given, key="hydra.sweep.dir")
@@ -239,7 +219,7 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
         from mjstack.jobs.sweep import SweepJob, find_slots, shared_sweep
 
         find_slots(OmegaConf.select(master, "hydra.launcher.jobs"))
-        known = [SweepJob(number, one, tuple(jobs[number])) for one, number in taken.items()]
+        known = [SweepJob(number, one, tuple(jobs[number])) for one, number in numbers.items()]
         claim = shared_sweep(folder, known) if given else claim
     with claim as claimed:
         if claimed != folder:
@@ -254,6 +234,39 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
             if _results:
                 _print_sweep(claimed, len(jobs))
     return max(result.exit_code for result in _results)
+
+
+def _check_jobs(
+    hydra: Hydra, master: DictConfig, folder: Path, jobs: Sequence[list[str]]
+) -> dict[Path, int]:
+    """Compose and check every job, and return their numbers by their folders.
+
+    Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
+    """
+    numbers: dict[Path, int] = {}
+    for number, job in enumerate(jobs):
+        cfg = compose(hydra, job, sweep=master)
+        if cfg.devices is not None:
+            raise ConfigError(
+                "devices",
+                cfg.devices,
+                "null with -m",
+                "Leave it out: with hydra/launcher=gpus each job has one GPU, and"
+                " hydra.launcher.jobs is how many run at once",
+            )
+        _check(cfg, job)
+        with open_dict(cfg):
+            cfg.hydra.job.num = number
+            cfg.hydra.job.id = str(number)
+        one = Path(os.path.normpath(folder / _hydra_path(cfg, "sweep.subdir")))
+        if not one.is_relative_to(folder):
+            check_unused(one, key="hydra.sweep.subdir")
+        if numbers.setdefault(one, number) != number:
+            raise CompositionError(
+                f"hydra.sweep.subdir: jobs {numbers[one]} and {number} would both write into {one},"
+                " expected a folder for each job. Leave it out, or let it name what differs."
+            )
+    return numbers
 
 
 def _print_help(hydra: Hydra, args: list[str]) -> None:

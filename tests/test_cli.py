@@ -70,6 +70,18 @@ def test_torchrun_is_for_one_training(
     assert not everything(folder)
 
 
+@pytest.mark.parametrize("launcher", [[], ["hydra/launcher=gpus"]])
+def test_a_sweep_shares_no_job_among_devices(
+    launcher: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["-m", *launcher, "sim=native", "seed=0,1", "devices=2"]) == 2
+    assert capsys.readouterr().err.strip() == (
+        "mjstack: devices=2: expected null with -m. Leave it out: with hydra/launcher=gpus each job"
+        " has one GPU, and hydra.launcher.jobs is how many run at once."
+    )
+    assert not everything(folder)
+
+
 # Refusals of the composition itself are in test_config.py.
 BAD = [
     ["nworld=0"],
