@@ -249,7 +249,10 @@ def test_failing_worlds_stand_beside_their_native_copies(failing: Path) -> None:
         assert ", native" in labels[2 * one + 1]
         assert labels[2 * one].endswith(": STACKED")
     assert labels[-1] == "baseline, native"
-    assert "href='episode.html'" in (failing / "report.html").read_text()
+    report = (failing / "report.html").read_text()
+    assert "href='episode.html'" in report
+    assert report.count("<path class='w x'") == 2 * lost  # of both cubes; copies have none
+    assert report.count("<path class=w ") == 2 * (6 - lost)
 
 
 @pytest.mark.full

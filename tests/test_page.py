@@ -174,6 +174,21 @@ def test_maps_of_a_large_batch_show_failed_worlds_first(
     assert len(text) < 1e6
 
 
+def test_maps_show_ways(tmp_path: Path) -> None:
+    """A line per episode from the start on, one point while the object rests; what is not finite
+    is left out."""
+    gate, worlds = batch(8)
+    way = np.array([[0.1, 0.1], [0.1, 0.1], [0.3, 0.1], [np.nan, np.nan], [0.1, 0.1]])
+    lost = np.full((3, 2), np.nan)
+    worlds.maps[0].ways = [("5: STACKED", True, way), ("1", False, way[:3]), ("2", False, lost)]
+    text = to_html(Report(folder=tmp_path, gates=[gate]), Page(worlds={"batch": worlds}))
+    assert re.findall(r"<path class='?(w[ x]*)'? d='(.*?)'><title>(.*?)<", text) == [
+        ("w", "M123 246L123 123", "1"),
+        ("w x", "M123 246L123 123L123 246", "5: STACKED"),
+    ]
+    assert "Lines are the objects' ways in 3 of the episodes." in text
+
+
 def test_text_is_not_markup(tmp_path: Path) -> None:
     bad = "<script>alert(1)</script>'\"&"
     gate = GateResult(
@@ -187,7 +202,8 @@ def test_text_is_not_markup(tmp_path: Path) -> None:
         tables=[Table(title=bad, header=[bad], rows=[[bad]])],
     )
     two = np.array([0.0, 1.0])
-    maps = [Map(title=bad, xy=np.zeros((2, 2)), table=([0.3, 0.0], [0.2, 0.3]))]
+    ways = [(bad, True, np.zeros((2, 2)))]
+    maps = [Map(title=bad, xy=np.zeros((2, 2)), table=([0.3, 0.0], [0.2, 0.3]), ways=ways)]
     worlds = Worlds(
         names=[bad] * 2, broken=[[bad], []], rules={bad: bad}, values={bad: two}, maps=maps
     )

@@ -402,8 +402,11 @@ def _worlds(tally: EpisodeTally, context: RunContext) -> Worlds:
         rules=rules.texts,
         values=held,
     )
+    moving = [world for world in context.page.worlds3d.get(tally.gate, []) if not world.twin]
     for name, (at, _) in context.index.objects.items():
-        worlds.maps.append(Map(title=name, xy=start[:, at : at + 2], table=table))
+        xy = slice(at, at + 2)
+        ways = [(world.label, world.failed, world.qpos[:, xy]) for world in moving]
+        worlds.maps.append(Map(title=name, xy=start[:, xy], table=table, ways=ways))
     return worlds
 
 

@@ -58,6 +58,7 @@ figure{margin:.5rem 0}.pictures{display:flex;flex-wrap:wrap;gap:1rem}
 .plots{display:flex;flex-wrap:wrap;gap:.4rem 1.4rem}svg{display:block;overflow:visible}
 svg text{font-size:11px;fill:var(--dim)}.g{fill:var(--bar)}.b{fill:var(--bad)}
 .o{fill:var(--bar);fill-opacity:.5}.x{stroke:var(--bad);stroke-width:2}
+.w{fill:none;stroke:var(--bar);stroke-opacity:.4}.w.x{stroke:var(--bad);stroke-width:1}
 .axis{stroke:var(--line)}.limit{stroke:var(--near);stroke-dasharray:4 3}
 .go{display:inline-block;padding:.4rem .9rem;border:1px solid var(--bar);border-radius:6px;
 text-decoration:none}
@@ -357,6 +358,8 @@ def _plots(worlds: Worlds, thresholds: Mapping[str, float]) -> list[str]:
             lost = int(bad.sum())
             failed = f"{_POINTS:,} of {lost:,}" if lost > _POINTS else "all"
             note = f" {_POINTS:,} of {count:,} are drawn, {failed} failed ones among them."
+        if ways := len(worlds.maps[0].ways):
+            note += f" Lines are the objects' ways in {ways} of the episodes."
         drawn = "".join(
             table_map(one, worlds.names, worlds.broken, shown.tolist()) for one in worlds.maps
         )

@@ -1,5 +1,6 @@
 """Plots of a page as SVG: histograms, and maps of the table."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,17 +15,20 @@ _BINS = 30
 
 @dataclass(kw_only=True, slots=True)
 class Map:
-    """Where an object stood at the starts, seen from above.
+    """Where an object stood at the starts and went, seen from above.
 
     Attributes:
         title: The object.
         xy: Positions [m], shape ``(n, 2)``.
         table: Centre and half size of the table in x and y [m].
+        ways: Its ways in some episodes: a label, whether that failed, and positions [m], shape
+            ``(frames, 2)``.
     """
 
     title: str
     xy: np.ndarray
     table: tuple[Sequence[float], Sequence[float]]
+    ways: Sequence[tuple[str, bool, np.ndarray]] = ()
 
 
 def histogram(name: str, values: np.ndarray, bad: np.ndarray, limits: Sequence[float]) -> str:
@@ -88,6 +92,14 @@ def table_map(
         return scale * (y0 + hy - y), scale * (x0 + hx - x)
 
     marks = []
+    for text, failed, way in sorted(one.ways, key=lambda way: way[1]):
+        good = way[np.isfinite(way).all(1)].tolist()
+        if not good:
+            continue
+        points = ("{:.0f} {:.0f}".format(*place(x, y)) for x, y in good)
+        line = "L".join(point for point, _ in itertools.groupby(points))  # at rest it costs nothing
+        css = "'w x'" if failed else "w"
+        marks.append(f"<path class={css} d='M{line}'><title>{escape(text)}</title></path>")
     for row in sorted(shown, key=lambda row: bool(broken[row])):  # failed ones on top
         x, y = place(*map(float, one.xy[row, :2]))
         if not (math.isfinite(x) and math.isfinite(y)):
