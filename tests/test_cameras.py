@@ -275,7 +275,9 @@ def test_replayed_steps_draw_what_eager_steps_draw(make: Make) -> None:
         ends.append({name: image.clone() for name, image in env.images.items()})
         assert env.graph.captured == (graph == "require")
     for name, image in ends[0].items():
-        assert (image == ends[1][name]).float().mean() > 0.99, name
+        # No run on CUDA repeats another bit for bit: a depth is metres, the rest are integers.
+        off = (image.float() - ends[1][name].float()).abs()
+        assert (off <= 1e-4).float().mean() > 0.99, name
 
 
 @pytest.mark.gpu

@@ -17,6 +17,7 @@ the managers.
 With cameras, the images of all worlds and cameras are timed too, however slow a camera is.
 """
 
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -36,6 +37,7 @@ from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
 from mjstack.episodes.rollout import State, restore, snapshot
 from mjstack.sim.cameras import image_bytes
+from mjstack.sim.graph import StepGraph
 
 _COST = 4.0  # of a repetition over that of its whole steps from the start, when fewer things touch
 
@@ -155,9 +157,8 @@ class _Parts:
 
     @property
     def captured(self) -> bool:
-        """Whether physics and managers were replayed."""
-        used = self._parts if self._env.images else self._parts[:2]
-        return all(part.captured for part in used)
+        """Whether the parts were replayed."""
+        return all(part.captured for part in self._parts)
 
     def warm_up(self) -> float:
         """Start worlds at random ages, compile and capture; return the seconds of a step."""
@@ -166,7 +167,7 @@ class _Parts:
         ages = torch.randint(env.max_episode_steps, (env.nworld,), generator=self._generator)
         env.episode_step.copy_(ages)
         seconds = [timed(env.sim, partial(env.step, action)) for action in self._actions(WARM_UP)]
-        self._parts = env.parts()
+        self._parts: Sequence[StepGraph] = env.parts() if env.images else env.parts()[:2]
         if self.on_cuda:  # a repetition may be too short to warm them up
             for part in self._parts:
                 for _ in range(WARM_UP):

@@ -252,8 +252,9 @@ class Learner:
             steps = self._pool.steps[self._drawn]
             images = self._augment(self._pool.images, self._drawn)
         loss = self._loss(self._network, steps, images, self._widest * self._noise)
+        # Into memory that is laid out as the weights, which the fused optimizer asks for
         for weight, gradient in zip(weights, torch.autograd.grad(loss, weights), strict=True):
-            weight.grad = gradient
+            weight.grad = torch.empty_like(weight).copy_(gradient)
         self._ranks.average_gradients(weights)
         self._optimizer.step()
         average = [p.data for p in self._average.parameters()]
