@@ -135,6 +135,15 @@ def test_worlds_pause_step_and_are_chosen(
             assert time.monotonic() < deadline
             time.sleep(0.01)
         assert view._shown == [4, 1]
+        # Another plotted world: its own lines, from here on
+        assert plot.data[0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+        view._plotted.value = 3
+        while "world 3: step" not in view._status.content:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert plot.data[0].tolist() == [4.0]
+        values = env.reward_manager.values[3].tolist()
+        assert np.allclose([column[0] for column in plot.data], [4.0, sum(values), *values])
     finally:
         on.set()
         view._toggle()

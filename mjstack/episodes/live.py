@@ -65,6 +65,7 @@ class LiveView(Observer):
         self._shown: list[int] = []
         self._part = ""
         self._chosen = ""
+        self._asked = ("", 0)  # of the last picture: the texts of both choices
         self._steps = 0  # that a click lets the run make
         self.paused = False
 
@@ -126,7 +127,7 @@ class LiveView(Observer):
         while self.paused and not self._steps:
             check_interrupt()
             time.sleep(0.02)
-            if self._worlds.value != self._chosen:
+            if self._asked != (self._worlds.value, self._plotted.value):
                 self._show(step + 1)
         self._steps = max(0, self._steps - 1)
         self._wait(real and not self.paused)
@@ -152,6 +153,10 @@ class LiveView(Observer):
         """Draw the chosen worlds, and what is known of the plotted one."""
         env = self.env
         self._last = time.perf_counter()
+        asked = (self._worlds.value, self._plotted.value)
+        if asked[1] != self._asked[1]:
+            self._history.clear()  # it is another world's
+        self._asked = asked
         problem = self._choose()
         index = torch.tensor(self._shown, device=env.device)
         qpos = env.sim.qpos[index].double().cpu().numpy()
@@ -162,7 +167,7 @@ class LiveView(Observer):
             labels = [str(number) for number in env.world[index].tolist()]
             self._stage = Stage(self._server, self._shapes, labels, [None] * len(labels))
         self._stage.update(np.nan_to_num(qpos))
-        world = min(max(0, int(self._plotted.value)), env.nworld - 1)
+        world = min(max(0, int(asked[1])), env.nworld - 1)
         terms, lines = self._values(world)
         for title, values in lines.items():
             self._plot(title, step, values)
@@ -228,6 +233,8 @@ class LiveView(Observer):
         """Add a point to every line of a plot."""
         key = (title, *values)
         held = self._history.setdefault(key, deque(maxlen=_HISTORY))
+        if held and held[-1][0] == step:
+            held.pop()  # drawn again, as other worlds were chosen
         held.append((float(step), *np.nan_to_num(list(values.values())).tolist()))
         data = tuple(np.array(column) for column in zip(*held, strict=True))
         if key in self._plots:
