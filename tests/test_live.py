@@ -212,6 +212,32 @@ def test_without_a_browser_nothing_is_drawn(
     assert view.aside > 0.9 * waited
 
 
+def test_a_paused_run_goes_on_when_the_last_browser_leaves(
+    server: Any, stage: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not at once: a page that is loaded anew leaves and comes back."""
+    env = build_env(configure("task=reach"), nworld=2)
+    env.reset()
+    lines: list[str] = []
+    model = stage("so101").stage.visual_model
+    view = LiveView(server, lambda: model, print_line=lines.append)
+    view.start(env)
+    view._toggle()
+    began = time.perf_counter()
+    monkeypatch.setattr(
+        server, "get_clients", lambda: {} if time.perf_counter() - began > 0.5 else {0: None}
+    )
+    worker = threading.Thread(target=view.after_step, args=(0,), daemon=True)
+    worker.start()
+    worker.join(timeout=2.0)
+    assert worker.is_alive()
+    worker.join(timeout=10.0)
+    env.close()
+    assert not worker.is_alive()
+    assert not view.paused
+    assert lines == ["live view: the run was paused, and goes on without a browser"]
+
+
 @pytest.fixture
 def port() -> int:
     """A port that no program has."""

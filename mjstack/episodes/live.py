@@ -22,6 +22,7 @@ from mjstack.sim import StateRenderer
 _RATE = 25.0  # pictures per second, at most
 _HISTORY = 500  # points of a plot
 _FIRST = 16  # worlds that are shown at first
+_GRACE = 3.0  # s in which a page that is loaded anew comes back
 _COLORS = ("#4478b8", "#c93434", "#1a7f4b", "#9a6700", "#7b4ab8", "#1f8a99", "#b8447f", "#656d76")
 _HEIGHT = "height above the table [mm]"
 _REAL = "real time"
@@ -45,6 +46,7 @@ class LiveView(Observer):
         *,
         renderer: Callable[[Sequence[str]], StateRenderer] | None = None,
         pausable: bool = True,
+        print_line: Callable[[str], None] = lambda line: None,
     ) -> None:
         """Add the controls to a server.
 
@@ -54,8 +56,10 @@ class LiveView(Observer):
             renderer: Makes what draws the cameras where the environment draws nothing, for a state
                 with these model fields of its own; None without cameras.
             pausable: Whether the run may wait; not where other processes wait for it.
+            print_line: Prints a line.
         """
         self._server = server
+        self._print_line = print_line
         self._model = model
         self._make_renderer = renderer
         self._renderer: StateRenderer | None = None
@@ -124,9 +128,15 @@ class LiveView(Observer):
         began = time.perf_counter()
         if self.paused or (watched and began - self._last >= 1.0 / _RATE):
             self._show(step + 1)
+        seen = time.perf_counter()
         while self.paused and not self._steps:
             check_interrupt()
             time.sleep(0.02)
+            if self._server.get_clients():
+                seen = time.perf_counter()
+            elif time.perf_counter() - seen > _GRACE:
+                self._print_line("live view: the run was paused, and goes on without a browser")
+                self._toggle()
             if self._asked != (self._worlds.value, self._plotted.value):
                 self._show(step + 1)
         self._steps = max(0, self._steps - 1)

@@ -436,6 +436,7 @@ def _live_view(context: RunContext, console: Console) -> Iterator[LiveView | Non
                 lambda: context.stage.visual_model,
                 renderer=partial(_camera_renderer, context) if cfg.scene.cameras else None,
                 pausable=context.ranks.size == 1,
+                print_line=console.print,
             )
         ) as live:
             yield live
