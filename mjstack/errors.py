@@ -8,7 +8,8 @@ import json
 import re
 import sysconfig
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,6 +58,23 @@ class KeyedError(MjstackError):
         """Name the key that the user has set instead."""
         self.args = (key + str(self).removeprefix(self.key),)
         self.key = key
+
+
+@contextmanager
+def renamed_keys(keys: Mapping[str, str]) -> Iterator[None]:
+    """Let errors of what runs inside name the keys that the user has set.
+
+    Args:
+        keys: The key in the configuration, by the beginning of the one that an error names.
+    """
+    try:
+        yield
+    except KeyedError as error:
+        for inner, outer in keys.items():
+            if f"{error.key}.".startswith(f"{inner}."):
+                error.move(outer + error.key.removeprefix(inner))
+                break
+        raise
 
 
 class ConfigError(KeyedError):

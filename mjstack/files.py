@@ -38,7 +38,8 @@ def reading(path: Path, kind: type[MjstackError], fix: str) -> Iterator[None]:
     except MjstackError:
         raise
     except Exception as error:
-        reason = f"{type(error).__name__}: {first_line(error)}"
+        reason = getattr(error, "strerror", None)
+        reason = reason or f"{type(error).__name__}: {first_line(error)}"
         raise kind(f"{path}: cannot be read ({reason}), expected it as written", fix) from error
 
 

@@ -260,6 +260,10 @@ BAD = [
     (["job.minibatches=64"], "job.minibatches=64: expected at most 8"),
     (["job.critic=[nope]"], "job.critic: observation group 'nope' does not exist"),
     (["job.leave_out=[nope]"], "term of policy 'nope' does not exist"),
+    (
+        ["+job.observation.policy.terms.joint_pos.params.foo=1"],
+        ": job.observation.policy.terms.joint_pos: parameter 'foo' does not exist",
+    ),
     (["job.start_from=/nowhere"], "policy=/nowhere: has no policy.json"),
     (["job.start_from={rebot}"], "was trained with robot.name=rebot, and here it is so101"),
     (["job.batch_size=3"], "'job.batch_size' does not exist"),

@@ -25,13 +25,22 @@ from compositions import load_config
 from mjstack import cli
 from mjstack.__main__ import main
 from mjstack.config.explain import own_overrides
-from mjstack.errors import FolderError
-from mjstack.files import claim_folder
+from mjstack.errors import FolderError, RunError
+from mjstack.files import claim_folder, reading
 from mjstack.jobs import CheckedJob, check_job, runner
 from mjstack.report.record import GateResult, Status
 
 NOON = "outputs/2026-11-21/12-00-00"
 SWEEP = "outputs/sweeps/2026-11-21/12-00-00"
+
+
+def test_a_missing_file_is_said_in_plain_words(tmp_path: Path) -> None:
+    path = tmp_path / "nowhere.npz"
+    with pytest.raises(RunError) as caught, reading(path, RunError, "Name another"):
+        path.open()
+    assert str(caught.value) == (
+        f"{path}: cannot be read (No such file or directory), expected it as written. Name another."
+    )
 
 
 @pytest.fixture(scope="module")

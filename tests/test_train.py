@@ -245,7 +245,7 @@ BAD = [
     (["job.test_seed=0"], "job.test_seed=0: expected seeds that training does not use"),
     (
         ["job.observation.policy.terms.headings.func=mjstack.mdp.observation.nope"],
-        "'nope' does not exist",
+        ": job.observation.policy.terms.headings: func=mjstack.mdp.observation.nope: 'nope' does",
     ),
     (["job.leave_out=[joint_vle]"], "Did you mean 'joint_vel'?"),
     (["observation@job.observation=nope"], "nope"),

@@ -15,7 +15,7 @@ from mjstack.envs.build import driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.earlier_run import REPORT, EarlierRun, archive_starts, archived_starts
 from mjstack.episodes.rollout import CLOSED_LOOP, POLICY, STATE_BASED
-from mjstack.errors import ConfigError, KeyedError, RunError, Unreachable
+from mjstack.errors import ConfigError, RunError, Unreachable, renamed_keys
 from mjstack.gates.images import load_images
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
@@ -156,12 +156,8 @@ def check_env(context: RunContext, cfg: Config, **keys: str) -> None:
     """Build an environment in the context's scene, which checks every term. ``keys`` has the key of
     each group whose terms come from elsewhere.
     """
-    try:
+    with renamed_keys(keys):
         build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu").close()
-    except KeyedError as error:
-        group, dot, rest = error.key.partition(".")
-        error.move(f"{keys.get(group, group)}{dot}{rest}")
-        raise
 
 
 def check_gates(cfg: Config) -> CheckedJob:

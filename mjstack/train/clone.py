@@ -13,14 +13,13 @@ import torch
 from mjstack.config.schema import Backend, CloneJobCfg, CloneSizes
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.context import RunContext
-from mjstack.errors import ConfigError, FolderError, MjstackError, UnknownName
+from mjstack.errors import ConfigError, MjstackError, UnknownName, renamed_keys
 from mjstack.managers.observation import ObservationManager
-from mjstack.policy.checkpoint import read_state
 from mjstack.sim.memory import free_memory
 from mjstack.train.clone_learner import Learner
 from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import batches_of, play_expert
-from mjstack.train.trainer import LAST, STATE, Trained, Trainer, observed_group
+from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, observed_group
 
 
 def check_clone(context: RunContext) -> range:
@@ -31,7 +30,8 @@ def check_clone(context: RunContext) -> range:
     group = observed_group(job, sizes.leave_out)
     check_vision(context, job)
     with _one_world(context) as env:
-        widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
+        with renamed_keys({"observation": "job.observation"}):
+            widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
         if job.dataset is not None:
             return check_dataset(Path(job.dataset), env, group, widths)
     return range(cfg.seed, cfg.seed + len(batches_of(job, sizes, cfg.nworld)))
@@ -98,12 +98,7 @@ def train_clone(context: RunContext, folder: Path) -> Trained:
     device = context.backend[1].partition(":")[0]
     ranks = context.ranks
     made_with = {"sizes": asdict(sizes), "device": device, "processes": ranks.size}
-    earlier = read_state(folder / STATE) if (folder / STATE).exists() else None
-    if earlier and (theirs := earlier[1]["made_with"]) != made_with:
-        raise FolderError(
-            f"{folder} has a training with {theirs}, and this one has {made_with}. Set job.folder"
-            " to another folder"
-        )
+    earlier = earlier_state(folder, made_with)
     if earlier and earlier[1]["done"] == sizes.batches:
         context.print_line(f"train: {folder} is trained already, and is judged anew")
         return _trained(folder, earlier[1])

@@ -17,14 +17,22 @@ from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import STATE_BASED, play_episode
-from mjstack.errors import ConfigError, FolderError, MjstackError
+from mjstack.errors import ConfigError, MjstackError
 from mjstack.managers.view import random_uniform
 from mjstack.policy import Policy, save_policy
 from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.train.clone import check_clone, resolve_sizes
 from mjstack.train.clone_learner import Learner
 from mjstack.train.demonstrations import DemonstrationRecorder, Demonstrations
-from mjstack.train.trainer import BEST, LAST, STATE, EventWriter, Trained, Trainer, observed_group
+from mjstack.train.trainer import (
+    BEST,
+    LAST,
+    EventWriter,
+    Trained,
+    Trainer,
+    earlier_state,
+    observed_group,
+)
 
 _SPELL = 0.5  # s, for which the expert or the policy drives before it is drawn anew
 
@@ -167,12 +175,7 @@ def train_dagger(context: RunContext, folder: Path) -> Trained:
     device = context.backend[1].partition(":")[0]
     sizes = resolve_sizes(job, device)
     made_with = {"sizes": asdict(sizes), "device": device}
-    earlier = read_state(folder / STATE) if (folder / STATE).exists() else None
-    if earlier and (theirs := earlier[1]["made_with"]) != made_with:
-        raise FolderError(
-            f"{folder} has a training with {theirs}, and this one has {made_with}. Set job.folder"
-            " to another folder"
-        )
+    earlier = earlier_state(folder, made_with)
     if earlier and len(earlier[1]["curve"]) == job.rounds:
         context.print_line(f"train: {folder} is trained already, and is judged anew")
         return _trained(folder, earlier[1])

@@ -15,7 +15,7 @@ from mjstack.config.schema import (
 )
 from mjstack.envs import build_env
 from mjstack.episodes.context import RunContext
-from mjstack.errors import ConfigError, PolicyError, UnknownName
+from mjstack.errors import ConfigError, PolicyError, UnknownName, renamed_keys
 from mjstack.managers.term import check_params
 from mjstack.policy import Policy, load_policy
 from mjstack.policy.checkpoint import read_state
@@ -102,13 +102,16 @@ def check_ppo(context: RunContext) -> range:
             label = f"reset.{name}"
             check_params(label, resolve_func(label, reset[name].func), reset[name].params, 1)
         reset = whole_starts(reset)
-    env = build_env(
-        replace(plan.cfg, reset=reset),
-        model=context.model,
-        nworld=1,
-        backend=Backend.native,
-        device="cpu",
-    )
+    seen = f"observation.{plan.group}"
+    keys = {seen: f"job.{seen}"} if plan.start is None else {}
+    with renamed_keys(keys):
+        env = build_env(
+            replace(plan.cfg, reset=reset),
+            model=context.model,
+            nworld=1,
+            backend=Backend.native,
+            device="cpu",
+        )
     try:
         if plan.start is not None:
             plan.start.check_widths(env.observation_manager.term_dims[plan.group])

@@ -10,7 +10,8 @@ from torch.optim import Optimizer
 
 from mjstack.config.schema import CloneJobCfg, ObservationGroupCfg, PpoJobCfg
 from mjstack.episodes.context import RunContext
-from mjstack.errors import UnknownName
+from mjstack.errors import FolderError, UnknownName
+from mjstack.policy.checkpoint import read_state
 
 # In the folder of a training: two policies, and what it needs to go on.
 LAST = "last"
@@ -106,6 +107,26 @@ def observed_group(job: CloneJobCfg | PpoJobCfg, leave_out: Sequence[str]) -> Ob
             raise UnknownName(f"job.leave_out: term of {job.group}", name, group.terms)
     terms = {name: term for name, term in group.terms.items() if name not in leave_out}
     return replace(group, noise=job.observation_noise, terms=terms)
+
+
+def earlier_state(
+    folder: Path, made_with: Mapping[str, Any]
+) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+    """The state that an earlier call has left in a training's folder; None without one.
+
+    Raises:
+        FolderError: It had other sizes, or another kind of device.
+        PolicyError: Its file cannot be read.
+    """
+    if not (folder / STATE).exists():
+        return None
+    earlier = read_state(folder / STATE)
+    if (theirs := earlier[1]["made_with"]) != made_with:
+        raise FolderError(
+            f"{folder} has a training with {theirs}, and this one has {made_with}. Set job.folder"
+            " to another folder"
+        )
+    return earlier
 
 
 def pack_weights(networks: Mapping[str, nn.Module], optimizer: Optimizer) -> dict[str, Tensor]:
