@@ -242,7 +242,7 @@ GRIPPER = "mjstack.mdp.action.Gripper"
 TERM = ("observation", "terms", "joint_pos")
 DAMAGED: dict[str, tuple[Callable[[Path], object], str]] = {
     "no file": (lambda f: (f / "policy.json").unlink(), "has no policy.json"),
-    "no weights": (lambda f: weights(f).unlink(), "FileNotFoundError"),
+    "no weights": (lambda f: weights(f).unlink(), "cannot be read (No such file or directory)"),
     "truncated weights": (
         lambda f: weights(f).write_bytes(weights(f).read_bytes()[:-100]),
         "its content is not that of policy.json",
