@@ -46,6 +46,22 @@ def test_a_held_action_is_that_action_again_and_again() -> None:
             assert torch.equal(value, theirs[name]), name
 
 
+@pytest.mark.parametrize(("history", "calls"), [(1, 1), (2, HELD)])
+def test_held_steps_are_observed_for_a_history_alone(
+    history: int, calls: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = on_new_sim(
+        "native", 2, held(f"observation.policy.terms.grasp_point_to_goal.history={history}")
+    )
+    env.reset(seed=1)
+    seen: list[int] = []
+    compute = env.observation_manager.compute
+    monkeypatch.setattr(env.observation_manager, "compute", lambda: seen.append(1) or compute())
+    for number, move in enumerate(actions(env, 3)):
+        env.step(move)
+        assert len(seen) == calls * (number + 1)
+
+
 @pytest.mark.parametrize(
     ("ends", "last", "success"),
     [

@@ -48,7 +48,8 @@ class Env:
     With ``timing.policy_decimation`` 1 to 4 are repeated so many times with the same action, each
     time for a control step. Rewards are summed. A world whose episode ends before the last of them
     goes on without rewards until then, and is reset with the others: its success, its length and
-    its way of ending are those of the control step in which it ended.
+    its way of ending are those of the control step in which it ended. Observations are computed
+    after the last one, and with a history after each.
 
     On CUDA the whole step is one graph: the first step after a build runs eagerly, the second is
     captured, and later ones replay it. After a change of anything that it has
@@ -354,8 +355,8 @@ class Env:
         self.sim.ctrl.copy_(given)
 
     def _evaluate(self, ended: Tensor | None = None, *, last: bool = True) -> Tensor | None:
-        """Success, terminations, rewards and observations of the new state; after the last control
-        step of a decision the resets.
+        """Success, terminations and rewards of the new state; after the last control step of a
+        decision observations and resets.
 
         Args:
             ended: Worlds whose episode ended in an earlier control step of the decision, shape
@@ -387,7 +388,9 @@ class Env:
                 if broken is not None:
                     achieved = achieved & ~broken
                 self.success.copy_(achieved)
-            side_by_side(self.device, reward, observe)
+            # A held step is seen by what remembers it alone.
+            observes = last or self.observation_manager.remembers
+            side_by_side(self.device, reward, *([observe] if observes else []))
         current_term.label = ""
         if self._check_faults and not lost.is_cuda and not self._faults.none_now(broken):
             self._faults.record(lost)

@@ -85,7 +85,7 @@ class _Group:
             shift += [self.dim + column for column in newest]
             repeat += [*newest] * part.cfg.history
             start += part.width
-        self._has_history = start < self.dim
+        self.remembers = start < self.dim
         self._shift = indices(shift)
         self._repeat = indices(repeat)
         self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
@@ -105,7 +105,7 @@ class _Group:
     def append(self, out: torch.Tensor, step: torch.Tensor) -> None:
         """Take in a new step of every world, and forget the oldest."""
         step = step[:, self._columns]
-        if not self._has_history:
+        if not self.remembers:
             out.copy_(step)
             return
         both = torch.cat((self._past, step), dim=1)
@@ -117,14 +117,14 @@ class _Group:
         alone where it has their numbers.
         """
         step = step[:, self._columns]
-        kept = self._past if self._has_history else out
-        if self._has_history:
+        kept = self._past if self.remembers else out
+        if self.remembers:
             step = step.index_select(1, self._repeat)
         if isinstance(at, torch.Tensor):
             kept.index_copy_(0, at, step)
         else:
             torch.where(mask[:, None], step, kept, out=kept)
-        if self._has_history:
+        if self.remembers:
             out.copy_(self._past)
 
 
@@ -145,6 +145,7 @@ class ObservationManager:
         term_dims: Width of each term, history included, by group and name, in the order of the
             columns.
         groups: The tensors, by group. They are written anew at every step.
+        remembers: Whether a term has a history, which needs every control step.
     """
 
     def __init__(self, env: EnvView, cfg: Mapping[str, ObservationGroupCfg]) -> None:
@@ -158,6 +159,7 @@ class ObservationManager:
         for name, group in cfg.items():
             first = sum(each.width for each in self._groups.values())
             self._groups[name] = _Group(name, group, env, first)
+        self.remembers = any(group.remembers for group in self._groups.values())
         self.group_dims = {name: group.dim for name, group in self._groups.items()}
         self.term_dims = {
             name: {term: p.dim for term, p in group.parts.items()}
