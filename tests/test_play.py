@@ -17,7 +17,7 @@ from policies import write_policy
 
 import mjstack
 import mjstack.jobs.play as play
-import mjstack.jobs.runner as runner
+import mjstack.jobs.showing as showing
 from mjstack.cli import run
 from mjstack.episodes.context import RunContext
 from mjstack.errors import MjstackError
@@ -79,8 +79,8 @@ def test_the_expert_plays_without_a_policy_in_the_viewer(
     def viewer(context: RunContext) -> Callable[[int, Simulation], None]:
         return lambda step, sim: shown.append(step)
 
-    monkeypatch.setattr(runner, "_viewer", viewer)
-    monkeypatch.setattr(runner, "opens_windows", lambda: True)
+    monkeypatch.setattr(showing, "_viewer", viewer)
+    monkeypatch.setattr(showing, "opens_windows", lambda: True)
     out = tmp_path / "out"
     fast = [
         f"controller.phases.{name}.seconds=0.2"

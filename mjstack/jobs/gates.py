@@ -19,7 +19,8 @@ from mjstack.errors import ConfigError, RunError, Unreachable, renamed_keys
 from mjstack.gates.images import load_images
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
-from mjstack.jobs.runner import CheckedJob, Job, check_showing, count_devices, run_provenance
+from mjstack.jobs.runner import CheckedJob, Job, count_devices, run_provenance
+from mjstack.jobs.showing import check_showing
 from mjstack.managers.episode import required_fields
 from mjstack.report.gl import require_offscreen
 from mjstack.sim import resolve_backend

@@ -21,7 +21,8 @@ from mjstack.episodes.rollout import POLICY, WorldRecorder, play_episode, rollou
 from mjstack.errors import ConfigError
 from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.runner import CheckedJob, Job, check_showing
+from mjstack.jobs.runner import CheckedJob, Job
+from mjstack.jobs.showing import check_showing
 from mjstack.report.gl import require_offscreen
 from mjstack.report.picture import save_video
 from mjstack.report.record import GateResult, Status

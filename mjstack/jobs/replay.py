@@ -25,7 +25,8 @@ from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.replay_failing import Failing, replay_failing
-from mjstack.jobs.runner import CheckedJob, Job, check_showing, run_provenance
+from mjstack.jobs.runner import CheckedJob, Job, run_provenance
+from mjstack.jobs.showing import check_showing
 from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import resolve_backend, resolve_device

@@ -3,12 +3,9 @@
 import gc
 import hashlib
 import logging
-import os
 import re
 import socket
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,55 +21,24 @@ from mjstack.config.functions import find_object
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.context import Artifacts, RunContext
 from mjstack.episodes.live import LiveView
-from mjstack.episodes.rollout import Hook, Observer, StepHook
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import log_error
 from mjstack.interrupt import check_interrupt, interrupted
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
+from mjstack.jobs.showing import draw_episode, find_viewers, save_page, serve_live_view
 from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.report.html import PAGE, Page, write_page
-from mjstack.report.picture import (
-    opens_windows,
-    require_video,
-    save_scene,
-    save_trajectories,
-    save_video,
-)
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
 from mjstack.report.table import Console, Table, to_document
-from mjstack.report.web import (
-    EPISODE,
-    check_address,
-    choose_worlds,
-    frame_stride,
-    lacks_viser,
-    save_episode,
-    start_server,
-    stop_server,
-)
+from mjstack.report.web import EPISODE
 from mjstack.report.write import safely_write, summarize, write_report
-from mjstack.sim import Simulation, StateRenderer, resolve_backend
+from mjstack.sim import resolve_backend
 from mjstack.sim.build import cuda_driver, cuda_name, cuda_uuid
-from mjstack.sim.cameras import color_cameras
 from mjstack.sim.native import available_cores
 
 log = logging.getLogger(__name__)
-
-
-def check_showing(cfg: Config, ending: str = ".mp4") -> None:
-    """Raise if this machine cannot show an episode as ``view`` or ``video`` ask for, the video with
-    a name of this ending.
-    """
-    if cfg.view == "web":
-        check_address(cfg.web.host, cfg.web.port)
-    elif cfg.view == "true" and not opens_windows():
-        shown = os.environ.get("DISPLAY", "not set")
-        expected = f"a display that opens windows (DISPLAY={shown})"
-        raise ConfigError("view", "true", expected, "Use view=web or video=true instead")
-    if cfg.video:
-        require_video(ending)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,68 +115,19 @@ class CheckedJob:
             report.
         """
         console = Console(highlight=False, soft_wrap=True)
-        errors = Console(stderr=True, soft_wrap=True, markup=False)
         report = Report(
             folder=folder, overrides=list(overrides), resumes=self.resumes or self.resumable
         )
-        cfg = self.context.cfg
-        page = Page(title=f"{cfg.robot.title}, {self.title}")
+        page = Page(title=f"{self.context.cfg.robot.title}, {self.title}")
         # The collector need not look at all that was loaded each time it frees a gate's worlds.
         gc.collect()
         gc.freeze()
-
-        def record(result: GateResult) -> None:
-            report.gates.append(result)
-            _write(report, page)
-            log.info("%s: %s %s", result.name, result.status, result.reason)
-            bar.finish(result)
-
-        # The work, and the pictures of its artifacts
-        try:
-            where = f"{escape(self.title)} -> {escape(str(folder))}"
-            console.print(f"[bold]{escape(cfg.robot.title)}[/], {where}")
-            report.provenance = run_provenance(self.context)
-            if self.earlier:
-                report.provenance["earlier_calls"] = list(self.earlier)
-            if self.context.ranks.size > 1:
-                places = self.context.ranks.gather(self._place())
-                report.provenance["ranks"] = [f"rank {r}: {p}" for r, p in enumerate(places)]
-            _write(report, page)
-            with ProgressBar(console) as bar, _live_view(self.context, console) as live:
-                context = replace(
-                    self.context,
-                    folder=folder,
-                    overrides=overrides,
-                    print_line=bar.print_line,
-                    begin=partial(_begin, bar, live),
-                    record=record,
-                    advance=bar.advance,
-                    viewers=[live] if live else _viewers(self.context),
-                    live=live,
-                    artifacts=Artifacts(),
-                    page=page,
-                )
-                self.work(context, folder)
-            report.conclude()
-            _write(report, page)
-            report.pictures = [*_draw(context, console), *page.pictures]
-            page.note = _save_episode(context)
-            check_interrupt()
         # However it ends, the finished results are in the report.
+        try:
+            self._do(report, page, console)
+            check_interrupt()
         except (Exception, SystemExit, KeyboardInterrupt) as error:
-            cause = self.context.ranks.cause(error)
-            if interrupted() or isinstance(cause, KeyboardInterrupt):
-                report.status = Status.interrupted
-                console.print("interrupted; the finished gates are in the report")
-            else:
-                report.status = Status.failed
-                if isinstance(cause, OSError):
-                    problem = f"{folder} cannot be written: {cause.strerror}. Free space, or set"
-                    problem += " hydra.run.dir."
-                else:
-                    problem = log_error(cause)
-                    log.error("%s", problem)
-                errors.print(f"mjstack: {problem}")
+            self._end(error, report, console)
         for finish in (partial(_write, page=page), partial(_print_summary, console)):
             try:
                 finish(report)
@@ -218,6 +135,61 @@ class CheckedJob:
                 log_error(error)
         gc.unfreeze()
         return report
+
+    def _do(self, report: Report, page: Page, console: Console) -> None:
+        """Do the work, and draw what it has left."""
+        folder = report.folder
+        where = f"{escape(self.title)} -> {escape(str(folder))}"
+        console.print(f"[bold]{escape(self.context.cfg.robot.title)}[/], {where}")
+        report.provenance = run_provenance(self.context)
+        if self.earlier:
+            report.provenance["earlier_calls"] = list(self.earlier)
+        if self.context.ranks.size > 1:
+            places = self.context.ranks.gather(self._place())
+            report.provenance["ranks"] = [f"rank {r}: {p}" for r, p in enumerate(places)]
+        _write(report, page)
+
+        def record(result: GateResult) -> None:
+            report.gates.append(result)
+            _write(report, page)
+            log.info("%s: %s %s", result.name, result.status, result.reason)
+            bar.finish(result)
+
+        with ProgressBar(console) as bar, serve_live_view(self.context, console) as live:
+            context = replace(
+                self.context,
+                folder=folder,
+                overrides=report.overrides,
+                print_line=bar.print_line,
+                begin=partial(_begin, bar, live),
+                record=record,
+                advance=bar.advance,
+                viewers=[live] if live else find_viewers(self.context),
+                live=live,
+                artifacts=Artifacts(),
+                page=page,
+            )
+            self.work(context, folder)
+        report.conclude()
+        _write(report, page)
+        report.pictures = [*draw_episode(context, console), *page.pictures]
+        page.note = save_page(context)
+
+    def _end(self, error: BaseException, report: Report, console: Console) -> None:
+        """Say why the work has ended early."""
+        cause = self.context.ranks.cause(error)
+        if interrupted() or isinstance(cause, KeyboardInterrupt):
+            report.status = Status.interrupted
+            console.print("interrupted; the finished gates are in the report")
+            return
+        report.status = Status.failed
+        if isinstance(cause, OSError):
+            problem = f"{report.folder} cannot be written: {cause.strerror}. Free space, or set"
+            problem += " hydra.run.dir."
+        else:
+            problem = log_error(cause)
+            log.error("%s", problem)
+        Console(stderr=True, soft_wrap=True, markup=False).print(f"mjstack: {problem}")
 
 
 def _write(report: Report, page: Page) -> None:
@@ -364,119 +336,11 @@ def _device_name(backend: Backend, device: str) -> str:
     return f"{device}: {name}"
 
 
-def _draw(context: RunContext, console: Console) -> list[str]:
-    """Draw the one-world episode, if there was one; return the pictures' file names."""
-    if context.artifacts.shown is None:
-        return []
-    world, episode = context.artifacts.shown
-    cfg = context.cfg
-    folder = cast(Path, context.folder)
-    objects = {name: (thing.half, thing.color) for name, thing in cfg.scene.free.items()}
-    positions = np.stack([episode.qpos[:, a : a + 3] for a in context.index.object_qpos], axis=1)
-    title = f"{cfg.robot.title}, {cfg.task.name}: {world}"
-    model = context.stage.visual_model
-    drawn: dict[str, tuple[Callable[..., object], tuple]] = {
-        "scene.png": (save_scene, (model, episode.qpos[-1])),
-        "trajectories.png": (save_trajectories, (positions, objects, title)),
-    }
-    if cfg.video:
-        drawn["episode.mp4"] = (save_video, (model, episode.qpos[None], cfg.timing.step_dt))
-    pictures = []
-    for name, (draw, args) in drawn.items():
-        if problem := safely_write(folder / name, draw, *args):
-            console.print(escape(problem))
-        elif name.endswith(".png"):
-            pictures.append(name)
-        else:
-            console.print(escape(f"video: {folder}/{name}"))
-    return pictures
-
-
-def _save_episode(context: RunContext) -> str:
-    """Write the 3-D page of the run's worlds, if there were any; return why there is none."""
-    cfg = context.cfg
-    page = context.page
-    folder = cast(Path, context.folder)
-    if not cfg.web.episode:
-        return "web.episode=false: no 3-D page"
-    worlds = choose_worlds(page.worlds3d)
-    problem = lacks_viser()
-    if worlds and not problem:
-        frame_dt = frame_stride(cfg.timing.step_dt) * cfg.timing.step_dt
-        shown = (context.stage.visual_model, worlds, frame_dt)
-        problem = safely_write(folder / EPISODE, save_episode, *shown)
-    if (folder / EPISODE).exists():  # perhaps an earlier call's, of seeds that were read back
-        page.episode = EPISODE
-    if problem:
-        context.print_line(problem)
-    return problem
-
-
 def _begin(bar: ProgressBar, live: LiveView | None, name: str) -> None:
     """Name the part of the run that begins."""
     bar.start(name)
     if live is not None:
         live.begin(name)
-
-
-@contextmanager
-def _live_view(context: RunContext, console: Console) -> Iterator[LiveView | None]:
-    """Serve the live view inside, if it is asked for."""
-    cfg = context.cfg
-    if cfg.view != "web":
-        yield None
-        return
-    check_address(cfg.web.host, cfg.web.port)  # another program may have come first
-    server = start_server(cfg.web.host, cfg.web.port)
-    try:
-        console.print(f"live view: http://{cfg.web.host}:{server.get_port()}")
-        with closing(
-            LiveView(
-                server,
-                lambda: context.stage.visual_model,
-                renderer=partial(_camera_renderer, context) if cfg.scene.cameras else None,
-                pausable=context.ranks.size == 1,
-                print_line=console.print,
-            )
-        ) as live:
-            yield live
-    finally:
-        stop_server(server)
-
-
-def _camera_renderer(context: RunContext, fields: Sequence[str]) -> StateRenderer:
-    """What draws the cameras of one world for the live view, on the backend of the batch."""
-    cfg = context.cfg
-    colors = replace(cfg, scene=replace(cfg.scene, cameras=color_cameras(cfg.scene.cameras)))
-    backend, device = context.backend
-    return StateRenderer(context.model, colors, 1, backend=backend, device=device, fields=fields)
-
-
-def _viewers(context: RunContext) -> list[Observer]:
-    """MuJoCo's viewer, if it is asked for."""
-    return [Hook(_viewer(context))] if context.cfg.view == "true" else []
-
-
-def _viewer(context: RunContext) -> StepHook:
-    """Show a one-world episode in MuJoCo's viewer, in real time; closing the window lets the run
-    go on.
-    """
-    import mujoco.viewer
-
-    model = context.stage.visual_model
-    data = mujoco.MjData(model)
-    handle = mujoco.viewer.launch_passive(model, data)
-
-    def show(step: int, sim: Simulation) -> None:
-        if not handle.is_running():
-            return
-        began = time.perf_counter()
-        data.qpos[:] = sim.qpos[0].cpu().numpy()
-        mujoco.mj_forward(model, data)
-        handle.sync()
-        time.sleep(max(0.0, context.cfg.timing.step_dt - (time.perf_counter() - began)))
-
-    return show
 
 
 def _print_summary(console: Console, report: Report) -> None:

@@ -20,7 +20,8 @@ from mjstack.files import check_unused, reading, to_csv, write_atomic
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import run_success
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.runner import CheckedJob, Job, check_showing, write_tables
+from mjstack.jobs.runner import CheckedJob, Job, write_tables
+from mjstack.jobs.showing import check_showing
 from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
