@@ -38,7 +38,7 @@ from mjstack.episodes.rollout import CommandRecorder
 from mjstack.errors import ConfigError
 from mjstack.jobs import CheckedJob, check_job, collection
 from mjstack.jobs.collect import LOADING, collect_folder, plan_collection, run_collect
-from mjstack.jobs.collection import FILE, CollectPlan
+from mjstack.jobs.collected import FILE, CollectPlan
 from mjstack.jobs.demonstration import (
     Played,
     StepRecorder,

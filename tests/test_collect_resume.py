@@ -29,8 +29,9 @@ from mjstack.datasets.part import PartWriter
 from mjstack.envs import build_env, demonstration_config
 from mjstack.episodes.context import RunContext, Stage
 from mjstack.errors import UnwrittenError
-from mjstack.jobs import collection, demonstration
-from mjstack.jobs.collection import FILE, Collection, CollectPlan
+from mjstack.jobs import collected, collection, demonstration
+from mjstack.jobs.collected import FILE, CollectPlan
+from mjstack.jobs.collection import Collection
 from mjstack.jobs.demonstration import play_demonstrations
 from mjstack.jobs.runner import run_provenance
 from mjstack.report.record import GateResult, Status
@@ -62,7 +63,7 @@ def patch_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         collection, "play_demonstrations", fake_demonstrations(some_fail, noise=True)
     )
-    monkeypatch.setattr(collection, "run_provenance", lambda context: dict(_provenance()))
+    monkeypatch.setattr(collected, "run_provenance", lambda context: dict(_provenance()))
     monkeypatch.setattr(
         demonstration,
         "config_content",

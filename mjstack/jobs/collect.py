@@ -20,13 +20,8 @@ from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.context import RunContext, require_episode
 from mjstack.errors import ConfigError, DatasetError, RankError
 from mjstack.files import check_unused, lock_folder, write_atomic
-from mjstack.jobs.collection import (
-    DATASET,
-    FILE,
-    Collection,
-    CollectPlan,
-    read_batches,
-)
+from mjstack.jobs.collected import FILE, CollectPlan, read_batches
+from mjstack.jobs.collection import DATASET, Collection
 from mjstack.jobs.demonstration import ACTION, STATE, episode_config
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job

@@ -2,132 +2,38 @@
 until enough are there.
 """
 
-import itertools
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import cast
 
 import numpy as np
 
 from mjstack.config.schema import CollectJobCfg
-from mjstack.datasets import DatasetSpec, DatasetWriter, EpisodeData, lerobot
+from mjstack.datasets import DatasetWriter, lerobot
 from mjstack.datasets.part import FILE_MB, Part, PartWriter
 from mjstack.datasets.spec import typed_arrays, typed_values
-from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
-from mjstack.errors import ConfigError, DatasetError
-from mjstack.files import reading, write_atomic
-from mjstack.jobs.demonstration import (
-    STATE,
-    EpisodeRenderer,
-    Played,
-    make_spec,
-    play_demonstrations,
+from mjstack.files import write_atomic
+from mjstack.jobs.collected import (
+    FILE,
+    CollectedBatch,
+    CollectPlan,
+    describe_batches,
+    read_batches,
 )
-from mjstack.jobs.runner import run_provenance
-from mjstack.math import wilson_interval
+from mjstack.jobs.demonstration import STATE, Played, play_demonstrations
+from mjstack.jobs.episode_source import EpisodeSource
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation
 
 DATASET = "dataset"  # within the job's folder
-FILE = "batches.json"
 _SPARE = 1.05  # worlds played over episodes that are missing: some fail
-_MOST_DRAWN = 4096  # states at once
 _GIVE_UP = 3  # batches in a row without an episode
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CollectPlan:
-    """A dataset to be collected.
-
-    Attributes:
-        home: The job's folder.
-        spec: The dataset's columns and provenance.
-        most: Largest number of worlds of a batch: those whose steps fit into the buffers of all
-            ranks.
-        rank_most: Largest number of worlds whose steps fit into the buffer of a rank.
-    """
-
-    home: Path
-    spec: DatasetSpec
-    most: int
-    rank_most: int
-
-    @classmethod
-    def of(cls, context: RunContext, home: Path, env: Env) -> "CollectPlan":
-        """Plan from an environment of the demonstrations, with any number of worlds.
-
-        Raises:
-            ConfigError: The steps of not even one world fit into the buffer, or a column's name is
-                taken.
-        """
-        cfg = context.cfg
-        gib = cast(CollectJobCfg, cfg.job).buffer_gib
-        provenance = run_provenance(context)
-        # They differ between calls that make the same episodes.
-        del provenance["date"], provenance["config_sha256"]
-        spec = make_spec(env, cfg, provenance)
-        step = 4 * sum(column.dim for column in spec.features.values() if column.dtype == "float32")
-        if spec.videos:
-            step += 4 * context.model.nq
-        world = context.episode_steps * step / 2**30
-        if gib < world:
-            expected = f"at least {world:.2g}, which the steps of one world take"
-            raise ConfigError("job.buffer_gib", gib, expected)
-        room = int(gib / world)
-        most = min(cfg.nworld, context.ranks.size * room)
-        return cls(home=home, spec=spec, most=most, rank_most=room)
-
-
-@dataclass(kw_only=True, slots=True)
-class CollectedBatch:
-    """One seed, played in some worlds.
-
-    Attributes:
-        seed: The seed.
-        worlds: Number of worlds.
-        keep: Number of episodes that are to be kept.
-        succeeded: Number of worlds that the check passed.
-        kept: Episodes of it that are in the dataset; fewer than ``keep`` if it is unfinished.
-        retries: Grasps that were tried again, in all worlds.
-        broken: How many worlds broke each rule, by its words; among them those that are left out
-            only because a number in them is not finite.
-    """
-
-    seed: int
-    worlds: int
-    keep: int
-    succeeded: int
-    kept: int = 0
-    retries: int = 0
-    broken: dict[str, int] = field(default_factory=dict)
-
-
-def read_batches(path: Path) -> list[CollectedBatch]:
-    """The batches of earlier calls, ``kept`` as it was then.
-
-    Raises:
-        DatasetError: The file cannot be read.
-    """
-    if not path.exists():
-        return []
-    fix = (
-        f"Remove {FILE}: the dataset stands, and the expert's success rate is counted from then on"
-    )
-    with reading(path, DatasetError, fix):
-        batches = [CollectedBatch(**batch) for batch in json.loads(path.read_text())]
-        for batch in batches:
-            counts = asdict(batch) | batch.broken
-            del counts["broken"]
-            if any(type(count) is not int or count < 0 for count in counts.values()):
-                raise ValueError(counts)
-    return batches
 
 
 @dataclass(kw_only=True, slots=True)
@@ -173,7 +79,7 @@ class Collection:
         self.path = plan.home / DATASET
         self.batches: list[CollectedBatch] = []
         self._sim: Simulation | None = None
-        self._renderer: EpisodeRenderer | None = None
+        self._source = EpisodeSource(context, plan.spec.config_sha256, plan.rank_most)
         self._writer: DatasetWriter | None = None
         if not context.ranks.writes:
             return
@@ -216,8 +122,7 @@ class Collection:
                     self._record()
             if self._sim is not None:
                 self._sim.close()
-            if self._renderer is not None:
-                self._renderer.close()
+            self._source.close()
 
     def _play(self) -> str:
         ranks = self._context.ranks
@@ -323,7 +228,7 @@ class Collection:
         """
         if self._plan.spec.videos:
             self.writer.flush()  # the batch before
-        for count, data in enumerate(self._episodes(played, worlds), 1):
+        for count, data in enumerate(self._source.episodes(played, worlds), 1):
             self.writer.add([data])
             self._context.advance(f"episodes of seed {played.seed}", count, len(worlds))
         if not self._plan.spec.videos:
@@ -350,7 +255,7 @@ class Collection:
         try:
             for one in played:
                 mine = [world for world in one.worlds if world in before]
-                for world, data in zip(mine, self._episodes(one, mine), strict=True):
+                for world, data in zip(mine, self._source.episodes(one, mine), strict=True):
                     if writer is None:
                         number = f"{name}-{len(parts)}"
                         room = self._job.buffer_gib
@@ -399,45 +304,6 @@ class Collection:
         records = [asdict(batch) for batch in self.batches]
         write_atomic(self._record_path, json.dumps(records, indent=1) + "\n")
 
-    def _episodes(self, played: Played, worlds: Sequence[int]) -> Iterator[EpisodeData]:
-        """Some worlds' episodes, with their images if there are cameras."""
-        rows = [played.worlds.index(world) for world in worlds]
-        images: Iterator[dict[str, np.ndarray]] = itertools.repeat({})
-        if played.states is not None and rows:
-            if self._renderer is None:
-                count = min(self._plan.rank_most, len(played.worlds), _MOST_DRAWN)
-                self._renderer = EpisodeRenderer(self._context, count)
-            images = self._renderer.episodes(played, rows)
-        for (row, arrays), shown in zip(played.episodes(rows), images, strict=False):
-            yield self._episode(played, row, arrays, shown)
-
-    def _episode(
-        self,
-        played: Played,
-        world: int,
-        arrays: dict[str, np.ndarray],
-        images: dict[str, np.ndarray],
-    ) -> EpisodeData:
-        """A world's steps and its result. `next.success` is true in the last step of a successful
-        episode alone.
-        """
-        task = self._context.cfg.task
-        broken = self._context.check.rules.describe(int(played.failed[world]))
-        last = np.arange(len(arrays[STATE])) == len(arrays[STATE]) - 1
-        return EpisodeData(
-            arrays={**arrays, "next.done": last, "next.success": last & (not broken)},
-            images=images,
-            task=task.instruction or task.name,
-            success=not broken,
-            seed=played.seed,
-            world=played.worlds[world],
-            values={
-                "retries": int(played.retries[world]),
-                "failed_rules": broken,
-                "config_sha256": self._plan.spec.config_sha256,
-            },
-        )
-
     def _worlds(self, n: int) -> Simulation:
         if self._sim is None or self._sim.nworld != n:
             if self._sim is not None:
@@ -464,33 +330,14 @@ class Collection:
         reasons = [problem] if problem else []
         there = f"{steps:,} steps, {size:.1f} MB"
         reasons.append(f"{self.committed:,} episodes, {asked:,} asked for ({there})")
-        details = []
+        details: list[str] = []
 
-        # The expert, in the batches that are on record
         if self.batches:
-            worlds = sum(batch.worlds for batch in self.batches)
-            succeeded = sum(batch.succeeded for batch in self.batches)
-            low, high = wilson_interval(succeeded, worlds)
             notes["seeds"] = f"{self.batches[0].seed} to {self.batches[-1].seed}"
-            metrics |= {
-                "worlds_played": worlds,
-                "succeeded": succeeded,
-                "success_rate": succeeded / worlds,
-                "success_rate_low95": low,
-                "success_rate_high95": high,
-                "retries": sum(batch.retries for batch in self.batches),
-            }
-            share = f"{succeeded:,} of {worlds:,} worlds ({100.0 * succeeded / worlds:.4g} %)"
             driver = "expert" if self._context.phases else "policy"
-            reasons.append(f"the {driver} succeeded in {share}")
-            broken = sum((Counter(batch.broken) for batch in self.batches), Counter())
-            details += [f"{text}: {count} of {worlds} worlds" for text, count in broken.items()]
-            details += [
-                f"seed {batch.seed} is unfinished: {batch.keep - batch.kept} of its episodes are"
-                " still to come"
-                for batch in self.batches
-                if batch.kept < batch.keep
-            ]
+            reason, found, details = describe_batches(self.batches, driver)
+            reasons.append(reason)
+            metrics |= found
         if unknown := self.committed - sum(batch.kept for batch in self.batches):
             metrics["episodes_without_note"] = unknown
             reasons.append(f"{unknown:,} episodes are of seeds that {FILE} does not have")
@@ -498,8 +345,8 @@ class Collection:
         # This call
         if new:
             metrics["episodes_per_s"] = new / seconds
-            if self._renderer is not None:
-                metrics["drawing_s"] = self._renderer.seconds
+            if self._plan.spec.videos:
+                metrics["drawing_s"] = self._source.drawing
                 metrics["encoding_wait_s"] = self.writer.waited
             reasons.append(f"{new / seconds:.3g} episodes/s in all")
         elif self.committed >= asked:

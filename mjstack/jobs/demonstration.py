@@ -2,8 +2,6 @@
 step, and what a dataset of them holds.
 """
 
-import math
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
@@ -23,10 +21,8 @@ from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import Observer, play_episode, reset_worlds
 from mjstack.errors import ConfigError
-from mjstack.managers.episode import required_fields
 from mjstack.mdp.starts.placement import GAP, SCHEMA, may_meet
-from mjstack.sim import Simulation, StateRenderer, resolve_backend
-from mjstack.sim.cameras import color_cameras
+from mjstack.sim import Simulation, resolve_backend
 
 STATE = "observation.state"
 ACTION = "action"
@@ -191,83 +187,6 @@ def play_demonstrations(
         states=recorder.states,
         fields={name: sim.fields[name].clone() for name in sim.fields} if drawn else {},
     )
-
-
-class EpisodeRenderer:
-    """Draws the images of episodes after they have been judged, as many steps at once as there are
-    worlds.
-
-    Attributes:
-        seconds: Time that it took [s].
-    """
-
-    def __init__(self, context: RunContext, count: int) -> None:
-        """Make worlds in which ``count`` states are drawn at once.
-
-        Raises:
-            MjstackError: They do not fit into memory.
-        """
-        cfg = context.cfg
-        cameras = color_cameras(cfg.scene.cameras)
-        cfg = replace(cfg, scene=replace(cfg.scene, cameras=cameras))
-        backend, device = context.backend
-        fields = required_fields(cfg.reset)
-        self.seconds = 0.0
-        self._count = count
-        self._renderer = StateRenderer(
-            context.model, cfg, count, backend=backend, device=device, fields=fields
-        )
-        # Steps from one image to the next, as the environment draws them
-        hz = cfg.task.control_hz
-        self._sizes = {name: each.size for name, each in cameras.items()}
-        self._every = {name: round(hz / (each.rate or hz)) for name, each in cameras.items()}
-
-    def episodes(self, played: Played, rows: Sequence[int]) -> Iterator[dict[str, np.ndarray]]:
-        """Images of some worlds' episodes on the host, by column, each ``(steps, height, width,
-        3)``, uint8.
-        """
-        assert played.states is not None
-        steps = len(played.states)
-        step = math.gcd(*self._every.values())
-        states = played.states[::step]
-        at_once = max(1, self._count // len(states))
-        for first in range(0, len(rows), at_once):
-            began = time.perf_counter()
-            some = torch.tensor(rows[first : first + at_once])
-            shown = states.index_select(1, some.to(states.device)).transpose(0, 1).flatten(0, 1)
-            fields = {
-                name: values[some.to(values.device)].repeat_interleave(len(states), 0)
-                for name, values in played.fields.items()
-            }
-            drawn = self._draw(shown, fields)
-            self.seconds += time.perf_counter() - began
-            for row in range(len(some)):
-                rows_of = slice(row * len(states), (row + 1) * len(states))
-                episode = {}
-                for name, every in self._every.items():
-                    images = drawn[name][rows_of][:: every // step]
-                    if every > 1:
-                        images = np.repeat(images, every, axis=0)[:steps]
-                    episode[f"{IMAGES}.{name}"] = images
-                yield episode
-
-    def close(self) -> None:
-        """Give the worlds back."""
-        self._renderer.close()
-
-    def _draw(
-        self, qpos: torch.Tensor, fields: Mapping[str, torch.Tensor]
-    ) -> dict[str, np.ndarray]:
-        """Images of any number of states by camera, on the host."""
-        shapes = {name: (len(qpos), *size, 3) for name, size in self._sizes.items()}
-        out = {name: np.empty(shape, np.uint8) for name, shape in shapes.items()}
-        for first in range(0, len(qpos), self._count):
-            rows = slice(first, first + self._count)
-            looks = {name: values[rows] for name, values in fields.items()}
-            images = self._renderer.draw(qpos[rows], looks)
-            for name, whole in out.items():
-                torch.from_numpy(whole[rows]).copy_(images[f"images.{name}"])
-        return out
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:
