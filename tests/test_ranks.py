@@ -32,7 +32,7 @@ from mjstack.datasets import read_dataset
 from mjstack.distributed import Ranks, current_ranks
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.record import EpisodeRecord
-from mjstack.episodes.tally import _record as record_of
+from mjstack.episodes.seeds import _record as record_of
 from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.jobs import check_ranks, count_devices
 
@@ -232,12 +232,12 @@ def test_a_rank_that_breaks(env: dict[str, str], why: str, trap: list[str], tmp_
     assert re.match(r"rank 1 of 2 \(.*\).*" + why, gate["reason"])
     assert f"resume={folder}" in gate["reason"]
     assert f"mjstack: {gate['reason'].split('.')[0]}" in text
-    assert sorted(path.name for path in folder.glob("*.npz")) == [
+    assert sorted(path.name for path in folder.glob("*_seed*.npz")) == [
         "worlds_seed0.npz",
         "worlds_seed1.npz",
     ]
 
-    before = {path: path.stat().st_mtime_ns for path in folder.glob("*.npz")}
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("*_seed*.npz")}
     play(0, [*trap, f"resume={folder}"], tmp_path, 1)
     play(0, [*trap, f"hydra.run.dir={tmp_path}/whole"], tmp_path, 1)
     assert_same_episodes(tmp_path / "whole", folder)

@@ -2,7 +2,7 @@
 
 from mjstack.episodes.context import RunContext, needs_episode, spread
 from mjstack.episodes.rollout import Snapshots
-from mjstack.episodes.tally import play_seeds
+from mjstack.episodes.seeds import play_seeds
 from mjstack.report.record import GateResult
 
 

@@ -17,7 +17,7 @@ from mjstack.episodes.context import RunContext, needs_episode, spread
 from mjstack.episodes.record import starts_name
 from mjstack.episodes.regions import find_regions, regions_table, save_regions
 from mjstack.episodes.rollout import CLOSED_LOOP, FEEDBACK, Observer
-from mjstack.episodes.tally import play_seeds
+from mjstack.episodes.seeds import play_seeds
 from mjstack.mdp.starts.starts_file import start_rows, write_rows, write_starts
 from mjstack.report.record import GateResult
 from mjstack.report.write import format_percent, safely_write
