@@ -107,54 +107,79 @@ def run_jobs(folder: Path, jobs: Sequence[SweepJob], count: int | None = None) -
     every = _with_those_there(folder, jobs)
     folder.mkdir(parents=True, exist_ok=True)
     write_atomic(folder / SWEEP, json.dumps(every, indent=1) + "\n")
-    say = Console(highlight=False, soft_wrap=True, markup=False).print
-    common = set.intersection(*(set(job.overrides) for job in jobs)) if len(jobs) > 1 else set()
-    waiting = list(jobs)
-    running: dict[Slot, _Running] = {}
-    reports: dict[int, Report] = {}
-    elsewhere: set[int] = set()
+    queue = _Queue(jobs, slots)
     try:
-        while len(reports) < len(jobs):
-            for slot, one in list(running.items()):
-                if (code := one.process.poll()) is not None:
-                    del running[slot]
-                    report = reports[one.job.number] = _conclude(one, code)
-                    seconds = time.monotonic() - one.began
-                    say(f"job {one.job.number}: {report.status} ({seconds:.0f} s, {slot.name})")
+        while len(queue.reports) < len(jobs):
+            queue.collect()
             if interrupted():
                 raise KeyboardInterrupt
-            for job in list(waiting):
-                if (done := _result(job)) is not None:
-                    say(f"job {job.number}: {done.status}, done before")
-                    reports[job.number] = done
-                    waiting.remove(job)
-                    continue
-                free = [slot for slot in slots if slot not in running]
-                if not free:
-                    break
-                slot = free[0]
-                log = _lock(job.folder / LOG)
-                if log is None:
-                    if job.number not in elsewhere:
-                        say(f"job {job.number}: another command is running it")
-                    elsewhere.add(job.number)
-                    continue
-                if _result(job) is not None:  # it has just ended elsewhere
-                    log.close()
-                    continue
-                held = None if slot.lock is None else _lock(slot.lock)
-                if slot.lock is not None and held is None:  # another sweep's
-                    log.close()
-                    slots.append(slots.pop(slots.index(slot)))
-                    break
-                running[slot] = _start(job, slot, log, held)
-                waiting.remove(job)
-                own = [each for each in job.overrides if each not in common]
-                say(f"job {job.number} on {slot.name}: {' '.join(own)}")
+            queue.begin()
             time.sleep(_POLL)
     finally:
-        _stop(running)
-    return [reports[job.number] for job in jobs]
+        _stop(queue.running)
+    return [queue.reports[job.number] for job in jobs]
+
+
+class _Queue:
+    """Jobs that wait for a slot, those that run, and the reports of the others.
+
+    Attributes:
+        running: Processes of jobs, by slot.
+        reports: Reports, by the number of the job.
+    """
+
+    def __init__(self, jobs: Sequence[SweepJob], slots: list[Slot]) -> None:
+        self.running: dict[Slot, _Running] = {}
+        self.reports: dict[int, Report] = {}
+        self._waiting = list(jobs)
+        self._slots = slots
+        self._elsewhere: set[int] = set()  # what has been said to run there
+        several = len(jobs) > 1
+        self._common = set.intersection(*(set(job.overrides) for job in jobs)) if several else set()
+        self._say = Console(highlight=False, soft_wrap=True, markup=False).print
+
+    def collect(self) -> None:
+        """Take the reports of processes that have ended."""
+        for slot, one in list(self.running.items()):
+            if (code := one.process.poll()) is not None:
+                del self.running[slot]
+                report = self.reports[one.job.number] = _conclude(one, code)
+                seconds = time.monotonic() - one.began
+                self._say(f"job {one.job.number}: {report.status} ({seconds:.0f} s, {slot.name})")
+
+    def begin(self) -> None:
+        """Start waiting jobs as long as there are slots, and take results that are there."""
+        for job in list(self._waiting):
+            if (done := _result(job)) is not None:
+                self._say(f"job {job.number}: {done.status}, done before")
+                self.reports[job.number] = done
+                self._waiting.remove(job)
+                continue
+            free = [slot for slot in self._slots if slot not in self.running]
+            if not free or not self._start(job, free[0]):
+                break
+
+    def _start(self, job: SweepJob, slot: Slot) -> bool:
+        """Start a job, unless another command has it; return whether the slot could be had."""
+        log = _lock(job.folder / LOG)
+        if log is None:
+            if job.number not in self._elsewhere:
+                self._say(f"job {job.number}: another command is running it")
+            self._elsewhere.add(job.number)
+            return True
+        if _result(job) is not None:  # it has just ended elsewhere
+            log.close()
+            return True
+        held = None if slot.lock is None else _lock(slot.lock)
+        if slot.lock is not None and held is None:  # another sweep's
+            log.close()
+            self._slots.append(self._slots.pop(self._slots.index(slot)))
+            return False
+        self.running[slot] = _start(job, slot, log, held)
+        self._waiting.remove(job)
+        own = [each for each in job.overrides if each not in self._common]
+        self._say(f"job {job.number} on {slot.name}: {' '.join(own)}")
+        return True
 
 
 def find_slots(count: int | None) -> list[Slot]:
