@@ -21,7 +21,8 @@ from mjstack.errors import PolicyError
 from mjstack.interrupt import handle_interrupts
 from mjstack.policy import Policy, load_policy
 from mjstack.sim import StateRenderer
-from mjstack.train.clone_learner import Learner, vision_of
+from mjstack.train.clone_learner import Learner
+from mjstack.train.clone_network import vision_of
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.images import Augmentation, ImagePool
 

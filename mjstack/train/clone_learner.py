@@ -16,12 +16,12 @@ from torch import Tensor
 
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import CloneJobCfg, CloneSizes, Config
-from mjstack.distributed import Ranks
 from mjstack.episodes.context import RunContext
 from mjstack.interrupt import check_interrupt
-from mjstack.policy import Policy, PolicyNetwork, Vision, save_policy
+from mjstack.policy import Policy, PolicyNetwork, save_policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.sim.graph import StepGraph
+from mjstack.train.clone_network import make_network
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.images import Augmentation, ImagePool
 from mjstack.train.trainer import (
@@ -34,7 +34,6 @@ from mjstack.train.trainer import (
 )
 
 _HELD_OUT = 20  # of so many episodes one is for validation
-_LEAST = 0.1  # scale of a column, of the largest one of its term
 _VALIDATED = 65536  # steps at once
 _VALIDATED_IMAGES = 4096  # steps, at most
 _SHOWN = 10  # batches between two looks at the progress
@@ -90,21 +89,8 @@ class Learner:
         self._batch_size = max(1, sizes.batch_size // ranks.size)
 
         # The network, its average and its optimizer
-        vision = vision_of(cfg, job)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(cfg.seed)
-            network = PolicyNetwork(
-                self._seen.shape[1], self._labels.shape[1], job.chunk, sizes.hidden, vision
-            )
-        mean, std = _moments(self._labels, ranks)
-        network.set_scale("action", mean.cpu(), std.cpu())
-        # A column that hardly moves would count as much as the others of its term, and the policy
-        # would follow its noise.
-        mean, std = _moments(self._seen, ranks)
-        parts = [part for part in std.split(list(demonstrations.widths.values())) if len(part)]
-        std = torch.cat([torch.maximum(part, _LEAST * part.amax()) for part in parts])
-        network.set_scale("observation", mean.cpu(), std.cpu())
-        self._network = network.to(device)
+        self._network = make_network(cfg, sizes.hidden, demonstrations, ranks).to(device)
+        vision = self._network.vision
         self._average = copy.deepcopy(self._network).requires_grad_(False)
         self._networks = {"network": self._network, "average": self._average}
         # What a batch depends on lies in tensors, so that a graph can hold the batch.
@@ -373,30 +359,6 @@ class Learner:
 def draw_seed(seed: int, rank: int, batch: int) -> int:
     """Seed of what a rank draws for a batch: no other batch or rank of the training has it."""
     return 1_000_003 * (seed + rank) + batch
-
-
-def _moments(values: Tensor, ranks: Ranks) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of each column, over the rows of all processes."""
-    variance, mean = torch.var_mean(values, dim=0, correction=0)
-    count = torch.full((1,), len(values), dtype=torch.float64, device=values.device)
-    first = mean.double() * count
-    second = (variance.double() + mean.double() ** 2) * count
-    ranks.sum_(count, first, second)
-    mean = (first / count).float()
-    return mean, (second / count - (first / count) ** 2).clamp(min=0.0).sqrt().float()
-
-
-def vision_of(cfg: Config, job: CloneJobCfg) -> Vision:
-    """The images that a policy of the job sees."""
-    settings = job.vision
-    if not settings.cameras:
-        return Vision()
-    cameras = cfg.scene.cameras
-    return Vision(
-        sizes={name: (cameras[name].size[0], cameras[name].size[1]) for name in settings.cameras},
-        channels=settings.channels,
-        features=settings.features,
-    )
 
 
 @contextmanager
