@@ -27,7 +27,8 @@ from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetWriter, lerobot
 from mjstack.datasets.part import PartWriter
 from mjstack.envs import build_env, demonstration_config
-from mjstack.episodes.context import RunContext, Stage
+from mjstack.episodes.context import RunContext
+from mjstack.episodes.stage import Stage
 from mjstack.errors import UnwrittenError
 from mjstack.jobs import collected, collection, demonstration
 from mjstack.jobs.collected import FILE, CollectPlan

@@ -1,4 +1,4 @@
-"""The context of a run: configuration, scene, plan, and the products of its gates."""
+"""The context of a run: its configuration, its stage, and the products of its gates."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,14 +30,14 @@ from mjstack.episodes.rollout import (
     play_episode,
     reset_worlds,
 )
+from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
 from mjstack.managers.view import offers
 from mjstack.mdp.geometry import source_xy
-from mjstack.policy import Policy, load_policy
 from mjstack.report.html import Page
 from mjstack.report.record import GateResult, Status
-from mjstack.scene import SceneIndex, build_model
+from mjstack.scene import SceneIndex
 from mjstack.scene.phases import Phase
 from mjstack.sim import BatchSizes, Simulation, make_simulation, resolve_backend, resolve_sizes
 from mjstack.sim.sizes import apply_configured
@@ -70,49 +70,6 @@ class NominalRun:
     episode: Episode
     world: WorldRecorder
     states: dict[int, State]
-
-
-@dataclass(eq=False)
-class Stage:
-    """Scene, plan and policy of a run, each built once when it is first needed.
-
-    Attributes:
-        cfg: The configuration of scene, robot and phases.
-    """
-
-    cfg: Config
-
-    @cached_property
-    def model(self) -> mujoco.MjModel:
-        """The scene for physics."""
-        return build_model(self.cfg)
-
-    @cached_property
-    def visual_model(self) -> mujoco.MjModel:
-        """The same scene with everything that only pictures need."""
-        return build_model(self.cfg, visuals=True)
-
-    @cached_property
-    def index(self) -> SceneIndex:
-        """Addresses in the model."""
-        return SceneIndex(self.model, self.cfg.robot, self.cfg.scene)
-
-    @cached_property
-    def planner(self) -> OpenLoopPlanner:
-        """The planner, its nominal plan made."""
-        return OpenLoopPlanner(self.cfg)
-
-    @cached_property
-    def policy(self) -> Policy:
-        """The policy of ``controller=policy``.
-
-        Raises:
-            MjstackError: There is none, or it cannot be read.
-        """
-        if self.cfg.policy is None:
-            expected = "the folder of a trained policy, which controller=policy plays"
-            raise ConfigError("policy", None, expected)
-        return load_policy(Path(self.cfg.policy))
 
 
 @dataclass(eq=False, kw_only=True, slots=True)

@@ -16,7 +16,8 @@ import numpy as np
 from mjstack.bench.physics import HeldPhysics, play_to_phase
 from mjstack.bench.timing import describe_lost, steps_that_fit
 from mjstack.config.schema import Config, SolverCfg, StudyJobCfg
-from mjstack.episodes.context import RunContext, Stage, require_episode
+from mjstack.episodes.context import RunContext, require_episode
+from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError
 from mjstack.files import to_csv
 from mjstack.gates.runner import log_error

@@ -13,8 +13,9 @@ from typing import cast
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Config, TrainJobCfg
-from mjstack.episodes.context import RunContext, Stage, require_episode
+from mjstack.episodes.context import RunContext, require_episode
 from mjstack.episodes.rollout import POLICY
+from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, FolderError
 from mjstack.files import check_unused, reading, to_csv, write_atomic
 from mjstack.gates.runner import run_guarded
