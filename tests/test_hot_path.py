@@ -28,6 +28,7 @@ PATHS: dict[str, list[str] | None] = {
             "_reset_managers",
         )
     ],
+    "envs/command_delay.py": ["CommandDelay.late", "CommandDelay.reset"],
     "envs/faults.py": ["FaultLatch.record"],
     "envs/statistics.py": ["EpisodeStatistics.update"],
     "envs/outputs.py": [

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mjstack.config.schema import Config
 from mjstack.envs.camera_schedule import CameraSchedule
+from mjstack.envs.command_delay import CommandDelay
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
@@ -115,9 +116,7 @@ class Env:
         self._started = self._closed = False
         self._decimation = cfg.timing.decimation
         self._held_steps = cfg.timing.policy_decimation
-        # Commands that physics has not seen yet, the oldest first
-        shape = (cfg.timing.command_delay, *sim.ctrl.shape)
-        self._late = sim.ctrl.new_zeros(shape) if cfg.timing.command_delay else None
+        self._delay = CommandDelay(sim.ctrl, cfg.timing.command_delay)
 
         # Terms are checked on worlds that have started, because a term may read anything.
         self.reset_manager = ResetManager(self, cfg.reset)
@@ -343,16 +342,8 @@ class Env:
 
     def _step_physics(self) -> None:
         current_term.label = ""
-        late = self._late
-        if late is None:
+        with self._delay.late():
             self.sim.step(self._decimation, kinematics=True)
-            return
-        # Physics alone sees the late command.
-        given = self.sim.ctrl.clone()
-        self.sim.ctrl.copy_(late[0])
-        late.copy_(torch.cat((late[1:], given[None])))
-        self.sim.step(self._decimation, kinematics=True)
-        self.sim.ctrl.copy_(given)
 
     def _evaluate(self, ended: Tensor | None = None, *, last: bool = True) -> Tensor | None:
         """Success, terminations and rewards of the new state; after the last control step of a
@@ -445,8 +436,7 @@ class Env:
         """Start states of the masked worlds; a function of seed, world and episode alone."""
         self.reset_manager.reset(mask)
         self.sim.kinematics(mask)
-        if self._late is not None:  # the start's command holds
-            torch.where(mask[:, None], self.sim.ctrl, self._late, out=self._late)
+        self._delay.reset(mask)
 
     def _reset_managers(self, mask: Tensor) -> None:
         """Clear what managers keep from step to step."""
