@@ -1,7 +1,6 @@
 """The environment: one step order over any simulation."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -14,6 +13,7 @@ from mjstack.envs.command_delay import CommandDelay
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import Outputs
 from mjstack.envs.statistics import EpisodeStatistics
+from mjstack.envs.threads import few_threads
 from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
 from mjstack.managers.episode import ResetManager, RewardManager, TerminationManager
@@ -26,7 +26,6 @@ from mjstack.sim import Simulation
 from mjstack.sim.graph import StepGraph, side_by_side
 
 FAULT_WINDOW = 200  # steps between two reads of the faults on CUDA; on the CPU each step reads
-_WORLDS_PER_THREAD = 2048  # of torch, on the CPU
 
 
 class Env:
@@ -227,7 +226,7 @@ class Env:
         if not self._started:
             found = "step() before reset(), or after close()"
             raise ArgumentError("env", found, "reset() first", "Call env.reset()")
-        with self._few_threads():
+        with few_threads(self.device, self.nworld):
             self.action_manager.process(action)
             self.graph()
             self._steps += 1
@@ -260,7 +259,7 @@ class Env:
             name: Its name in messages.
         """
         return StepGraph(
-            self._few_threads()(work),
+            few_threads(self.device, self.nworld)(work),
             self.device,
             self.cfg.graph if self.device.type == "cuda" else "off",
             name=name,
@@ -322,23 +321,6 @@ class Env:
             self.reward_manager,
         )
         return "\n".join((head, *(str(manager) for manager in managers)))
-
-    @contextmanager
-    def _few_threads(self) -> Iterator[None]:
-        """Torch on few threads inside, on the CPU: the numbers of some thousand worlds are too few
-        to share out, and threads that wait for more take cores from the physics.
-        """
-        before = threads = torch.get_num_threads()
-        if self.device.type == "cpu":
-            threads = max(1, min(before, self.nworld // _WORLDS_PER_THREAD))
-        if threads == before:
-            yield
-            return
-        torch.set_num_threads(threads)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(before)
 
     def _step_physics(self) -> None:
         current_term.label = ""

@@ -1,5 +1,7 @@
 """Statistics of the episodes that ended, added up on the device and read now and then."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -61,3 +63,18 @@ class EpisodeStatistics:
         self._sums.zero_()
         means = zip(self._names, sums, strict=True) if episodes else ()
         return {"episodes": episodes} | {name: total / episodes for name, total in means}
+
+
+def join_statistics(parts: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Statistics of the episodes of all ranks, from those that each has read."""
+    if len(parts) == 1:
+        return parts[0]
+    counts = [part["episodes"] for part in parts]
+    total = sum(counts)
+    names = dict.fromkeys(name for part in parts for name in part if name != "episodes")
+    means = {
+        name: sum(n * part[name] for n, part in zip(counts, parts, strict=True) if n) / total
+        for name in names
+        if total
+    }
+    return {"episodes": total, **means}

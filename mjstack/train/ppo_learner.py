@@ -4,7 +4,6 @@ import io
 import math
 import sys
 import time
-from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from mjstack.adapters.rsl_rl_runner import Log, Network, Runner, ScaledRewards
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import Config, PpoJobCfg, PpoSettings
 from mjstack.envs import build_env
+from mjstack.envs.statistics import join_statistics
 from mjstack.episodes.context import RunContext
 from mjstack.interrupt import check_interrupt
 from mjstack.policy import Policy, PolicyNetwork, save_policy
@@ -233,7 +233,7 @@ class Learner:
     def _row(self) -> dict[str, Any]:
         """Figures since the last row. Values of reward terms are means over the episodes' steps."""
         env = self._env.env
-        found = _mean(self._ranks.gather(env.read_statistics()))
+        found = join_statistics(self._ranks.gather(env.read_statistics()))
         steps = found.get("steps", math.nan)
         each = self._job.horizon * self._plan.cfg.nworld
         earlier = self.curve[-1] if self.curve else {"decisions": 0, "training_s": 0.0}
@@ -389,18 +389,3 @@ class Learner:
         self.best = (facts["best"][0], facts["best"][1])
         self.curve = facts["curve"]
         self._context.print_line(f"train: goes on after iteration {self.done}")
-
-
-def _mean(parts: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Statistics of the episodes of all ranks, from those of each."""
-    if len(parts) == 1:
-        return parts[0]
-    counts = [part["episodes"] for part in parts]
-    total = sum(counts)
-    names = dict.fromkeys(name for part in parts for name in part if name != "episodes")
-    means = {
-        name: sum(n * part[name] for n, part in zip(counts, parts, strict=True) if n) / total
-        for name in names
-        if total
-    }
-    return {"episodes": total, **means}
