@@ -352,6 +352,17 @@ def test_history_starts_full_and_slides(backend: str) -> None:
         assert torch.equal(a[[0, 2]], b[[0, 2]])
 
 
+def test_a_slide_has_less_noise_than_a_hinge() -> None:
+    """A tenth as many metres as the others have radians."""
+    env = on_new_sim("native", 64, configure("task=reach", "reset=nominal", robot="rebot"))
+    obs, _ = env.reset(seed=0)
+    seen, clean = (split(env, name, obs[name])["joint_pos"] for name in ("policy", "privileged"))
+    width = env.cfg.observation["policy"].terms["joint_pos"].noise
+    largest = (seen - clean).abs().amax(0)
+    assert (largest[:6] > 0.8 * width).all()
+    assert ((largest[6:] > 0.08 * width) & (largest[6:] < 0.1001 * width)).all()
+
+
 def test_noise_is_keyed_and_within_its_width() -> None:
     base = randomized("reach", "so101", steps=5)
     env = on_shared_sim("native", 3, base)

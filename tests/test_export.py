@@ -61,15 +61,21 @@ def session_of(folder: Path) -> onnxruntime.InferenceSession:
 
 @pytest.mark.parametrize("batch", [1, 64])
 def test_onnxruntime_gives_torchs_numbers(exported: Path, batch: int) -> None:
-    """Far observations are among them, which the network clamps."""
+    """Far observations are among them, which the network clamps, and answers beyond its range."""
     network = load_policy(exported / "policy").network
     width = network.observation_mean.shape[0]
     network.set_scale("observation", torch.randn(width), torch.rand(width) + 0.1)
+    middle = network.action_mean
+    network.set_range(middle - 0.01, middle + 0.02)
     seen = 4.0 * torch.randn(batch, width)
     session = onnxruntime.InferenceSession(to_onnx(network, {}))
     (found,) = session.run(["action"], {"observation": seen.numpy()})
     np.testing.assert_allclose(found, network(seen).numpy(), rtol=0.0, atol=2e-6)
     assert found.shape == (batch, network.chunk, network.joints)
+    if batch > 1:
+        joints = torch.from_numpy(found).flatten(0, 1)
+        torch.testing.assert_close(joints.amin(0), middle - 0.01)
+        torch.testing.assert_close(joints.amax(0), middle + 0.02)
 
 
 def test_the_metadata_is_what_a_program_needs(exported: Path) -> None:

@@ -74,7 +74,7 @@ def test_a_policy_sees_images_and_joints(trained: Path) -> None:
     vision = policy.network.vision
     assert vision.sizes == {"front": (16, 24), "wrist": (16, 16)}
     facts = json.loads((trained / "last/policy.json").read_text())
-    assert facts["format"] == 2
+    assert facts["format"] == 4
     assert facts["observation"]["images"] == {"front": [16, 24], "wrist": [16, 16]}
     assert facts["network"]["channels"] == [4, 8]
     gates = json.loads((trained / "report.json").read_text())["gates"]

@@ -251,7 +251,7 @@ DAMAGED: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda f: (f / "policy.json").write_text((f / "policy.json").read_text()[:200]),
         "cannot be read (JSONDecodeError",
     ),
-    "another format": (edit(lambda d: put(d, "format", value=7)), "has format 7, expected 1"),
+    "another format": (edit(lambda d: put(d, "format", value=7)), "has format 7, expected 3"),
     "another network": (edit(lambda d: put(d, "network", "hidden", value=[16])), "cannot be read"),
     "no number": (edit(lambda d: put(d, "action", "execute", value=0)), "cannot be read"),
     "a key less": (edit(lambda d: d["config"]["robot"].pop("home")), "cannot be read (KeyError"),

@@ -326,11 +326,9 @@ def test_a_missing_extra_is_one_line(
 def test_a_clones_answer_has_its_actions() -> None:
     """One action of the environment has the targets of a whole decision."""
     policy = make_policy(configure("~observation.policy.terms.last_action"), chunk=3, execute=5)
-    params = {
-        "mean": policy.network.action_mean.tolist(),
-        "std": policy.network.action_std.tolist(),
-        "steps": 3,
-    }
+    names = ("mean", "std", "low", "high")
+    params = {name: policy.network.get_buffer(f"action_{name}").tolist() for name in names}
+    params["steps"] = 3
     cfg = configure("timing.policy_decimation=5", "~observation.policy.terms.last_action")
     cfg.action = {
         "targets": type(cfg.action["arm"])(func="mjstack.mdp.action.JointTargets", params=params)

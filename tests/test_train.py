@@ -27,7 +27,7 @@ from mjstack.mdp.observation import headings
 from mjstack.policy import load_policy
 from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.train.clone_learner import Learner, draw_seed
-from mjstack.train.demonstrations import play_expert
+from mjstack.train.demonstrations import Demonstrations, lead_gripper, play_expert
 from mjstack.train.trainer import STATE, observed_group
 
 TINY = (
@@ -224,6 +224,25 @@ def test_noise_moves_the_arm_alone_and_labels_lack_it() -> None:
     speed = seen[:, 100:, 6:12].abs().mean(1)  # where the expert holds still
     assert (speed[2:, :5].mean(0) > 5.0 * speed[:2, :5].mean(0)).all()
     assert (speed[:, 5] < 1e-3).all()  # the gripper's
+
+
+def test_jaws_are_led_to_where_they_will_stand() -> None:
+    """In no step to what the next episode begins with."""
+    first = [1.0, 1.0, 0.8, 0.4, 0.0, 0.0, 0.3, 1.0, 1.0]
+    second = [0.0, 0.5, 1.0]
+    arm = torch.rand(12)
+    data = Demonstrations(
+        seen=torch.zeros(12, 3),
+        labels=torch.stack((arm, torch.tensor(first + second)), dim=1),
+        ends=torch.tensor([9, 12]),
+        widths={"positions": 3},
+        played=2,
+        source="a test",
+    )
+    led = lead_gripper(data, 1).labels
+    assert torch.equal(led[:, 0], arm)
+    assert led[:, 1].tolist() == [1.0, *[0.0] * 4, *[1.0] * 4, *[1.0] * 3]
+    assert data.labels[2, 1] == torch.tensor(0.8)
 
 
 def test_headings_are_those_of_a_quarter_turn() -> None:

@@ -102,8 +102,7 @@ def _scene_facts(env: Env, policy: Policy) -> dict:
         "exported_with": {"mjstack": mjstack.__version__, "mujoco": mujoco.__version__},
         "columns": {"names": columns.names, "units": columns.units},
         "normalization": {
-            name: network.get_buffer(name).tolist()
-            for name in ("observation_mean", "observation_std", "action_mean", "action_std")
+            name: network.get_buffer(name).tolist() for name, _ in network.named_buffers()
         },
         "robot": {
             "name": robot.name,

@@ -5,13 +5,17 @@ and history.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
+import mujoco
 import torch
 
+from mjstack.config.functions import offered
 from mjstack.config.schema import ObservationGroupCfg, ObservationTermCfg
 from mjstack.errors import TermError
 from mjstack.managers.term import Term, first_value, render_table
 from mjstack.managers.view import EnvView, rows_of, unit_draw
 from mjstack.scene.index import ALL, Columns, Rows
+
+_SLIDE = 0.1  # m: as much noise for a sliding joint as 1 rad for another
 
 
 class _Part:
@@ -67,7 +71,12 @@ class _Group:
             return torch.tensor(columns, dtype=torch.int64, device=env.device)
 
         # Only columns with noise get numbers: where one stands in the draw follows from them alone.
-        noise = spread(widths, [part.cfg.noise if cfg.noise else 0.0 for part in parts])
+        slides = slide_joints(env.sim.model, env.cfg.robot.joints)
+        noise = [
+            size if cfg.noise else 0.0
+            for part in parts
+            for size in column_noise(part.cfg, part.width, slides)
+        ]
         noisy = [column for column, size in enumerate(noise) if size]
         self._noise_columns = Columns([first + column for column in noisy], env.device)
         self._noise = torch.tensor(
@@ -126,6 +135,19 @@ class _Group:
             torch.where(mask[:, None], step, kept, out=kept)
         if self.remembers:
             out.copy_(self._past)
+
+
+def slide_joints(model: mujoco.MjModel, joints: Sequence[str]) -> list[bool]:
+    """Which joints slide, and have metres in place of radians."""
+    return [model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_SLIDE for name in joints]
+
+
+def column_noise(cfg: ObservationTermCfg, width: int, slides: Sequence[bool]) -> list[float]:
+    """Half-width of the noise of each of a term's columns in one step, before its scale. What a
+    term of joints has in radians, a sliding one has in decimetres.
+    """
+    joints = offered(cfg.func, "unit") in ("joint", "joint/s") and width == len(slides)
+    return [cfg.noise * (_SLIDE if joints and slides[column] else 1.0) for column in range(width)]
 
 
 def spread(widths: Iterable[int], values: Iterable[float]) -> list[float]:

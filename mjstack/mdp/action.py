@@ -112,35 +112,48 @@ class JointTargets(_Commands):
     """Absolute joint targets of the control steps of one decision: the answer of a cloned policy.
 
     The action has the targets of the first step, then of the second, and so on, each less ``mean``
-    and over ``std``. If there are fewer of them than control steps, the last ones hold.
+    and over ``std``. If there are fewer of them than control steps, the last ones hold. Targets are
+    kept within ``low`` and ``high``.
     """
 
     unit = "standard deviations"
 
     def __init__(
-        self, env: EnvView, *, mean: Sequence[float], std: Sequence[Positive], steps: Count = 1
+        self,
+        env: EnvView,
+        *,
+        mean: Sequence[float],
+        std: Sequence[Positive],
+        low: Sequence[float],
+        high: Sequence[float],
+        steps: Count = 1,
     ) -> None:
-        """Take the scale.
+        """Take scale and range.
 
         Args:
             env: The environment.
             mean: Of every joint's targets [rad, m].
             std: Of every joint's targets [rad, m].
+            low: Of every joint's targets [rad, m]: the smallest.
+            high: Of every joint's targets [rad, m]: the largest.
             steps: Control steps for which there are targets.
 
         Raises:
             ParameterError: There are not as many numbers as joints.
         """
         joints = len(env.index.ctrl)
-        for key, values in (("mean", mean), ("std", std)):
+        given = {"mean": mean, "std": std, "low": low, "high": high}
+        for key, values in given.items():
             if len(values) != joints:
                 raise ParameterError(key, list(values), f"{joints} numbers, one per joint")
         self._set_up(env, range(joints), dim=steps * joints)
         self._steps = steps
-        self._mean, self._std = (
+        self._mean, self._std, least, most = (
             torch.tensor(values, dtype=self._ctrl.dtype, device=env.device)
-            for values in (mean, std)
+            for values in given.values()
         )
+        self._low = torch.maximum(self._low, least)
+        self._high = torch.minimum(self._high, most)
         self.low, self.high = (
             ((limit - self._mean) / self._std).repeat(steps) for limit in (self._low, self._high)
         )

@@ -29,8 +29,8 @@ from mjstack.files import reading, write_atomic
 from mjstack.policy.network import PolicyNetwork, Vision
 
 # Grows when an older mjstack could not read what is written
-FORMAT = 1
-_WITH_IMAGES = 2
+FORMAT = 3
+_WITH_IMAGES = 4
 _NAME_ANOTHER = "Name a folder that job=train has written"
 # A stranger's files may ask for more than this.
 _MOST_TEXT = 2**24  # bytes

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 _CONSTANT = 1e-6  # a column that varies less has no scale
+_UNBOUNDED = torch.finfo(torch.float32).max
 FARTHEST = 5.0  # standard deviations: an observation beyond is taken for one there
 
 
@@ -53,7 +54,8 @@ class ImageEncoder(nn.Module):
 class PolicyNetwork(nn.Module):
     """Answers an observation with the joint targets of the next control steps, a chunk.
 
-    Both are normalised inside, by mean and standard deviation, which are saved with the weights.
+    Both are normalised inside, by mean and standard deviation, which are saved with the weights. So
+    is a range that no joint target leaves.
 
     Attributes:
         chunk: Steps of one answer.
@@ -65,6 +67,8 @@ class PolicyNetwork(nn.Module):
     observation_std: Tensor
     action_mean: Tensor
     action_std: Tensor
+    action_low: Tensor
+    action_high: Tensor
 
     def __init__(
         self,
@@ -98,6 +102,8 @@ class PolicyNetwork(nn.Module):
         for name, width in (("observation", inputs), ("action", joints)):
             self.register_buffer(f"{name}_mean", torch.zeros(width))
             self.register_buffer(f"{name}_std", torch.ones(width))
+        self.register_buffer("action_low", torch.full((joints,), -_UNBOUNDED))
+        self.register_buffer("action_high", torch.full((joints,), _UNBOUNDED))
 
     def set_scale(self, name: str, mean: Tensor, std: Tensor) -> None:
         """Set how ``observation`` or ``action`` is normalised, each shape ``(width,)``. A constant
@@ -106,6 +112,11 @@ class PolicyNetwork(nn.Module):
         constant = 1.0 if name == "observation" else 1e-3
         self.get_buffer(f"{name}_mean").copy_(mean)
         self.get_buffer(f"{name}_std").copy_(torch.where(std > _CONSTANT, std, constant))
+
+    def set_range(self, low: Tensor, high: Tensor) -> None:
+        """Set the range that joint targets are kept in [rad, m], each shape ``(joints,)``."""
+        self.action_low.copy_(low)
+        self.action_high.copy_(high)
 
     def normalized(self, observation: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """Answer in normalised joint targets, shape ``(n, chunk, joints)``."""
@@ -126,4 +137,5 @@ class PolicyNetwork(nn.Module):
         Returns:
             Shape ``(n, chunk, joints)``.
         """
-        return self.action_mean + self.action_std * self.normalized(observation, images)
+        answer = self.action_mean + self.action_std * self.normalized(observation, images)
+        return torch.minimum(torch.maximum(answer, self.action_low), self.action_high)

@@ -67,7 +67,8 @@ def to_onnx(network: PolicyNetwork, facts: Mapping[str, Any]) -> bytes:
             raise TypeError(f"{type(layer).__name__} has no counterpart here")
     shape = np.array([-1, network.chunk, network.joints], np.int64)
     value = add("Mul", add("Reshape", value, shape), network.action_std)
-    add("Add", value, network.action_mean)
+    value = add("Add", value, network.action_mean)
+    add("Min", add("Max", value, network.action_low), network.action_high)
     nodes[-1].output[0] = OUTPUT
 
     # The model around it

@@ -17,7 +17,7 @@ _AWAY = 1e6  # m above everything: where cameras that draw nothing look up from
 TILE = 8
 """Pixels along the edge of the squares in which rays are cast: neighbours on the device are
 neighbours in the image."""
-BLOCK_DIM = 32
+BLOCK_DIM = 64
 """Rays of a CUDA block."""
 
 

@@ -21,7 +21,7 @@ from mjstack.interrupt import check_interrupt
 from mjstack.policy import Policy, PolicyNetwork, save_policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.sim.graph import StepGraph
-from mjstack.train.clone_network import make_network
+from mjstack.train.clone_network import input_noise, make_network
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.images import Augmentation, ImagePool
 from mjstack.train.trainer import (
@@ -84,8 +84,7 @@ class Learner:
         self._made_with = made_with
         self._expert = expert
         self._ranks = ranks = context.ranks
-        self.take(demonstrations)
-        device = self._seen.device
+        device = demonstrations.seen.device
         self._batch_size = max(1, sizes.batch_size // ranks.size)
 
         # The network, its average and its optimizer
@@ -93,6 +92,7 @@ class Learner:
         vision = self._network.vision
         self._average = copy.deepcopy(self._network).requires_grad_(False)
         self._networks = {"network": self._network, "average": self._average}
+        self.take(demonstrations)
         # What a batch depends on lies in tensors, so that a graph can hold the batch.
         self._optimizer = torch.optim.AdamW(
             self._network.parameters(),
@@ -104,13 +104,8 @@ class Learner:
         self._forget = torch.zeros((), device=device)  # share of the average that a batch replaces
         self._drawn = torch.zeros(self._batch_size, dtype=torch.int64, device=device)
         self._noise = torch.zeros((self._batch_size, self._seen.shape[1]), device=device)
-        terms = cfg.observation[job.group].terms
-        widest = [
-            sizes.input_noise * terms[name].noise * terms[name].scale
-            for name, width in demonstrations.widths.items()
-            for _ in range(width)
-        ]
-        self._widest = torch.tensor(widest, device=device)  # half-width of each column's noise
+        widest = input_noise(cfg, context.model, sizes, demonstrations.widths)
+        self._widest = torch.tensor(widest, device=device)
         self._generator = torch.Generator(device)
         # Images
         self._pool: ImagePool | None = None
@@ -146,7 +141,10 @@ class Learner:
         self._batch: Callable[[], None] = self._fit
 
     def take(self, demonstrations: Demonstrations) -> None:
-        """Learn from these demonstrations from now on. The scale stays that of the first ones."""
+        """Learn from these demonstrations from now on, whose range of joint targets is the
+        policy's. The scale stays that of the first ones.
+        """
+        self._average.set_range(*demonstrations.labels.aminmax(dim=0))
         self._seen = demonstrations.seen
         self._labels = demonstrations.labels
         self._last = demonstrations.last()

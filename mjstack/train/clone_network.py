@@ -1,13 +1,16 @@
-"""The network of a clone, with the scale of its demonstrations."""
+"""The network of a clone with the scale of its demonstrations, and the noise on what it sees."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import cast
 
+import mujoco
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import CloneJobCfg, Config
+from mjstack.config.functions import offered
+from mjstack.config.schema import CloneJobCfg, CloneSizes, Config, ObservationTermCfg
 from mjstack.distributed import Ranks
+from mjstack.managers.observation import column_noise, slide_joints
 from mjstack.policy import PolicyNetwork, Vision
 from mjstack.train.demonstrations import Demonstrations
 
@@ -42,6 +45,38 @@ def make_network(
     std = torch.cat([torch.maximum(part, _LEAST * part.amax()) for part in parts])
     network.set_scale("observation", mean.cpu(), std.cpu())
     return network
+
+
+def input_noise(
+    cfg: Config, model: mujoco.MjModel, sizes: CloneSizes, widths: Mapping[str, int]
+) -> list[float]:
+    """Half-width of the noise on each column of the observation in a training.
+
+    Measured jaws have more of it. Their joint target depends on where they are more than any other,
+    and a policy that answers with where they are lets them drift.
+
+    Args:
+        cfg: The training's configuration.
+        model: The scene's.
+        sizes: Of the training.
+        widths: Numbers of each term of the observation.
+    """
+    job = cast(CloneJobCfg, cfg.job)
+    robot = cfg.robot
+    slides = slide_joints(model, robot.joints)
+    travel = [abs(a - b) for a, b in zip(robot.gripper_open, robot.gripper_closed, strict=True)]
+    found: list[float] = []
+    for name, width in widths.items():
+        term = cast(ObservationTermCfg, cfg.observation[job.group].terms[name])
+        columns = column_noise(term, width // term.history, slides)
+        columns = [sizes.input_noise * column for column in columns]
+        if offered(term.func, "unit") == "joint" and len(columns) == len(robot.joints):
+            jaws = columns[-len(travel) :]
+            columns[-len(travel) :] = [
+                noise + job.gripper_noise * each for noise, each in zip(jaws, travel, strict=True)
+            ]
+        found += [term.scale * column for column in term.history * columns]
+    return found
 
 
 def vision_of(cfg: Config, job: CloneJobCfg) -> Vision:

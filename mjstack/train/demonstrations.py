@@ -5,7 +5,7 @@ targets that the expert has given.
 import math
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import cast
 
 import torch
@@ -20,6 +20,7 @@ from mjstack.managers.observation import ObservationManager
 from mjstack.managers.view import random_uniform
 
 NOISE_SECONDS = 0.5  # in which the noise of a joint is forgotten
+_STANDS = 1e-4  # of a joint target's range: by less it moves in no step
 
 
 class NoisyDriver:
@@ -147,6 +148,28 @@ class Demonstrations:
     def last(self) -> Tensor:
         """The last step of the episode that each step belongs to, shape ``(steps,)``, int64."""
         return (self.ends - 1).repeat_interleave(self.lengths())
+
+
+def lead_gripper(demonstrations: Demonstrations, fingers: int) -> Demonstrations:
+    """Demonstrations whose jaws are led to where they will stand, in place of along the way there.
+
+    An expert closes and opens its jaws in a ramp. A policy that copies the ramp reads from the
+    measured jaws how far it is on it. Where an object stops them early it would wait for ever.
+
+    Args:
+        demonstrations: Episodes of an expert.
+        fingers: How many of the joint targets, the last ones, are the gripper's.
+    """
+    labels = demonstrations.labels.clone()
+    jaws = labels[:, -fingers:]
+    steps = torch.arange(len(jaws), device=jaws.device)
+    least = _STANDS * (jaws.amax(0) - jaws.amin(0))
+    stands = torch.ones_like(steps, dtype=torch.bool)
+    stands[:-1] = (jaws.diff(dim=0).abs() <= least).all(1)
+    stands[demonstrations.ends - 1] = True
+    next_stand = torch.where(stands, steps, len(steps)).flip(0).cummin(0).values.flip(0)
+    labels[:, -fingers:] = jaws[next_stand]
+    return replace(demonstrations, labels=labels)
 
 
 def batches_of(job: CloneJobCfg, sizes: CloneSizes, nworld: int) -> list[tuple[int, float]]:

@@ -2,7 +2,7 @@
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 
@@ -64,9 +64,11 @@ def _acting_as(cfg: Config, policy: Policy) -> Config:
     action = policy.action
     network = policy.network
     if action is None:
-        mean, std = (each.double().tolist() for each in (network.action_mean, network.action_std))
-        steps = min(network.chunk, policy.execute)
-        params = {"mean": mean, "std": std, "steps": steps}
+        params: dict[str, Any] = {
+            name: network.get_buffer(f"action_{name}").double().tolist()
+            for name in ("mean", "std", "low", "high")
+        }
+        params["steps"] = min(network.chunk, policy.execute)
         action = {"targets": TermCfg(func=_TARGETS, params=params)}
     elif network.chunk > 1:
         raise PolicyError(

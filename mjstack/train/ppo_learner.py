@@ -305,6 +305,7 @@ class Learner:
         if targets:
             given = cast(Policy, start).network
             network.set_scale("action", given.action_mean, given.action_std)
+            network.set_range(given.action_low, given.action_high)
         return Policy(
             network=network,
             group=plan.group,

@@ -169,6 +169,8 @@ class CloneJobCfg(TrainJobCfg):
     """Whether its observations have their noise."""
     command_noise: float = spec(unit="rad", ge=0.0)
     """Standard deviation of that noise, which changes slowly."""
+    gripper_noise: float = spec(unit="share", ge=0.0)
+    """Noise, besides, on the measured jaws that training sees: half its width, of their travel."""
     chunk: int = spec(unit="steps", ge=1, le=1000)
     """Joint targets of one answer."""
     execute: int = spec(unit="steps", ge=1, le=1000)
