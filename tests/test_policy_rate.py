@@ -193,6 +193,23 @@ def test_a_roll_needs_a_free_joint() -> None:
         )
 
 
+def test_a_gripper_with_a_step_stays_as_it_is_until_it_is_told() -> None:
+    """So a world that starts with an object in the hand keeps it."""
+    env = on_shared_sim("native", 3, configure("action=ee_tilt", "reset=randomized"))
+    env.reset(seed=0)
+    travel = env.cfg.robot.gripper_open[0] - env.cfg.robot.gripper_closed[0]
+    opened = []
+    for told in (-1.0, 1.0):
+        action = torch.zeros((3, 6))
+        action[:, 5] = torch.tensor([0.0, 0.5, 1.0]) * told
+        for _ in range(30):
+            env.step(action)
+            opened.append((env.sim.ctrl[:, -1] - env.cfg.robot.gripper_closed[0]) / travel)
+    wanted = {0: [1.0, 0.98, 0.96], 29: [1.0, 0.4, 0.0], 30: [1.0, 0.42, 0.04], 59: [1.0, 1.0, 1.0]}
+    for step, values in wanted.items():
+        torch.testing.assert_close(opened[step].tolist(), values, rtol=0.0, atol=1e-6)
+
+
 def test_a_late_command_moves_the_arm_as_the_same_command_later() -> None:
     """And after the reset of one world, which holds its start again, to the bit."""
     late = 3

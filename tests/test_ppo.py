@@ -24,6 +24,7 @@ from mjstack.errors import MjstackError
 from mjstack.interrupt import handle_interrupts
 from mjstack.policy import load_policy
 from mjstack.scene.index import ALL
+from mjstack.tasks.check import make_check
 
 TINY = (
     "job=train",
@@ -82,6 +83,18 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(tmp_path: Path) -> N
         ["task=reach", *drive, "gate.batch.failed_worlds=2", f"hydra.run.dir={tmp_path / 'gates'}"]
     )
     assert status == 0
+
+
+@pytest.mark.parametrize(("wanted", "bound"), [(1e-9, 0.01), (1e9, 10.0)], ids=["fall", "rise"])
+def test_the_actors_learning_rate_adapts_before_every_step(
+    wanted: float, bound: float, tmp_path: Path
+) -> None:
+    """Sixteen of them are enough to get from the start to a bound."""
+    out = tmp_path / "out"
+    keys = [f"job.desired_kl={wanted}", "job.learning_rate=0.0002"]
+    assert run([*REACH, *keys, f"job.folder={out}"]) == 0
+    rows = np.genfromtxt(out / "train.csv", delimiter=",", names=True)
+    assert rows["learning_rate"][-1] == pytest.approx(0.0002 * bound)
 
 
 @pytest.mark.full
@@ -228,6 +241,20 @@ def test_the_expert_plays_at_the_beginning(tmp_path: Path) -> None:
     height = bank["qpos"][:, 8]  # of red
     assert len(bank["qpos"]) == len(bank["episode"]) == len(set(bank["episode"])) * 60
     assert height.max() > height.min() + 0.04
+
+    # With actions of 0 what a world starts with in its hand stays there
+    params = {"path": out / "expert_states.npz", "share": 1.0, "last_share": 1.0}
+    keys = [f"reset.expert.params.{name}={value}" for name, value in params.items()]
+    env = on_new_sim("native", 16, configure("reset=expert_states", "action=ee_tilt", *keys))
+    env.reset(seed=0)
+    view = make_check(env.cfg).view(env)
+    for step in range(50):
+        env.step(torch.zeros((16, 6)))
+        if step == 0:
+            held = view.step().in_hand[:, 0].clone()
+    assert 2 < held.sum() < 14
+    assert view.step().in_hand[held, 0].all()
+
     written = (out / "expert_states.npz").stat().st_mtime_ns
     assert run([*command, f"job.folder={out}"]) == 0
     assert (out / "expert_states.npz").stat().st_mtime_ns == written

@@ -94,17 +94,31 @@ class JointPosition(_Commands):
 
 
 class Gripper(_Commands):
-    """One number for all fingers: -1 is closed, 1 is open, as the robot's profile has them."""
+    """One number for all fingers: -1 is closed, 1 is open, as the robot's profile has them.
 
-    def __init__(self, env: EnvView) -> None:
-        """Read the profile."""
+    With ``step`` it moves the last command instead: an action of 0 keeps hold of what is held, and
+    noise does not drop it at once.
+    """
+
+    def __init__(self, env: EnvView, *, step: Fraction = 0.0) -> None:
+        """Read the profile.
+
+        Args:
+            env: The environment.
+            step: Share of the opening for an action of 1 [per step]; 0: the action is absolute.
+        """
+        self._step = step
         self._set_up(env, range(env.index.n_arm, len(env.index.ctrl)), dim=1)
         self._closed = robot(env).gripper_closed
         self._half_travel = 0.5 * robot(env).gripper_travel
 
     def write_commands(self, action: Tensor) -> None:
         """Write the fingers' commands."""
-        opened = (action.clamp(-1.0, 1.0) + 1.0) * self._half_travel
+        action = action.clamp(-1.0, 1.0)
+        if self._step:
+            last = (self._columns.read(self._ctrl) - self._closed) / self._half_travel - 1.0
+            action = (last + 2.0 * self._step * action).clamp(-1.0, 1.0)
+        opened = (action + 1.0) * self._half_travel
         self._columns.write(self._ctrl, self._closed + opened)
 
 

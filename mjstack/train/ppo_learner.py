@@ -31,7 +31,7 @@ from mjstack.train.trainer import (
 )
 
 _MEASURED = 8192  # decisions by which the change of a policy is measured
-_FACTOR = 1.5  # of a learning rate, per iteration
+_RATE = 0.001  # rsl_rl's learning rate at the start, which it keeps within 0.00001 and 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,12 +94,9 @@ class Learner:
         self._policy = self._make_policy()
         if plan.start is not None:
             self._begin_with(plan.start)
-        rates = (plan.settings.learning_rate, self._job.critic_learning_rate)
-        groups = [
-            {"params": list(network.parameters()), "lr": rate}
-            for network, rate in zip((alg.actor, alg.critic), rates, strict=True)
-        ]
+        groups = [{"params": list(network.parameters())} for network in (alg.actor, alg.critic)]
         alg.optimizer = torch.optim.Adam(groups)
+        alg.optimizer.register_step_pre_hook(lambda *_: self._set_rates())
 
         self.done = 0
         self.seconds = 0.0
@@ -172,15 +169,19 @@ class Learner:
             # By what learning has changed, not the scale of the observation
             after = scale._mean, scale._std
             scale._mean, scale._std = before
-            self._adapt_rate()
+            self._measure_change()
             scale._mean, scale._std = after
 
-    def _adapt_rate(self) -> None:
-        """Adapt the actor's learning rate to the change of the policy in the last iteration.
-
-        rsl_rl does so after each part of an iteration, for both networks, and within bounds that
-        are too high for an actor whose many actions have little noise.
+    def _set_rates(self) -> None:
+        """Set the learning rates of a step of the optimizer. rsl_rl, which has one for both
+        networks, adapts it to the change of the policy before every step: the actor's follows.
         """
+        actor, critic = self._alg.optimizer.param_groups
+        actor["lr"] = self._alg.learning_rate / _RATE * self._plan.settings.learning_rate
+        critic["lr"] = self._job.critic_learning_rate
+
+    def _measure_change(self) -> None:
+        """Measure how the last iteration changed the policy."""
         actor = self._alg.actor
         storage = self._alg.storage
         some = slice(
@@ -192,12 +193,6 @@ class Learner:
             change = actor.get_kl_divergence(before, actor.output_distribution_params).mean()
         self._ranks.sum_(change)
         self.change = float(change) / self._ranks.size
-        wanted = self._plan.settings.desired_kl
-        group = self._alg.optimizer.param_groups[0]
-        if self.change > 2.0 * wanted:
-            group["lr"] /= _FACTOR
-        elif self.change < 0.5 * wanted:
-            group["lr"] *= _FACTOR
 
     def _show(self) -> None:
         job = self._job
@@ -283,7 +278,9 @@ class Learner:
                 "class_name": "PPO",
                 "num_learning_epochs": job.epochs,
                 "num_mini_batches": job.minibatches,
-                "schedule": "fixed",  # the learner adapts it
+                "schedule": "adaptive",
+                "desired_kl": plan.settings.desired_kl,
+                "learning_rate": _RATE,
                 "gamma": job.gamma,
                 "lam": job.gae_lambda,
                 "clip_param": job.clip,
@@ -364,7 +361,7 @@ class Learner:
             "seconds": self.seconds,
             "best": self.best,
             "curve": self.curve,
-            "learning_rates": [group["lr"] for group in self._alg.optimizer.param_groups],
+            "learning_rate": self._alg.learning_rate,
         }
         write_state(self._folder / STATE, self._parameters(), facts)
 
@@ -373,8 +370,7 @@ class Learner:
         alg = self._alg
         networks = {"actor": alg.actor, "critic": alg.critic}
         unpack_weights(state, networks, alg.optimizer)
-        for group, rate in zip(alg.optimizer.param_groups, facts["learning_rates"], strict=True):
-            group["lr"] = rate
+        alg.learning_rate = facts["learning_rate"]
         self._env.sums.copy_(state["rewards"])
         if self._ranks.writes:  # the others have their own
             torch.set_rng_state(state["random"])

@@ -228,7 +228,7 @@ class PpoSettings:
     entropy: list[float] = spec(length=2, ge=0.0)
     """Weight of the entropy at the start, and after ``entropy_iterations``."""
     desired_kl: float = spec(gt=0.0)
-    """Change of the policy per iteration to which the learning rate adapts."""
+    """Change of the policy per iteration to which rsl_rl adapts the learning rate."""
     learning_rate: float = spec(gt=0.0)
     """Of the actor at the start."""
     critic_iterations: int = spec(ge=0)
@@ -290,9 +290,9 @@ class PpoJobCfg(TrainJobCfg):
     entropy: list[float] | None = spec(None, length=2, ge=0.0)
     """Weight of the entropy at the start, and after ``entropy_iterations``."""
     desired_kl: float | None = spec(None, gt=0.0)
-    """Change of the policy per iteration to which the learning rate adapts."""
+    """Change of the policy per iteration to which rsl_rl adapts the learning rate."""
     learning_rate: float | None = spec(None, gt=0.0)
-    """Of the actor at the start; it adapts to ``desired_kl``."""
+    """Of the actor at the start; it stays within a hundredth and ten times of it."""
     critic_iterations: int | None = spec(None, ge=0)
     """First iterations, in which only the critic learns."""
     settings: dict[str, PpoSettings] = spec(factory=dict)
