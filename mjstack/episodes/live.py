@@ -53,8 +53,8 @@ class LiveView(Observer):
         Args:
             server: Of `report.web.start_server`.
             model: Gives the scene with its visuals, when it is first shown.
-            renderer: Makes what draws the cameras where the environment draws nothing, for a state
-                with these model fields of its own; None without cameras.
+            renderer: Makes a renderer of the cameras, for states that differ in these model
+                fields. It draws where the environment does not; None without cameras.
             pausable: Whether the run may wait; not where other processes wait for it.
             print_line: Prints a line.
         """

@@ -1,4 +1,4 @@
-"""What a job shows of its worlds: pictures, the 3-D page, the live view and MuJoCo's viewer."""
+"""Shows a job's worlds: pictures, the 3-D page, the live view and MuJoCo's viewer."""
 
 import os
 import time
@@ -128,7 +128,7 @@ def serve_live_view(context: RunContext, console: Console) -> Iterator[LiveView 
 
 
 def camera_renderer(context: RunContext, fields: Sequence[str]) -> StateRenderer:
-    """What draws the cameras of one world for the live view, on the backend of the batch."""
+    """A renderer of one world's cameras for the live view, on the backend of the batch."""
     cfg = context.cfg
     colors = replace(cfg, scene=replace(cfg.scene, cameras=color_cameras(cfg.scene.cameras)))
     backend, device = context.backend
