@@ -17,7 +17,7 @@ from check_cases import rules_of
 from stack_checker import BLUE, RED
 from test_stack_check import World, feed, reference
 
-from mjstack.drivers.driver import Driver, PhaselessDriver
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import Observer, play_episode
@@ -27,7 +27,7 @@ RULES = rules_of("stack")
 NWORLD = 4
 
 
-class Targets(PhaselessDriver):
+class Targets(Driver):
     """Gives joint targets, shape ``(steps, nworld, nu)``."""
 
     def __init__(self, targets: torch.Tensor) -> None:

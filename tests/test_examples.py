@@ -12,7 +12,7 @@ import torch
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.schema import Config
-from mjstack.drivers.driver import PhaselessDriver
+from mjstack.drivers.driver import Driver
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import play_episode
 
@@ -110,7 +110,7 @@ def test_what_nothing_can_meet_fails_by_its_own_rule(
     }
 
 
-class Still(PhaselessDriver):
+class Still(Driver):
     """Holds the arm where it starts."""
 
     def __init__(self, cfg: Config) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.drivers.driver import require_joint_targets
+from mjstack.drivers.driver import Driver, require_joint_targets
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.drivers.tilt import CarryTilt
 from mjstack.envs import Env
@@ -25,7 +25,7 @@ _ROLL_STEP = 0.05  # rad per step
 _DONE = 1e-3  # steps: a phase is over this much before its last step would be
 
 
-class ClosedLoopDriver:
+class ClosedLoopDriver(Driver):
     """Phase, time and targets of every world as tensors; targets from where its objects are;
     batched inverse kinematics.
 
@@ -59,29 +59,24 @@ class ClosedLoopDriver:
         """
         cfg = env.cfg
         device = env.device
-        n = env.nworld
 
         # The environment
         require_joint_targets(cfg, "absolute joint commands, which the expert gives")
         if bool((env.episode_step != 0).any()):  # it begins where the environment's episodes do
-            raise ArgumentError(
-                "env",
-                "worlds that have moved on",
-                "worlds at their start",
-                "Call env.reset() before",
-            )
+            found = "worlds that have moved on"
+            raise ArgumentError("env", found, "worlds at their start", "Call env.reset() before")
 
         # Plan and inverse kinematics
+        phases = build_phases(cfg)
+        super().__init__(env.nworld, phases[-1].stop, device, phases)
         self._env = env
         self._cfg = cfg
-        self.phases = build_phases(cfg)
-        self.steps = self.phases[-1].stop
         self._build_tables(cfg, device)
         c = cfg.controller
         self._ik = BatchedIk(
             env.sim.model,
             cfg.robot,
-            n,
+            env.nworld,
             device,
             iterations=c.step_iterations,
             posture_gain=c.posture_gain,
@@ -101,13 +96,10 @@ class ClosedLoopDriver:
 
         # Buffers
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-            return torch.zeros((n, *shape), dtype=dtype, device=device)
+            return torch.zeros((env.nworld, *shape), dtype=dtype, device=device)
 
-        self.phase = zeros(dtype=torch.int64)
         self._time = zeros()
         self._rate = zeros()
-        self.retries = zeros(dtype=torch.int32)
-        self.error = zeros()
         self.unreachable = zeros(dtype=torch.bool)
         # Whose grasp has been tried again
         self._tried = zeros(len(cfg.scene.objects), dtype=torch.bool)

@@ -1,7 +1,7 @@
 """Drivers give the joint targets of every world, step by step, and the phase of each world."""
 
 from abc import ABC, abstractmethod
-from typing import Protocol
+from collections.abc import Sequence
 
 import torch
 
@@ -11,13 +11,13 @@ from mjstack.errors import ArgumentError
 from mjstack.scene.phases import Phase
 
 
-class Driver(Protocol):
+class Driver(ABC):
     """Gives the joint targets of every world, one step at a time. Fixed shapes, no host read: a
     captured graph may hold it.
 
     Attributes:
         phases: The phases, laid out as a world without a retry goes through them. Empty for a
-            driver without phases.
+            driver without phases, such as a policy: a check judges every step of its episode.
         steps: Length of the episode.
         phase: Number of the phase that each world's last command belonged to, shape ``(nworld,)``,
             int64.
@@ -25,12 +25,17 @@ class Driver(Protocol):
         retries: Grasps that were tried again, shape ``(nworld,)``, int32.
     """
 
-    phases: list[Phase]
-    steps: int
-    phase: torch.Tensor
-    error: torch.Tensor
-    retries: torch.Tensor
+    def __init__(
+        self, nworld: int, steps: int, device: torch.device, phases: Sequence[Phase] = ()
+    ) -> None:
+        """Allocate for the worlds; ``steps`` is the length of the episode."""
+        self.phases = list(phases)
+        self.steps = steps
+        self.phase = torch.zeros(nworld, dtype=torch.int64, device=device)
+        self.error = torch.zeros(nworld, device=device)
+        self.retries = torch.zeros(nworld, dtype=torch.int32, device=device)
 
+    @abstractmethod
     def command(self) -> torch.Tensor:
         """Commands of the next step, shape ``(nworld, nu)``."""
 
@@ -55,25 +60,7 @@ def require_joint_targets(cfg: Config, expected: str) -> None:
         raise ArgumentError("env", f"actions for {held} control steps", expected, fix)
 
 
-class PhaselessDriver(ABC):
-    """A driver without phases, such as a policy: a check judges every step of its episode. See
-    `Driver` for the attributes.
-    """
-
-    def __init__(self, nworld: int, steps: int, device: torch.device) -> None:
-        """Take the worlds and the length of the episode."""
-        self.phases: list[Phase] = []
-        self.steps = steps
-        self.phase = torch.zeros(nworld, dtype=torch.int64, device=device)
-        self.error = torch.zeros(nworld, device=device)
-        self.retries = torch.zeros(nworld, dtype=torch.int32, device=device)
-
-    @abstractmethod
-    def command(self) -> torch.Tensor:
-        """See `Driver`."""
-
-
-class Recorded:
+class Recorded(Driver):
     """Joint targets of an episode of another driver, to be given again.
 
     Memory: ``steps * nworld * (4 * nu + 2)`` bytes on the device, 0.85 GB for 2,000 steps of 16,384
@@ -84,16 +71,12 @@ class Recorded:
         """Allocate for the worlds and steps of a driver, whose commands are nu wide; NaN until they
         are written.
         """
-        self.phases = source.phases
-        self.steps = source.steps
-        self.phase = torch.zeros_like(source.phase)
+        nworld = len(source.phase)
+        device = source.phase.device
+        super().__init__(nworld, source.steps, device, source.phases)
         self.error = source.error
         self.retries = source.retries
-        nworld = source.phase.shape[0]
-        device = source.phase.device
-        self._commands = torch.full(
-            (self.steps, nworld, nu), torch.nan, dtype=torch.float32, device=device
-        )
+        self._commands = torch.full((self.steps, nworld, nu), torch.nan, device=device)
         self._phases = torch.zeros((self.steps, nworld), dtype=torch.int16, device=device)
         self._next = torch.zeros(1, dtype=torch.int64, device=device)
 
@@ -118,26 +101,22 @@ class Recorded:
         return out
 
 
-class OpenLoopDriver:
+class OpenLoopDriver(Driver):
     """Plays joint trajectories once, from the start that they were planned for: every world is in
     the same phase.
     """
 
     def __init__(self, trajectory: JointTrajectory, phases: list[Phase]) -> None:
         """Take the trajectory, which must be on the device."""
-        self._trajectory = trajectory
-        nworld = len(trajectory.knots)
         device = trajectory.knots.device
-        self.phases = phases
-        self.steps = trajectory.steps
+        super().__init__(len(trajectory.knots), trajectory.steps, device, phases)
+        self.error = torch.as_tensor(trajectory.waypoint_error, device=device)
+        self._trajectory = trajectory
         numbers = [
             number for number, phase in enumerate(phases) for _ in range(phase.start, phase.stop)
         ]
         self._phase_at = torch.tensor(numbers, device=device)
         self._next = torch.zeros(1, dtype=torch.int64, device=device)
-        self.phase = torch.zeros(nworld, dtype=torch.int64, device=device)
-        self.error = torch.as_tensor(trajectory.waypoint_error, device=device)
-        self.retries = torch.zeros(nworld, dtype=torch.int32, device=device)
 
     def command(self) -> torch.Tensor:
         """Commands of the next step, shape ``(nworld, nu)``."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mjstack.config.schema import CameraCfg
-from mjstack.drivers.driver import PhaselessDriver, require_joint_targets
+from mjstack.drivers.driver import Driver, require_joint_targets
 from mjstack.envs.env import Env
 from mjstack.errors import PolicyError, TermError
 from mjstack.managers.action import ActionManager
@@ -23,7 +23,7 @@ from mjstack.sim.cameras import Cameras, color_cameras
 _GRID = 2.0**20  # per rad or m
 
 
-class PolicyDriver(PhaselessDriver):
+class PolicyDriver(Driver):
     """Joint targets of a policy for every world.
 
     A world asks at its reset and every ``execute`` control steps from there, so worlds may end and

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mjstack.config.schema import CloneSizes, DaggerJobCfg
-from mjstack.drivers.driver import Driver, PhaselessDriver
+from mjstack.drivers.driver import Driver
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
@@ -37,7 +37,7 @@ from mjstack.train.trainer import (
 _SPELL = 0.5  # s, for which the expert or the policy drives before it is drawn anew
 
 
-class MixedDriver(PhaselessDriver):
+class MixedDriver(Driver):
     """The expert or the policy drives, as a draw for every world and spell says. In some worlds the
     policy drives alone.
 

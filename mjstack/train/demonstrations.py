@@ -23,7 +23,7 @@ NOISE_SECONDS = 0.5  # in which the noise of a joint is forgotten
 _STANDS = 1e-4  # of a joint target's range: by less it moves in no step
 
 
-class NoisyDriver:
+class NoisyDriver(Driver):
     """An expert whose arm is pushed off its way: a slow random offset is added to the joint targets
     of the arm, and the expert answers to where that leads.
 
@@ -33,8 +33,7 @@ class NoisyDriver:
 
     def __init__(self, expert: Driver, env: Env, noise: float) -> None:
         """Take the expert, and the standard deviation of the offsets [rad]."""
-        self.phases = expert.phases
-        self.steps = expert.steps
+        super().__init__(env.nworld, expert.steps, env.device, expert.phases)
         self.phase = expert.phase
         self.error = expert.error
         self.retries = expert.retries
