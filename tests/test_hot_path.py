@@ -80,7 +80,7 @@ PATHS: dict[str, list[str] | None] = {
             for name in ("ObjectMasses", "SlidingFriction", "ServoGains")
             for n in ("read", "write")
         ),
-        *(f"_Elements.{n}" for n in ("read", "write", "scale")),
+        *(f"Elements.{n}" for n in ("read", "write", "scale")),
     ],
     "mdp/starts/starts_file.py": ["FromStartsFile.__call__"],
     "mdp/starts/expert_states.py": ["ExpertStates.__call__"],

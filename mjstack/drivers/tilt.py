@@ -91,13 +91,10 @@ class CarryTilt:
         keeps = self._keeps[phase]
         self._kept.copy_(torch.where(grasps[:, None], self._ik.forward(command)[2], self._kept))
         self._kept_turn.copy_(torch.where(grasps, command[:, 0], self._kept_turn))
-        x, y, z = torch.where(
-            keeps[:, None], self._kept, self._there_ik.forward(self._there)[2]
-        ).unbind(1)
-        turn = self._sign * (command[:, 0] - torch.where(keeps, self._kept_turn, self._there[:, 0]))
-        cos = torch.cos(turn)
-        sin = torch.sin(turn)
-        return torch.stack((cos * x - sin * y, sin * x + cos * y, z), dim=1)
+        axis = self._there_ik.forward(self._there)[2]
+        axis = torch.where(keeps[:, None], self._kept, axis)
+        since = torch.where(keeps, self._kept_turn, self._there[:, 0])
+        return self._turned(axis, command[:, 0] - since)
 
     def release_approach(
         self, command: torch.Tensor, phase: torch.Tensor, there: torch.Tensor
@@ -107,10 +104,13 @@ class CarryTilt:
         """
         start = self._nominal[self.place[phase]]
         arm = self._there_ik.solve(start, there)[0]
-        x, y, z = self._there_ik.forward(arm)[2].unbind(1)
-        turn = self._sign * (command[:, 0] - arm[:, 0])
-        cos = torch.cos(turn)
-        sin = torch.sin(turn)
+        return self._turned(self._there_ik.forward(arm)[2], command[:, 0] - arm[:, 0])
+
+    def _turned(self, axis: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
+        """Axes, shape ``(nworld, 3)``, turned with the first joint [rad], shape ``(nworld,)``."""
+        x, y, z = axis.unbind(1)
+        cos = torch.cos(self._sign * turn)
+        sin = torch.sin(self._sign * turn)
         return torch.stack((cos * x - sin * y, sin * x + cos * y, z), dim=1)
 
 

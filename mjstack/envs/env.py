@@ -1,7 +1,6 @@
 """The environment: one step order over any simulation."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import torch
@@ -11,7 +10,7 @@ from mjstack.config.schema import Config
 from mjstack.envs.camera_schedule import CameraSchedule
 from mjstack.envs.command_delay import CommandDelay
 from mjstack.envs.faults import FaultLatch
-from mjstack.envs.outputs import Outputs
+from mjstack.envs.outputs import Outputs, StepResult
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.envs.threads import few_threads
 from mjstack.errors import ArgumentError
@@ -24,8 +23,6 @@ from mjstack.rng import check_seed
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
 from mjstack.sim.graph import StepGraph, side_by_side
-
-FAULT_WINDOW = 200  # steps between two reads of the faults on CUDA; on the CPU each step reads
 
 
 class Env:
@@ -52,8 +49,8 @@ class Env:
     after the last one, and with a history after each.
 
     On CUDA the whole step is one graph: the first step after a build runs eagerly, the second is
-    captured, and later ones replay it. After a change of anything that it has
-    baked in, such as a term's Python number, call `recapture`.
+    captured, and later ones replay it. After a change of anything that it has baked in, such as a
+    term's Python number, call `recapture`.
 
     Values that derive from contacts (``sensordata``, ``contact_count``) are those of the last
     physics step before, and zero in a world that has just been reset.
@@ -110,11 +107,8 @@ class Env:
         self.given_places: dict[str, Tensor] = {}
         self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
         self._all_worlds = torch.ones_like(self.success)
-        self._steps = self._version = 0
-        self._check_faults = check_faults
+        self._version = 0
         self._started = self._closed = False
-        self._decimation = cfg.timing.decimation
-        self._held_steps = cfg.timing.policy_decimation
         self._delay = CommandDelay(sim.ctrl, cfg.timing.command_delay)
 
         # Terms are checked on worlds that have started, because a term may read anything.
@@ -124,25 +118,21 @@ class Env:
         self.action_manager = ActionManager(self, cfg.action)
         self.action = self.action_manager.action
         self.previous_action = self.action_manager.previous_action
-        self._success: Term | None = None
-        if cfg.task.success is not None:
-            self._success = Term("task.success", cfg.task.success, self)
+        success = cfg.task.success
+        self._success = Term("task.success", success, self) if success is not None else None
+        if self._success is not None:
             first_value(self._success, self, boolean=True)
-        self.termination_manager = TerminationManager(self, cfg.termination)
-        self.reward_manager = RewardManager(self, cfg.reward)
-        self.observation_manager = ObservationManager(self, cfg.observation)
-        self.statistics = EpisodeStatistics(
-            self.reward_manager.names, self.termination_manager.names, sim.device
-        )
+        self.termination_manager = ends = TerminationManager(self, cfg.termination)
+        self.reward_manager = rewards = RewardManager(self, cfg.reward)
+        self.observation_manager = seen = ObservationManager(self, cfg.observation)
+        self.statistics = EpisodeStatistics(rewards.names, ends.names, sim.device)
         self._reset_managers(self._all_worlds)
         self._draws = CameraSchedule(self, cfg.scene.cameras)
         self.images = self._draws.images
         self.cameras = self._draws.cameras
         self.episode.fill_(-1)
-        self._outputs = Outputs(
-            self.reward_manager, self.termination_manager, self.observation_manager, self.success
-        )
-        self._faults = FaultLatch(self, self._outputs.numbers)
+        self._outputs = Outputs(rewards, ends, seen, self.success)
+        self._faults = FaultLatch(self, self._outputs.numbers, check=check_faults)
         self.graph = self.captured(self.advance, "env.step")
 
     @property
@@ -150,11 +140,8 @@ class Env:
         """Control step after which an episode times out: the time-out term's, or the task's where
         there is none.
         """
-        limits = [
-            t.params["steps"]
-            for t in self.cfg.termination.values()
-            if t.time_out and "steps" in t.params
-        ]
+        terms = self.cfg.termination.values()
+        limits = [t.params["steps"] for t in terms if t.time_out and "steps" in t.params]
         return min(limits, default=self.cfg.task.episode_steps)
 
     def reset(
@@ -198,9 +185,7 @@ class Env:
         self._draws.draw_started(None if everywhere else mask)
         return {name: group.clone() for name, group in observed.items()} | self.images, {}
 
-    def step(
-        self, action: Tensor
-    ) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, action: Tensor) -> StepResult:
         """Advance every world by one decision of the policy; see the class for the order.
 
         Args:
@@ -229,13 +214,8 @@ class Env:
         with few_threads(self.device, self.nworld):
             self.action_manager.process(action)
             self.graph()
-            self._steps += 1
-            if self._check_faults and self._all_worlds.is_cuda and self._steps % FAULT_WINDOW == 0:
-                self.raise_faults()
-            obs, reward, terminated, truncated, extras = self._outputs.returned()
-            obs |= self.images
-            extras["final_obs"] |= self._draws.final_images
-            return obs, reward, terminated, truncated, extras
+            self._faults.after_step()
+            return self._outputs.returned(self.images, self._draws.final_images)
 
     def advance(self) -> None:
         """The part of `step` that is the same at every step: it acts on the action that was
@@ -244,7 +224,7 @@ class Env:
         On CUDA it has fixed shapes and no host read, so that a larger graph may hold it.
         """
         ended: Tensor | None = None
-        for left in reversed(range(self._held_steps)):
+        for left in reversed(range(self.cfg.timing.policy_decimation)):
             self.action_manager.apply()
             self._step_physics()
             ended = self._evaluate(ended, last=left == 0)
@@ -281,7 +261,7 @@ class Env:
             self._evaluate()
 
         physics = self.captured(self._step_physics, "the physics")
-        images = self.captured(partial(self._draws.draw_started, None), "the images")
+        images = self.captured(lambda: self._draws.draw_started(None), "the images")
         return physics, self.captured(managers, "the managers"), images
 
     def read_statistics(self) -> dict[str, float]:
@@ -309,23 +289,18 @@ class Env:
         self.sim.close()
 
     def __str__(self) -> str:
-        head = (
-            f"{self.cfg.task.name} with {self.cfg.robot.title}: {self.nworld} worlds,"
-            f" {self.sim.description}"
+        worlds = f"{self.nworld} worlds, {self.sim.description}"
+        lines = (
+            f"{self.cfg.task.name} with {self.cfg.robot.title}: {worlds}",
+            *(self.action_manager, self.observation_manager, self.reset_manager),
+            *(self.termination_manager, self.reward_manager),
         )
-        managers = (
-            self.action_manager,
-            self.observation_manager,
-            self.reset_manager,
-            self.termination_manager,
-            self.reward_manager,
-        )
-        return "\n".join((head, *(str(manager) for manager in managers)))
+        return "\n".join(map(str, lines))
 
     def _step_physics(self) -> None:
         current_term.label = ""
         with self._delay.late():
-            self.sim.step(self._decimation, kinematics=True)
+            self.sim.step(self.cfg.timing.decimation, kinematics=True)
 
     def _evaluate(self, ended: Tensor | None = None, *, last: bool = True) -> Tensor | None:
         """Success, terminations and rewards of the new state; after the last control step of a
@@ -365,42 +340,38 @@ class Env:
             observes = last or self.observation_manager.remembers
             side_by_side(self.device, reward, *([observe] if observes else []))
         current_term.label = ""
-        if self._check_faults and not lost.is_cuda and not self._faults.none_now(broken):
-            self._faults.record(lost)
-            self._faults.raise_first()
+        self._faults.look(lost, broken)
+        ends = self.termination_manager
+        done = ends.terminated | ends.truncated
         if last:
-            self._reset_ended(broken)
-            return None
-        return self.termination_manager.terminated | self.termination_manager.truncated
+            self._reset_ended(done, broken)
+        return None if last else done
 
-    def _reset_ended(self, broken: Tensor | None) -> None:
+    def _reset_ended(self, done: Tensor, broken: Tensor | None) -> None:
         """The terminal observation, the statistics, the reset of the worlds that ended, and the
         observation to go on with.
 
         Args:
+            done: Worlds that end, shape ``(nworld,)``, bool.
             broken: Worlds whose state is not finite, shape ``(nworld,)``, bool; None if there are
                 none.
         """
-        ends = self.termination_manager
-        rewards = self.reward_manager
-        on_cuda = self.success.is_cuda
-        done = ends.terminated | ends.truncated
+        ended_by = self.termination_manager.values
         # On CUDA, where looking would stop the device, worlds are always reset: those of an empty
         # mask, if need be.
-        ending = len(ends.names) > 0 and (on_cuda or bool(done.any()))
+        ending = ended_by.shape[1] > 0 and (done.is_cuda or bool(done.any()))
 
         def keep() -> None:
-            self._outputs.write_final(self.success, broken)
+            self._outputs.write_final(broken)
             self._draws.draw_ended(done)
 
         def count() -> None:
             if ending:
-                self.statistics.update(
-                    done, self.episode_step, self.success, rewards.episode_sums, ends.values
-                )
+                rewards = self.reward_manager.episode_sums
+                self.statistics.update(done, self.episode_step, self.success, rewards, ended_by)
 
         def record() -> None:
-            if on_cuda and self._check_faults and broken is not None:
+            if done.is_cuda and broken is not None:
                 self._faults.record(broken)
 
         side_by_side(self.device, keep, count, record)
@@ -422,9 +393,8 @@ class Env:
 
     def _reset_managers(self, mask: Tensor) -> None:
         """Clear what managers keep from step to step."""
-        self.action_manager.reset(mask)
-        self.termination_manager.reset(mask)
-        self.reward_manager.reset(mask)
+        for manager in (self.action_manager, self.termination_manager, self.reward_manager):
+            manager.reset(mask)
         self.success.masked_fill_(mask, False)
         if self._success is not None:
             self._success.reset(mask)

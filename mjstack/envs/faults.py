@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 POOL = int(Overflow.BROADPHASE | Overflow.NARROWPHASE)
 _HUGE = 1e18  # an action whose square may be more than a float32 holds
+FAULT_WINDOW = 200  # steps between two reads of the faults on CUDA; on the CPU each step reads
 NO_KEY = "Simplify the model, or run sim=native"
 
 
@@ -31,15 +32,18 @@ _FIXES = {
 class FaultLatch:
     """Keeps the faults of every world of an environment until it is cleared."""
 
-    def __init__(self, env: "Env", numbers: Tensor) -> None:
+    def __init__(self, env: "Env", numbers: Tensor, *, check: bool) -> None:
         """Allocate for the worlds of an environment whose managers are there.
 
         Args:
             env: The environment.
             numbers: The memory of its reward and observations, float32.
+            check: Whether faults of its steps are recorded.
         """
         self._env = env
         self._numbers = numbers
+        self._check = check
+        self._steps = 0
         self._any = False  # latched since `clear`, on the CPU
         n = env.nworld
         self._faults = torch.zeros((n, len(_FIXES)), dtype=torch.bool, device=env.device)
@@ -50,18 +54,26 @@ class FaultLatch:
         self._lost = POOL if "overflow" in ends_on else LOST_PHYSICS
         self._state_ends = "non_finite" in ends_on
 
-    def none_now(self, broken: Tensor | None) -> bool:
-        """Whether a short look on the CPU shows that there is nothing to record or to raise.
+    def look(self, lost: Tensor, broken: Tensor | None) -> None:
+        """Record the faults of a step and raise the first, on the CPU; a short look at all numbers
+        shows that there are none.
 
         Args:
-            broken: Worlds whose state is not finite, or None if there are none.
+            lost: Worlds whose state is not finite, shape ``(nworld,)``, bool.
+            broken: The same, or None if there are none.
         """
-        return (
-            broken is None
-            and not self._any
-            and all_finite(self._numbers)
-            and not bool(self._env.sim.overflow.any())
-        )
+        if lost.is_cuda or not self._check:
+            return
+        fine = broken is None and not self._any and all_finite(self._numbers)
+        if not fine or bool(self._env.sim.overflow.any()):
+            self.record(lost)
+            self.raise_first()
+
+    def after_step(self) -> None:
+        """Now and then raise what CUDA has recorded."""
+        self._steps += 1
+        if self._check and self._faults.is_cuda and self._steps % FAULT_WINDOW == 0:
+            self.raise_first()
 
     def record(self, broken: Tensor) -> None:
         """Add the faults of a step, before a reset can erase them.
@@ -69,6 +81,8 @@ class FaultLatch:
         Args:
             broken: Worlds whose state is not finite, shape ``(nworld,)``, bool.
         """
+        if not self._check:
+            return
         env = self._env
         self._any = True
         self._overflow |= env.sim.overflow & self._lost

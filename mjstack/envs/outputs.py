@@ -13,6 +13,7 @@ from torch import Tensor
 from mjstack.managers.episode import RewardManager, TerminationManager
 from mjstack.managers.observation import ObservationManager
 
+StepResult = tuple[dict[str, Tensor], Tensor, Tensor, Tensor, dict[str, Any]]
 _ALIGNMENT = 16  # bytes
 
 
@@ -35,6 +36,7 @@ class Outputs:
     ) -> None:
         """Allocate the block, and move the managers' results into it."""
         groups = observations.groups
+        self._success = success
         self._groups = list(groups)
         # The same order for both kinds of observations, so that one copy takes all of them.
         like = {
@@ -72,16 +74,15 @@ class Outputs:
         self._observed = self._memory[obs[0] if obs else first : first]
         self._final = self._memory[first : begins["terminated"]]
 
-    def write_final(self, success: Tensor, broken: Tensor | None) -> None:
+    def write_final(self, broken: Tensor | None) -> None:
         """Keep success and the observations of this step, before a reset changes them.
 
         Args:
-            success: Shape ``(nworld,)``, bool.
             broken: Worlds whose state is not finite, shape ``(nworld,)``, bool; None if there are
                 none. Their last observation is 0 where it is NaN, which a value times 0 would hand
                 on.
         """
-        self.tensors["success"].copy_(success)
+        self.tensors["success"].copy_(self._success)
         if broken is None:
             self._final.copy_(self._observed)
             return
@@ -94,13 +95,11 @@ class Outputs:
         """Make the final observations the current ones, where no world is reset."""
         self._observed.copy_(self._final)
 
-    def returned(
-        self,
-    ) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Copies, as `Env.step` returns them."""
+    def returned(self, images: dict[str, Tensor], final_images: dict[str, Tensor]) -> StepResult:
+        """Copies, as `Env.step` returns them, and the images themselves."""
         out = self._views(self._memory.clone())
-        obs = {name: out[f"obs/{name}"] for name in self._groups}
-        final = {name: out[f"final/{name}"] for name in self._groups}
+        obs = {name: out[f"obs/{name}"] for name in self._groups} | images
+        final = {name: out[f"final/{name}"] for name in self._groups} | final_images
         extras = {"final_obs": final, "success": out["success"]}
         return obs, out["reward"], out["terminated"], out["truncated"], extras
 

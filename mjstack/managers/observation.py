@@ -67,21 +67,14 @@ class _Group:
         self.width = sum(widths)
         self._columns = slice(first, first + self.width)
 
-        def indices(columns: Sequence[int]) -> torch.Tensor:
-            return torch.tensor(columns, dtype=torch.int64, device=env.device)
-
         # Only columns with noise get numbers: where one stands in the draw follows from them alone.
         slides = slide_joints(env.sim.model, env.cfg.robot.joints)
-        noise = [
-            size if cfg.noise else 0.0
-            for part in parts
-            for size in column_noise(part.cfg, part.width, slides)
-        ]
+        noise = [size for p in parts for size in column_noise(p.cfg, p.width, slides)]
+        noise = noise if cfg.noise else []
         noisy = [column for column, size in enumerate(noise) if size]
         self._noise_columns = Columns([first + column for column in noisy], env.device)
-        self._noise = torch.tensor(
-            [noise[column] for column in noisy], dtype=torch.float32, device=env.device
-        )
+        sizes = [noise[column] for column in noisy]
+        self._noise = torch.tensor(sizes, dtype=torch.float32, device=env.device)
         # Where each column of the group comes from: for `append` in the group before and the new
         # step behind it, where a part's steps move up by one; for `restart` in the new step.
         shift: list[int] = []
@@ -95,8 +88,10 @@ class _Group:
             repeat += [*newest] * part.cfg.history
             start += part.width
         self.remembers = start < self.dim
-        self._shift = indices(shift)
-        self._repeat = indices(repeat)
+        self._shift, self._repeat = (
+            torch.tensor(columns, dtype=torch.int64, device=env.device)
+            for columns in (shift, repeat)
+        )
         self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
 
     def add_noise(self, step: torch.Tensor, at: Rows) -> None:
@@ -150,12 +145,6 @@ def column_noise(cfg: ObservationTermCfg, width: int, slides: Sequence[bool]) ->
     return [cfg.noise * (_SLIDE if joints and slides[column] else 1.0) for column in range(width)]
 
 
-def spread(widths: Iterable[int], values: Iterable[float]) -> list[float]:
-    """A number for each column of one step, from one for each part."""
-    pairs = zip(widths, values, strict=True)
-    return [value for width, value in pairs for _ in range(width)]
-
-
 class ObservationManager:
     """Computes every group into one tensor of shape ``(nworld, group_dim)``, float32.
 
@@ -192,10 +181,12 @@ class ObservationManager:
             for name, dim in self.group_dims.items()
         }
         self._parts = [p for group in self._groups.values() for p in group.parts.values()]
-        widths = [part.width for part in self._parts]
+        widths = torch.tensor([part.width for part in self._parts], dtype=torch.int64)
 
         def row(values: Iterable[float]) -> torch.Tensor:
-            return torch.tensor(spread(widths, values), dtype=torch.float32, device=env.device)
+            """A number for each column of one step, from one for each part."""
+            of_parts = torch.tensor([*values], dtype=torch.float32)
+            return of_parts.repeat_interleave(widths).to(env.device)
 
         clips = [part.cfg.clip or (-math.inf, math.inf) for part in self._parts]
         self._clips = any(part.cfg.clip for part in self._parts)

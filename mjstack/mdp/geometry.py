@@ -51,21 +51,6 @@ def pose_w(env: EnvView, name: str) -> Tensor:
     return env.sim.part("qpos", env.index.object_columns(name)[0])
 
 
-def write_object(
-    env: EnvView, mask: Tensor, name: str, xy: Tensor, quat: Tensor, at: Rows = ALL
-) -> None:
-    """Put the masked worlds' object at x and y [m], turned by a quaternion (wxyz); its height
-    stays. Where ``at`` has their numbers, the values have their rows alone.
-    """
-    address, _ = env.index.object_address(name)
-    view = env.sim.qpos[:, address : address + 7]
-    if isinstance(at, Tensor):
-        view[at, :2] = xy
-        view[at, 3:] = quat
-        return
-    torch.where(mask[:, None], torch.cat((xy, view[:, 2:3], quat), dim=1), view, out=view)
-
-
 def lost_state(env: EnvView) -> Tensor:
     """Whether a position or velocity is NaN or infinite, shape ``(nworld,)``, bool. Not to be
     written into.

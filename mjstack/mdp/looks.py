@@ -12,25 +12,8 @@ from mjstack.config.fields import Fraction, NotNegative
 from mjstack.errors import MjstackError, ParameterError, suggest
 from mjstack.managers.view import EnvView, random_uniform, rows_of, uses_fields
 from mjstack.math import quat_mul
-from mjstack.mdp.starts.randomization import bounds
-from mjstack.scene.index import Columns, Rows
-
-
-class _Look:
-    """A part of the model, its nominal values, and where they are written."""
-
-    label = "reset.look"
-
-    def __init__(self, env: EnvView, field: str, elements: Sequence[int]) -> None:
-        view = env.sim.fields[field]
-        self._view = view
-        self._columns = Columns(elements, env.device)
-        values = getattr(env.sim.model, field)[list(elements)]
-        self.nominal = torch.from_numpy(values.copy()).to(view)
-
-    def write(self, mask: Tensor, value: Tensor, at: Rows) -> None:
-        """Write the masked worlds' values, a row for each of ``at``."""
-        self._columns.write_masked(self._view, mask, value, at)
+from mjstack.mdp.starts.randomization import Elements, bounds
+from mjstack.scene.index import Rows
 
 
 @uses_fields("light_pos", "light_dir", "light_diffuse")
@@ -59,7 +42,8 @@ class Light:
         _require_pictures(model.nlight, "lights")
         lights = range(model.nlight)
         self._pos, self._dir, self._diffuse = (
-            _Look(env, name, lights) for name in ("light_pos", "light_dir", "light_diffuse")
+            Elements(env, f"light_{name}", lights, exact=False)
+            for name in ("pos", "dir", "diffuse")
         )
         self._move = pos
         self._brightness = bounds("brightness", brightness)
@@ -115,11 +99,9 @@ class Colors:
         names = list(env.index.geoms if things is None else things)
         for name in names:
             if name not in known:
-                raise ParameterError(
-                    "things", list(names), f"names of things. {suggest(name, known)}"
-                )
+                raise ParameterError("things", names, f"names of things. {suggest(name, known)}")
         self._spread = spread
-        self._looks = [_Look(env, "geom_rgba", known[name]) for name in names]
+        self._looks = [Elements(env, "geom_rgba", known[n], exact=False) for n in names]
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write geom_rgba."""
@@ -148,8 +130,8 @@ class CameraPoses:
         """
         self._names = _cameras(env)
         cameras = range(len(self._names))
-        self._pos = _Look(env, "cam_pos", cameras)
-        self._quat = _Look(env, "cam_quat", cameras)
+        self._pos = Elements(env, "cam_pos", cameras, exact=False)
+        self._quat = Elements(env, "cam_quat", cameras, exact=False)
         self._move = pos
         self._angle = angle
 
@@ -174,7 +156,7 @@ class FieldOfView:
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Take the smallest and largest factor."""
         self._names = _cameras(env)
-        self._fovy = _Look(env, "cam_fovy", range(len(self._names)))
+        self._fovy = Elements(env, "cam_fovy", range(len(self._names)), exact=False)
         self._ends = bounds("scale", scale)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:

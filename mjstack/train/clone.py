@@ -4,14 +4,14 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 
-from mjstack.config.schema import Backend, CloneJobCfg, CloneSizes
-from mjstack.envs import Env, build_env, driven_config
+from mjstack.config.schema import CloneJobCfg, CloneSizes
+from mjstack.envs import Env, driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, MjstackError, UnknownName, renamed_keys
 from mjstack.managers.observation import ObservationManager
@@ -19,7 +19,15 @@ from mjstack.sim.memory import free_memory
 from mjstack.train.clone_learner import Learner
 from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import batches_of, lead_gripper, play_expert
-from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, observed_group
+from mjstack.train.trainer import (
+    LAST,
+    Trained,
+    Trainer,
+    earlier_state,
+    filled,
+    observed_group,
+    one_world,
+)
 
 
 def check_clone(context: RunContext) -> range:
@@ -29,7 +37,7 @@ def check_clone(context: RunContext) -> range:
     sizes = resolve_sizes(job, context.backend[1])
     group = observed_group(job, sizes.leave_out)
     check_vision(context, job)
-    with _one_world(context) as env:
+    with _started_world(context) as env:
         with renamed_keys({"observation": "job.observation"}):
             widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
         if job.dataset is not None:
@@ -71,22 +79,16 @@ def check_vision(context: RunContext, job: CloneJobCfg) -> None:
 
 
 @contextmanager
-def _one_world(context: RunContext) -> Iterator[Env]:
+def _started_world(context: RunContext) -> Iterator[Env]:
     """One started world of the task."""
-    cfg = driven_config(context.cfg, reset={})
-    env = build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu")
-    try:
+    with one_world(context, driven_config(context.cfg, reset={})) as env:
         env.reset()
         yield env
-    finally:
-        env.close()
 
 
 def resolve_sizes(job: CloneJobCfg, device: str) -> CloneSizes:
     """The job's sizes, those of the device where they are null."""
-    own = job.sizes["cuda" if device.startswith("cuda") else "cpu"]
-    given = {item.name: getattr(job, item.name) for item in fields(own)}
-    return replace(own, **{name: value for name, value in given.items() if value is not None})
+    return filled(job, job.sizes["cuda" if device.startswith("cuda") else "cpu"])
 
 
 def train_clone(context: RunContext, folder: Path) -> Trained:
@@ -110,7 +112,7 @@ def train_clone(context: RunContext, folder: Path) -> Trained:
     if job.dataset is None:
         demonstrations = play_expert(context, sizes, group)
     else:
-        with _one_world(context) as env:
+        with _started_world(context) as env:
             widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
         demonstrations = read_demonstrations(Path(job.dataset), context, group, widths)
     if len(demonstrations.ends) < 2:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import CloneJobCfg, CloneSizes, Config
@@ -91,7 +91,7 @@ class Learner:
         self._network = make_network(cfg, sizes.hidden, demonstrations, ranks).to(device)
         vision = self._network.vision
         self._average = copy.deepcopy(self._network).requires_grad_(False)
-        self._networks = {"network": self._network, "average": self._average}
+        self._networks = nn.ModuleDict({"network": self._network, "average": self._average})
         self.take(demonstrations)
         # What a batch depends on lies in tensors, so that a graph can hold the batch.
         self._optimizer = torch.optim.AdamW(

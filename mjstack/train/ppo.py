@@ -1,19 +1,13 @@
 """Trainer *ppo*: a policy learns from the task's rewards, by rsl-rl-lib's PPO."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 
 from mjstack.config.functions import resolve_func
-from mjstack.config.schema import (
-    Backend,
-    Config,
-    PpoJobCfg,
-    TermCfg,
-)
-from mjstack.envs import build_env
+from mjstack.config.schema import Config, PpoJobCfg, TermCfg
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ConfigError, PolicyError, UnknownName, renamed_keys
 from mjstack.managers.term import check_params
@@ -21,7 +15,7 @@ from mjstack.policy import Policy, load_policy
 from mjstack.policy.checkpoint import read_state
 from mjstack.train.expert_states import record_states, unrecorded, whole_starts, with_states
 from mjstack.train.ppo_learner import Learner, Plan
-from mjstack.train.trainer import LAST, STATE, Trained, Trainer, observed_group
+from mjstack.train.trainer import LAST, STATE, Trained, Trainer, filled, observed_group, one_world
 
 _STATES = "expert_states.npz"  # in the training's folder
 _TARGETS = "mjstack.mdp.action.JointTargets"
@@ -51,9 +45,7 @@ def make_plan(cfg: Config) -> Plan:
         if group not in cfg.observation:
             raise UnknownName("job.critic: observation group", group, cfg.observation)
     others = {group: cfg.observation[group] for group in job.critic if group != name}
-    own = job.settings["random" if start is None else "start_from"]
-    given = {item.name: getattr(job, item.name) for item in fields(own)}
-    settings = replace(own, **{k: value for k, value in given.items() if value is not None})
+    settings = filled(job, job.settings["random" if start is None else "start_from"])
     return Plan(replace(cfg, observation={name: seen, **others}), start, name, settings)
 
 
@@ -106,19 +98,9 @@ def check_ppo(context: RunContext) -> range:
         reset = whole_starts(reset)
     seen = f"observation.{plan.group}"
     keys = {seen: f"job.{seen}"} if plan.start is None else {}
-    with renamed_keys(keys):
-        env = build_env(
-            replace(plan.cfg, reset=reset),
-            model=context.model,
-            nworld=1,
-            backend=Backend.native,
-            device="cpu",
-        )
-    try:
+    with renamed_keys(keys), one_world(context, replace(plan.cfg, reset=reset)) as env:
         if plan.start is not None:
             plan.start.check_widths(env.observation_manager.term_dims[plan.group])
-    finally:
-        env.close()
     return range(cfg.seed, cfg.seed + 1)
 
 

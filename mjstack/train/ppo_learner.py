@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mjstack.adapters.rsl_rl_runner import Log, Network, Runner, ScaledRewards
 from mjstack.config.fingerprint import config_content
@@ -94,7 +94,8 @@ class Learner:
         self._policy = self._make_policy()
         if plan.start is not None:
             self._begin_with(plan.start)
-        groups = [{"params": list(network.parameters())} for network in (alg.actor, alg.critic)]
+        self._networks = nn.ModuleDict({"actor": alg.actor, "critic": alg.critic})
+        groups = [{"params": list(each.parameters())} for each in self._networks.values()]
         alg.optimizer = torch.optim.Adam(groups)
         alg.optimizer.register_step_pre_hook(lambda *_: self._set_rates())
 
@@ -184,9 +185,8 @@ class Learner:
         """Measure how the last iteration changed the policy."""
         actor = self._alg.actor
         storage = self._alg.storage
-        some = slice(
-            None, None, -(-storage.num_envs * storage.num_transitions_per_env // _MEASURED)
-        )
+        decisions = storage.num_envs * storage.num_transitions_per_env
+        some = slice(None, None, -(-decisions // _MEASURED))
         with torch.inference_mode():
             before = [p.flatten(0, 1)[some] for p in storage.distribution_params]
             actor(storage.observations.flatten(0, 1)[some], stochastic_output=True)
@@ -345,13 +345,11 @@ class Learner:
 
     def _parameters(self) -> dict[str, Tensor]:
         """Everything that training changes but the worlds, by name."""
-        alg = self._alg
         state = {"random": torch.get_rng_state(), "episode": self._env.env.episode}
         if self._env.device.type == "cuda":
             state["random_cuda"] = torch.cuda.get_rng_state(self._env.device)
         state["rewards"] = self._env.sums
-        networks = {"actor": alg.actor, "critic": alg.critic}
-        return state | pack_weights(networks, alg.optimizer)
+        return state | pack_weights(self._networks, self._alg.optimizer)
 
     def _write_state(self) -> None:
         if not self._ranks.writes:
@@ -367,20 +365,19 @@ class Learner:
 
     def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
         """Go on from the state and facts of an earlier call. Worlds begin their next episodes."""
-        alg = self._alg
-        networks = {"actor": alg.actor, "critic": alg.critic}
-        unpack_weights(state, networks, alg.optimizer)
-        alg.learning_rate = facts["learning_rate"]
+        unpack_weights(state, self._networks, self._alg.optimizer)
+        self._alg.learning_rate = facts["learning_rate"]
         self._env.sums.copy_(state["rewards"])
         if self._ranks.writes:  # the others have their own
             torch.set_rng_state(state["random"])
             if "random_cuda" in state and self._env.device.type == "cuda":
                 torch.cuda.set_rng_state(state["random_cuda"], self._env.device)
         episode = state["episode"]
-        if len(episode) != self._env.env.nworld:  # of another number of ranks, or another share
+        env = self._env.env
+        if len(episode) != env.nworld:  # of another number of ranks, or another share
             episode = episode.max()
-        self._env.env.episode.copy_(episode)
-        self._env.env.reset()
+        env.episode.copy_(episode)
+        env.reset()
         self.done = facts["done"]
         self.seconds = facts["seconds"]
         self.best = (facts["best"][0], facts["best"][1])

@@ -1,14 +1,24 @@
 """A trainer, as job=train runs it."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from mjstack.config.schema import CloneJobCfg, ObservationGroupCfg, PpoJobCfg
+from mjstack.config.schema import (
+    Backend,
+    CloneJobCfg,
+    CloneSizes,
+    Config,
+    ObservationGroupCfg,
+    PpoJobCfg,
+    PpoSettings,
+)
+from mjstack.envs import Env, build_env
 from mjstack.episodes.context import RunContext
 from mjstack.errors import FolderError, UnknownName
 from mjstack.policy.checkpoint import read_state
@@ -17,6 +27,8 @@ from mjstack.policy.checkpoint import read_state
 LAST = "last"
 BEST = "best"
 STATE = "training.safetensors"
+
+Settings = TypeVar("Settings", CloneSizes, PpoSettings)
 
 
 class EventWriter:
@@ -89,6 +101,20 @@ class Trainer:
     midway: bool = False
 
 
+def filled(job: CloneJobCfg | PpoJobCfg, defaults: Settings) -> Settings:
+    """Settings of a job, those of ``defaults`` where they are null."""
+    given = {item.name: getattr(job, item.name) for item in fields(defaults)}
+    return replace(defaults, **{name: value for name, value in given.items() if value is not None})
+
+
+@contextmanager
+def one_world(context: RunContext, cfg: Config) -> Iterator[Env]:
+    """A world on native MuJoCo, to find out about terms."""
+    env = build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu")
+    with closing(env):
+        yield env
+
+
 def observed_group(job: CloneJobCfg | PpoJobCfg, leave_out: Sequence[str]) -> ObservationGroupCfg:
     """The observation group of a new policy.
 
@@ -129,30 +155,23 @@ def earlier_state(
     return earlier
 
 
-def pack_weights(networks: Mapping[str, nn.Module], optimizer: Optimizer) -> dict[str, Tensor]:
+def pack_weights(networks: nn.ModuleDict, optimizer: Optimizer) -> dict[str, Tensor]:
     """Weights of networks and moments of an optimizer, by names that start with their own."""
-    state = {
-        f"{name}.{key}": value
-        for name, network in networks.items()
-        for key, value in network.state_dict().items()
-    }
+    state = dict(networks.state_dict())
     for number, values in optimizer.state_dict()["state"].items():
         state |= {f"optimizer.{number}.{key}": value for key, value in values.items()}
     return state
 
 
 def unpack_weights(
-    state: Mapping[str, Tensor], networks: Mapping[str, nn.Module], optimizer: Optimizer
+    state: Mapping[str, Tensor], networks: nn.ModuleDict, optimizer: Optimizer
 ) -> None:
     """Take back what `pack_weights` has given; other names are left out."""
-    parts: dict[str, dict[str, Tensor]] = {}
-    for key, value in state.items():
-        name, _, rest = key.partition(".")
-        parts.setdefault(name, {})[rest] = value
-    for name, network in networks.items():
-        network.load_state_dict(parts[name])
+    networks.load_state_dict({name: state[name] for name in networks.state_dict()})
     moments: dict[int, dict[str, Tensor]] = {}
-    for key, value in parts.get("optimizer", {}).items():
-        number, _, name = key.partition(".")
-        moments.setdefault(int(number), {})[name] = value
+    for key, value in state.items():
+        owner, _, rest = key.partition(".")
+        if owner == "optimizer":
+            number, _, name = rest.partition(".")
+            moments.setdefault(int(number), {})[name] = value
     optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})

@@ -57,7 +57,7 @@ class ObjectMasses(Quantity):
         bodies = [env.index.bodies[name] for name in env.index.objects]
         dofs = [dof + i for _, dof in env.index.objects.values() for i in range(6)]
         self._mass, *self._scaled, self._inverse, self._inverse_dofs = (
-            _Elements(env, name, dofs if name.startswith("dof") else bodies) for name in self.fields
+            Elements(env, name, dofs if name.startswith("dof") else bodies) for name in self.fields
         )
         self.columns = [f"{name}_mass_kg" for name in env.index.objects]
         self.nominal = self._mass.nominal
@@ -129,7 +129,7 @@ class ServoGains(Quantity):
         """Find the servos."""
         servos = env.index.ctrl.tolist()
         # A position servo's gain is kp and its bias (0, -kp, -kv): scaling all of them scales both.
-        self._gain, self._bias = (_Elements(env, name, servos) for name in self.fields)
+        self._gain, self._bias = (Elements(env, name, servos) for name in self.fields)
         self._kp = self._gain.nominal[:, 0]
         self.columns = [f"gain_{name}" for name in env.cfg.robot.joints]
         self.nominal = torch.ones_like(self._kp)
@@ -156,21 +156,32 @@ def bounds(name: str, values: Sequence[float]) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
-class _Elements:
-    """Some elements of a per-world model field, and the model's own values of them, in float64."""
+class Elements:
+    """Some elements of a per-world model field.
 
-    def __init__(self, env: EnvView, name: str, elements: Sequence[int]) -> None:
+    Attributes:
+        dtype: The field's type.
+        nominal: The model's own values of them.
+    """
+
+    def __init__(
+        self, env: EnvView, name: str, elements: Sequence[int], *, exact: bool = True
+    ) -> None:
+        """Find them; nominal values are float64 if they are to be ``exact``, else of the field's
+        type.
+        """
         self._view = env.sim.fields[name]
         self._columns = Columns(elements, env.device)
         self.dtype = self._view.dtype
-        self.nominal = torch.from_numpy(getattr(env.sim.model, name)[list(elements)].copy()).to(
-            env.device, torch.float64
-        )
+        nominal = torch.from_numpy(getattr(env.sim.model, name)[list(elements)].copy())
+        self.nominal = nominal.to(env.device, torch.float64 if exact else self.dtype)
 
     def read(self) -> Tensor:
+        """Values of every world."""
         return self._columns.read(self._view)
 
     def write(self, mask: Tensor, value: Tensor, at: Rows) -> None:
+        """Write the masked worlds' values, a row for each of ``at``."""
         self._columns.write_masked(self._view, mask, value, at)
 
     def scale(self, mask: Tensor, factor: Tensor, at: Rows) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from mjstack.errors import ArgumentError, ConfigError, ParameterError, suggest
 from mjstack.files import to_csv, write_atomic
 from mjstack.managers.view import EnvView, offers, uses_fields
-from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_object, write_robot
+from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_robot
 from mjstack.mdp.observation import joint_pos
 from mjstack.mdp.starts.placement import world_boxes
 from mjstack.mdp.starts.randomization import (
@@ -240,9 +240,11 @@ class FromStartsFile:
         """Write qpos, ctrl and the model fields that the file has columns for."""
         write_robot(env, mask, self._command.index_select(0, env.world))
         poses = self._poses.index_select(0, env.world)
-        for number, name in enumerate(env.index.objects):
+        for number, (address, _) in enumerate(env.index.objects.values()):
             xy, quat = poses[:, number].split((2, 4), dim=1)
-            write_object(env, mask, name, xy, quat)
+            view = env.sim.qpos[:, address : address + 7]
+            pose = torch.cat((xy, view[:, 2:3], quat), dim=1)  # its height stays
+            torch.where(mask[:, None], pose, view, out=view)
         for held, table in self._given:
             values = table.index_select(0, env.world)
             held.write(mask, torch.where(values.isnan(), held.read().double(), values))
