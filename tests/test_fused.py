@@ -350,6 +350,6 @@ def test_a_step_that_does_not_apply(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     other = simulate("auto", noslip=2)
     assert other.description.endswith("arranged step (noslip is on)")
-    assert "sim.step: arranged, because noslip is on." in caplog.text
+    assert "sim.step: arranged step (noslip is on)" in caplog.text
     with pytest.raises(UnsupportedModel, match=r"sim\.step=fused does not apply: noslip is on"):
         simulate("fused", noslip=2)

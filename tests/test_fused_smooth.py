@@ -313,16 +313,21 @@ def test_callbacks_and_many_bodies_are_left_to_mjwarp() -> None:
         assert "bytes of shared memory" in fused_smooth.why_not(mjw.put_model(many))
 
 
-def test_a_step_with_mjwarps_smooth_dynamics(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_step_names_what_mjwarp_does(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     cfg = configure("sim.step=fused")
     model = build_model(cfg)
     model.opt.density = 1.2
+    model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     sim = make_simulation(
         model, cfg, 2, backend=Backend.mjwarp, device="cpu", sizes=resolve_env_sizes(cfg)
     )
-    assert sim.description.endswith(", fused step")
-    assert "a fused step has MJWarp's smooth dynamics, because there is a fluid." in caplog.text
+    described = (
+        "fused step (MJWarp's contact rows, because cones are pyramidal;"
+        " MJWarp's smooth dynamics, because there is a fluid)"
+    )
+    assert sim.description.endswith(f", {described}")
+    assert f"sim.step: {described}" in caplog.text
     sim.step(3)
     assert bool(sim.qpos.isfinite().all())
 

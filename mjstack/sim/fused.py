@@ -161,6 +161,13 @@ def collision(m: mjw.Model, d: mjw.Data) -> None:
             wp.launch = launch
 
 
+def why_not_rows(m: mjw.Model) -> str:
+    """Why MJWarp writes the rows of contacts, and not `make_constraint`; empty if it does not."""
+    if m.opt.cone != mjw.ConeType.ELLIPTIC:
+        return "cones are pyramidal"
+    return "surfaces move" if m.flg_surfacevel else ""
+
+
 def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
     """`mujoco_warp.make_constraint`, the rows of elliptic contacts in one launch.
 
@@ -171,7 +178,7 @@ def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
     flags = int(m.opt.disableflags)
     contact = int(mjw.DisableBit.CONTACT)
     none = flags & (contact | int(mjw.DisableBit.CONSTRAINT))
-    if none or m.opt.cone != mjw.ConeType.ELLIPTIC or m.flg_surfacevel:
+    if none or why_not_rows(m):
         mjw.make_constraint(m, d)
         return
     opt = dataclasses.replace(m.opt, disableflags=flags | contact)

@@ -97,16 +97,17 @@ class MjwarpSimulation(Simulation):
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
             self._best, self._why = self._best_step()
             step = self._resolve(step)
-            self._smooth_applies = self._best == "fused" and self._check_smooth()
+            self._smooth_applies = self._best == "fused" and not fused_smooth.why_not(self._m)
             self._usage = usage = Usage(model, nworld, self.device)
 
         self.arrangement = ARRANGEMENTS[step]
-        self.description = (
-            f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}, {step} step"
-        )
-
+        described = f"{step} step"
         if self._why and step == self._best:
-            self.description += f" ({self._why})"
+            described += f" ({self._why})"
+            _tell(f"sim.step: {described}")
+        self.description = (
+            f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}, {described}"
+        )
 
         # Views of state, fields and counters
         for name in (
@@ -282,18 +283,19 @@ class MjwarpSimulation(Simulation):
         )
 
     def _best_step(self) -> tuple[str, str]:
-        """The fastest step that does all that the model needs, and why there is no faster one."""
+        """The fastest step that does all that the model needs, and why it is not faster."""
         if not can_rearrange(self.model, self._m):
             return "stock", "the model has features that only mujoco_warp.step knows"
         why = fused.why_not(self._m, self._d)
-        return ("arranged", why) if why else ("fused", "")
-
-    def _check_smooth(self) -> bool:
-        """Whether a fused step's smooth dynamics can be three kernels."""
-        why = fused_smooth.why_not(self._m)
         if why:
-            _tell(f"sim.step: a fused step has MJWarp's smooth dynamics, because {why}.")
-        return not why
+            return "arranged", why
+        slower = {
+            "contact rows": fused.why_not_rows(self._m),
+            "smooth dynamics": fused_smooth.why_not(self._m),
+        }
+        return "fused", "; ".join(
+            f"MJWarp's {part}, because {why}" for part, why in slower.items() if why
+        )
 
     def _smooth(self) -> bool:
         """Whether smooth dynamics are three kernels."""
@@ -302,8 +304,6 @@ class MjwarpSimulation(Simulation):
     def _resolve(self, asked: str) -> str:
         """The step that is done."""
         if asked == "auto":
-            if self._why:
-                _tell(f"sim.step: {self._best}, because {self._why}.")
             return self._best
         if not self.allows(ARRANGEMENTS[asked]):
             raise UnsupportedModel(
