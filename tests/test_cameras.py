@@ -27,6 +27,7 @@ from mjstack.distributed import Ranks
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.errors import ArgumentError, ConfigError, MjstackError, RunError
+from mjstack.gates import images as gate_images
 from mjstack.gates.capacity import run_capacity
 from mjstack.gates.images import agree, compare_images
 from mjstack.gates.parity import run_parity
@@ -492,10 +493,45 @@ def test_agreement_of_images() -> None:
     assert moved.same == pytest.approx(1 - 40 / 4096)
     darker = agree("c", painted(0, 200), painted(0, 190), labels, 100)
     assert darker.color == pytest.approx(10 * 400 / 4096)
-    assert agree("c", painted(0, 200), painted(1, 200), labels, 801).iou.keys() == {"floor"}
+    assert agree("c", painted(0, 200), painted(1, 200), labels, 841).iou.keys() == {"floor"}
+    assert agree("c", painted(0, 200), painted(1, 200), labels, 841).left_out == ["cube"]
     other = painted(0, 200)
     other["segmentation.c"] = other["segmentation.c"] + 2
     assert agree("c", painted(0, 200), other, labels, 100).color == np.inf
+
+
+def test_images_that_compare_too_little_fail(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cube wholly elsewhere, of too few pixels for an intersection over union: with nothing else
+    to compare but the background, and beside a robot that agrees.
+    """
+    labels = ["table", "red", "gripper"]
+
+    def images(size: int, cube: int, robot: int) -> dict[str, np.ndarray]:
+        things = np.zeros((12, size, size), np.int32)
+        things[:, cube : cube + 3, :3] = 1
+        things[:, :robot, size - robot :] = 2
+        return {
+            "segmentation.front": things,
+            "images.front": np.zeros((*things.shape, 3), np.uint8),
+            "depth.front": np.zeros((*things.shape, 1), np.float32),
+        }
+
+    monkeypatch.setattr(gate_images, "require_offscreen", lambda model: None)
+    context = RunContext(load_config(["cameras=front", "gate.parity.images=x.npz"]))
+    for size, robot, says in (
+        (8, 0, ["nothing but the background has gate.parity.image_pixels=1000 ", "71.88 %"]),
+        (64, 40, ["99.56 % of the pixels show the same thing"]),
+    ):
+        mjwarp = images(size, 0, robot)
+        native = images(size, size - 3, robot)
+        monkeypatch.setattr(gate_images, "load_images", lambda cfg, m=mjwarp: (np.zeros(1), m))
+        monkeypatch.setattr(gate_images, "_draw_states", lambda *args, n=native: (n, labels))
+        result = GateResult(name="parity", status=Status.passed)
+        problems = compare_images(context, result)
+        assert len(problems) == len(says)
+        assert all(says[k] in problem for k, problem in enumerate(problems))
+        assert "image_pixels=1000 pixels: " in result.details[0]
+        assert "red" in result.details[0]
 
 
 @GL

@@ -4,10 +4,11 @@ import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import torch
 
-from mjstack.config.schema import OUTPUTS, Backend, Config
+from mjstack.config.schema import OUTPUTS, Backend, Config, ParityCfg
 from mjstack.episodes.context import RunContext
 from mjstack.errors import MjstackError, RunError
 from mjstack.files import reading, write_npz
@@ -33,6 +34,7 @@ class Agreement:
     Attributes:
         same: Share of the pixels in which both show the same thing.
         iou: Intersection over union of each thing that is large enough, by name.
+        left_out: Names of the things that are too small to compare.
         color: Mean difference of the colours in those pixels, of 255.
         depth: Median difference of the depths there [m].
         worst: State with the fewest such pixels.
@@ -40,6 +42,7 @@ class Agreement:
 
     same: float
     iou: dict[str, float]
+    left_out: list[str]
     color: float
     depth: float
     worst: int
@@ -83,15 +86,31 @@ def compare_images(context: RunContext, result: GateResult) -> list[str]:
     _report(context, result, found)
     _draw(context, found, native, mjwarp)
     result.thresholds |= {
+        "images.same_thing": limits.image_same,
         "images.iou": limits.image_iou,
         "images.color_of_255": limits.image_color,
         "images.depth_m": limits.image_depth,
     }
+    return _problems(found, limits, _background(context.model))
+
+
+def _problems(found: dict[str, Agreement], limits: ParityCfg, background: set[str]) -> list[str]:
+    """Say where images differ too much, and which cameras compared nothing but the background."""
     problems = []
     for name, one in found.items():
+        if not one.iou.keys() - background:
+            problems.append(
+                f"camera {name}: nothing but the background has gate.parity.image_pixels="
+                f"{limits.image_pixels} pixels, so nothing was compared; raise"
+                f" scene.cameras.{name}.size"
+            )
         for thing, iou in one.iou.items():
             if not iou >= limits.image_iou:
                 problems.append(f"camera {name}: IoU of {thing} is {iou:.4f}")
+        if not one.same >= limits.image_same:
+            problems.append(
+                f"camera {name}: {100 * one.same:.2f} % of the pixels show the same thing"
+            )
         if not one.color <= limits.image_color:
             problems.append(f"camera {name}: colours differ by {one.color:.2f} of 255")
         if not one.depth <= limits.image_depth:
@@ -109,27 +128,38 @@ def agree(
         native: Images of native MuJoCo by output and camera, one of each state.
         mjwarp: Images of MJWarp.
         labels: Names of the things in the segmentation.
-        least_pixels: Things with fewer pixels in all images are left out.
+        least_pixels: Things with fewer pixels, of both backends' images together, are left out.
     """
     a = native[f"segmentation.{camera}"]
     b = mjwarp[f"segmentation.{camera}"]
     same = a == b
+    names = dict(enumerate(labels)) | {-1: "nothing"}
     iou = {}
-    for number in np.unique(a):
+    left_out = []
+    for number in np.union1d(a, b).tolist():
         union = int(((a == number) | (b == number)).sum())
-        if int((a == number).sum()) >= least_pixels:
-            name = labels[number] if number >= 0 else "nothing"
-            iou[name] = float(((a == number) & (b == number)).sum() / union)
+        name = names.get(number, f"number {number}")
+        if union >= least_pixels:
+            iou[name] = float((same & (a == number)).sum() / union)
+        else:
+            left_out.append(name)
     colors = [images[f"images.{camera}"].astype(float) for images in (native, mjwarp)]
     depths = [images[f"depth.{camera}"][..., 0] for images in (native, mjwarp)]
     both = bool(same.any())
     return Agreement(
         same=float(same.mean()),
         iou=iou,
+        left_out=left_out,
         color=float(np.abs(colors[0] - colors[1])[same].mean()) if both else np.inf,
         depth=float(np.median(np.abs(depths[0] - depths[1])[same])) if both else np.inf,
         worst=int(same.mean(axis=(1, 2)).argmin()),
     )
+
+
+def _background(model: mujoco.MjModel) -> set[str]:
+    """Names of the things that are fixed to the world, and of what is behind them."""
+    fixed = np.flatnonzero(model.geom_bodyid == 0)
+    return {"nothing", *(model.geom(number).name or "world" for number in fixed)}
 
 
 def _draw_states(
@@ -209,6 +239,10 @@ def _report(context: RunContext, result: GateResult, found: dict[str, Agreement]
             f"camera {name}: the same thing in {100 * one.same:.2f} % of the pixels, IoU at least"
             f" {worst:.4f}, colours within {one.color:.2f} of 255"
         )
+        if one.left_out:
+            few = f"fewer than gate.parity.image_pixels={context.cfg.gate.parity.image_pixels}"
+            left_out = ", ".join(one.left_out)
+            result.details.append(f"camera {name}: not compared, with {few} pixels: {left_out}")
     for thing in things:
         cells = [one.iou.get(thing) for one in found.values()]
         rows.append([thing, *("-" if iou is None else f"{iou:.4f}" for iou in cells)])
