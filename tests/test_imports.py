@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -154,3 +155,18 @@ def test_native_runs_do_not_load_warp() -> None:
     top = {node.module for node in module_level if isinstance(node, ast.ImportFrom)}
     assert "mjstack.sim.mjwarp" not in top
     assert "mjstack.sim.mjwarp" in FILES["sim/build.py"]
+
+
+def test_the_package_has_what_its_configuration_names() -> None:
+    """Classes of ``conf/``, and Hydra's plugins: their package is a namespace, which an
+    ``__init__.py`` would take from the plugins of others.
+    """
+    root = ROOT.parent
+    build = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]
+    wheel = {*build["wheel"]["packages"], *build["wheel"]["force-include"]}
+    assert {f"/{path}" for path in wheel} <= set(build["sdist"]["include"])
+    texts = [path.read_text() for path in (root / "conf").rglob("*.yaml")]
+    targets = {match for text in texts for match in re.findall(r"_target_: (\w+)\.", text)}
+    assert "hydra_plugins" in targets
+    assert {target for target in targets if (root / target).exists()} <= wheel
+    assert not (root / "hydra_plugins" / "__init__.py").exists()
