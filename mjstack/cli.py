@@ -89,7 +89,7 @@ def run(args: list[str]) -> int:
             traceback.print_exception(error)
         problem = describe_error(error, "MJSTACK_DEBUG=1 shows the traceback")
         who = f"rank {os.environ['RANK']}: " if int(os.environ.get("RANK", 0)) else ""
-        if not (isinstance(error, RankError) and (error.told or (error.gone and who))):
+        if not (isinstance(error, RankError) and error.told):
             errors.print(f"mjstack: {who}{problem}")
         return 1 if _results or _assisting else MjstackError.exit_code
 

@@ -5,6 +5,7 @@ over Gloo, tensors on CUDA over NCCL.
 import logging
 import os
 import socket
+import sys
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -95,7 +96,7 @@ class Ranks:
         try:
             dist.all_gather_object(found, value)
         except RuntimeError as error:
-            raise RankError(self._reason(error), gone=True) from error
+            raise self._gone(self._wait_for_lost(), error) from error
         return found
 
     def alike(self, work: Callable[[], T]) -> T:
@@ -148,7 +149,7 @@ class Ranks:
         if not stopped or not (lost := self.lost()):
             return error
         withdraw_interrupt()
-        return RankError(lost, gone=True)
+        return self._gone(lost, error)
 
     def end(self, problem: str = "") -> None:
         """Leave word for the other ranks of how this one ended."""
@@ -164,23 +165,42 @@ class Ranks:
             with suppress(Exception):
                 if rank == self.rank or not _store.check([f"{_KEY}/place/{rank}"]):
                     continue
+                if process := self._killed(rank):
+                    return f"rank {rank} of {self.size} ({process}) was killed"
                 ended = f"{_KEY}/ended/{rank}"
-                host, pid = _store.get(f"{_KEY}/place/{rank}").decode().split()
-                # A rank that concludes says so before its process ends.
-                dead = host == socket.gethostname() and not _alive(int(pid))
-                if _store.check([ended]):
-                    if problem := _store.get(ended).decode():
-                        return f"rank {rank} of {self.size} ({host}) failed: {problem}"
-                elif dead:
-                    return f"rank {rank} of {self.size} ({host}, process {pid}) was killed"
+                if _store.check([ended]) and (problem := _store.get(ended).decode()):
+                    host = _store.get(f"{_KEY}/place/{rank}").decode().split()[0]
+                    return f"rank {rank} of {self.size} ({host}) failed: {problem}"
         return ""
 
-    def _reason(self, error: RuntimeError) -> str:
-        """Why ranks cannot talk any more."""
+    def _killed(self, rank: int) -> str:
+        """Host and process of a rank of this machine that has ended without a word."""
+        host, pid = _store.get(f"{_KEY}/place/{rank}").decode().split()
+        # A rank that concludes says so before its process ends.
+        dead = host == socket.gethostname() and not _alive(int(pid))
+        silent = dead and not _store.check([f"{_KEY}/ended/{rank}"])
+        return f"{host}, process {pid}" if silent else ""
+
+    def _gone(self, lost: str, error: BaseException) -> RankError:
+        """The error of a rank that has gone: the lowest one that was not killed tells the user.
+
+        Args:
+            lost: Why it has gone; empty if that is not known.
+            error: The error in which this rank has seen it.
+        """
+        told = False
+        with suppress(Exception):  # the rank that has the store may be gone
+            told = bool(lost) and not all(self._killed(rank) for rank in range(self.rank))
+        return RankError(
+            lost or f"another rank has gone ({first_line(error)})", told=told, gone=True
+        )
+
+    def _wait_for_lost(self) -> str:
+        """Why ranks cannot talk any more, if that is known in time."""
         until = time.monotonic() + _GRACE
         while not (found := self.lost()) and time.monotonic() < until:
             time.sleep(0.1)
-        return found or f"another rank has gone ({first_line(error)})"
+        return found
 
 
 _current = Ranks()
@@ -280,6 +300,9 @@ def launch(args: Sequence[str], count: int) -> int:
     except SignalException:
         return EXIT_CODE
     except ChildFailedError as error:
+        first = error.failures.get(0)
+        if first is not None and first.exitcode < 0:  # the others may have ended before they know
+            print(f"mjstack: rank 0 of {count} was killed ({first.signal_name()})", file=sys.stderr)
         codes = {failure.exitcode for failure in error.failures.values()}
         return next((code for code in (2, EXIT_CODE) if code in codes), 1)
     finally:

@@ -116,7 +116,7 @@ class RankError(MjstackError):
     """Another process of the job has failed or gone.
 
     Attributes:
-        told: Whether rank 0 says so.
+        told: Whether another rank tells the user.
         gone: Whether it cannot be waited for any more.
     """
 

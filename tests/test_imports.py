@@ -162,9 +162,10 @@ def test_the_package_has_what_its_configuration_names() -> None:
     ``__init__.py`` would take from the plugins of others.
     """
     root = ROOT.parent
-    build = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]
-    wheel = {*build["wheel"]["packages"], *build["wheel"]["force-include"]}
-    assert {f"/{path}" for path in wheel} <= set(build["sdist"]["include"])
+    tools = tomllib.loads((root / "pyproject.toml").read_text())["tool"]
+    built = tools["hatch"]["build"]["targets"]
+    wheel = {*built["wheel"]["packages"], *built["wheel"]["force-include"]}
+    assert {f"/{path}" for path in wheel} <= set(built["sdist"]["include"])
     texts = [path.read_text() for path in (root / "conf").rglob("*.yaml")]
     targets = {match for text in texts for match in re.findall(r"_target_: (\w+)\.", text)}
     assert "hydra_plugins" in targets

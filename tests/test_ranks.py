@@ -37,6 +37,7 @@ from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.jobs import check_ranks, count_devices
 
 SHORT = ["sim=native", "gates=[batch]", *one_second_episode()]
+SCRIPT = Path(mjstack.__file__).parents[1] / "scripts" / "run.py"
 OF_CALL = {"seconds", "rank_first_world", "rank_place"}  # of a record
 
 MEETING = """\
@@ -69,7 +70,7 @@ TRAP = """\
 import os, signal
 
 def spring(env, mask):
-    if os.environ.get("RANK") == "1" and env.seed == 2:
+    if os.environ.get("RANK") == os.environ.get("TRAPPED", "1") and env.seed == 2:
         if "KILL" in os.environ:
             os.kill(os.getpid(), signal.SIGKILL)
         raise RuntimeError("the trap")
@@ -78,10 +79,16 @@ def spring(env, mask):
 
 def start(ranks: int, args: Sequence[str], folder: Path, **env: str) -> subprocess.Popen[str]:
     """A command in ranks of this machine; its output goes to one pipe."""
-    root = str(Path(mjstack.__file__).parents[1])
     launcher = ["-m", "torch.distributed.run", f"--nproc-per-node={ranks}", "-m"]
+    command = [*(launcher if ranks else ["-m"]), "mjstack", *args]
+    return start_python(command, folder, **env)
+
+
+def start_python(args: Sequence[str], folder: Path, **env: str) -> subprocess.Popen[str]:
+    """Python with arguments; it finds this mjstack, and its output goes to one pipe."""
+    root = str(Path(mjstack.__file__).parents[1])
     return subprocess.Popen(
-        [sys.executable, *(launcher if ranks else ["-m"]), "mjstack", *args],
+        [sys.executable, *args],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": root, "OMP_NUM_THREADS": "1"} | env,
         stdout=subprocess.PIPE,
@@ -210,7 +217,7 @@ def test_three_ranks(backend: str, tmp_path: Path) -> None:
 
 @pytest.fixture
 def trap(tmp_path: Path) -> list[str]:
-    """Overrides of a run whose second rank breaks under seed 2."""
+    """Overrides of a run in which one rank, by default the second, breaks under seed 2."""
     (tmp_path / "conf").mkdir()
     (tmp_path / "trap.py").write_text(TRAP)
     more = ["nworld=5", "gate.batch.seeds=4", "+reset.trap={func: trap.spring}"]
@@ -247,6 +254,30 @@ def test_a_rank_that_breaks(env: dict[str, str], why: str, trap: list[str], tmp_
     assert gate["metrics"]["episodes"] == 20
     assert "an earlier call has played seeds 0 to 1" in gate["details"]
     assert len(report["provenance"]["earlier_calls"]) == 1
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("script", [False, True], ids=["devices=2", "torchrun scripts/run.py"])
+def test_a_killed_first_rank_is_named(script: bool, trap: list[str], tmp_path: Path) -> None:
+    """It would have said so itself: the lowest rank that is left does, alone, and the command that
+    has started the ranks gives the signal.
+    """
+    folder = tmp_path / "run"
+    args = [*trap, f"hydra.run.dir={folder}"]
+    launcher = ["-m", "torch.distributed.run", "--nproc-per-node=3", str(SCRIPT)]
+    command = [*launcher, *args] if script else ["-m", "mjstack", "devices=2", *args]
+    process = start_python(command, tmp_path, TRAPPED="0", KILL="1")
+    text, _ = process.communicate(timeout=400)
+    assert process.returncode == 1, text
+    assert (
+        len(re.findall(r"mjstack: rank 1: rank 0 of [23] \(.*, process \d+\) was killed", text))
+        == 1
+    )
+    assert "mjstack: rank 2" not in text
+    assert ("mjstack: rank 0 of 2 was killed (SIGKILL)" in text) == (not script)
+    assert report_of(folder)["status"] == "interrupted"
+    play(0, [*trap, f"resume={folder}"], tmp_path, 1)
+    assert report_of(folder)["gates"][0]["metrics"]["episodes"] == 20
 
 
 @pytest.mark.full
