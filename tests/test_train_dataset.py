@@ -23,7 +23,7 @@ from mjstack.errors import MjstackError
 from mjstack.jobs.train import check_train
 from mjstack.train import clone
 from mjstack.train.dataset import read_demonstrations
-from mjstack.train.demonstrations import play_expert
+from mjstack.train.demonstrations import Demonstrations, play_expert
 from mjstack.train.trainer import observed_group
 
 REACH = ("task=reach", "sim=native", "nworld=3")
@@ -82,6 +82,70 @@ def test_a_policy_learns_from_a_dataset(
     train = json.loads((out / "report.json").read_text())["gates"][0]
     assert train["metrics"]["expert_episodes"] == 3
     assert train["notes"]["demonstrations"] == str(folder)
+
+
+def change_table(folder: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    """Change the data file."""
+    path = folder / "data/chunk-000/file-000.parquet"
+    pq.write_table(change(pq.read_table(path)), path)
+
+
+def as_mappings(info: dict[str, Any]) -> None:
+    """The names of numbers in the two forms that are no list."""
+    as_lerobot(info)
+    seen, action = (info["features"][name] for name in ("observation.policy", "action"))
+    names = seen["names"]
+    seen["names"] = {"joints": names[:6], "scene": names[6:]}
+    action["names"] = {name: k for k, name in reversed(list(enumerate(action["names"])))}
+
+
+def test_somebody_elses_dataset_is_read(dataset: Path, tmp_path: Path) -> None:
+    """From two files, and with names as mappings: the same numbers."""
+    folder = copied(dataset, tmp_path, as_mappings)
+    first = folder / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(first)
+    pq.write_table(table.slice(300), folder / "data/chunk-000/file-001.parquet")
+    pq.write_table(table.slice(0, 300), first)
+    theirs, ours = read(folder), read(dataset)
+    assert theirs.ends.tolist() == [150, 300, 450]
+    assert torch.equal(theirs.seen, ours.seen)
+    assert torch.equal(theirs.labels, ours.labels)
+
+
+def test_without_a_success_all_episodes_count(dataset: Path, tmp_path: Path) -> None:
+    def fail_the_second(table: pa.Table) -> pa.Table:
+        success = np.array(table["next.success"].to_pylist())
+        success[299] = False
+        number = table.column_names.index("next.success")
+        column = pa.array(success.reshape(-1), table.schema.field("next.success").type)
+        return table.set_column(number, "next.success", column)
+
+    folder = copied(dataset, tmp_path, as_lerobot)
+    change_table(folder, fail_the_second)
+    lines: list[str] = []
+    assert torch.equal(
+        read(folder, lines).seen, read(dataset).seen[[*range(150), *range(300, 450)]]
+    )
+    assert lines == [f"train: 2 of 3 episodes of {folder} succeeded in the task"]
+    info = json.loads((folder / "meta/info.json").read_text())
+    del info["features"]["next.success"]
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    change_table(folder, lambda table: table.drop_columns(["next.success"]))
+    assert torch.equal(read(folder, lines).seen, read(dataset).seen)
+    assert "3 of 3 episodes" in lines[1]
+    assert "(none has next.success) are taken to succeed in the task" in lines[1]
+
+
+def read(folder: Path, lines: list[str] | None = None) -> Demonstrations:
+    """What the training reads."""
+    cfg = load_config([*TRAIN, f"job.dataset={folder}"])
+    context = RunContext(cfg, print_line=(lines if lines is not None else []).append)
+    sizes = clone.resolve_sizes(cfg.job, "cpu")
+    group = observed_group(cfg.job, sizes.leave_out)
+    with clone._started_world(context) as env:
+        widths = clone.ObservationManager(env, {"policy": group}).term_dims["policy"]
+    assert check_train(cfg)
+    return read_demonstrations(folder, context, group, widths)
 
 
 def copied(

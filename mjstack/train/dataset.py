@@ -71,7 +71,8 @@ def read_demonstrations(
     group: ObservationGroupCfg,
     widths: dict[str, int],
 ) -> Demonstrations:
-    """The episodes of a dataset that succeeded, on the device of the training.
+    """The episodes of a dataset that succeeded, on the device of the training. Without a column
+    ``next.success`` all are taken to have succeeded.
 
     Args:
         folder: The dataset.
@@ -108,7 +109,10 @@ def read_demonstrations(
         return torch.as_tensor(columns[name][keep].astype(np.float32), device=device)
 
     played = len(ends[ranks.rank :: ranks.size])
-    context.print_line(f"train: {len(own)} of {played} episodes of {folder} succeeded in the task")
+    done = (
+        "succeeded in" if _SUCCESS in columns else f"(none has {_SUCCESS}) are taken to succeed in"
+    )
+    context.print_line(f"train: {len(own)} of {played} episodes of {folder} {done} the task")
     return Demonstrations(
         seen=on_device("observation"),
         labels=on_device(_ACTION),
@@ -191,10 +195,19 @@ def _places(names: Sequence[str], features: Mapping[str, Any]) -> dict[str, Plac
     found: dict[str, Place] = {}
     for name in names:
         feature = features.get(name, {})
-        if str(feature.get("dtype")).startswith("float") and isinstance(feature.get("names"), list):
-            for number, column in enumerate(feature["names"]):
+        if str(feature.get("dtype")).startswith("float"):
+            for number, column in enumerate(_names(feature.get("names"))):
                 found.setdefault(str(column), (name, number))
     return found
+
+
+def _names(given: object) -> list[object]:
+    """Names of a feature's numbers: LeRobot has a list, or a mapping of lists or of numbers."""
+    if isinstance(given, dict):
+        if all(isinstance(each, list) for each in given.values()):
+            return [name for names in given.values() for name in names]
+        return sorted(given, key=given.__getitem__)
+    return given if isinstance(given, list) else []
 
 
 def _files(folder: Path, info: Mapping[str, Any]) -> list[Path]:
