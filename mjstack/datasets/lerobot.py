@@ -76,17 +76,22 @@ def statistics_of(spec: DatasetSpec) -> dict[str, list[int]]:
     return shapes | {name: [3, 1, 1] for name in spec.videos}
 
 
-def video_info(video: Video, fps: int) -> dict[str, Any]:
-    """The block ``info`` of a video's feature."""
+def _video_feature(video: Video, fps: int) -> dict[str, Any]:
+    """The feature of a video."""
     return {
-        "video.height": video.height,
-        "video.width": video.width,
-        "video.codec": video.codec,
-        "video.pix_fmt": "yuv420p",
-        "video.fps": fps,
-        "video.channels": 3,
-        "has_audio": False,
-        "is_depth_map": False,
+        "dtype": "video",
+        "shape": [video.height, video.width, 3],
+        "names": ["height", "width", "channels"],
+        "info": {
+            "video.height": video.height,
+            "video.width": video.width,
+            "video.codec": video.codec,
+            "video.pix_fmt": "yuv420p",
+            "video.fps": fps,
+            "video.channels": 3,
+            "has_audio": False,
+            "is_depth_map": False,
+        },
     }
 
 
@@ -112,15 +117,7 @@ def make_info(
     features |= {
         name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in INDICES.items()
     }
-    features |= {
-        name: {
-            "dtype": "video",
-            "shape": [video.height, video.width, 3],
-            "names": ["height", "width", "channels"],
-            "info": video_info(video, spec.fps),
-        }
-        for name, video in spec.videos.items()
-    }
+    features |= {name: _video_feature(video, spec.fps) for name, video in spec.videos.items()}
     return {
         "codebase_version": VERSION,
         "robot_type": spec.robot_type,

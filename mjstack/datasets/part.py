@@ -106,31 +106,21 @@ class PartWriter:
         """
         length = len(next(iter(columns.values())))
         frame = np.arange(length)
-        indices = {
+        indices: dict[str, np.ndarray] = {
             "timestamp": (frame / self._spec.fps).astype(np.float32),
             "frame_index": frame,
             "episode_index": np.full(length, number),
             "index": start + frame,
             "task_index": np.full(length, task),
         }
-        columns = dict(columns)
-        for name, values in indices.items():
-            columns[name] = np.asarray(values)[:, None]
+        columns = columns | {name: values[:, None] for name, values in indices.items()}
         table = lerobot.frames_table(self._writer.schema, columns)
         self._writer.write_table(table, row_group_size=length)
-        # float64 holds every type's values exactly, but int64's beyond 2^53.
-        joined = np.concatenate([columns[name] for name in table.column_names], axis=1, dtype=float)
-        statistics = [lerobot.episode_statistics(joined)]
-        counts = [length] * joined.shape[1]
         if self._videos is not None:
             self._videos.add(episode.images)
-        sampled = lerobot.sampled_frames(length)
-        for name in self._spec.videos:
-            statistics.append(lerobot.image_statistics(episode.images[name][sampled]))
-            counts += [len(sampled)] * 3
-        named = lerobot.name_statistics(
-            self._spec, np.concatenate(statistics, axis=1), np.array(counts)
-        )
+        # float64 holds every type's values exactly, but int64's beyond 2^53.
+        joined = np.concatenate([columns[name] for name in table.column_names], axis=1, dtype=float)
+        named = self._statistics(joined, episode)
         shown = sum(row["length"] for row in self.part.rows)  # frames before it in the videos
         times = {
             "from_timestamp": shown / self._spec.fps,
@@ -159,6 +149,17 @@ class PartWriter:
                 },
             }
         )
+
+    def _statistics(self, frames: np.ndarray, episode: EpisodeData) -> dict[str, dict[str, list]]:
+        """Statistics of an episode's frames, shape ``(frames, dim)``, and of its images."""
+        statistics = [lerobot.episode_statistics(frames)]
+        counts = [len(frames)] * frames.shape[1]
+        sampled = lerobot.sampled_frames(len(frames))
+        for name in self._spec.videos:
+            statistics.append(lerobot.image_statistics(episode.images[name][sampled]))
+            counts += [len(sampled)] * 3
+        every = np.concatenate(statistics, axis=1)
+        return lerobot.name_statistics(self._spec, every, np.array(counts))
 
     def complete(self) -> Part:
         """Close the files; they are on the disk then."""

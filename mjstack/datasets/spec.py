@@ -165,14 +165,24 @@ def term_columns(term: str, dim: int, history: int) -> list[str]:
     ]
 
 
-def typed_arrays(spec: DatasetSpec, episode: EpisodeData) -> dict[str, np.ndarray]:
-    """The episode's frames in the dataset's types, each ``(frames, dim)``, in the order of the
-    features.
+def typed_episode(
+    spec: DatasetSpec, episode: EpisodeData
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """An episode in the dataset's types: the columns that it brings to its row beside its task, and
+    its frames, each ``(frames, dim)``, in the order of the features.
 
     Raises:
-        DatasetError: A feature is missing, unknown, of another shape or type, or not finite.
+        DatasetError: A value, a feature or images are missing, unknown, of another shape or type,
+            or not finite.
     """
-    where = _where(episode)
+    where = f"episode of seed {episode.seed}, world {episode.world}"
+    values = _typed_values(where, spec, episode)
+    arrays = _typed_arrays(where, spec, episode)
+    _check_images(where, spec, episode, len(next(iter(arrays.values()))))
+    return values, arrays
+
+
+def _typed_arrays(where: str, spec: DatasetSpec, episode: EpisodeData) -> dict[str, np.ndarray]:
     _check_names(where, "feature", episode.arrays, spec.features)
     frames = len(episode.arrays[next(iter(spec.features))])
     typed = {}
@@ -200,13 +210,7 @@ def typed_arrays(spec: DatasetSpec, episode: EpisodeData) -> dict[str, np.ndarra
     return typed
 
 
-def check_images(spec: DatasetSpec, episode: EpisodeData, frames: int) -> None:
-    """Check that an episode has the images of all its frames.
-
-    Raises:
-        DatasetError: An array is missing, unknown or of another shape or type.
-    """
-    where = _where(episode)
+def _check_images(where: str, spec: DatasetSpec, episode: EpisodeData, frames: int) -> None:
     _check_names(where, "video", episode.images, spec.videos)
     for name, video in spec.videos.items():
         images = episode.images[name]
@@ -218,13 +222,7 @@ def check_images(spec: DatasetSpec, episode: EpisodeData, frames: int) -> None:
             )
 
 
-def typed_values(spec: DatasetSpec, episode: EpisodeData) -> dict[str, Any]:
-    """The columns that an episode brings to its row beside its task, in the dataset's types.
-
-    Raises:
-        DatasetError: A value is missing, unknown or of another type.
-    """
-    where = _where(episode)
+def _typed_values(where: str, spec: DatasetSpec, episode: EpisodeData) -> dict[str, Any]:
     _check_names(where, "value", episode.values, spec.values)
     values = {name: getattr(episode, name) for name in OWN_VALUES} | dict(episode.values)
     row = {}
@@ -237,10 +235,6 @@ def typed_values(spec: DatasetSpec, episode: EpisodeData) -> dict[str, Any]:
             )
         row[name] = convert(values[name])
     return row
-
-
-def _where(episode: EpisodeData) -> str:
-    return f"episode of seed {episode.seed}, world {episode.world}"
 
 
 def _check_names(

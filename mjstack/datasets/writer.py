@@ -22,13 +22,7 @@ from mjstack.datasets.reader import (
     readable,
     uncommitted,
 )
-from mjstack.datasets.spec import (
-    DatasetSpec,
-    EpisodeData,
-    check_images,
-    typed_arrays,
-    typed_values,
-)
+from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_episode
 from mjstack.errors import DatasetError, UnwrittenError
 from mjstack.files import lock_folder, write_atomic
 
@@ -133,16 +127,13 @@ class DatasetWriter:
                 kept.
         """
         self._check_open()
-        checked = [(typed_values(self.spec, e), typed_arrays(self.spec, e)) for e in episodes]
-        for episode, (_, columns) in zip(episodes, checked, strict=True):
-            check_images(self.spec, episode, len(next(iter(columns.values()))))
+        checked = [typed_episode(self.spec, episode) for episode in episodes]
         for episode, (facts, columns) in zip(episodes, checked, strict=True):
             with self._guarded():
                 if self._part is None:
                     name = f"{self._shards:06d}"
-                    self._part = PartWriter(
-                        self.folder, self.spec, name, images_gib=self._images_gib
-                    )
+                    room = self._images_gib
+                    self._part = PartWriter(self.folder, self.spec, name, images_gib=room)
                 rows = self._part.part.rows
                 number = len(self.committed) + len(rows)
                 start = rows[-1]["dataset_to_index"] if rows else self.frames

@@ -21,13 +21,7 @@ from mjstack.errors import FaultError
 from mjstack.managers.episode import required_fields
 from mjstack.managers.view import random_uniform
 from mjstack.scene import SceneIndex
-from mjstack.sim import (
-    LOST_PHYSICS,
-    BatchSizes,
-    Overflow,
-    Simulation,
-    make_simulation,
-)
+from mjstack.sim import LOST_PHYSICS, BatchSizes, Overflow, Simulation, make_simulation
 from mjstack.sim.sizes import apply_configured, resolve_measuring_sizes
 
 log = logging.getLogger(__name__)

@@ -24,12 +24,7 @@ class EpisodeStatistics:
         self._sums = torch.zeros(1 + len(self._names), dtype=torch.float64, device=device)
 
     def update(
-        self,
-        done: Tensor,
-        steps: Tensor,
-        success: Tensor,
-        rewards: Tensor,
-        terminations: Tensor,
+        self, done: Tensor, steps: Tensor, success: Tensor, rewards: Tensor, terminations: Tensor
     ) -> None:
         """Add the episodes that end in this step.
 

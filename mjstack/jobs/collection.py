@@ -16,7 +16,7 @@ import numpy as np
 from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetWriter, lerobot
 from mjstack.datasets.part import FILE_MB, Part, PartWriter
-from mjstack.datasets.spec import typed_arrays, typed_values
+from mjstack.datasets.spec import typed_episode
 from mjstack.episodes.context import RunContext
 from mjstack.files import write_atomic
 from mjstack.jobs.collected import (
@@ -263,8 +263,7 @@ class Collection:
                     writer.write(
                         data,
                         task,
-                        typed_values(self._plan.spec, data),
-                        typed_arrays(self._plan.spec, data),
+                        *typed_episode(self._plan.spec, data),
                         episode + before[world],
                         frame + before[world] * len(data.arrays[STATE]),
                     )

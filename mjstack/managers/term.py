@@ -15,14 +15,7 @@ from rich.table import Table
 from mjstack.config.fields import Range, check_fields
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import TermCfg
-from mjstack.errors import (
-    ConfigError,
-    MjstackError,
-    ParameterError,
-    TermError,
-    first_line,
-    suggest,
-)
+from mjstack.errors import ConfigError, MjstackError, ParameterError, TermError, first_line, suggest
 from mjstack.managers.view import EnvView
 from mjstack.math import describe_tensor
 

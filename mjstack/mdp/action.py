@@ -80,7 +80,6 @@ class JointPosition(_Commands):
         self._mode = mode
         self._scale = scale
         self._pose = getattr(robot(env), pose)[chosen]
-        self.unit = "-1 to 1"
         if mode == "absolute":
             self.unit = "rad, m"
             self.low, self.high = self._low, self._high

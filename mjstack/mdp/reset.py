@@ -11,14 +11,7 @@ from torch import Tensor
 from mjstack.config.fields import Count, NotNegative
 from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
-from mjstack.managers.view import (
-    EnvView,
-    offers,
-    random_uniform,
-    rows_of,
-    uses_fields,
-    zero_rows,
-)
+from mjstack.managers.view import EnvView, offers, random_uniform, rows_of, uses_fields, zero_rows
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet

@@ -94,12 +94,7 @@ class StackCheck(EpisodeCheck):
         self.supported = on_table(t.onto, gap=t.support_gap)
         self.released = released(t.object, open_fraction=t.open_fraction)
         lift = Streak(
-            "LIFT",
-            "{object} not lifted",
-            moved,
-            up,
-            t.lift_steps,
-            phases=[t.lift_phases],
+            "LIFT", "{object} not lifted", moved, up, t.lift_steps, phases=[t.lift_phases]
         )
         carry = Carried(
             "CARRY",
@@ -114,13 +109,7 @@ class StackCheck(EpisodeCheck):
         return [
             lift,
             carry,
-            InWindow(
-                "STACKED",
-                "not stacked",
-                self.stacked,
-                t.window,
-                measure=self.trace,
-            ),
+            InWindow("STACKED", "not stacked", self.stacked, t.window, measure=self.trace),
             InWindow("SUPPORTED", f"{t.onto} not on the table", self.supported, t.window),
             AtRest(
                 t.window,

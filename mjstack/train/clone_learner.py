@@ -24,14 +24,7 @@ from mjstack.sim.graph import StepGraph
 from mjstack.train.clone_network import input_noise, make_network
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.images import Augmentation, ImagePool
-from mjstack.train.trainer import (
-    BEST,
-    LAST,
-    STATE,
-    EventWriter,
-    pack_weights,
-    unpack_weights,
-)
+from mjstack.train.trainer import BEST, LAST, STATE, EventWriter, pack_weights, unpack_weights
 
 _HELD_OUT = 20  # of so many episodes one is for validation
 _VALIDATED = 65536  # steps at once
@@ -110,6 +103,7 @@ class Learner:
         # Images
         self._pool: ImagePool | None = None
         self._shown: ImagePool | None = None
+        self._pools: list[ImagePool] = []
         if vision.sizes:
             seed = draw_seed(cfg.seed, ranks.rank, 0)
             own = (vision, demonstrations)
@@ -119,8 +113,8 @@ class Learner:
             self._validation = self._validation[::every]
             all_of_them = replace(job.vision, pool=len(self._validation))
             self._shown = ImagePool(context, all_of_them, *own, self._validation, size, seed)
-            cameras = len(vision.sizes)
-            self._augment = Augmentation(job.vision, cameras, self._batch_size, device)
+            self._pools = [self._pool, self._shown]
+            self._augment = Augmentation(job.vision, len(vision.sizes), size, device)
         self._policy = Policy(
             network=self._average,
             group=job.group,
@@ -166,9 +160,8 @@ class Learner:
         """
         total = self._sizes.batches if total is None else total
         before = self.seconds - time.perf_counter()
-        for pool in (self._pool, self._shown):
-            if pool is not None:
-                pool.fill(self.done - 1)
+        for pool in self._pools:
+            pool.fill(self.done - 1)
         self._events = self._open_events()
         self._batch = self._fit
         if self._seen.is_cuda and self._ranks.size == 1:
@@ -194,9 +187,8 @@ class Learner:
                 self._write_state()
                 raise
             finally:
-                for pool in (self._pool, self._shown):
-                    if pool is not None:
-                        pool.close()
+                for pool in self._pools:
+                    pool.close()
         if self._events is not None:
             self._events.close()
 

@@ -61,15 +61,12 @@ def check_dataset(
             f" {values.max():g}, expected absolute joint targets within {low[joint]:g} to"
             f" {high[joint]:g} rad or m. Give a dataset with these units"
         )
-    seeds = [row["seed"] for row in _episode_rows(folder, info) if "seed" in row]
+    seeds = _seeds(folder)
     return range(min(seeds), max(seeds) + 1) if seeds else range(0)
 
 
 def read_demonstrations(
-    folder: Path,
-    context: RunContext,
-    group: ObservationGroupCfg,
-    widths: dict[str, int],
+    folder: Path, context: RunContext, group: ObservationGroupCfg, widths: dict[str, int]
 ) -> Demonstrations:
     """The episodes of a dataset that succeeded, on the device of the training. Without a column
     ``next.success`` all are taken to have succeeded.
@@ -177,16 +174,14 @@ def _find_columns(
     ]
     targets = [f"{joint}.pos" for joint in cfg.robot.joints]
     done = _places([_ACTION], features)
-    for column, found, where in (
-        *((column, seen, name) for column in numbers),
-        *((column, done, _ACTION) for column in targets),
-    ):
-        if column not in found:
-            raise DatasetError(
-                f"job.dataset={folder}: has no column {column} in {where}, expected all that the"
-                " policy sees. Collect it with"
-                " job=collect observation=state, or choose observation@job.observation"
-            )
+    for wanted, found, where in ((numbers, seen, name), (targets, done, _ACTION)):
+        for column in wanted:
+            if column not in found:
+                raise DatasetError(
+                    f"job.dataset={folder}: has no column {column} in {where}, expected all that"
+                    " the policy sees. Collect it with job=collect observation=state, or choose"
+                    " observation@job.observation"
+                )
     return {"observation": [seen[n] for n in numbers], _ACTION: [done[n] for n in targets]}
 
 
@@ -218,15 +213,15 @@ def _files(folder: Path, info: Mapping[str, Any]) -> list[Path]:
     return sorted(folder.glob("data/chunk-*/file-*.parquet"))
 
 
-def _episode_rows(folder: Path, info: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of the episodes, their seeds alone."""
-    rows: list[dict[str, Any]] = []
+def _seeds(folder: Path) -> list[int]:
+    """Seeds of the episodes, as far as the dataset has them."""
+    seeds: list[int] = []
     for path in sorted(folder.glob("meta/episodes/chunk-*/file-*.parquet")):
         with readable(path):
             file = lerobot.require_pyarrow()[1].ParquetFile(path)
-            columns = [name for name in ("seed",) if name in file.schema_arrow.names]
-            rows += file.read(columns=columns).to_pylist() if columns else []
-    return rows
+            if "seed" in file.schema_arrow.names:
+                seeds += file.read(columns=["seed"])["seed"].to_pylist()
+    return seeds
 
 
 def _task_number(folder: Path, cfg: Config) -> int:

@@ -177,10 +177,7 @@ def batches_of(job: CloneJobCfg, sizes: CloneSizes, nworld: int) -> list[tuple[i
     """
     return [
         (min(nworld, count - first), noise)
-        for count, noise in (
-            (sizes.episodes, 0.0),
-            (sizes.noisy_episodes, job.command_noise),
-        )
+        for count, noise in ((sizes.episodes, 0.0), (sizes.noisy_episodes, job.command_noise))
         for first in range(0, count, nworld)
     ]
 

@@ -21,14 +21,7 @@ from mjstack.episodes.context import RunContext
 from mjstack.interrupt import check_interrupt
 from mjstack.policy import Policy, PolicyNetwork, save_policy
 from mjstack.policy.checkpoint import write_state
-from mjstack.train.trainer import (
-    BEST,
-    LAST,
-    STATE,
-    EventWriter,
-    pack_weights,
-    unpack_weights,
-)
+from mjstack.train.trainer import BEST, LAST, STATE, EventWriter, pack_weights, unpack_weights
 
 _MEASURED = 8192  # decisions by which the change of a policy is measured
 _RATE = 0.001  # rsl_rl's learning rate at the start, which it keeps within 0.00001 and 0.01
