@@ -72,8 +72,7 @@ class PolicyDriver(Driver):
                 f" {error}"
             ) from error
         width = len(cfg.robot.joints) if self._actions is None else self._actions.action_dim
-        policy.check_action_width(width)
-        policy.check_widths(self._observations.term_dims[group])
+        policy.check_widths(self._observations.term_dims[group], width)
         self._observed = self._observations.groups[group]
         self._remembers = any(term.history > 1 for term in policy.observation.terms.values())
         self._env = env

@@ -89,26 +89,21 @@ class Policy:
         trained = _requirements(self.config, cameras)
         self._compare(trained, _requirements(config_content(cfg), cameras))
 
-    def check_widths(self, widths: Mapping[str, int]) -> None:
-        """Check how many numbers each term of its group has in the worlds that it is to drive.
+    def check_widths(self, widths: Mapping[str, int], action: int | None = None) -> None:
+        """Check how many numbers an action, if it is given, and each term of its group have in the
+        worlds that it is to drive.
 
         Raises:
             PolicyError: One has another number.
         """
+        if action is not None:
+            self._compare({"action.width": self.network.joints}, {"action.width": action})
         key = f"observation.{self.group}.terms.{{}}.width"
         trained, here = (
             {key.format(name): width for name, width in one.items()}
             for one in (self.widths, widths)
         )
         self._compare(trained, here)
-
-    def check_action_width(self, width: int) -> None:
-        """Check how many numbers an action has in the worlds that it is to drive.
-
-        Raises:
-            PolicyError: It has another number.
-        """
-        self._compare({"action.width": self.network.joints}, {"action.width": width})
 
     def _compare(self, trained: Mapping[str, Any], here: Mapping[str, Any]) -> None:
         for key in dict.fromkeys([*trained, *here]):
