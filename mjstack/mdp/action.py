@@ -13,6 +13,8 @@ from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import Pose, robot
 from mjstack.scene.index import Columns
 
+_TILT_STEP = 0.03  # rad: how far `EndEffectorDelta` tilts the gripper in a step at most
+
 
 class _Commands(ActionTerm):
     """Commands of some of the robot's actuators, from actions of -1 to 1."""
@@ -201,7 +203,6 @@ class EndEffectorDelta(_Commands):
         roll: NotNegative = 0.0,
         upright: Fraction = 0.0,
         tilt: NotNegative = 0.0,
-        tilt_step: Positive = 0.03,
     ) -> None:
         """Build the solver.
 
@@ -214,7 +215,6 @@ class EndEffectorDelta(_Commands):
                 as ``approach_gain`` of `BatchedIk`; 0 leaves them where they are.
             tilt: Angle from straight down for an action of 1 [rad]; for -1 the gripper points down,
                 as it always does with 0.
-            tilt_step: How far the gripper tilts in a step at most [rad].
 
         Raises:
             ParameterError: The robot has no joint that rolls the gripper and nothing else; or the
@@ -228,7 +228,6 @@ class EndEffectorDelta(_Commands):
         if tilt and not upright:
             raise ParameterError("tilt", tilt, "0, because upright is 0")
         self._tilt = tilt
-        self._tilt_step = tilt_step
         self._all = robot(env).ctrl
         self._scale = scale
         profile = env.cfg.robot
@@ -274,5 +273,5 @@ class EndEffectorDelta(_Commands):
         wanted = 0.5 * (action + 1.0) * self._tilt
         away = point[:, :2] / torch.linalg.vector_norm(point[:, :2], dim=1, keepdim=True)
         now = torch.atan2((approach[:, :2] * away).sum(1), -approach[:, 2])
-        angle = now + (wanted - now).clamp(-self._tilt_step, self._tilt_step)
+        angle = now + (wanted - now).clamp(-_TILT_STEP, _TILT_STEP)
         return torch.cat((torch.sin(angle)[:, None] * away, -torch.cos(angle)[:, None]), dim=1)
