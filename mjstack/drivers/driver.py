@@ -76,7 +76,8 @@ class Recorded(Driver):
         super().__init__(nworld, source.steps, device, source.phases)
         self.error = source.error
         self.retries = source.retries
-        self._commands = torch.full((self.steps, nworld, nu), torch.nan, device=device)
+        shape = (self.steps, nworld, nu)
+        self._commands = torch.full(shape, torch.nan, dtype=torch.float32, device=device)
         self._phases = torch.zeros((self.steps, nworld), dtype=torch.int16, device=device)
         self._next = torch.zeros(1, dtype=torch.int64, device=device)
 
