@@ -17,7 +17,7 @@ import numpy as np
 
 from mjstack.errors import FolderError, MjstackError, first_line
 
-_KEY = "hydra.run.dir (job=collect: job.folder)"
+_KEY = "hydra.run.dir (job=collect, job=train: job.folder)"
 
 
 @contextmanager

@@ -156,6 +156,7 @@ TOLD = [
     ("-m hydra.sweeper.params={seed:1}", "hydra.sweeper.params: expected none. Give the values"),
     ("-m seed=1 +hydra.sweeper.params.nworld=2", "hydra.sweeper.params: expected none."),
     ("hydra/launcher=nope", ". Others are plugins of Hydra, which pip installs, such as hydra-"),
+    ("cameras=[front,wirst]", "cameras=wirst: 'wirst' does not exist. Did you mean 'wrist'?"),
     ("-sc", "-sc: expected install=SHELL or uninstall=SHELL alone."),
 ]
 

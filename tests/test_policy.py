@@ -180,7 +180,8 @@ def test_other_actions_are_refused() -> None:
 
 
 MISFITS = [
-    (["robot=rebot"], "was trained with robot.name=so101, and here it is rebot"),
+    (["robot=rebot"], "here it is rebot: expected the same. Name a policy"),
+    (["robot=rebot"], "was trained for this, or give robot=so101."),
     (["task=box"], "was trained with task.name=stack, and here it is box"),
     (["robot.home=[0,0,0.4,1.2,1.6,0.7]"], "was trained with robot.home=[0.0, 0.0, 0.473"),
     (["timing.command_delay=5"], "was trained with timing.command_delay=0"),

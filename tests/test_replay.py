@@ -684,6 +684,12 @@ DAMAGE = {
         lambda f: _replace(f / ".hydra" / "config.yaml", "name: gates", "name: replay"),
         "job=replay",
     ),
+    "a training": (  # has keys that no other job has
+        lambda f: _replace(
+            f / ".hydra" / "config.yaml", "name: gates", "name: train\n  trainer: null"
+        ),
+        "is a run of job=train, expected one of job=gates",
+    ),
     "no record": (
         lambda f: (f / "worlds_seed0.npz").unlink(),
         "gate batch has left no record of seed 0",

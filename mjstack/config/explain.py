@@ -108,7 +108,9 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
 def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        unknown = UnknownName(f"{group}={name}:", name, error.options or ())
+        # Of a list of choices Hydra names none.
+        options = error.options or list_choices().get(group, [])
+        unknown = UnknownName(f"{group}={name}:", name, options)
         own = "" if config_folders() else " A choice of your own needs --config-dir DIR."
         if group.startswith("hydra/"):
             own = " Others are plugins of Hydra, which pip installs, such as hydra-joblib-launcher."

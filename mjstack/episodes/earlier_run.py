@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from mjstack.config.check import reads_starts_file
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Config, TermCfg
+from mjstack.config.session import read_yaml
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import MjstackError, RunError
 from mjstack.files import reading, write_atomic
@@ -48,6 +50,12 @@ class EarlierRun:
                     " run, such as outputs/2026-11-21/04-02-05 (of a sweep: one of its jobs'). Name"
                     " another folder."
                 )
+        job = _named_job(saved)  # before the rest, which has keys of that job alone
+        if job not in (None, "gates"):
+            raise RunError(
+                f"{key}={name}: is a run of job={job}, expected one of job=gates. Name that run's"
+                " folder."
+            )
         try:
             cfg = load_saved(saved)
         except MjstackError as error:
@@ -57,11 +65,6 @@ class EarlierRun:
         with reading(report, RunError, "Name another folder"):
             provenance = dict(json.loads(report.read_text())["provenance"])
             provenance["versions"] = dict(provenance["versions"])
-        if cfg.job.name != "gates":
-            raise RunError(
-                f"{key}={name}: is a run of job={cfg.job.name}, expected one of job=gates. Name"
-                " that run's folder."
-            )
         return cls(folder=folder, cfg=cfg, provenance=provenance)
 
     def record(self, seed: int, gate: str) -> EpisodeRecord:
@@ -136,3 +139,10 @@ def _from_copies(cfg: Config, folder: Path, names: Mapping[str, str]) -> Config:
 
     success = replace(cfg.gate.success, reset=swap(cfg.gate.success.reset))
     return replace(cfg, reset=swap(cfg.reset), gate=replace(cfg.gate, success=success))
+
+
+def _named_job(saved: Path) -> str | None:
+    """The job of a saved configuration; None if the file does not name one."""
+    with suppress(Exception):  # `load_saved` says what is wrong with it
+        return str(read_yaml(saved)["job"]["name"]).partition("\n")[0]
+    return None

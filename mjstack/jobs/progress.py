@@ -44,6 +44,8 @@ class ProgressBar:
         self._gate = ""
         self._unit = ""
         self._task = self._progress.add_task("", visible=False, rate="")
+        self._first = 0
+        self._done = 0
         self._began = self._spoke = time.monotonic()
 
     def __enter__(self) -> "ProgressBar":
@@ -69,15 +71,19 @@ class ProgressBar:
         """Show how much of something is done."""
         check_interrupt()
         now = time.monotonic()
-        if unit != self._unit or done <= 1:
+        if unit != self._unit or done <= 1 or done < self._done:
             self._unit = unit
+            self._first = done  # work that goes on begins in the middle
             self._began = now
             self._show(f"{self._gate}: {unit}", total)
-        rate = f"{done / (now - self._began):.1f}/s" if now > self._began and done > 1 else ""
+        self._done = done
+        made = done - self._first
+        speed = made / (now - self._began) if now > self._began else 0.0
+        rate = f"{speed:.1f}/s" if speed > 0.0 else ""
         self._progress.update(self._task, completed=done, rate=rate)
-        if self._progress.disable and done > 1 and now - self._spoke > 15.0:
+        if self._progress.disable and speed > 0.0 and now - self._spoke > 15.0:
             self._spoke = now
-            left = (total - done) * (now - self._began) / done
+            left = (total - done) / speed
             self.print_line(f"{self._gate}: {unit} {done}/{total}, {rate}, {left:.0f} s left")
 
     def finish(self, result: GateResult) -> None:

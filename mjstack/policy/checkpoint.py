@@ -31,7 +31,7 @@ from mjstack.policy.network import PolicyNetwork, Vision
 # Grows when an older mjstack could not read what is written
 FORMAT = 3
 _WITH_IMAGES = 4
-_NAME_ANOTHER = "Name a folder that job=train has written"
+_NAME_ANOTHER = "Name a policy that job=train has written, such as outputs/mine/last"
 # A stranger's files may ask for more than this.
 _MOST_TEXT = 2**24  # bytes
 _MOST_WEIGHTS = 2**32  # bytes
@@ -110,10 +110,12 @@ class Policy:
             before = trained.get(key, "missing")
             now = here.get(key, "missing")
             if before != now:
+                group, _, leaf = key.partition(".")
+                back = f"give {group}={before}" if leaf == "name" else "set the key back"
                 raise PolicyError(
                     f"policy={self.folder}: was trained with {key}={before}, and here it is {now}:"
                     " expected the same",
-                    "Name a policy that was trained for this, or set the key back",
+                    f"Name a policy that was trained for this, or {back}",
                 )
 
 

@@ -89,7 +89,8 @@ class NativeSimulation(Simulation):
         self.device = torch.device("cpu")
         self.nthread = nthread = max(1, min(nthread or available_cores(), nworld))
         self.description = (
-            f"MuJoCo {mujoco.__version__} on {nthread} threads, {platform.machine()} CPU"
+            f"MuJoCo {mujoco.__version__} on {nthread} thread{'s' if nthread > 1 else ''},"
+            f" {platform.machine()} CPU"
         )
         own = copy.copy(m)
         # MuJoCo skips an offset that was zero when it compiled: these flags make it read the field.
