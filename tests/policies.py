@@ -12,10 +12,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from compositions import load_config
+from environments import configure
 
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import build_env
+from mjstack.episodes.context import RunContext
 from mjstack.policy import Policy, PolicyNetwork, save_policy
 
 
@@ -48,6 +51,16 @@ def make_policy(
         action=action,
         training={"seed": seed},
     )
+
+
+def hold_above_red(folder: Path) -> Path:
+    """The folder of a policy of task reach that holds the arm above the nominal red cube."""
+    nominal = RunContext(load_config(["task=reach", "sim=native", "reset=nominal"])).nominal
+    policy = make_policy(configure("task=reach"), chunk=1, execute=1)
+    reached = torch.from_numpy(nominal.world.qpos[-1]).float()[: policy.network.joints]
+    policy.network.set_scale("action", reached, torch.full_like(reached, 1e-6))
+    save_policy(folder, policy)
+    return folder
 
 
 def write_policy(folder: Path, cfg: Config, **options: int | str) -> Path:

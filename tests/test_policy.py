@@ -13,15 +13,17 @@ from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 from compositions import load_config
 from environments import configure, on_new_sim, one_second_episode
-from policies import make_policy, write_policy
+from policies import hold_above_red, make_policy, write_policy
 from safetensors.torch import load, save
 
 import mjstack
+import mjstack.jobs.showing as showing
 from mjstack.cli import run
 from mjstack.config.schema import ObservationTermCfg
 from mjstack.drivers.policy import PolicyDriver
@@ -451,6 +453,36 @@ def test_every_gate_takes_a_policy(folder: Path, tmp_path: Path) -> None:
         status = run(["job=replay", f"run={out}", f"world={world}", f"hydra.run.dir={again}"])
         assert status == 1
         assert "bit for bit where it did" in report(again)["replay_native"]["reason"]
+
+
+def test_a_policy_that_succeeds_is_timed_and_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The episode has a figure, and the video shows the policy's world of *baseline*."""
+    shown: list[np.ndarray] = []
+
+    def save(path: Path, model: mujoco.MjModel, qpos: np.ndarray, step_dt: float) -> None:
+        path.touch()
+        shown.append(qpos)
+
+    monkeypatch.setattr(showing, "save_video", save)
+    policy = hold_above_red(tmp_path / "policy")
+    out = tmp_path / "run"
+    drive = ["task=reach", "reset=jitter", "controller=policy", f"policy={policy}"]
+    gates = ["gates=[baseline,batch,throughput]", "gate.throughput.measurements=[episode]"]
+    where = ["sim=native", "nworld=2", "web.episode=false", f"hydra.run.dir={out}"]
+    assert run([*drive, *gates, *where, "gate.throughput.episodes=2", "video=true"]) == 0
+    found = report(out)
+    assert {found[gate]["status"] for gate in ("baseline", "batch", "throughput")} == {"pass"}
+    figures = found["throughput"]["metrics"]
+    assert figures["episode.succeeded"] == 2
+    assert figures["episode.seconds.median"] > 0.0
+    assert "episode: " in found["throughput"]["reason"]
+    assert (out / "episode.mp4").exists()
+    (qpos,) = shown
+    assert qpos.shape[:2] == (1, configure("task=reach").task.episode_steps)
+    apart = np.abs(qpos[0, -1, :6] - load_policy(policy).network.action_mean.numpy())
+    assert apart.max() < 0.05
 
 
 @pytest.mark.full

@@ -141,44 +141,54 @@ def test_drivers_decide_in_every_control_step() -> None:
         make_expert(env)
 
 
-def test_the_upright_gripper_rolls_and_points_down() -> None:
+def near_the_table(robot: str) -> list[str]:
+    """Random starts at which the gripper can point down: high up the reBot's wrist cannot."""
+    low = "robot.start=[0.0,-1.435,-2.022,1.6,0.0,0.0,0.04,0.04]"
+    return ["reset=randomized", *([low] if robot == "rebot" else [])]
+
+
+def test_the_upright_gripper_rolls_and_points_down(robot: str) -> None:
     """The grasp point goes where it is sent, and the roll joint turns by itself."""
-    env = on_shared_sim("native", 2, configure("action=ee_upright", "reset=randomized"))
+    cfg = configure("action=ee_upright", *near_the_table(robot), robot=robot)
+    env = on_shared_sim("native", 2, cfg)
     env.reset(seed=0)
     term = env.action_manager.terms["arm"]
     assert env.action_manager.action_dim == 5
-    column = env.cfg.robot.joints.index("wrist_roll")
+    column = env.cfg.robot.joints.index(env.cfg.robot.roll_joint)
     before = env.sim.ctrl.clone()
     point, _, tilt = (each.clone() for each in term._ik.forward(before))
-    action = torch.tensor([[0.0, 0.0, 1.0, 1.0, 1.0], [0.5, 0.5, 1.0, -1.0, 1.0]])
+    up = 1.0 if robot == "so101" else -1.0  # the reBot's wrist turns down farther below
+    action = torch.tensor([[0.0, 0.0, up, 1.0, 1.0], [0.5, 0.5, up, -1.0, 1.0]])
     for _ in range(10):
         env.step(action)
     turned = (env.sim.ctrl - before)[:, column]
     torch.testing.assert_close(turned, torch.tensor([0.3, -0.3]).double(), rtol=0.0, atol=1e-5)
     after, _, upright = term._ik.forward(env.sim.ctrl)
-    moved = torch.tensor([[0.0, 0.0, 0.05], [0.025, 0.025, 0.05]])
+    moved = torch.tensor([[0.0, 0.0, 0.05 * up], [0.025, 0.025, 0.05 * up]])
     torch.testing.assert_close(after - point, moved, rtol=0.0, atol=3e-3)
     assert (upright[:, 2] <= tilt[:, 2] + 1e-3).all()
     assert (upright[:, 2] < -0.9).all()
 
 
-def test_the_gripper_tilts_as_far_as_it_is_told() -> None:
+def test_the_gripper_tilts_as_far_as_it_is_told(robot: str) -> None:
     """Away from the base, by a step at most, while the grasp point stays."""
-    env = on_shared_sim("native", 3, configure("action=ee_tilt", "reset=randomized"))
+    cfg = configure("action=ee_tilt", *near_the_table(robot), robot=robot)
+    env = on_shared_sim("native", 3, cfg)
     env.reset(seed=0)
     term = env.action_manager.terms["arm"]
     assert env.action_manager.action_dim == 6
     before, _, _ = (each.clone() for each in term._ik.forward(env.sim.ctrl))
     action = torch.zeros((3, 6))
     action[:, 5] = 1.0  # where a jaw swings it moves the grasp point
-    action[:, 4] = torch.tensor([0.0, 0.5, 1.0])
+    wanted = torch.tensor([0.4, 0.6, 0.8] if robot == "so101" else [0.6, 0.7, 0.8])
+    action[:, 4] = wanted / 0.4 - 1.0
     tilts = []
     for _ in range(45):
         env.step(action)
         point, _, approach = term._ik.forward(env.sim.ctrl)
         away = point[:, :2] / point[:, :2].norm(dim=1, keepdim=True)
         tilts.append(torch.atan2((approach[:, :2] * away).sum(1), -approach[:, 2]))
-    torch.testing.assert_close(tilts[-1], torch.tensor([0.4, 0.6, 0.8]), rtol=0.0, atol=0.03)
+    torch.testing.assert_close(tilts[-1], wanted, rtol=0.0, atol=0.03)
     assert torch.stack(tilts).diff(dim=0).abs().max() < 0.04
     torch.testing.assert_close(point[:, :2], before[:, :2], rtol=0.0, atol=2e-3)
 
