@@ -165,7 +165,9 @@ def test_a_process_may_come_when_the_first_one_has_begun(
 
 @pytest.mark.full
 def test_two_cores_train_reach(tmp_path: Path) -> None:
-    """In two minutes of both; every world reaches its point."""
+    """In two minutes of both: four of processor time, as other work may share the machine. Every
+    world reaches its point.
+    """
     began = time.process_time()
     out = tmp_path / "training"
     assert run(["job=train", "task=reach", "sim=native", "nworld=64", f"job.folder={out}"]) == 0
@@ -175,7 +177,7 @@ def test_two_cores_train_reach(tmp_path: Path) -> None:
 
 @pytest.mark.full
 def test_two_cores_train_stack_from_64_episodes(tmp_path: Path) -> None:
-    """In three minutes of both; half of the unseen worlds at least stack."""
+    """In three minutes of both: six of processor time. Half of the unseen worlds at least stack."""
     began = time.process_time()
     out = tmp_path / "training"
     few = ["nworld=32", "job.episodes=32", "job.noisy_episodes=32", "gate.success.rate=0.5"]
