@@ -34,6 +34,7 @@ from mjstack.config.session import (
     hydra_session,
     lacking_folders,
     list_items,
+    quoted,
     search_path,
     search_path_args,
 )
@@ -224,7 +225,7 @@ def _sweep(hydra: Hydra, overrides: list[str]) -> int:
     with claim as claimed:
         if claimed != folder:
             master.hydra.sweep.dir = str(claimed)
-            master.hydra.overrides.hydra.append(f"hydra.sweep.dir='{claimed}'")  # of its jobs
+            master.hydra.overrides.hydra.append(f"hydra.sweep.dir={quoted(claimed)}")  # of its jobs
         try:
             returned = hydra.multirun(CONFIG_NAME, run_job, overrides)
             batches = returned if isinstance(returned, list) else []

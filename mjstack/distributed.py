@@ -102,7 +102,7 @@ class Ranks:
     def alike(self, work: Callable[[], T]) -> T:
         """The result of work that every rank does for itself, as `in_all`."""
         kept: list[T] = []
-        self._outcomes(lambda: kept.append(work()))
+        self.in_all(lambda: kept.append(work()))
         return kept[0]
 
     def from_first(self, work: Callable[[], T]) -> T:
@@ -111,8 +111,8 @@ class Ranks:
         Raises:
             RankError: It failed there, in the other ranks.
         """
-        (result, *_) = self._outcomes(work if self.writes else lambda: None)
-        return result
+        mine: Callable[[], Any] = work if self.writes else lambda: None
+        return self.in_all(mine)[0]
 
     def in_all(self, work: Callable[[], T]) -> list[T]:
         """The results of work that every rank does, by rank. If it fails in one, it fails in all.
@@ -120,13 +120,10 @@ class Ranks:
         Raises:
             RankError: It failed in another rank. One error in all of them is rank 0's.
         """
-        return self._outcomes(work)
-
-    def _outcomes(self, work: Callable[[], Any]) -> list[Any]:
-        """Results by rank, or the error of the first rank that has one."""
         if self.size == 1:
             return [work()]
-        result = own = text = None
+        result: Any = None
+        own = text = None
         try:
             result = work()
         except (Exception, SystemExit) as error:

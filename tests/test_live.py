@@ -29,7 +29,6 @@ from mjstack.episodes.live import LiveView, read_worlds
 from mjstack.episodes.rollout import rollout
 from mjstack.errors import MjstackError
 from mjstack.jobs import check_job
-from mjstack.jobs.showing import camera_renderer
 from mjstack.report.web import Shapes, start_server, stop_server
 from mjstack.sim.cameras import color_cameras
 
@@ -164,7 +163,7 @@ def test_a_driven_episode_shows_cameras_and_rewards(server: Any, backend: str) -
     sim = context.batch_simulation(3)
     env = context.start(sim, cfg.reset)
     assert env.images == {}
-    renderer = partial(camera_renderer, context)
+    renderer = partial(context.stage.color_renderer, 1)
     with closing(LiveView(server, lambda: context.stage.visual_model, renderer=renderer)) as view:
         view._plotted.value = 2
         rollout(env, context.driver(env), [view], steps=3)

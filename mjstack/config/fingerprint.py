@@ -52,17 +52,21 @@ def config_hash(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
 
-def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
-    """Keys in which two configurations differ, such as ``seed=1, expected 2``."""
+def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str:
+    """The first keys in which two configurations differ, such as ``seed=1, expected 2``, and how
+    many more do; empty if they are equal.
+    """
     before, now = (
         {key: value for key, value in list_items(one) if value == {} or not isinstance(value, dict)}
         for one in (theirs, ours)
     )
-    return [
+    found = [
         f"{key}={before.get(key, 'missing')}, expected {now.get(key, 'none')}"
         for key in before | now
         if before.get(key) != now.get(key)
     ]
+    more = f", and {len(found) - 3} more keys" if len(found) > 3 else ""
+    return "; ".join(found[:3]) + more
 
 
 def _content(key: str, path: str) -> str:

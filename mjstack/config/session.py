@@ -80,9 +80,13 @@ def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
     folders = _added.get() if folders is None else folders
     if len(folders) < 2:
         return [arg for folder in folders for arg in ("--config-dir", str(folder))]
-    quoted = [str(folder).replace("\\", "\\\\").replace("'", "\\'") for folder in folders]
-    listed = ",".join(f"'{folder}'" for folder in quoted)
-    return [f"hydra.searchpath=[{listed}]"]
+    return [f"hydra.searchpath=[{','.join(map(quoted, folders))}]"]
+
+
+def quoted(path: Path) -> str:
+    """A path as a value of an override."""
+    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{text}'"
 
 
 def add_folder(saved: Path) -> str:

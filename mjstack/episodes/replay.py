@@ -59,7 +59,7 @@ def replay_world(
         observers: Look on.
     """
     cfg = context.cfg
-    with closing(simulate_one(context, backend, device)) as sim:
+    with closing(simulate_alone(context, backend, device)) as sim:
         trace = _Trace()
         recorder = WorldRecorder()
         looking = [trace, *observers, recorder]
@@ -119,17 +119,14 @@ def start_of_world(
     context: RunContext, *, seed: int, world: int, backend: Backend, device: str
 ) -> np.ndarray:
     """Positions at which a world starts, shape ``(nq,)``; arguments as of `replay_world`."""
-    with closing(simulate_one(context, backend, device)) as sim:
+    with closing(simulate_alone(context, backend, device)) as sim:
         context.start(sim, context.cfg.reset, seed=seed, worlds=[world])
         return sim.qpos[0].cpu().numpy().copy()
 
 
-def simulate_one(context: RunContext, backend: Backend, device: str) -> Simulation:
-    """Make the simulation of one world of the batch, which plays alone."""
-    return simulate_alone(context, backend, device, 1)
-
-
-def simulate_alone(context: RunContext, backend: Backend, device: str, nworld: int) -> Simulation:
+def simulate_alone(
+    context: RunContext, backend: Backend, device: str, nworld: int = 1
+) -> Simulation:
     """Make the simulation of some worlds of the batch, without the others."""
     sizes = _sizes_alone(resolve_sizes(context.cfg), context.cfg.nworld)
     return context.simulation(nworld, backend, device, sizes=sizes)

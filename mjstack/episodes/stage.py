@@ -1,6 +1,7 @@
 """Scene, plan and policy of a run."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.errors import ConfigError
 from mjstack.policy import Policy, load_policy
 from mjstack.scene import SceneIndex, build_model
+from mjstack.sim import StateRenderer
+from mjstack.sim.cameras import color_cameras
 
 
 @dataclass(eq=False)
@@ -42,6 +45,21 @@ class Stage:
     def planner(self) -> OpenLoopPlanner:
         """The planner, its nominal plan made."""
         return OpenLoopPlanner(self.cfg)
+
+    def color_renderer(
+        self, count: int, fields: Sequence[str], cameras: Sequence[str] | None = None
+    ) -> StateRenderer:
+        """Renderer of the cameras' colours, on the backend of the batch.
+
+        Args:
+            count: Most states that are drawn at once.
+            fields: Model fields that differ between them.
+            cameras: Names of the cameras; all if None.
+        """
+        scene = self.cfg.scene
+        chosen = color_cameras(scene.cameras, cameras)
+        cfg = replace(self.cfg, scene=replace(scene, cameras=chosen))
+        return StateRenderer(self.model, cfg, count, fields=fields)
 
     @cached_property
     def policy(self) -> Policy:

@@ -93,11 +93,6 @@ class EpisodeTally:
         return self.episodes - len(self.failed)
 
     @property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval of the success rate."""
-        return wilson_interval(self.good, self.episodes)
-
-    @property
     def distinct_ends(self) -> int:
         """Number of distinct final states."""
         return len(np.unique(np.concatenate(self.ends)))
@@ -149,15 +144,11 @@ class EpisodeTally:
 
     def metrics(self) -> dict[str, float]:
         """Counts, the success rate with its interval, and the extremes of what was measured."""
-        low, high = self.interval
         metrics: dict[str, float] = {
             "worlds": len(self.succeeded[0]),
             "seeds": len(self.seeds),
             "episodes": self.episodes,
-            "succeeded": self.good,
-            "success_rate": self.good / self.episodes,
-            "success_rate_low95": low,
-            "success_rate_high95": high,
+            **rate_metrics(self.good, self.episodes),
         }
         for metric, (value, side) in self.check.summaries.items():
             metrics[metric] = (self.low if side == "min" else self.high)[value]
@@ -172,7 +163,7 @@ class EpisodeTally:
     @property
     def summary(self) -> str:
         """The success rate in words."""
-        low, high = self.interval
+        low, high = wilson_interval(self.good, self.episodes)
         rate = format_percent(self.good / self.episodes)
         return (
             f"{self.good} of {self.episodes} {self.noun} succeeded ({rate}, 95 % interval"
@@ -275,6 +266,17 @@ class EpisodeTally:
             header = ["first sign of failure", "failed episodes", "which"]
             tables.append(Table(title="Where it went wrong", header=header, rows=rows))
         return tables
+
+
+def rate_metrics(succeeded: int, episodes: int) -> dict[str, float]:
+    """A success rate with its 95 % interval, by name."""
+    low, high = wilson_interval(succeeded, episodes)
+    return {
+        "succeeded": succeeded,
+        "success_rate": succeeded / episodes,
+        "success_rate_low95": low,
+        "success_rate_high95": high,
+    }
 
 
 def rate_cells(k: int, n: int) -> list[str]:

@@ -200,10 +200,9 @@ def _check_folder(dataset: Path, spec: DatasetSpec) -> None:
     if info["mjstack"]["config_sha256"] != spec.config_sha256:
         theirs = (info["mjstack"]["provenance"] or [{}])[-1].get("config", {})
         found = differences(theirs, spec.provenance["config"])
-        more = f", and {len(found) - 3} more keys" if len(found) > 3 else ""
         raise DatasetError(
-            f"{dataset} has episodes of another configuration: {'; '.join(found[:3])}{more}. Set"
-            " job.folder to another folder, or these keys back"
+            f"{dataset} has episodes of another configuration: {found}. Set job.folder to another"
+            " folder, or these keys back"
         )
     check_same(dataset, info, spec)
     read_batches(dataset.parent / FILE)

@@ -11,11 +11,11 @@ from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetSpec
 from mjstack.envs import Env
 from mjstack.episodes.context import RunContext
+from mjstack.episodes.tally import rate_metrics
 from mjstack.errors import ConfigError, DatasetError
 from mjstack.files import reading
 from mjstack.jobs.demonstration import make_spec
 from mjstack.jobs.runner import run_provenance
-from mjstack.math import wilson_interval
 
 FILE = "batches.json"
 
@@ -118,13 +118,9 @@ def describe_batches(
     """
     worlds = sum(batch.worlds for batch in batches)
     succeeded = sum(batch.succeeded for batch in batches)
-    low, high = wilson_interval(succeeded, worlds)
     metrics = {
         "worlds_played": worlds,
-        "succeeded": succeeded,
-        "success_rate": succeeded / worlds,
-        "success_rate_low95": low,
-        "success_rate_high95": high,
+        **rate_metrics(succeeded, worlds),
         "retries": sum(batch.retries for batch in batches),
     }
     share = f"{succeeded:,} of {worlds:,} worlds ({100.0 * succeeded / worlds:.4g} %)"

@@ -6,7 +6,6 @@ import itertools
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -22,7 +21,12 @@ _MOST_DRAWN = 4096  # states at once
 
 
 class EpisodeSource:
-    """Makes the episodes of played worlds, with their images if there are cameras."""
+    """Makes the episodes of played worlds. With cameras their images are drawn after they have been
+    judged, as many steps at once as there are worlds.
+
+    Attributes:
+        drawing: Time that images have taken [s].
+    """
 
     def __init__(self, context: RunContext, config_sha256: str, most: int) -> None:
         """Prepare for a run.
@@ -34,13 +38,14 @@ class EpisodeSource:
         """
         self._context = context
         self._config_sha256 = config_sha256
-        self._most = most
-        self._renderer: EpisodeRenderer | None = None
-
-    @property
-    def drawing(self) -> float:
-        """Time that images have taken [s]."""
-        return 0.0 if self._renderer is None else self._renderer.seconds
+        self._most = min(most, _MOST_DRAWN)
+        self.drawing = 0.0
+        self._count = 0
+        self._renderer: StateRenderer | None = None
+        self._cameras = color_cameras(context.cfg.scene.cameras)
+        # Steps from one image to the next, as the environment draws them
+        hz = context.cfg.task.control_hz
+        self._every = {name: round(hz / (each.rate or hz)) for name, each in self._cameras.items()}
 
     def close(self) -> None:
         """Give back what draws."""
@@ -48,14 +53,15 @@ class EpisodeSource:
             self._renderer.close()
 
     def episodes(self, played: Played, worlds: Sequence[int]) -> Iterator[EpisodeData]:
-        """Some worlds' episodes, with their images if there are cameras."""
+        """Some worlds' episodes, with their images if there are cameras.
+
+        Raises:
+            MjstackError: The worlds in which images are drawn do not fit into memory.
+        """
         rows = [played.worlds.index(world) for world in worlds]
         images: Iterator[dict[str, np.ndarray]] = itertools.repeat({})
         if played.states is not None and rows:
-            if self._renderer is None:
-                count = min(self._most, len(played.worlds), _MOST_DRAWN)
-                self._renderer = EpisodeRenderer(self._context, count)
-            images = self._renderer.episodes(played, rows)
+            images = self._images(played, rows)
         for (row, arrays), shown in zip(played.episodes(rows), images, strict=False):
             yield self._episode(played, row, arrays, shown)
 
@@ -86,41 +92,16 @@ class EpisodeSource:
             },
         )
 
-
-class EpisodeRenderer:
-    """Draws the images of episodes after they have been judged, as many steps at once as there are
-    worlds.
-
-    Attributes:
-        seconds: Time that it took [s].
-    """
-
-    def __init__(self, context: RunContext, count: int) -> None:
-        """Make worlds in which ``count`` states are drawn at once.
-
-        Raises:
-            MjstackError: They do not fit into memory.
-        """
-        cfg = context.cfg
-        cameras = color_cameras(cfg.scene.cameras)
-        cfg = replace(cfg, scene=replace(cfg.scene, cameras=cameras))
-        backend, device = context.backend
-        fields = required_fields(cfg.reset)
-        self.seconds = 0.0
-        self._count = count
-        self._renderer = StateRenderer(
-            context.model, cfg, count, backend=backend, device=device, fields=fields
-        )
-        # Steps from one image to the next, as the environment draws them
-        hz = cfg.task.control_hz
-        self._sizes = {name: each.size for name, each in cameras.items()}
-        self._every = {name: round(hz / (each.rate or hz)) for name, each in cameras.items()}
-
-    def episodes(self, played: Played, rows: Sequence[int]) -> Iterator[dict[str, np.ndarray]]:
+    def _images(self, played: Played, rows: Sequence[int]) -> Iterator[dict[str, np.ndarray]]:
         """Images of some worlds' episodes on the host, by column, each ``(steps, height, width,
         3)``, uint8.
         """
         assert played.states is not None
+        if self._renderer is None:
+            self._count = min(self._most, len(played.worlds))
+            self._renderer = self._context.stage.color_renderer(
+                self._count, required_fields(self._context.cfg.reset)
+            )
         steps = len(played.states)
         step = math.gcd(*self._every.values())
         states = played.states[::step]
@@ -133,8 +114,8 @@ class EpisodeRenderer:
                 name: values[some.to(values.device)].repeat_interleave(len(states), 0)
                 for name, values in played.fields.items()
             }
-            drawn = self._draw(shown, fields)
-            self.seconds += time.perf_counter() - began
+            drawn = self._draw(self._renderer, shown, fields)
+            self.drawing += time.perf_counter() - began
             for row in range(len(some)):
                 rows_of = slice(row * len(states), (row + 1) * len(states))
                 episode = {}
@@ -145,20 +126,16 @@ class EpisodeRenderer:
                     episode[f"{IMAGES}.{name}"] = images
                 yield episode
 
-    def close(self) -> None:
-        """Give the worlds back."""
-        self._renderer.close()
-
     def _draw(
-        self, qpos: torch.Tensor, fields: Mapping[str, torch.Tensor]
+        self, renderer: StateRenderer, qpos: torch.Tensor, fields: Mapping[str, torch.Tensor]
     ) -> dict[str, np.ndarray]:
         """Images of any number of states by camera, on the host."""
-        shapes = {name: (len(qpos), *size, 3) for name, size in self._sizes.items()}
+        shapes = {name: (len(qpos), *each.size, 3) for name, each in self._cameras.items()}
         out = {name: np.empty(shape, np.uint8) for name, shape in shapes.items()}
         for first in range(0, len(qpos), self._count):
             rows = slice(first, first + self._count)
             looks = {name: values[rows] for name, values in fields.items()}
-            images = self._renderer.draw(qpos[rows], looks)
+            images = renderer.draw(qpos[rows], looks)
             for name, whole in out.items():
                 torch.from_numpy(whole[rows]).copy_(images[f"images.{name}"])
         return out

@@ -3,8 +3,8 @@ MuJoCo.
 """
 
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
+from typing import cast
 
 import mujoco
 import numpy as np
@@ -42,15 +42,16 @@ def check_export(cfg: Config) -> CheckedJob:
             "Play it with controller=policy",
         )
     title = f"task {cfg.task.name}, policy {context.stage.policy.folder}"
-    return CheckedJob(context=context, title=title, work=_export)
+    return CheckedJob(
+        context=context,
+        title=title,
+        work=lambda context, folder: run_guarded(context, NAME, export_policy),
+    )
 
 
-def _export(context: RunContext, folder: Path) -> None:
-    run_guarded(context, NAME, partial(export_policy, folder))
-
-
-def export_policy(folder: Path, context: RunContext) -> list[GateResult]:
+def export_policy(context: RunContext) -> list[GateResult]:
     """Write both files, or none."""
+    folder = cast(Path, context.folder)
     policy = context.stage.policy
     facts = export_facts(context.cfg, policy)
     files = {MODEL: _model_bytes(context.model), POLICY: to_onnx(policy.network, facts)}

@@ -192,9 +192,8 @@ def _check_resumed(context: RunContext, name: str) -> list[str]:
     run = EarlierRun.read(name, "resume")
     theirs, ours = (_played_config(cfg) for cfg in (run.cfg, context.cfg))
     if found := differences(theirs, ours):
-        more = f", and {len(found) - 3} more keys" if len(found) > 3 else ""
         raise RunError(
-            f"resume={name}: has a run of another configuration: {'; '.join(found[:3])}{more}.",
+            f"resume={name}: has a run of another configuration: {found}.",
             "Name another folder, or set these keys back",
         )
     if run.provenance.get("model_sha256") != run_provenance(context)["model_sha256"]:

@@ -16,7 +16,7 @@ import torch
 from mjstack.config.schema import Config, PlayJobCfg
 from mjstack.episodes.context import RunContext, judge_one
 from mjstack.episodes.motion import show_world
-from mjstack.episodes.replay import simulate_one
+from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import POLICY, WorldRecorder, play_episode, rollout
 from mjstack.errors import ConfigError
 from mjstack.gates.runner import run_guarded
@@ -27,7 +27,6 @@ from mjstack.report.gl import require_offscreen
 from mjstack.report.picture import save_video
 from mjstack.report.record import GateResult, Status
 from mjstack.report.write import safely_write
-from mjstack.sim import StateRenderer
 
 NAME = "play"
 _MOST = 64  # worlds of a video
@@ -55,11 +54,11 @@ def check_play(cfg: Config) -> CheckedJob:
         require_offscreen(context.model)
     driver = "a policy" if cfg.controller.name == POLICY else "the expert"
     title = f"task {cfg.task.name}, {cfg.nworld} worlds with {driver}"
-    return CheckedJob(context=context, title=title, work=_play)
-
-
-def _play(context: RunContext, folder: Path) -> None:
-    run_guarded(context, NAME, play_worlds)
+    return CheckedJob(
+        context=context,
+        title=title,
+        work=lambda context, folder: run_guarded(context, NAME, play_worlds),
+    )
 
 
 def play_worlds(context: RunContext) -> list[GateResult]:
@@ -71,7 +70,7 @@ def play_worlds(context: RunContext) -> list[GateResult]:
     fields = []
     details = []
     good = 0
-    with closing(simulate_one(context, *context.backend)) as sim:
+    with closing(simulate_alone(context, *context.backend)) as sim:
         for world in range(cfg.nworld):
             env = context.start(sim, cfg.reset, worlds=[world])
             driver = context.driver(env)
@@ -137,12 +136,9 @@ def _save_by_camera(
     *args: object,
 ) -> None:
     """Call `save_video` so that a camera of the scene draws, each world in its own looks."""
-    cfg = context.cfg
-    name = cast(str, cast(PlayJobCfg, cfg.job).camera)
-    camera = replace(cfg.scene.cameras[name], outputs=["rgb"])
-    one = replace(cfg, scene=replace(cfg.scene, cameras={name: camera}))
+    name = cast(str, cast(PlayJobCfg, context.cfg.job).camera)
     looks = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
-    renderer = StateRenderer(context.model, one, len(qpos), fields=list(looks))
+    renderer = context.stage.color_renderer(len(qpos), list(looks), [name])
 
     def draw(states: np.ndarray) -> np.ndarray:
         images = renderer.draw(torch.from_numpy(states), looks)

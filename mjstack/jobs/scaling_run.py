@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mjstack.config.session import search_path_args
+from mjstack.config.session import quoted, search_path_args
 from mjstack.errors import is_out_of_memory
 from mjstack.files import write_atomic
 from mjstack.interrupt import check_interrupt
@@ -66,8 +66,7 @@ def run_process(
     if folder.exists():
         shutil.rmtree(folder)  # an earlier try's
     folder.mkdir(parents=True)
-    target = str(folder).replace("\\", "\\\\").replace("'", "\\'")
-    command = own_command([*overrides, *search_path_args(), f"hydra.run.dir='{target}'"])
+    command = own_command([*overrides, *search_path_args(), f"hydra.run.dir={quoted(folder)}"])
     began = time.monotonic()
     with (folder / "output.log").open("w") as log:
         process = subprocess.Popen(

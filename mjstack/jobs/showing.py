@@ -2,9 +2,8 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -36,8 +35,7 @@ from mjstack.report.web import (
     stop_server,
 )
 from mjstack.report.write import safely_write
-from mjstack.sim import Simulation, StateRenderer
-from mjstack.sim.cameras import color_cameras
+from mjstack.sim import Simulation
 
 
 def check_showing(cfg: Config, ending: str = ".mp4") -> None:
@@ -117,7 +115,7 @@ def serve_live_view(context: RunContext, console: Console) -> Iterator[LiveView 
             LiveView(
                 server,
                 lambda: context.stage.visual_model,
-                renderer=partial(camera_renderer, context) if cfg.scene.cameras else None,
+                renderer=partial(context.stage.color_renderer, 1) if cfg.scene.cameras else None,
                 pausable=context.ranks.size == 1,
                 print_line=console.print,
             )
@@ -125,14 +123,6 @@ def serve_live_view(context: RunContext, console: Console) -> Iterator[LiveView 
             yield live
     finally:
         stop_server(server)
-
-
-def camera_renderer(context: RunContext, fields: Sequence[str]) -> StateRenderer:
-    """A renderer of one world's cameras for the live view, on the backend of the batch."""
-    cfg = context.cfg
-    colors = replace(cfg, scene=replace(cfg.scene, cameras=color_cameras(cfg.scene.cameras)))
-    backend, device = context.backend
-    return StateRenderer(context.model, colors, 1, backend=backend, device=device, fields=fields)
 
 
 def find_viewers(context: RunContext) -> list[Observer]:

@@ -17,7 +17,7 @@ from typing import IO, Any
 
 import torch
 
-from mjstack.config.session import search_path_args
+from mjstack.config.session import quoted, search_path_args
 from mjstack.errors import ConfigError, FolderError
 from mjstack.files import write_atomic
 from mjstack.interrupt import interrupted
@@ -277,9 +277,9 @@ def _start(job: SweepJob, slot: Slot, log: IO[bytes], held: IO[bytes] | None) ->
     earlier = read_report(job.folder, job.overrides)
     args = list(job.overrides)
     if earlier is not None and earlier.resumes == "gates":
-        args.append(f"resume={_quoted(job.folder)}")
+        args.append(f"resume={quoted(job.folder)}")
     else:
-        args.append(f"hydra.run.dir={_quoted(job.folder)}")
+        args.append(f"hydra.run.dir={quoted(job.folder)}")
         if earlier is None or not earlier.resumes:  # nothing that another process can use
             for path in [path for path in job.folder.iterdir() if path.name != LOG]:
                 (shutil.rmtree if path.is_dir() and not path.is_symlink() else os.remove)(path)
@@ -296,11 +296,6 @@ def _start(job: SweepJob, slot: Slot, log: IO[bytes], held: IO[bytes] | None) ->
         with suppress(OSError):  # it may have ended
             os.sched_setaffinity(process.pid, slot.cores)
     return _Running(job, process, log, logged, held, time.monotonic())
-
-
-def _quoted(path: Path) -> str:
-    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
 
 
 def _conclude(one: _Running, code: int) -> Report:

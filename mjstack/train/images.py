@@ -3,7 +3,6 @@ on the device.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -12,8 +11,6 @@ from mjstack.config.schema import VisionCfg
 from mjstack.episodes.context import RunContext
 from mjstack.managers.episode import required_fields
 from mjstack.policy import Vision
-from mjstack.sim import StateRenderer
-from mjstack.sim.cameras import color_cameras
 from mjstack.train.demonstrations import Demonstrations
 
 _OWN = 2**40  # seeds that nothing else has
@@ -69,13 +66,8 @@ class ImagePool:
             self._fresh = min(_AT_ONCE, len(steps))
         rows = len(steps) if self._whole else -(-settings.pool // self._fresh) * self._fresh
         self._count = -(-rows // self._fresh)
-        cfg = context.cfg
-        cameras = color_cameras(cfg.scene.cameras, self._names)
-        cfg = replace(cfg, scene=replace(cfg.scene, cameras=cameras))
-        backend, where = context.backend
-        fields = required_fields(cfg.reset)
-        self._renderer = StateRenderer(
-            context.model, cfg, self._fresh, backend=backend, device=where, fields=fields
+        self._renderer = context.stage.color_renderer(
+            self._fresh, required_fields(context.cfg.reset), self._names
         )
         self._generator = torch.Generator(device)
         self._seed = _OWN + seed
