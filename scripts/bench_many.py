@@ -26,11 +26,12 @@ from mjstack.process import own_command  # noqa: E402
 from mjstack.report.picture import figure  # noqa: E402
 from mjstack.report.table import Console, Table, to_document  # noqa: E402
 
-FIGURES = {
-    "physics": ("throughput", "physics.world_steps_per_s.median"),
-    "episode": ("throughput", "episode.world_steps_per_s.median"),
-    "env.step": ("throughput", "env_step.env_steps_per_s.median"),
+SPEEDS = {
+    "physics": "physics.world_steps_per_s.median",
+    "episode": "episode.world_steps_per_s.median",
+    "env.step": "env_step.env_steps_per_s.median",
 }
+FIGURES = (*SPEEDS, "batch", "samples/s", "gate runs/h")
 SWEEP = 8  # jobs
 Run = dict[str, Any]
 """``what``, ``worlds`` (as on the command line), ``gpus``, ``round``, ``seconds`` of the whole
@@ -81,7 +82,7 @@ def read(what: str, folder: Path, gpus: int, seconds: float) -> dict[str, float]
     found = {"succeeded": batch["succeeded"], "episodes": batch["episodes"]}
     if "world_steps_per_s" in batch:  # void where worlds failed
         found["batch"] = batch["world_steps_per_s"]
-    for name, (_, key) in FIGURES.items():
+    for name, key in SPEEDS.items():
         key = f"all_ranks.{key}" if gpus > 1 else key
         if key in speed:
             found[name] = speed[key]
@@ -94,7 +95,7 @@ def rows_of(runs: list[Run]) -> list[dict[str, Any]]:
     for what, worlds in dict.fromkeys((run["what"], run["worlds"]) for run in runs):
         mine = [run for run in runs if (run["what"], run["worlds"]) == (what, worlds)]
         for gpus in sorted({run["gpus"] for run in mine} - {1}):
-            names = dict.fromkeys(name for run in mine for name in run if name in UNITS)
+            names = dict.fromkeys(name for run in mine for name in run if name in FIGURES)
             for name in names:
                 pairs = [
                     (one[name], many[name])
@@ -121,16 +122,6 @@ def rows_of(runs: list[Run]) -> list[dict[str, Any]]:
                         }
                     )
     return rows
-
-
-UNITS = {
-    "physics": "world-steps/s",
-    "episode": "world-steps/s",
-    "batch": "world-steps/s",
-    "env.step": "env-steps/s",
-    "samples/s": "samples/s",
-    "gate runs/h": "runs/h",
-}
 
 
 def write(folder: Path, runs: list[Run]) -> None:

@@ -113,7 +113,7 @@ class _Player:
         context = self.context
         tally = self.tally
         shows = records_motion(context) and seed == context.cfg.seed
-        record = context.ranks.from_first(partial(_read, context, tally.gate, seed))
+        record = context.ranks.from_first(partial(self._read, seed))
         if record is not None:
             tally.again.append(seed)
             if shows:
@@ -127,12 +127,68 @@ class _Player:
         )
         if tally.first is None:
             tally.first = episode
-        part = _record(context, self.sim, seed, episode, monitors)
+        part = self._record(seed, episode, monitors)
         record = EpisodeRecord.join(context.ranks.gather(part))
-        _write(record, tally)
+        self._write(record)
         for recorder in recorders:
             show_batch(context, tally.gate, recorder, record.failed)
         return record
+
+    def _read(self, seed: int) -> EpisodeRecord | None:
+        """The results of a seed that an earlier call of the run has left."""
+        cfg = self.context.cfg
+        folder = self.context.folder
+        if cfg.resume is None or folder is None:
+            return None
+        record = EpisodeRecord.read(folder, seed, self.tally.gate, whole=True)
+        if record is not None and len(record.failed) != cfg.nworld:
+            raise RunError(
+                f"resume={folder}: has {len(record.failed)} worlds of seed {seed}, expected"
+                f" {cfg.nworld}. Name another folder."
+            )
+        return record
+
+    def _record(
+        self, seed: int, episode: Episode, monitors: Sequence[FailureMonitor]
+    ) -> EpisodeRecord:
+        """The record of this rank's worlds."""
+        sim = self.sim
+        ranks = self.context.ranks
+        place = f"rank {ranks.rank}: {socket.gethostname()}, {sim.device}"
+        return EpisodeRecord(
+            seed=seed,
+            backend=sim.backend,
+            device=str(sim.device),
+            failed=episode.failed,
+            values=episode.values,
+            qpos=sim.qpos.cpu().numpy().copy(),
+            start=episode.start,
+            circumstances=Circumstances.of(episode, monitors[0]) if monitors else None,
+            measured={
+                "waypoint_error_m": episode.waypoint_error,
+                "peak_contacts": sim.peak_contacts.cpu().numpy().copy(),
+                "peak_constraint_rows": sim.peak_constraints.cpu().numpy().copy(),
+            },
+            seconds=episode.timing.seconds,
+            steps=int(sim.step_count.sum()),
+            ranks={self.context.worlds.start: place} if ranks.size > 1 else {},
+        )
+
+    def _write(self, record: EpisodeRecord) -> None:
+        """Write the seed's record, before the next one can break or be stopped. A full disk takes
+        no result back.
+        """
+        tally = self.tally
+        if tally.path is None:
+            return
+        try:
+            record.write(tally.path.parent, tally.gate)
+        except OSError as error:
+            log.exception("the record of seed %d was not written", record.seed)
+            tally.details.append(
+                f"seed {record.seed}: no record of its {tally.noun} could be written"
+                f" ({error.strerror})"
+            )
 
 
 def _worlds(tally: EpisodeTally, context: RunContext) -> Worlds:
@@ -165,65 +221,8 @@ def _worlds(tally: EpisodeTally, context: RunContext) -> Worlds:
     return worlds
 
 
-def _read(context: RunContext, gate: str, seed: int) -> EpisodeRecord | None:
-    """The results of a seed that an earlier call of the run has left."""
-    if context.cfg.resume is None or context.folder is None:
-        return None
-    record = EpisodeRecord.read(context.folder, seed, gate, whole=True)
-    if record is not None and len(record.failed) != context.cfg.nworld:
-        raise RunError(
-            f"resume={context.folder}: has {len(record.failed)} worlds of seed {seed}, expected"
-            f" {context.cfg.nworld}. Name another folder."
-        )
-    return record
-
-
-def _record(
-    context: RunContext,
-    sim: Simulation,
-    seed: int,
-    episode: Episode,
-    monitors: Sequence[FailureMonitor],
-) -> EpisodeRecord:
-    """The record of this rank's worlds."""
-    place = f"rank {context.ranks.rank}: {socket.gethostname()}, {sim.device}"
-    return EpisodeRecord(
-        seed=seed,
-        backend=sim.backend,
-        device=str(sim.device),
-        failed=episode.failed,
-        values=episode.values,
-        qpos=sim.qpos.cpu().numpy().copy(),
-        start=episode.start,
-        circumstances=Circumstances.of(episode, monitors[0]) if monitors else None,
-        measured={
-            "waypoint_error_m": episode.waypoint_error,
-            "peak_contacts": sim.peak_contacts.cpu().numpy().copy(),
-            "peak_constraint_rows": sim.peak_constraints.cpu().numpy().copy(),
-        },
-        seconds=episode.timing.seconds,
-        steps=int(sim.step_count.sum()),
-        ranks={context.worlds.start: place} if context.ranks.size > 1 else {},
-    )
-
-
 def _runs(numbers: Sequence[int]) -> Iterator[str]:
     """Ascending numbers in words, neighbours as ``3 to 7``."""
     for _, group in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
         run = [number for _, number in group]
         yield str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}"
-
-
-def _write(record: EpisodeRecord, tally: EpisodeTally) -> None:
-    """Write the seed's record, before the next one can break or be stopped. A full disk takes no
-    result back.
-    """
-    if tally.path is None:
-        return
-    try:
-        record.write(tally.path.parent, tally.gate)
-    except OSError as error:
-        log.exception("the record of seed %d was not written", record.seed)
-        tally.details.append(
-            f"seed {record.seed}: no record of its {tally.noun} could be written ({error.strerror})"
-        )

@@ -4,6 +4,7 @@ import gc
 import os
 import time
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 import torch
@@ -168,7 +169,7 @@ def _on_environment(
     gc.collect()
     began = time.perf_counter()
     cfg = decided_every_step(context.cfg)
-    env = build_env(
+    made = build_env(
         cfg if cameras else without_images(cfg),
         model=context.model,
         backend=backend,
@@ -176,8 +177,8 @@ def _on_environment(
         sizes=context.env_sizes,
     )
     build_seconds = time.perf_counter() - began
-    result.notes.setdefault("backend", env.sim.description)
-    try:
+    with closing(made) as env:
+        result.notes.setdefault("backend", env.sim.description)
         found = measure_env_step(
             env,
             steps=cfg.gate.throughput.env_steps,
@@ -190,8 +191,6 @@ def _on_environment(
         if env.sim.sizes is not None:
             found.notes["sizes"] = str(env.sim.sizes)
         return found
-    finally:
-        env.close()
 
 
 def _draws(context: RunContext, backend: Backend, found: dict[str, Measurement]) -> bool:

@@ -5,6 +5,7 @@ asked for are there.
 import json
 import os
 import time
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -81,16 +82,14 @@ def plan_collection(context: RunContext) -> CollectPlan:
     """
     cfg = context.cfg
     shown = demonstration_config(cfg)
-    env = build_env(shown, model=context.model, nworld=2, backend=Backend.native, device="cpu")
-    try:
+    made = build_env(shown, model=context.model, nworld=2, backend=Backend.native, device="cpu")
+    with closing(made) as env:
         if cast(CollectJobCfg, cfg.job).episodes > 1:
             _check_starts(env)
         plan = CollectPlan.of(context, collect_folder(cfg), env)
         if cfg.scene.cameras:
             _check_images(cfg, plan)
         return plan
-    finally:
-        env.close()
 
 
 def _check_images(cfg: Config, plan: CollectPlan) -> None:

@@ -2,6 +2,7 @@
 MuJoCo.
 """
 
+from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import cast
@@ -85,11 +86,8 @@ def export_facts(cfg: Config, policy: Policy) -> dict:
     own = driven_config(cfg)
     own.observation = {policy.group: policy.observation}
     own.action = policy.action or own.action
-    env = build_env(own, nworld=1, backend=Backend.native, device="cpu")
-    try:
+    with closing(build_env(own, nworld=1, backend=Backend.native, device="cpu")) as env:
         return policy_facts(policy) | _scene_facts(env, policy)
-    finally:
-        env.close()
 
 
 def _scene_facts(env: Env, policy: Policy) -> dict:

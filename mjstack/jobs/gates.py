@@ -1,6 +1,6 @@
 """Job *gates*: a configuration and a folder in, gates run, a report left behind."""
 
-import contextlib
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,7 @@ import torch
 from mjstack.config.fingerprint import config_content, differences
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.tilt import turn_sign
-from mjstack.envs import build_env
-from mjstack.envs.build import driven_config
+from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.earlier_run import REPORT, EarlierRun, archive_starts, archived_starts
 from mjstack.episodes.rollout import CLOSED_LOOP, POLICY, STATE_BASED
@@ -75,7 +74,7 @@ def _check_starts(context: RunContext) -> None:
     """Raise if worlds cannot start as a gate has them, by the key that says so."""
     cfg = context.cfg
     if "capacity" in cfg.gates:
-        with contextlib.suppress(Unreachable):  # the gate reports it
+        with suppress(Unreachable):  # the gate reports it
             own = driven_config(cfg, cfg.gate.capacity.reset)
             check_env(context, own, reset="gate.capacity.reset")
     if "success" in cfg.gates:
@@ -145,12 +144,9 @@ def check_driver(context: RunContext) -> None:
     ones.
     """
     cfg = context.driven({})
-    env = build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu")
-    try:
+    with closing(_one_world(context, cfg)) as env:
         env.reset()
         context.driver(env)
-    finally:
-        env.close()
 
 
 def check_env(context: RunContext, cfg: Config, **keys: str) -> None:
@@ -158,7 +154,11 @@ def check_env(context: RunContext, cfg: Config, **keys: str) -> None:
     each group whose terms come from elsewhere.
     """
     with renamed_keys(keys):
-        build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu").close()
+        _one_world(context, cfg).close()
+
+
+def _one_world(context: RunContext, cfg: Config) -> Env:
+    return build_env(cfg, model=context.model, nworld=1, backend=Backend.native, device="cpu")
 
 
 def check_gates(cfg: Config) -> CheckedJob:

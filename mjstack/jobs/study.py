@@ -100,8 +100,7 @@ def _measure(context: RunContext, base: HeldPhysics, steps: int) -> Row:
     """
     cfg = context.cfg
     job = cast(StudyJobCfg, cfg.job)
-    sim = _simulation(context)
-    try:
+    with closing(_simulation(context)) as sim:
         # The episode
         result = context.play(sim, cfg.reset).result
         failed = result.failed.cpu().numpy()
@@ -134,8 +133,6 @@ def _measure(context: RunContext, base: HeldPhysics, steps: int) -> Row:
                 if problem := describe_lost(one.lost):
                     raise MjstackError(f"no time: {problem} (of {sim.nworld}).")
             context.advance("repetitions", repetition + 1, job.repetitions)
-    finally:
-        sim.close()
     ratios = [a / b for a, b in zip(times[ours], times[base], strict=True)]
     for name, values in (("ms", times[ours]), ("ratio", ratios)):
         row |= {f"{name}_min": min(values), f"{name}_max": max(values)}

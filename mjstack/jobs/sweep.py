@@ -61,6 +61,12 @@ class _Running:
     held: IO[bytes] | None
     began: float
 
+    def close(self) -> None:
+        """Give the locks of the job and of its GPU back."""
+        self.log.close()
+        if self.held is not None:
+            self.held.close()
+
 
 @contextmanager
 def shared_sweep(folder: Path, jobs: Sequence[SweepJob] = ()) -> Iterator[Path]:
@@ -300,9 +306,7 @@ def _start(job: SweepJob, slot: Slot, log: IO[bytes], held: IO[bytes] | None) ->
 
 def _conclude(one: _Running, code: int) -> Report:
     """The report of a job whose process has ended."""
-    one.log.close()
-    if one.held is not None:
-        one.held.close()
+    one.close()
     report = read_report(one.job.folder, one.job.overrides)
     if report is not None and report.status in _ENDED:
         return report
@@ -330,6 +334,4 @@ def _stop(running: dict[Slot, _Running]) -> None:
         except subprocess.TimeoutExpired:
             one.process.kill()
             one.process.wait()
-        one.log.close()
-        if one.held is not None:
-            one.held.close()
+        one.close()

@@ -30,17 +30,19 @@ Frames = Callable[[Sequence[int]], Iterator[np.ndarray]]
 
 
 @contextmanager
-def figure(path: Path, title: str, columns: int = 1, **options: Any) -> Iterator[tuple[Any, Any]]:
-    """Make a figure with panels side by side by options of ``plt.subplots``, and save it when the
-    block ends.
+def figure(
+    path: Path, title: str, columns: int = 1, rows: int = 1, **options: Any
+) -> Iterator[tuple[Any, Any]]:
+    """Make a figure with panels by options of ``plt.subplots``, and save it when the block ends.
 
     Yields:
         The figure, and its axes: an array unless there is one panel.
     """
-    drawn, axes = plt.subplots(1, columns, layout="constrained", **options)
+    drawn, axes = plt.subplots(rows, columns, layout="constrained", **options)
     try:
         yield drawn, axes
-        drawn.suptitle(title, wrap=True)
+        if title:
+            drawn.suptitle(title, wrap=True)
         drawn.savefig(path, dpi=100)
     finally:
         plt.close(drawn)
@@ -256,10 +258,8 @@ def save_images(
 ) -> None:
     """Save images, each of shape ``(height, width, 3)``, uint8, in named rows and columns."""
     size = (2.6 * len(columns), 2.6 * len(rows))
-    drawn, axes = plt.subplots(
-        len(rows), len(columns), layout="constrained", figsize=size, squeeze=False
-    )
-    try:
+    panels = figure(path, "", len(columns), len(rows), figsize=size, squeeze=False)
+    with panels as (_, axes):
         for line, (name, images) in zip(axes, rows.items(), strict=True):
             line[0].set_ylabel(name)
             for axis, image in zip(line, images, strict=True):
@@ -267,9 +267,6 @@ def save_images(
                 axis.set(xticks=[], yticks=[])
         for axis, name in zip(axes[0], columns, strict=True):
             axis.set_title(name)
-        drawn.savefig(path, dpi=100)
-    finally:
-        plt.close(drawn)
 
 
 def save_curves(

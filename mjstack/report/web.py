@@ -262,7 +262,6 @@ def save_episode(
         frame_dt: Time between two frames [s].
 
     Raises:
-        MissingExtra: viser is not installed.
         OSError: The file cannot be written.
     """
     server = start_server("127.0.0.1", 0)
@@ -310,14 +309,9 @@ def check_address(host: str, port: int) -> None:
 def start_server(host: str, port: int) -> Any:
     """A viser server; port 0 is any that is free. Ask `check_address` of others: where one is in
     use, viser tries the next ones and then hangs.
-
-    Raises:
-        MissingExtra: viser is not installed.
     """
-    try:
-        import viser
-    except ImportError as error:
-        raise MissingExtra("view=web", "viser", "web") from error
+    import viser
+
     logging.getLogger("websockets").setLevel(logging.WARNING)
     with contextlib.redirect_stdout(io.StringIO()):  # its banner
         return viser.ViserServer(host=host, port=port, verbose=False)
