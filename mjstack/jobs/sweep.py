@@ -307,9 +307,8 @@ def _start(job: SweepJob, slot: Slot, log: IO[bytes], held: IO[bytes] | None) ->
 def _conclude(one: _Running, code: int) -> Report:
     """The report of a job whose process has ended."""
     one.close()
-    report = read_report(one.job.folder, one.job.overrides)
-    if report is not None and report.status in _ENDED:
-        return report
+    if (done := _result(one.job)) is not None:
+        return done
     with (one.job.folder / LOG).open("rb") as log:
         log.seek(one.logged)
         lines = log.read().decode(errors="replace").splitlines()

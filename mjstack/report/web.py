@@ -161,9 +161,8 @@ class Stage:
         low, high = shapes.box
         self._offsets = _grid(count, high[:2] - low[:2] + _MARGIN)
         self._handles: list[tuple[int, Any]] = []
-        self._last: list[tuple[np.ndarray, np.ndarray]] = []
-        places, turns = shapes.poses(np.repeat(shapes.model.qpos0[None], count, 0))
-        places, turns = self._round(places, turns)
+        places, turns = self._round(*shapes.poses(np.repeat(shapes.model.qpos0[None], count, 0)))
+        self._last = (places, turns)
         for number, (body, rgba, vertices, faces) in enumerate(shapes):
             color = np.repeat(np.array(rgba[:3])[None], count, 0)
             if body == 0:
@@ -183,7 +182,6 @@ class Stage:
                 lod="off",
             )
             self._handles.append((body, handle))
-        self._last = [(places[:, body], turns[:, body]) for body in range(len(shapes.bodies))]
 
         # Texts, the floor, and where one looks from
         for world, text in enumerate(labels):
@@ -223,13 +221,13 @@ class Stage:
         nothing.
         """
         places, turns = self._round(*self._shapes.poses(qpos))
+        old_places, old_turns = self._last
         for body, handle in self._handles:
-            old_place, old_turn = self._last[body]
-            if not np.array_equal(old_place, places[:, body]):
+            if not np.array_equal(old_places[:, body], places[:, body]):
                 handle.batched_positions = places[:, body]
-            if not np.array_equal(old_turn, turns[:, body]):
+            if not np.array_equal(old_turns[:, body], turns[:, body]):
                 handle.batched_wxyzs = turns[:, body]
-        self._last = [(places[:, body], turns[:, body]) for body in range(places.shape[1])]
+        self._last = (places, turns)
 
     def _round(self, places: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses in the scene, with as many bits as eyes need: the file is compressed."""
