@@ -373,11 +373,7 @@ def _print_sweep(folder: Path, count: int) -> None:
     columns = ["job", "overrides", *names, "status"]
     rows = [
         {gate.name: f"{gate.status}: {gate.reason}" for gate in result.gates}
-        | {
-            "job": str(job),
-            "overrides": " ".join(result.overrides),
-            "status": result.status,
-        }
+        | {"job": str(job), "overrides": " ".join(result.overrides), "status": result.status}
         for job, result in enumerate(_results)
     ]
     title = f"sweep of {max(count, len(rows))} jobs"

@@ -17,13 +17,7 @@ from mjstack.bench.timing import (
 )
 from mjstack.drivers.driver import Recorded
 from mjstack.episodes.context import RunContext
-from mjstack.episodes.rollout import (
-    FEEDBACK,
-    CommandRecorder,
-    Episode,
-    Observer,
-    rollout,
-)
+from mjstack.episodes.rollout import FEEDBACK, CommandRecorder, Episode, Observer, rollout
 from mjstack.errors import name_worlds
 from mjstack.sim import Simulation
 

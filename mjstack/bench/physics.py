@@ -60,12 +60,7 @@ class HeldPhysics:
 
 
 def measure_physics(
-    context: RunContext,
-    sim: Simulation,
-    *,
-    seconds: float,
-    repetitions: int,
-    meter: EnergyMeter,
+    context: RunContext, sim: Simulation, *, seconds: float, repetitions: int, meter: EnergyMeter
 ) -> Measurement:
     """Measure physics steps under a held joint target, the object in hand.
 

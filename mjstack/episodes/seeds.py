@@ -127,7 +127,7 @@ class _Player:
         )
         if tally.first is None:
             tally.first = episode
-        part = self._record(seed, episode, monitors)
+        part = _record(context, self.sim, seed, episode, monitors)
         record = EpisodeRecord.join(context.ranks.gather(part))
         self._write(record)
         for recorder in recorders:
@@ -147,32 +147,6 @@ class _Player:
                 f" {cfg.nworld}. Name another folder."
             )
         return record
-
-    def _record(
-        self, seed: int, episode: Episode, monitors: Sequence[FailureMonitor]
-    ) -> EpisodeRecord:
-        """The record of this rank's worlds."""
-        sim = self.sim
-        ranks = self.context.ranks
-        place = f"rank {ranks.rank}: {socket.gethostname()}, {sim.device}"
-        return EpisodeRecord(
-            seed=seed,
-            backend=sim.backend,
-            device=str(sim.device),
-            failed=episode.failed,
-            values=episode.values,
-            qpos=sim.qpos.cpu().numpy().copy(),
-            start=episode.start,
-            circumstances=Circumstances.of(episode, monitors[0]) if monitors else None,
-            measured={
-                "waypoint_error_m": episode.waypoint_error,
-                "peak_contacts": sim.peak_contacts.cpu().numpy().copy(),
-                "peak_constraint_rows": sim.peak_constraints.cpu().numpy().copy(),
-            },
-            seconds=episode.timing.seconds,
-            steps=int(sim.step_count.sum()),
-            ranks={self.context.worlds.start: place} if ranks.size > 1 else {},
-        )
 
     def _write(self, record: EpisodeRecord) -> None:
         """Write the seed's record, before the next one can break or be stopped. A full disk takes
@@ -219,6 +193,35 @@ def _worlds(tally: EpisodeTally, context: RunContext) -> Worlds:
         ways = [(world.label, world.failed, world.qpos[:, xy]) for world in moving]
         worlds.maps.append(Map(title=name, xy=start[:, xy], table=table, ways=ways))
     return worlds
+
+
+def _record(
+    context: RunContext,
+    sim: Simulation,
+    seed: int,
+    episode: Episode,
+    monitors: Sequence[FailureMonitor],
+) -> EpisodeRecord:
+    """The record of this rank's worlds."""
+    place = f"rank {context.ranks.rank}: {socket.gethostname()}, {sim.device}"
+    return EpisodeRecord(
+        seed=seed,
+        backend=sim.backend,
+        device=str(sim.device),
+        failed=episode.failed,
+        values=episode.values,
+        qpos=sim.qpos.cpu().numpy().copy(),
+        start=episode.start,
+        circumstances=Circumstances.of(episode, monitors[0]) if monitors else None,
+        measured={
+            "waypoint_error_m": episode.waypoint_error,
+            "peak_contacts": sim.peak_contacts.cpu().numpy().copy(),
+            "peak_constraint_rows": sim.peak_constraints.cpu().numpy().copy(),
+        },
+        seconds=episode.timing.seconds,
+        steps=int(sim.step_count.sum()),
+        ranks={context.worlds.start: place} if context.ranks.size > 1 else {},
+    )
 
 
 def _runs(numbers: Sequence[int]) -> Iterator[str]:

@@ -102,11 +102,7 @@ def run_capacity(context: RunContext) -> list[GateResult]:
     used = f"{peaks.contacts.max()} of {share:g} contacts, {peaks.rows.max()} of {task.sizes.njmax}"
     result.reason = "; ".join(problems) or f"{used} rows, at most, in {nworld} worlds"
     result.status = Status.failed if problems else Status.passed
-    result.thresholds = {
-        "contacts_per_world": share,
-        "njmax": task.sizes.njmax,
-        "margin": t.margin,
-    }
+    result.thresholds = {"contacts_per_world": share, "njmax": task.sizes.njmax, "margin": t.margin}
     result.notes |= {"backend": task_run.description, "sizes_from": task.sizes.source}
     for group in (task, env):
         _report(context, group, result)

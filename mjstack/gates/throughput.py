@@ -112,11 +112,7 @@ def _describe(one: Measurement, on_cuda: bool) -> str:
 
 
 def _on_driven_worlds(
-    context: RunContext,
-    backend: Backend,
-    device: str,
-    result: GateResult,
-    limits: dict[str, Any],
+    context: RunContext, backend: Backend, device: str, result: GateResult, limits: dict[str, Any]
 ) -> dict[str, Measurement]:
     """Measurements *physics* and *episode*, on the same worlds."""
     t = context.cfg.gate.throughput

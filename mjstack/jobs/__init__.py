@@ -1,12 +1,5 @@
 """The jobs of the command line, by the name in `conf/job/`."""
 
-from mjstack.jobs.runner import (
-    CheckedJob,
-    Job,
-    check_job,
-    check_ranks,
-    check_share,
-    count_devices,
-)
+from mjstack.jobs.runner import CheckedJob, Job, check_job, check_ranks, check_share, count_devices
 
 __all__ = ["CheckedJob", "Job", "check_job", "check_ranks", "check_share", "count_devices"]

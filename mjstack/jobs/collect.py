@@ -151,10 +151,7 @@ def _write_table(cfg: Config, plan: CollectPlan, folder: Path, result: GateResul
             ranges.append([f"{name} {joint}", unit, *(f"{value:.4f}" for value in values)])
     facts = [[key, format_value(value)] for key, value in (result.notes | result.metrics).items()]
     header = ["number", "unit", "smallest", "mean", "largest"]
-    tables = [
-        Table(header=["fact", "value"], rows=facts),
-        Table(header=header, rows=ranges),
-    ]
+    tables = [Table(header=["fact", "value"], rows=facts), Table(header=header, rows=ranges)]
     title = f"{cfg.robot.title}, task {cfg.task.name}: demonstrations"
     loading = LOADING.format(folder=dataset)
     text = f"{to_document(title, tables)}\nWith pyarrow alone:\n\n```python\n{loading}```\n"

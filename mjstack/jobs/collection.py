@@ -19,13 +19,7 @@ from mjstack.datasets.part import FILE_MB, Part, PartWriter
 from mjstack.datasets.spec import typed_episode
 from mjstack.episodes.context import RunContext
 from mjstack.files import write_atomic
-from mjstack.jobs.collected import (
-    FILE,
-    CollectedBatch,
-    CollectPlan,
-    describe_batches,
-    read_batches,
-)
+from mjstack.jobs.collected import FILE, CollectedBatch, CollectPlan, describe_batches, read_batches
 from mjstack.jobs.demonstration import STATE, Played, play_demonstrations
 from mjstack.jobs.episode_source import EpisodeSource
 from mjstack.report.record import GateResult, Status

@@ -172,11 +172,7 @@ def play_demonstrations(
     drawn = bool(context.cfg.scene.cameras)
     recorder = StepRecorder(keep_states=drawn)
     episode = play_episode(
-        env,
-        context.driver(env),
-        [recorder],
-        advance=context.advance,
-        label=f"steps of seed {seed}",
+        env, context.driver(env), [recorder], advance=context.advance, label=f"steps of seed {seed}"
     )
     return Played(
         seed=seed,

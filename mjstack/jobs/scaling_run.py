@@ -70,10 +70,7 @@ def run_process(
     began = time.monotonic()
     with (folder / "output.log").open("w") as log:
         process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
+            command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
         )
         try:
             while (code := process.poll()) is None and (

@@ -142,11 +142,7 @@ class Stage:
     """Worlds side by side in a viser server's scene."""
 
     def __init__(
-        self,
-        server: Any,
-        shapes: Shapes,
-        labels: Sequence[str],
-        tints: Sequence[np.ndarray | None],
+        self, server: Any, shapes: Shapes, labels: Sequence[str], tints: Sequence[np.ndarray | None]
     ) -> None:
         """Add the worlds.
 
