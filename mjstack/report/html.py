@@ -281,18 +281,18 @@ def _matrices(metrics: dict[str, float]) -> list[Table]:
     return tables
 
 
-def _beside_limits(metrics: Mapping[str, float], thresholds: dict[str, float]) -> list[Table]:
+def _beside_limits(metrics: Mapping[str, float], thresholds: Mapping[str, float]) -> list[Table]:
     """What was measured beside what is required, and the requirements of nothing that was
     measured.
     """
-    left = dict(thresholds)
     rows = []
+    used: set[str] = set()
     for name, value in metrics.items():
-        found = _limits_of(name, left)
-        limits = " to ".join(with_unit(limit, left[limit]) for limit in found)
+        found = _limits_of(name, thresholds)
+        used.update(found)
+        limits = " to ".join(with_unit(limit, thresholds[limit]) for limit in found)
         rows.append([label(name), with_unit(name, value), limits])
-    used = {limit for name in metrics for limit in _limits_of(name, left)}
-    rest = [[label(name), with_unit(name, left[name])] for name in left if name not in used]
+    rest = [[label(name), with_unit(name, x)] for name, x in thresholds.items() if name not in used]
     tables = []
     if rows:
         header = ["measured", "", "required"]
