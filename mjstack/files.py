@@ -216,3 +216,13 @@ def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) ->
     writer.writeheader()
     writer.writerows(rows)
     return out.getvalue()
+
+
+def read_inside(path: Path, most: int) -> bytes:
+    """The content of a file inside its folder, if it is not larger than ``most`` bytes."""
+    if path.resolve().parent != path.parent.resolve():
+        raise ValueError("it is a link that leads out of the folder")
+    size = path.stat().st_size
+    if size > most:
+        raise ValueError(f"it has {size} bytes, more than {most}")
+    return path.read_bytes()

@@ -190,7 +190,7 @@ def test_bad_input_is_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     policy = exported / "policy"
-    assert export(policy, tmp_path / "out") == 2
+    assert export(policy, tmp_path / "out", "task=stack") == 2
     assert "was trained with task.name=reach, and here it is stack" in refused(capsys)
     before = (exported / "out" / "policy.onnx").read_bytes()
     assert export(policy, exported / "out", "task=reach") == 2

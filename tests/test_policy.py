@@ -197,6 +197,35 @@ def folder(tmp_path: Path) -> Path:
     return write_policy(tmp_path / "mine", configure())
 
 
+def test_robot_task_and_cameras_follow_the_policy(tmp_path: Path) -> None:
+    """They are those of its training, unless the command line chooses others."""
+    seen = ["cameras=[wrist,front]", "robot=rebot", "task=reach"]
+    cfg = configure(*seen, "observation=reach")
+    policy = str(write_policy(tmp_path / "it=s [mine]", cfg))
+    named = ["controller=policy", f"policy='{policy}'"]
+    found = mjstack.load_config(named)
+    assert (found.robot.name, found.task.name) == ("rebot", "reach")
+    assert list(found.scene.cameras) == []  # this policy sees none
+
+    path = Path(policy) / "policy.json"
+    facts = json.loads(path.read_text())
+    facts["observation"]["images"] = {"wrist": [8, 8], "front": [8, 8]}
+    path.write_text(json.dumps(facts))
+    assert list(mjstack.load_config(named).scene.cameras) == ["wrist", "front"]
+    assert list(mjstack.load_config([*named, "cameras=top"]).scene.cameras) == ["top"]
+    own = mjstack.load_config([*named, "robot=so101", "task=stack"])
+    assert (own.robot.name, own.task.name) == ("so101", "stack")
+
+    # What is no choice here, or no policy, chooses nothing: the check of the policy says so.
+    for damage in ('{"config": [], "observation": {}}', "[" * 100_000, "", "\0"):
+        path.write_text(damage)
+        assert mjstack.load_config(named).task.name == "stack"
+    facts["config"]["task"]["name"] = "../task/reach"
+    path.write_text(json.dumps(facts))
+    found = mjstack.load_config(named)
+    assert (found.robot.name, found.task.name) == ("rebot", "stack")
+
+
 @pytest.mark.parametrize(
     ("overrides", "says"), MISFITS, ids=[" ".join(overrides) for overrides, _ in MISFITS]
 )

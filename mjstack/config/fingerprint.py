@@ -17,6 +17,7 @@ from mjstack.errors import ConfigError
 CONTENT = "sha256:"  # in front of what stands for a file
 _OF_THE_CALL = ("resume", "devices", "web")  # they change no result
 POLICY_FILE = "policy.json"  # of a policy's folder; it names the weights by their SHA-256
+MOST_TEXT = 2**24  # bytes of it; a stranger's may ask for more
 
 
 def config_content(cfg: Config) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Composes `conf/` into the dataclasses of `schema`."""
 
+import json
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -18,6 +19,7 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 from mjstack.config.check import validate
 from mjstack.config.complete import complete
 from mjstack.config.explain import check_added, check_overrides, explain, parse
+from mjstack.config.fingerprint import MOST_TEXT, POLICY_FILE
 from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Config
 from mjstack.config.session import (
     CONFIG_NAME,
@@ -25,12 +27,13 @@ from mjstack.config.session import (
     check_beside,
     check_trusted,
     hydra_session,
+    list_choices,
     read_yaml,
     search_path,
     without_hydra,
 )
 from mjstack.errors import CompositionError, ConfigError
-from mjstack.files import reading
+from mjstack.files import read_inside, reading
 
 _schema = OmegaConf.structured(Config)
 _schema.gate._set_flag("struct", False)  # gates of the search path are added to it
@@ -76,7 +79,7 @@ def extended_search_path(
     composition inside.
 
     Yields:
-        The other overrides.
+        The other overrides, and what the policy that they name was trained for.
     """
     entries = [] if config_dir is None else [str(config_dir)]
     others = []
@@ -91,7 +94,30 @@ def extended_search_path(
         else:
             others.append(override)
     with search_path(entries):
-        yield others
+        yield [*others, *_policy_choices(others)]
+
+
+def _policy_choices(overrides: Sequence[str]) -> list[str]:
+    """Robot, task and cameras of the policy that the overrides name, where they choose none; none
+    of a policy that cannot be read, which a check says later.
+    """
+    keys = {override.partition("=")[0] for override in overrides}
+    named = [parse(override).value() for override in overrides if override.startswith("policy=")]
+    folder = named[0] if len(named) == 1 and "experiment" not in keys else None
+    if not isinstance(folder, str):
+        return []
+    try:
+        facts = json.loads(read_inside(Path(folder) / POLICY_FILE, MOST_TEXT))
+        trained = {group: [facts["config"][group]["name"]] for group in ("robot", "task")}
+        trained["cameras"] = list(facts["observation"].get("images", {}))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return []
+    choices = list_choices()
+    return [
+        f"{group}={names[0] if len(names) == 1 else names}".replace("'", "").replace(" ", "")
+        for group, names in trained.items()
+        if group not in keys and names and all(name in choices[group] for name in names)
+    ]
 
 
 def compose(

@@ -21,11 +21,11 @@ from torch import Tensor
 
 import mjstack
 from mjstack.config.complete import typed
-from mjstack.config.fingerprint import POLICY_FILE, config_content
+from mjstack.config.fingerprint import MOST_TEXT, POLICY_FILE, config_content
 from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg, TermCfg
 from mjstack.config.session import is_trusted_function
 from mjstack.errors import PolicyError
-from mjstack.files import reading, write_atomic
+from mjstack.files import read_inside, reading, write_atomic
 from mjstack.policy.network import PolicyNetwork, Vision
 
 # Grows when an older mjstack could not read what is written
@@ -33,7 +33,6 @@ FORMAT = 3
 _WITH_IMAGES = 4
 _NAME_ANOTHER = "Name a policy that job=train has written, such as outputs/mine/last"
 # A stranger's files may ask for more than this.
-_MOST_TEXT = 2**24  # bytes
 _MOST_WEIGHTS = 2**32  # bytes
 _MOST_COUNT = 1_000_000
 _MOST_LAYERS = 100
@@ -216,7 +215,7 @@ def load_policy(folder: Path) -> Policy:
         expected = "expected the folder of a policy"
         raise PolicyError(f"policy={folder}: has no {POLICY_FILE}, {expected}", _NAME_ANOTHER)
     with reading(path, PolicyError, _NAME_ANOTHER):
-        facts = json.loads(_read(path, _MOST_TEXT))
+        facts = json.loads(read_inside(path, MOST_TEXT))
         if facts["format"] not in (FORMAT, _WITH_IMAGES):
             raise PolicyError(
                 f"policy={folder}: has format {facts['format']}, expected {FORMAT} or"
@@ -229,7 +228,7 @@ def load_policy(folder: Path) -> Policy:
             raise ValueError("weights_sha256 is no SHA-256")
     weights = folder / _weights_name(digest)
     with reading(weights, PolicyError, "Copy the whole folder again, or train the policy again"):
-        content = _read(weights, _MOST_WEIGHTS)
+        content = read_inside(weights, _MOST_WEIGHTS)
         if sha256(content).hexdigest() != digest:
             raise ValueError(f"its content is not that of {POLICY_FILE}")
         found = load(content)
@@ -239,16 +238,6 @@ def load_policy(folder: Path) -> Policy:
         policy.network.load_state_dict(found, assign=True)
     policy.network.requires_grad_(False)
     return policy
-
-
-def _read(path: Path, most: int) -> bytes:
-    """The content of a file inside its folder, if it is not larger than ``most`` bytes."""
-    if path.resolve().parent != path.parent.resolve():
-        raise ValueError("it is a link that leads out of the folder")
-    size = path.stat().st_size
-    if size > most:
-        raise ValueError(f"it has {size} bytes, more than {most}")
-    return path.read_bytes()
 
 
 def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
