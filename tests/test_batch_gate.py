@@ -24,6 +24,7 @@ from mjstack.episodes import tally as tally_module
 from mjstack.episodes.context import RunContext
 from mjstack.episodes.record import FAILING, EpisodeRecord
 from mjstack.episodes.rollout import Episode, play_episode
+from mjstack.episodes.tally import EpisodeTally
 from mjstack.errors import RunError
 from mjstack.files import to_csv, write_atomic
 from mjstack.gates.batch import run_batch
@@ -300,6 +301,42 @@ def test_no_trajectory_is_kept(new_context: Callable[..., RunContext], tmp_path:
 
     peak(2)  # whatever is made once
     assert (peak(12) - peak(2)) / 10 < 15_000
+
+
+def test_a_further_seed_takes_9_bytes_a_world(new_context: Callable[..., RunContext]) -> None:
+    """Of worlds that do not fail, after those that the page shows: a flag and a hash."""
+    check = new_context("sim=native").check
+    tally = EpisodeTally(
+        gate="batch", noun="worlds", several=True, check=check, path=None, replayed=False
+    )
+    worlds = 20_000
+    rng = np.random.default_rng(0)
+
+    def add(seed: int) -> None:
+        record = EpisodeRecord(
+            seed=seed,
+            backend="native",
+            device="cpu",
+            failed=np.zeros(worlds, np.int32),
+            values={name: rng.random(worlds) for name in ("xy_err", "height_err")},
+            qpos=rng.random((worlds, 20)),
+            start=rng.random((worlds, 20)),
+            measured={"peak_contacts": rng.random(worlds)},
+        )
+        tally.add(record)
+
+    add(0)
+    tracemalloc.start()
+    try:
+        add(1)
+        before = tracemalloc.get_traced_memory()[0]
+        for seed in range(2, 8):
+            add(seed)
+        grown = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert tally.distinct_ends == tally.good == 8 * worlds
+    assert 8.9 < grown / (6 * worlds) < 9.2
 
 
 @pytest.mark.full

@@ -27,7 +27,7 @@ from environments import one_second_episode
 
 import mjstack
 from mjstack.cli import run
-from mjstack.config.schema import Config
+from mjstack.config.schema import Backend, Config
 from mjstack.datasets import read_dataset
 from mjstack.distributed import Ranks, current_ranks
 from mjstack.episodes.context import RunContext
@@ -38,6 +38,7 @@ from mjstack.jobs import check_ranks, count_devices
 
 SHORT = ["sim=native", "gates=[batch]", *one_second_episode()]
 SCRIPT = Path(mjstack.__file__).parents[1] / "scripts" / "run.py"
+ON_CUDA = (Backend.mjwarp, "cuda:0")
 OF_CALL = {"seconds", "rank_first_world", "rank_place"}  # of a record
 
 MEETING = """\
@@ -413,7 +414,7 @@ def test_devices_is_a_number_or_all(value: str) -> None:
         load_config([f"devices={value}"])
 
 
-def test_more_devices_than_there_are() -> None:
+def test_more_devices_than_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     def cfg(value: str) -> Config:
         return load_config(["sim=native", f"devices={value}"])
 
@@ -421,6 +422,20 @@ def test_more_devices_than_there_are() -> None:
     assert count_devices(cfg("all")) == 1  # on a CPU one process uses all cores
     with pytest.raises(ConfigError, match=r"devices=9999: expected at most \d+, as this machine"):
         count_devices(cfg("9999"))
+    monkeypatch.setattr("mjstack.jobs.runner.resolve_backend", lambda cfg: ON_CUDA)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    assert [count_devices(cfg(value)) for value in ("all", "2", "1")] == [2, 2, 1]
+    says = "devices=3: expected at most 2, as this machine has 2 CUDA devices for sim=mjwarp"
+    with pytest.raises(ConfigError, match=says):
+        count_devices(cfg("3"))
+
+
+def test_two_ranks_on_one_gpu_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RunContext, "backend", ON_CUDA)
+    monkeypatch.setattr("mjstack.jobs.runner.cuda_uuid", lambda device: "GPU-7")
+    monkeypatch.setattr(Others, "change", {}, raising=False)
+    with pytest.raises(MjstackError, match=r"ranks 0 and 1 \(.*\) have one GPU, GPU-7, expected"):
+        check_ranks(RunContext(load_config([]), ranks=Others(0, 2)))
 
 
 @pytest.mark.full

@@ -1,0 +1,111 @@
+"""Jobs and gates in several ranks, on one machine and as two nodes: each leaves what one rank
+leaves.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset_checker import check_dataset
+from environments import at_double_speed, one_second_episode
+from one_node_slurm import free_ports
+from test_ranks import SCRIPT, SHORT, play, report_of, start_python
+
+from mjstack.datasets import read_dataset
+from mjstack.policy import load_policy
+
+CAMERA = ["cameras=front", "scene.cameras.front.size=[32,32]", "sim=mjwarp", "sim.device=cpu"]
+
+pytestmark = pytest.mark.full
+
+
+@pytest.mark.parametrize("allowed", [3, 0], ids=["passes", "fails"])
+def test_two_nodes(allowed: int, tmp_path: Path) -> None:
+    """Two agents of torchrun, as on two machines with one disk: one report, and neither agent waits
+    for the other after it, also if the gate has failed.
+    """
+    run = [
+        *SHORT,
+        "nworld=3",
+        f"gate.batch.failed_worlds={allowed}",
+        f"hydra.run.dir={tmp_path}/run",
+    ]
+    (port,) = free_ports(1)
+    nodes = []
+    for node in (0, 1):
+        (tmp_path / str(node)).mkdir()
+        where = [f"--node-rank={node}", "--master-addr=127.0.0.1", f"--master-port={port}"]
+        agent = ["-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=1", *where]
+        nodes.append(start_python([*agent, str(SCRIPT), *run], tmp_path / str(node)))
+    began = time.monotonic()
+    texts = [node.communicate(timeout=500)[0] for node in nodes]
+    assert time.monotonic() - began < 200.0, texts  # an agent waits 300 s for one that fails
+    assert nodes[0].returncode == (0 if allowed else 1), texts
+    assert texts[0].count("status: ") == 1
+    assert "status: " not in texts[1]
+    assert not list((tmp_path / "1").iterdir())
+    report = report_of(tmp_path / "run")
+    assert report["status"] == ("pass" if allowed else "fail")
+    (gate,) = report["gates"]
+    assert gate["metrics"]["episodes"] == 3
+    assert len(report["provenance"]["ranks"]) == 2
+
+
+def test_each_rank_measures_its_own_worlds(tmp_path: Path) -> None:
+    """Capacity in ranks, and scripts/bench_many.py, whose figures are the sums over the ranks."""
+    own = ["sim=mjwarp", "sim.device=cpu", "gates=[capacity]", "gate.capacity.random_steps=20"]
+    args = [*own, "nworld=3", *one_second_episode(), f"hydra.run.dir={tmp_path}/capacity"]
+    play(2, args, tmp_path, None)
+    (gate,) = report_of(tmp_path / "capacity")["gates"]
+    assert gate["notes"]["ranks"] == "each of 2 ranks its own worlds; figures are rank 0's"
+    assert any(line.startswith("rank 1: ") for line in gate["details"])
+
+    few = ["repetitions=2", "steps=2", "env_steps=2", "episodes=1"]
+    small = ["sim=native", *at_double_speed(), *(f"gate.throughput.{key}" for key in few)]
+    bench = [str(SCRIPT.parent / "bench_many.py"), "--gpus=2", "--worlds=2", "--rounds=1"]
+    command = [sys.executable, *bench, f"--folder={tmp_path}/many", "--", *small]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    runs = [json.loads(line) for line in (tmp_path / "many/many.jsonl").read_text().splitlines()]
+    assert [(run["gpus"], run["episodes"], run["status"]) for run in runs] == [(2, 4, 0), (1, 2, 0)]
+    for run in runs:
+        assert min(run[name] for name in ("physics", "episode", "batch", "env.step")) > 0.0
+    table = (tmp_path / "many/many.md").read_text()
+    for name in ("physics", "episode", "batch", "env.step"):
+        assert f"| weak | 2 | {name} | 2 |" in table
+    assert (tmp_path / "many/many.png").exists()
+
+
+def test_ranks_collect_images(tmp_path: Path) -> None:
+    """Videos of both ranks: each frame is that of the world which one rank draws."""
+    args = ["job=collect", *CAMERA, "nworld=3", "job.keep_failures=true", "job.episodes=3"]
+    args += one_second_episode()
+    for ranks in (1, 2):
+        play(ranks, [*args, f"job.folder={tmp_path}/{ranks}"], tmp_path)
+    one, two = (read_dataset(tmp_path / name / "dataset") for name in "12")
+    for key in ("world", "length"):
+        assert [row[key] for row in two.episodes] == [row[key] for row in one.episodes]
+    np.testing.assert_array_equal(two.frames("action"), one.frames("action"))
+    check_dataset(tmp_path / "2" / "dataset")
+
+
+def test_ranks_learn_from_pixels(tmp_path: Path) -> None:
+    """Each draws images of its own episodes; both have one policy, which the first one writes."""
+    few = ["channels=[4,8]", "features=8", "pool=40", "uses=2", "shift=1", "cameras=[front]"]
+    sizes = ["episodes=4", "noisy_episodes=0", "hidden=[16]", "batches=4", "batch_size=16"]
+    args = ["job=train", "trainer=pixels", *CAMERA, "task=reach", "nworld=4", "web.episode=false"]
+    args += ["controller.phases.hold.seconds=0.4", "task.episode_steps=70", "task.check.window=10"]
+    args += [f"job.vision.{key}" for key in few] + [f"job.{key}" for key in sizes]
+    args += ["job.save_every=2", "gate.success.rate=0.0", f"job.folder={tmp_path}/out"]
+    text = play(2, args, tmp_path)
+    assert text.count("status: pass") == 1
+    train, success = report_of(tmp_path / "out")["gates"]
+    assert train["metrics"]["expert_episodes_played"] == 4
+    assert success["metrics"]["episodes"] == 4
+    assert load_policy(tmp_path / "out/last").network.vision.sizes == {"front": (32, 32)}
