@@ -376,7 +376,8 @@ def _print_sweep(folder: Path, count: int) -> None:
         | {"job": str(job), "overrides": " ".join(result.overrides), "status": result.status}
         for job, result in enumerate(_results)
     ]
-    title = f"sweep of {max(count, len(rows))} jobs"
+    jobs = max(count, len(rows))
+    title = f"sweep of {jobs} job{'s' if jobs > 1 else ''}"
     table = Table.of({name: name for name in columns}, rows, title)
     Console().print(table.to_console())
     if len(rows) > 1:

@@ -135,6 +135,7 @@ def test_a_page_holds_every_frame(stage: Callable[..., RunContext], tmp_path: Pa
     shapes = Shapes(model)
     heights = shapes.poses(worlds[0].qpos)[0][:, :, 2]
     rising = int(np.ptp(heights, 0).argmax())
+    assert "<title>Episode</title>" in path.read_text()
     sent = messages(path)
     names = {
         message["name"]: message["props"]

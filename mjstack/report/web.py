@@ -270,7 +270,8 @@ def save_episode(
             scene.insert_sleep(frame_dt)
             stage.update(row)
         scene.insert_sleep(1.0)
-        path.write_text(scene.as_html(), encoding="utf-8")
+        page = scene.as_html().replace("<title>Viser</title>", "<title>Episode</title>", 1)
+        path.write_text(page, encoding="utf-8")
     finally:
         stop_server(server)
 
