@@ -27,8 +27,11 @@ import test_fuzz as fuzz
 import torch
 from compositions import make_env
 from environments import one_second_episode
+from test_train import REACH, weights
 
 from mjstack.interrupt import EXIT_CODE
+from mjstack.policy.checkpoint import read_state
+from mjstack.train.trainer import STATE
 
 NO_WORK = "mjstack: interrupted before anything ran\n"
 WORK = "interrupted; the finished gates are in the report\n"
@@ -50,6 +53,36 @@ def test_a_command_that_is_interrupted(kind: str) -> None:
 def test_a_script_that_is_interrupted() -> None:
     """KeyboardInterrupt reaches it and no other error does, and the environment goes on."""
     assert interrupt_steps(30) == {"KeyboardInterrupt": 30}
+
+
+@pytest.mark.full
+def test_a_training_that_is_killed_goes_on_where_it_saved(tmp_path: Path) -> None:
+    """SIGKILL after the first save: the same command ends bit for bit as a whole one."""
+    ends = []
+    for name in ("killed", "whole"):
+        folder = tmp_path / name
+        # With more batches than can follow before the kill
+        train = [*REACH, "job.batches=400", "job.save_every=50", f"job.folder={folder}"]
+        command = [sys.executable, "-m", "mjstack", *train]
+        alone = os.environ | {"OMP_NUM_THREADS": "1"}  # other work may share the machine
+        if name == "killed":
+            process = subprocess.Popen(command, env=alone, stdout=subprocess.DEVNULL)
+            until = time.monotonic() + 300.0
+            while not (folder / STATE).exists():
+                assert process.poll() is None
+                assert time.monotonic() < until
+                time.sleep(0.005)
+            process.kill()
+            assert process.wait() == -signal.SIGKILL
+            done = read_state(folder / STATE)[1]["done"]
+            assert 0 < done < 400
+        subprocess.run(command, env=alone, stdout=subprocess.DEVNULL, check=True, timeout=300)
+        state, facts = read_state(folder / STATE)
+        ends.append(state | weights(folder / "last") | weights(folder / "best"))
+        assert facts["done"] == 400
+    killed, whole = ends
+    assert killed.keys() == whole.keys()
+    assert all(torch.equal(value, whole[name]) for name, value in killed.items() if name != "sum")
 
 
 def interrupt_steps(count: int) -> Counter[str]:

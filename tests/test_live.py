@@ -14,13 +14,18 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.error import URLError
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
+import test_ppo
+import test_train
 from browser import EXECUTABLE, browse
 from compositions import load_config
 from environments import configure, has_gl
 
+import mjstack.jobs.showing as showing
 import mjstack.report.web as web
 from mjstack.cli import run
 from mjstack.envs import build_env
@@ -297,6 +302,47 @@ def test_worlds_move_as_without_it(tmp_path: Path, port: int) -> None:
         with np.load(out / "worlds_seed0.npz") as held:
             ends.append(held["qpos"])
     assert np.array_equal(*ends)
+
+
+JOBS: dict[str, tuple[tuple[str, ...], set[str]]] = {
+    "play": (("job=play", "task=reach", "sim=native", "nworld=1"), {"play"}),
+    "clone": (test_train.REACH, {"train", "success"}),
+    "ppo": (test_ppo.REACH, {"train", "success"}),
+}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("job", JOBS)
+def test_jobs_serve_the_live_view(
+    job: str, tmp_path: Path, port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A page on this machine shows the worlds of each part; after the end there is none."""
+    command, parts = JOBS[job]
+    looked: dict[str, str] = {}
+
+    def start(host: str, number: int) -> Any:
+        opened = start_server(host, number)
+        monkeypatch.setattr(opened, "get_clients", lambda: {0: None})
+        return opened
+
+    def look(self: LiveView, step: int) -> None:
+        after_step(self, step)
+        if self._part not in looked:
+            with urlopen(f"http://127.0.0.1:{port}", timeout=60) as page:
+                assert b"<html" in page.read()
+            looked[self._part] = self._status.content
+
+    after_step = LiveView.after_step
+    monkeypatch.setattr(LiveView, "after_step", look)
+    monkeypatch.setattr(showing, "start_server", start)
+    where = ["view=web", f"web.port={port}"]
+    folder = f"hydra.run.dir={tmp_path}" if job == "play" else f"job.folder={tmp_path}"
+    assert run([*command, *where, folder]) == 0
+    assert looked.keys() == parts
+    worlds = "1 world" if job == "play" else "4 worlds"
+    assert all(f"**{part}**" in text and worlds in text for part, text in looked.items()), looked
+    with pytest.raises(URLError):
+        urlopen(f"http://127.0.0.1:{port}", timeout=5)
 
 
 @pytest.mark.full
