@@ -149,6 +149,34 @@ class Demonstrations:
         return (self.ends - 1).repeat_interleave(self.lengths())
 
 
+def drop_waits(demonstrations: Demonstrations) -> Demonstrations:
+    """Demonstrations without the steps in which the expert waits to go on.
+
+    A policy does not see how long it has waited. It would answer with the mean of staying and
+    leaving, and stay for ever. The first step of a wait remains, and so does the end of an episode.
+
+    Args:
+        demonstrations: Episodes of an expert.
+    """
+    labels = demonstrations.labels
+    ends = demonstrations.ends
+    steps = torch.arange(len(labels), device=labels.device)
+    least = _STANDS * (labels.amax(0) - labels.amin(0))
+    moves = torch.ones_like(steps, dtype=torch.bool)
+    moves[1:] = (labels.diff(dim=0).abs() > least).any(1)
+    moves[ends[:-1]] = True  # first steps
+    last_move = torch.where(moves, steps, 0).cummax(0).values[ends - 1]
+    kept = moves | (steps > last_move.repeat_interleave(demonstrations.lengths()))
+    qpos = demonstrations.qpos
+    return replace(
+        demonstrations,
+        seen=demonstrations.seen[kept],
+        labels=labels[kept],
+        ends=kept.cumsum(0)[ends - 1],
+        qpos=None if qpos is None else qpos[kept],
+    )
+
+
 def lead_gripper(demonstrations: Demonstrations, fingers: int) -> Demonstrations:
     """Demonstrations whose jaws are led to where they will stand, in place of along the way there.
 
