@@ -119,7 +119,8 @@ def test_the_driver_sees_what_the_environment_draws(trained: Path) -> None:
 def test_other_cameras_are_refused(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     base = [*SMALL[:4], *SHORT, "controller=policy", f"policy={trained}/last", "gates=[batch]"]
     for cameras, says in (
-        ([], "was trained with scene.cameras.front.size=[16, 24], and here it is missing"),
+        (["cameras=[]"], "with scene.cameras.front.size=[16, 24], and here it is missing"),
+        ([], "was trained with scene.cameras.front.size=[16, 24], and here it is ["),
         ([*CAMERAS, "scene.cameras.wrist.size=[32,32]"], "wrist.size=[16, 16], and here it is"),
         ([*CAMERAS, "scene.cameras.front.fovy=50"], "front.fovy=45.0, and here it is 50.0"),
     ):
