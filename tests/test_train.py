@@ -27,7 +27,7 @@ from mjstack.mdp.observation import headings
 from mjstack.policy import load_policy
 from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.train.clone_learner import Learner, draw_seed
-from mjstack.train.demonstrations import Demonstrations, drop_waits, lead_gripper, play_expert
+from mjstack.train.demonstrations import Demonstrations, lead_gripper, play_expert
 from mjstack.train.trainer import STATE, observed_group
 
 TINY = (
@@ -245,33 +245,6 @@ def test_jaws_are_led_to_where_they_will_stand() -> None:
     assert torch.equal(led[:, 0], arm)
     assert led[:, 1].tolist() == [1.0, *[0.0] * 4, *[1.0] * 4, *[1.0] * 3]
     assert data.labels[2, 1] == torch.tensor(0.8)
-
-
-def test_waits_are_left_out() -> None:
-    """All but their first step, and but the end of an episode."""
-    first = [0.0, 0.0, 0.0, 0.5, 1.0, 1.0, 1.0, 0.9, 0.2, 0.2]
-    second = [0.2, 0.2, 0.7, 0.7]
-    still = [0.0, 0.0]
-    arm = torch.tensor(first + second + still)
-    jaws = torch.zeros(16)
-    jaws[6] = 0.5  # they move where the arm waits
-    rows = torch.arange(16.0)[:, None]
-    data = Demonstrations(
-        seen=rows,
-        labels=torch.stack((arm, jaws), dim=1),
-        ends=torch.tensor([10, 14, 16]),
-        widths={"row": 1},
-        played=3,
-        source="a test",
-        qpos=rows + 100.0,
-    )
-    found = drop_waits(data)
-    kept = torch.tensor([0, 3, 4, 6, 7, 8, 9, 10, 12, 13, 14, 15])
-    assert found.seen[:, 0].tolist() == kept.tolist()
-    assert torch.equal(found.labels, data.labels[kept])
-    assert found.qpos is not None
-    assert torch.equal(found.qpos, found.seen + 100.0)
-    assert found.ends.tolist() == [7, 10, 12]
 
 
 def test_headings_are_those_of_a_quarter_turn() -> None:

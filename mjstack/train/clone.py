@@ -18,7 +18,7 @@ from mjstack.managers.observation import ObservationManager
 from mjstack.sim.memory import free_memory
 from mjstack.train.clone_learner import Learner
 from mjstack.train.dataset import check_dataset, read_demonstrations
-from mjstack.train.demonstrations import batches_of, drop_waits, lead_gripper, play_expert
+from mjstack.train.demonstrations import batches_of, lead_gripper, play_expert
 from mjstack.train.trainer import (
     LAST,
     Trained,
@@ -121,7 +121,7 @@ def train_clone(context: RunContext, folder: Path) -> Trained:
             " episodes succeeded, expected two at least",
             "Ask for more (job.episodes), or look at why with gates=[success]",
         )
-    demonstrations = lead_gripper(drop_waits(demonstrations), len(cfg.robot.gripper_joints))
+    demonstrations = lead_gripper(demonstrations, len(cfg.robot.gripper_joints))
     counts = torch.tensor([len(demonstrations.ends), demonstrations.played], device=device)
     ranks.sum_(counts)
     facts = {

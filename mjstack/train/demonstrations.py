@@ -21,7 +21,6 @@ from mjstack.managers.view import random_uniform
 
 NOISE_SECONDS = 0.5  # in which the noise of a joint is forgotten
 _STANDS = 1e-4  # of a joint target's range: by less it moves in no step
-_CREEPS = 1e-3  # of a joint target's range: a slower way has fewer steps
 
 
 class NoisyDriver(Driver):
@@ -148,37 +147,6 @@ class Demonstrations:
     def last(self) -> Tensor:
         """The last step of the episode that each step belongs to, shape ``(steps,)``, int64."""
         return (self.ends - 1).repeat_interleave(self.lengths())
-
-
-def drop_waits(demonstrations: Demonstrations) -> Demonstrations:
-    """Demonstrations without the steps in which the expert waits to go on, or creeps.
-
-    A policy does not see how long it has waited. It would answer with the mean of staying and
-    leaving, and stay for ever. So a step remains where the joint targets' way, in ranges of theirs,
-    passes another thousandth. The end of an episode, in which the expert stays, remains too.
-
-    Args:
-        demonstrations: Episodes of an expert.
-    """
-    labels = demonstrations.labels
-    ends = demonstrations.ends
-    steps = torch.arange(len(labels), device=labels.device)
-    scale = (labels.amax(0) - labels.amin(0)).clamp(min=torch.finfo(labels.dtype).tiny)
-    passed = torch.zeros(len(labels), dtype=torch.float64, device=labels.device)
-    passed[1:] = (labels.diff(dim=0).abs() / scale).amax(1)
-    moves = torch.ones_like(steps, dtype=torch.bool)
-    moves[1:] = (passed.cumsum(0) / _CREEPS).floor().diff() > 0.0
-    moves[ends[:-1]] = True  # first steps
-    last_move = torch.where(moves, steps, 0).cummax(0).values[ends - 1]
-    kept = moves | (steps > last_move.repeat_interleave(demonstrations.lengths()))
-    qpos = demonstrations.qpos
-    return replace(
-        demonstrations,
-        seen=demonstrations.seen[kept],
-        labels=labels[kept],
-        ends=kept.cumsum(0)[ends - 1],
-        qpos=None if qpos is None else qpos[kept],
-    )
 
 
 def lead_gripper(demonstrations: Demonstrations, fingers: int) -> Demonstrations:
