@@ -377,6 +377,6 @@ def test_a_browser_looks_at_a_run(tmp_path: Path, port: int) -> None:
             assert tab.problems == []
             assert {address.rstrip("/") for address in tab.requests} == {f"http://127.0.0.1:{port}"}
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=180) == 130
+        assert process.wait(timeout=60) == 130
     finally:
         process.kill()
